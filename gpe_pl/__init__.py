@@ -1,0 +1,1 @@
+"""Learned simulators of particles and meshes: the Graph-based Physics Engine and its baselines."""

@@ -1,0 +1,54 @@
+"""Run a benchmark suite: ``python -m gpe_pl.benchmark suite=speed``; results in ``{paths.runs}/benchmark/{suite}/``."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import platform
+import subprocess
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gpe_pl.config import construct, entry_point
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+
+def environment() -> dict[str, Any]:
+    """What a number depends on besides the code: machine, library versions, commit."""
+    import torch
+
+    here = Path(__file__).resolve().parent
+    git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=here, capture_output=True, text=True, check=False)
+    return {
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": git.stdout.strip() or "unknown",
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "machine": platform.machine(),
+        "cores": os.cpu_count(),
+    }
+
+
+def benchmark(cfg: DictConfig) -> None:
+    """Run one suite and write ``results.json`` and ``table.md``."""
+    suite = importlib.import_module(f"gpe_pl.suites.{cfg.suite.name}")
+    settings = construct(suite.Settings, {k: v for k, v in cfg.suite.items() if k != "name"}, "suite")
+    records, table = suite.run(settings)
+    folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name
+    folder.mkdir(parents=True, exist_ok=True)
+    results = {"environment": environment(), "settings": vars(settings), "records": records}
+    for name, text in (("results.json", json.dumps(results, indent=1)), ("table.md", table + "\n")):
+        temporary = folder / f".{name}.part"
+        temporary.write_text(text)
+        os.replace(temporary, folder / name)
+    print(table)
+
+
+main = entry_point("benchmark")(benchmark)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""Walls that a learned simulator cannot cross: particles that end a step inside a boundary are put back on its surface, and counted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from array_api_compat import array_namespace
+
+from gpe_pl.geometry import outward_normal, signed_distance
+from gpe_pl.rollout import Simulator
+from gpe_pl.trajectory import Array, State
+
+TOLERANCE = 1e-6
+"""Penetration [m] below which a particle counts as being on the surface."""
+
+
+def contain(state: State, dt: float) -> tuple[State, Array]:
+    """Move penetrating nodes along the surface normal back to the surface of the boundary's shapes.
+
+    Velocities, and the last entry of the velocity history, change by displacement / ``dt``, so that they still are differences of positions.
+
+    Args:
+        state: after a step.
+        dt: frame interval [s].
+
+    Returns:
+        The corrected state (the same object if nothing was inside) and a mask [node] of the corrected nodes.
+    """
+    shapes = state.boundary.shapes
+    pos = state.pos
+    xp = array_namespace(pos)
+    inside = signed_distance(shapes, pos) < -TOLERANCE
+    if not bool(xp.any(inside)):
+        return state, inside
+    rows = xp.nonzero(inside)[0]
+    moved = pos[rows]
+    for _ in range(4):  # corners need a pass per surface
+        for shape in shapes:
+            depth = xp.clip(-shape.signed_distance(moved), 0.0, None)
+            moved = moved + depth[:, None] * outward_normal(shape, moved, step=1e-6)
+    new_pos, vel = xp.asarray(pos, copy=True), xp.asarray(state.vel, copy=True)
+    new_pos[rows] = moved
+    vel[rows] = vel[rows] + (moved - pos[rows]) / dt
+    history = state.velocity_history
+    if history is not None:
+        history = xp.asarray(history, copy=True)
+        history[:, -1] = vel
+    return replace(state, pos=new_pos, vel=vel, velocity_history=history), inside
+
+
+@dataclass
+class Contained:
+    """A simulator with containment after every step, which counts what it corrected.
+
+    Attributes:
+        simulator: the simulator inside.
+        dt: frame interval [s].
+        num_corrected, num_steps: corrected particle-steps out of all particle-steps so far.
+    """
+
+    simulator: Simulator
+    dt: float
+    num_corrected: int = field(default=0, init=False)
+    num_steps: int = field(default=0, init=False)
+
+    def step(self, state: State) -> State:
+        state, corrected = contain(self.simulator.step(state), self.dt)
+        self.num_corrected += int(corrected.sum())
+        self.num_steps += state.num_nodes
+        return state
+
+    @property
+    def share_corrected(self) -> float:
+        return self.num_corrected / self.num_steps if self.num_steps else 0.0

@@ -1,0 +1,97 @@
+"""``LightningDataModule`` over the HDF5 store."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import lightning as L
+import numpy as np
+import torch
+from torch_geometric.data import HeteroData
+from torch_geometric.loader import DataLoader
+
+from gpe_pl.data.dataset import StepSampler, WindowDataset, open_split
+from gpe_pl.data.noise import Noise
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.trajectory import StoreError, Trajectory, iter_trajectories
+
+
+def data_statistics(root: Path | str) -> dict[str, float]:
+    """Statistics of the train split, as written beside it by ``simulate``."""
+    path = Path(root) / "statistics.json"
+    try:
+        return json.loads(path.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise StoreError(f"{path}: cannot be read ({error}); run `python -m gpe_pl.simulate` again") from None
+
+
+class TrajectoryDataModule(L.LightningDataModule):
+    """Training windows in an endless, resumable, seeded order; a fixed, noise-free sample of validation windows.
+
+    Args:
+        root: folder of the data set.
+        graph: how states become graphs.
+        noise: on training inputs.
+        batch_size: graphs per step.
+        seed: of order and noise.
+        num_workers: processes that build graphs; 0 builds them in the training process.
+        num_val_windows: windows of the one-step validation loss, evenly spread over the ``val`` split.
+    """
+
+    def __init__(
+        self,
+        root: Path | str,
+        graph: GraphConfig,
+        noise: Noise,
+        batch_size: int = 2,
+        seed: int = 0,
+        num_workers: int = 0,
+        num_val_windows: int = 256,
+    ) -> None:
+        super().__init__()
+        self.root, self.noise, self.batch_size, self.seed = Path(root), noise, batch_size, seed
+        self.num_workers, self.num_val_windows = num_workers, num_val_windows
+        train = open_split(root, "train")
+        val = open_split(root, "val")
+        self.metadata = train[0].window(0, 1).metadata
+        self.builder = GraphBuilder(graph, self.metadata)
+        unit = data_statistics(root)["acceleration_std"] * self.metadata.frame_dt
+        self.train_set = WindowDataset(train, self.builder, noise, unit, seed)
+        self.val_set = WindowDataset(val, self.builder)
+
+    def statistics_sample(self, num_windows: int = 256) -> Iterator[HeteroData]:
+        """Training graphs, noise included, evenly spread over the split; for the standardisation of features."""
+        for window in _spread(len(self.train_set), num_windows):
+            yield self.train_set[int(window)]
+
+    def val_trajectories(self, count: int) -> list[Trajectory]:
+        """The first ``count`` trajectories of the ``val`` split."""
+        return [t for t, _ in zip(iter_trajectories(self.root, "val"), range(count), strict=False)]
+
+    def train_dataloader(self) -> DataLoader:
+        sampler = StepSampler(len(self.train_set), self.seed, start=lambda: self.trainer.global_step * self.batch_size)
+        return DataLoader(
+            self.train_set,
+            batch_size=self.batch_size,
+            sampler=sampler,
+            num_workers=self.num_workers,
+            persistent_workers=self.num_workers > 0,
+            prefetch_factor=4 if self.num_workers else None,
+            worker_init_fn=_one_thread,
+        )
+
+    def val_dataloader(self) -> DataLoader:
+        windows = [int(w) for w in _spread(len(self.val_set), self.num_val_windows)]
+        return DataLoader([self.val_set[w] for w in windows], batch_size=8)
+
+
+def _spread(length: int, count: int) -> np.ndarray:
+    return np.unique(np.linspace(0, length - 1, min(length, count)).round().astype(int))
+
+
+def _one_thread(_: int) -> None:
+    torch.set_num_threads(1)
+

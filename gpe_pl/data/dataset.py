@@ -1,0 +1,148 @@
+"""Training samples: short windows of trajectories as graphs with a target acceleration.
+
+A sample is a pure function of (split, seed, sample number): runs resume exactly, whatever the number of workers. Stored arrays are read-only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset, Sampler
+from torch_geometric.data import HeteroData
+
+from gpe_pl import integrators
+from gpe_pl.data.noise import Noise
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.trajectory import State, Trajectory, read_trajectory, shards, trajectory_names
+
+CACHE_BYTES = 2 * 1024**3
+"""Splits smaller than this are held in memory; larger ones are read from disk window by window."""
+
+
+@dataclass(frozen=True)
+class StoredTrajectory:
+    """Where a trajectory lies, and the trajectory itself if the split is held in memory."""
+
+    path: Path
+    name: str
+    num_frames: int
+    held: Trajectory | None
+
+    def window(self, start: int, stop: int) -> Trajectory:
+        """Frames ``start:stop``."""
+        if self.held is not None:
+            return self.held.frames(start, stop)
+        return read_trajectory(self.path, self.name, frames=slice(start, stop))
+
+
+def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> list[StoredTrajectory]:
+    """Index all trajectories of a split, holding them in memory if they are small enough."""
+    paths = shards(root, split)
+    hold = 2 * sum(p.stat().st_size for p in paths) <= cache_bytes
+    stored = []
+    for path in paths:
+        for name in trajectory_names(path):
+            trajectory = read_trajectory(path, name)
+            for array in (trajectory.pos, trajectory.vel, trajectory.node_type, trajectory.mass, trajectory.material_params):
+                array.setflags(write=False)
+            stored.append(StoredTrajectory(path, name, trajectory.num_frames, trajectory if hold else None))
+    return stored
+
+
+class WindowDataset(Dataset[HeteroData]):
+    """Windows x[t−H … t+1] of a split as graphs at frame t.
+
+    Every material's store has ``target`` [node, dim]: the acceleration from t to t+1 without gravity [m/s²], from float64 differences. The graph carries
+    ``trajectory`` and ``frame`` numbers for error messages.
+
+    Args:
+        trajectories: of the split.
+        builder: makes the graphs.
+        noise: applied to inputs; None for evaluation.
+        velocity_unit: acceleration std × frame interval [m/s], the unit of velocity noise.
+        seed: of the noise.
+    """
+
+    def __init__(
+        self,
+        trajectories: list[StoredTrajectory],
+        builder: GraphBuilder,
+        noise: Noise | None = None,
+        velocity_unit: float = 0.0,
+        seed: int = 0,
+    ) -> None:
+        self.trajectories, self.builder, self.noise = trajectories, builder, noise
+        self.velocity_unit, self.seed = velocity_unit, seed
+        history = builder.config.history
+        counts = [max(0, t.num_frames - history - 1) for t in trajectories]
+        self.ends = np.cumsum(counts)
+        if not len(self.ends) or self.ends[-1] == 0:
+            raise ValueError(f"no trajectory is longer than the {history + 2} frames that a window with history {history} needs")
+
+    def __len__(self) -> int:
+        return int(self.ends[-1])
+
+    def locate(self, window: int) -> tuple[int, int]:
+        """Trajectory number and frame t of a window."""
+        trajectory = int(np.searchsorted(self.ends, window, side="right"))
+        start = 0 if trajectory == 0 else int(self.ends[trajectory - 1])
+        return trajectory, window - start + self.builder.config.history
+
+    def __getitem__(self, key: int | tuple[int, int]) -> HeteroData:
+        """The graph of a window; ``key`` is its number, or (sample number, window number) where the sample number seeds the noise."""
+        sample, window = key if isinstance(key, tuple) else (key, key)
+        number, frame = self.locate(window)
+        history = self.builder.config.history
+        trajectory = self.trajectories[number].window(frame - history, frame + 2)
+        dt = trajectory.metadata.frame_dt
+        pos = trajectory.pos.astype(np.float64)
+        if self.noise is not None:
+            rng = np.random.default_rng((self.seed, sample))
+            pos = self.noise.apply(pos, self.velocity_unit, dt, rng)
+        velocities = integrators.velocities(pos, dt)
+        gravity = np.asarray(trajectory.metadata.gravity)
+        target = integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity
+        past = np.ascontiguousarray(velocities[:-1].swapaxes(0, 1))
+        state = State(
+            pos[-2],
+            past[:, -1],
+            trajectory.node_type,
+            trajectory.mass,
+            trajectory.material_params,
+            trajectory.boundary,
+            gravity,
+            past,
+            frame * dt,
+        )
+        data = self.builder(state.to_torch())
+        target_tensor = torch.from_numpy(target).float()
+        for material in self.builder.spec.materials:
+            data[material].target = target_tensor[data[material].node_id]
+        data.trajectory, data.frame = number, frame
+        return data
+
+
+class StepSampler(Sampler[tuple[int, int]]):
+    """Endless shuffled passes over a data set as (sample number, window), starting at any sample number.
+
+    Args:
+        num_windows: size of the data set.
+        seed: of the order; every pass has its own.
+        start: called when iteration begins; the number of samples already consumed.
+    """
+
+    def __init__(self, num_windows: int, seed: int, start=lambda: 0) -> None:  # noqa: ANN001
+        self.num_windows, self.seed, self.start = num_windows, seed, start
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        sample = self.start()
+        while True:
+            epoch, offset = divmod(sample, self.num_windows)
+            order = np.random.default_rng((self.seed, epoch)).permutation(self.num_windows)
+            for window in order[offset:]:
+                yield sample, int(window)
+                sample += 1

@@ -1,0 +1,443 @@
+"""Names everything that is wrong with stored trajectories, and prints the page that describes their format.
+
+    python -m gpe_pl.data.validate PATH [PATH ...]     shards, or folders of shards; exit status 1 when anything is violated
+    python -m gpe_pl.data.validate --format-page       Markdown, kept in data/README.md
+
+The reader in ``gpe_pl.trajectory`` refuses what it cannot read; this module also looks at the meaning: units, ranges, completeness. Each
+check reports its first offender with frame and node, and how many more there are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+import math
+import re
+import sys
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, get_args
+
+import h5py
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from gpe_pl.geometry import Shape
+from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup, param_names
+from gpe_pl.trajectory import (
+    Metadata,
+    StoreError,
+    digest,
+    metadata_of,
+    node_types_of,
+    open_group,
+    open_shard,
+    read_field,
+    read_text,
+    shapes_of,
+    size_conflicts,
+)
+
+Finding = tuple[str, str]
+"""Name of the field or attribute, and what is wrong with it."""
+
+SAME_IN_A_DATASET = ("dataset", "materials", "param_names", "frame_dt", "spacing", "connectivity_radius", "dim")
+
+
+@dataclass(frozen=True)
+class Violation:
+    """One thing that is wrong; ``trajectory`` and ``field`` are empty where the whole file is meant."""
+
+    path: Path
+    trajectory: str
+    field: str
+    message: str
+
+    def __str__(self) -> str:
+        parts = (str(self.path), self.trajectory, self.field, self.message)
+        text = ": ".join(part for part in parts if part)
+        return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)  # names in a hostile file must not steer a terminal
+
+
+@dataclass
+class Group:
+    """What the sound trajectories of one data set and split have in common."""
+
+    metadata: Metadata
+    frames: list[int] = field(default_factory=list)
+    nodes: list[int] = field(default_factory=list)
+    max_speed: float = 0.0
+    low: np.ndarray = field(default_factory=lambda: np.array(math.inf))
+    high: np.ndarray = field(default_factory=lambda: np.array(-math.inf))
+    params: dict[str, set[float]] = field(default_factory=dict)
+
+    def add(self, metadata: Metadata, arrays: dict[str, np.ndarray]) -> None:
+        """Count one more trajectory."""
+        pos, vel = arrays["pos"], arrays["vel"].astype(np.float64)
+        self.frames.append(pos.shape[0])
+        self.nodes.append(pos.shape[1])
+        self.max_speed = max(self.max_speed, float(np.sqrt((vel**2).sum(-1)).max()))
+        self.low, self.high = np.minimum(self.low, pos.min((0, 1))), np.maximum(self.high, pos.max((0, 1)))
+        for name, column in zip(metadata.param_names, arrays["material_params"].T, strict=True):
+            self.params.setdefault(name, set()).update(np.unique(column[~np.isnan(column)]).tolist())
+
+    def __str__(self) -> str:
+        m = self.metadata
+
+        def span(values: Iterable[float]) -> str:
+            low, high = min(values), max(values)
+            return f"{low:.6g}" if low == high else f"{low:.6g} … {high:.6g}"
+
+        box = " × ".join(f"{a:.4g} … {b:.4g}" for a, b in zip(self.low, self.high, strict=True))
+        lines = [
+            f"{m.dataset}/{m.split}: {len(self.frames)} trajectories of {'+'.join(m.materials)} in {m.dim}D",
+            f"  frames {span(self.frames)}, nodes {span(self.nodes)}, frame_dt {m.frame_dt:.6g} s, solver_dt {m.solver_dt:.6g} s",
+            f"  spacing {m.spacing:.6g} m, connectivity_radius {m.connectivity_radius:.6g} m",
+            f"  positions {box} m, fastest {self.max_speed:.4g} m/s",
+        ]
+        lines += [f"  {name}: {len(values)} values, {span(values)}" for name, values in self.params.items() if values]
+        return "\n".join(lines)
+
+
+@dataclass
+class Result:
+    """Violations, and the groups of everything that has none."""
+
+    violations: list[Violation] = field(default_factory=list)
+    groups: dict[tuple[str, str], Group] = field(default_factory=dict)
+
+
+def validate(paths: Iterable[Path | str]) -> Result:
+    """Check shards and folders of shards; never raises because of their content."""
+    result = Result()
+    seen: dict[str, str] = {}  # digest -> where it was first
+    reference: dict[str, tuple[str, Metadata]] = {}  # data set -> where, and the metadata that all its trajectories share
+    for path in map(Path, paths):
+        files = sorted(path.rglob("*.h5")) if path.is_dir() else [path]
+        if not files:
+            result.violations.append(
+                Violation(path, "", "", "no shards (*.h5) in this folder; generate them with `python -m gpe_pl.simulate`")
+            )
+        for file in files:
+            _check_file(file, result, seen, reference)
+    return result
+
+
+def _check_file(path: Path, result: Result, seen: dict[str, str], reference: dict[str, tuple[str, Metadata]]) -> None:
+    def violation(trajectory: str, field: str, message: str) -> None:
+        # the reader's messages begin with file and trajectory, which a violation names already
+        for prefix in (f"{path}:{trajectory}: ", f"{path}: "):
+            message = message.removeprefix(prefix)
+        result.violations.append(Violation(path, trajectory, field, message))
+
+    try:
+        with open_shard(path) as file:
+            for key, message in _check_shard(file):
+                violation("", key, message)
+            for name in sorted(file):
+                before = len(result.violations)
+                try:
+                    metadata, arrays, sha, findings = _check_trajectory(open_group(file, name), path)
+                except StoreError as error:
+                    violation(name, "", str(error))
+                    continue
+                for key, message in findings:
+                    violation(name, key, message)
+                where = f"{path}:{name}"
+                if seen.setdefault(sha, where) != where:
+                    violation(name, "", f"has exactly the content of {seen[sha]}: the same scene twice")
+                first, common = reference.setdefault(metadata.dataset, (where, metadata))
+                for key in SAME_IN_A_DATASET:
+                    if getattr(metadata, key) != getattr(common, key):
+                        violation(name, key, f"is {getattr(metadata, key)}, but {getattr(common, key)} in {first} of the same data set")
+                if len(result.violations) == before:
+                    group = result.groups.setdefault((metadata.dataset, metadata.split), Group(metadata))
+                    group.add(metadata, arrays)
+    except StoreError as error:
+        violation("", "", str(error))
+
+
+def _check_shard(file: h5py.File) -> Iterator[Finding]:
+    count = file.attrs.get("num_trajectories")
+    if not isinstance(count, np.integer) or count != len(file):
+        yield "num_trajectories", f"is {count}, but the file holds {len(file)} trajectories"
+    if len(file) == 0:
+        yield "", "no trajectories"
+    expected = {key: spec.unit for key, spec in FIELDS.items()}
+    try:
+        units = json.loads(read_text(file, "units"))
+    except StoreError as error:
+        yield "units", str(error).split(": ", 1)[-1]
+    except (ValueError, RecursionError) as error:
+        yield "units", f"is not JSON: {error}"
+    else:
+        if units != expected:
+            yield "units", "differ from those of the schema; the store is in SI units"
+
+
+def _check_trajectory(group: h5py.Group, path: Path) -> tuple[Metadata, dict[str, np.ndarray], str, list[Finding]]:
+    """Metadata, readable arrays, digest and findings of one trajectory; raises ``StoreError`` where not even the metadata can be read."""
+    metadata = metadata_of(group)
+    findings = list(_check_metadata(metadata, path))
+    arrays: dict[str, np.ndarray] = {}
+    for key, spec in FIELDS.items():
+        if key in group or spec.required:
+            try:
+                arrays[key] = read_field(group, key)
+            except StoreError as error:
+                findings.append(("", str(error)))
+    findings += [(key, "is not a field of this schema") for key in group if key not in FIELDS]
+    conflicts = size_conflicts(arrays, metadata)
+    findings += [("", conflict) for conflict in conflicts]
+    sha = read_text(group, "sha256")
+    if digest(arrays, {key: read_text(group, key) for key in ("metadata", "shapes", "node_types")}) != sha:
+        findings.append(("sha256", "does not match the content; delete the shard and run simulate again"))
+    complete = all(key in arrays for key, spec in FIELDS.items() if spec.required)
+    if complete and not conflicts:  # the checks of meaning rely on consistent shapes
+        findings += _check_nodes(metadata, arrays, node_types_of(group))
+        findings += _check_motion(metadata, arrays)
+        findings += _check_boundary(metadata, arrays, shapes_of(group))
+    return metadata, arrays, sha, findings
+
+
+def _check_metadata(m: Metadata, path: Path) -> Iterator[Finding]:
+    for key in ("dataset", "solver", "solver_version"):
+        if not getattr(m, key):
+            yield key, "is empty; it is needed to tell where the data come from"
+    unknown = [name for name in m.materials if name not in MATERIALS]
+    if unknown or not m.materials:
+        yield "materials", f"names {unknown or 'nothing'}; known: {', '.join(MATERIALS)}"
+    elif m.param_names != param_names(m.materials):
+        yield "param_names", f"is {m.param_names}, expected {param_names(m.materials)} for {m.materials}"
+    for key in ("frame_dt", "spacing", "connectivity_radius"):
+        if not 0 < getattr(m, key) < math.inf:
+            yield key, f"is {getattr(m, key)}, must be positive"
+    if not 0 <= m.solver_dt <= m.frame_dt * (1 + 1e-9):
+        yield "solver_dt", f"is {m.solver_dt} s, must lie between 0 and frame_dt = {m.frame_dt} s"
+    if m.dim not in (2, 3):
+        yield "bounds", f"has {m.dim} axes, must have 2 or 3"
+    for axis, (low, high) in enumerate(m.bounds):
+        if not -math.inf < low < high < math.inf:
+            yield "bounds", f"axis {axis}: low {low} must be below high {high}, both finite"
+    for key in ("gravity", "periodic"):
+        if len(getattr(m, key)) != m.dim:
+            yield key, f"has {len(getattr(m, key))} components in {m.dim}D"
+    if not all(map(math.isfinite, m.gravity)):
+        yield "gravity", f"is {m.gravity}, must be finite"
+    try:
+        json.loads(m.config)
+    except (ValueError, RecursionError):
+        yield "config", "is not JSON"
+    if m.split not in SPLITS:
+        yield "split", f"is {m.split!r}, must be one of {', '.join(SPLITS)}"
+    folder = path.absolute().parent.name
+    if folder in SPLITS and m.split != folder:
+        yield "split", f"is {m.split!r}, but the shard lies in the folder {folder!r}"
+    if m.parameter_group not in get_args(ParameterGroup):
+        yield "parameter_group", f"is {m.parameter_group!r}, must be one of {', '.join(get_args(ParameterGroup))}"
+    elif (m.split == "test_unseen") == (m.parameter_group == "seen"):
+        yield "parameter_group", f"is {m.parameter_group!r} in split {m.split!r}: unseen values belong into test_unseen, and only there"
+
+
+def _offenders(key: str, bad: np.ndarray) -> str | None:
+    """Where a check fails: first place, and how many; None where it holds."""
+    if not bad.any():
+        return None
+    place = np.argwhere(bad)[0]
+    axes = [f"{axis} {i}" for axis, i in zip(FIELDS[key].dims, place, strict=False) if axis != "one"]
+    more = int(bad.sum()) - 1
+    return ", ".join(axes) + (f" and {more} more" if more else "")
+
+
+def _check_nodes(m: Metadata, arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> Iterator[Finding]:
+    codes, params = arrays["node_type"], arrays["material_params"].astype(np.float64)
+    allowed = [k for k, name in enumerate(names) if name in m.materials]
+    if where := _offenders("node_type", ~np.isin(codes, allowed)):
+        yield "node_type", f"{where}: the code stands for none of the data set's materials ({', '.join(m.materials)})"
+        return
+    if where := _offenders("mass", ~(np.isfinite(arrays["mass"]) & (arrays["mass"] > 0))):
+        yield "mass", f"{where}: must be positive and finite"
+    by_code = [MATERIALS.get(name) for name in names]
+    for column, name in enumerate(m.param_names):
+        used = np.isin(codes, [k for k, p in enumerate(by_code) if p is not None and p.name == name])
+        value = params[:, column]
+        if where := _offenders("mass", used & np.isnan(value)):
+            yield "material_params", f"{name}: {where}: NaN, but the material has this parameter"
+        if where := _offenders("mass", ~used & ~np.isnan(value)):
+            yield "material_params", f"{name}: {where}: has a value, but the material has no such parameter (NaN expected)"
+        for code in np.unique(codes[used]):
+            p = by_code[code]
+            if p is None:
+                continue
+            slack = 1e-6 * max(abs(p.low), abs(p.high))  # float32
+            outside = used & (codes == code) & ((value < p.low - slack) | (value > p.high + slack))
+            if where := _offenders("mass", outside):
+                yield (
+                    "material_params",
+                    f"{name}: {where}: {value[outside][0]:.6g} is outside {p.low:g} … {p.high:g} {p.unit} of {names[code]}",
+                )
+    if "cells" in arrays and (where := _offenders("cells", (arrays["cells"] < 0) | (arrays["cells"] >= len(codes)))):
+        yield "cells", f"{where}: no such node, there are {len(codes)}"
+
+
+def _check_motion(m: Metadata, arrays: dict[str, np.ndarray]) -> Iterator[Finding]:
+    pos = arrays["pos"]
+    if pos.shape[0] < 2 or pos.shape[1] < 1:
+        yield "pos", f"has {pos.shape[0]} frames and {pos.shape[1]} nodes; at least 2 frames and 1 node are needed"
+        return
+    for key in ("pos", "vel", "rest_pos", "stress"):
+        if key in arrays and (where := _offenders(key, ~np.isfinite(arrays[key]))):
+            yield key, f"{where}: not finite"
+    for axis, (low, high) in enumerate(m.bounds):
+        slack = 1e-5 * max(abs(low), abs(high), high - low)  # float32, and the solvers' own margin
+        outside = (pos[..., axis] < low - slack) | (pos[..., axis] > high + slack)
+        if m.periodic[axis : axis + 1] != (True,) and (where := _offenders("pos", outside)):
+            yield (
+                "pos",
+                f"{where}: {'xyz'[axis : axis + 1]} = {pos[..., axis][outside][0]:.6g} m is outside the bounds {low:g} … {high:g} m",
+            )
+
+
+def _check_boundary(m: Metadata, arrays: dict[str, np.ndarray], shapes: tuple[Shape, ...]) -> Iterator[Finding]:
+    pos, normal = arrays["boundary_pos"], arrays["boundary_normal"].astype(np.float64)
+    sound = True
+    for key in ("boundary_pos", "boundary_vel", "boundary_normal", "boundary_friction", "boundary_restitution"):
+        if where := _offenders(key, ~np.isfinite(arrays[key])):
+            sound = sound and key != "boundary_pos"
+            yield key, f"{where}: not finite"
+    length = np.sqrt((normal**2).sum(-1))
+    if where := _offenders("boundary_normal", np.abs(length - 1) > 1e-4):
+        yield "boundary_normal", f"{where}: length {length[np.abs(length - 1) > 1e-4][0]:.6g}, must be 1"
+    if where := _offenders("boundary_friction", arrays["boundary_friction"] < 0):
+        yield "boundary_friction", f"{where}: negative"
+    restitution = arrays["boundary_restitution"]
+    if where := _offenders("boundary_restitution", (restitution < 0) | (restitution > 1)):
+        yield "boundary_restitution", f"{where}: must lie between 0 and 1"
+    for k, shape in enumerate(shapes):
+        if message := _bad_shape(shape, m.dim):
+            sound = False
+            yield "shapes", f"shape {k} ({shape.kind}): {message}"
+    if shapes and sound and m.spacing > 0:
+        distance = np.min([np.abs(shape.signed_distance(pos.astype(np.float64))) for shape in shapes], axis=0)
+        if where := _offenders("boundary_pos", distance > 0.1 * m.spacing):
+            yield "boundary_pos", f"{where}: {distance[distance > 0.1 * m.spacing][0]:.4g} m away from every shape that it could belong to"
+
+
+def _bad_shape(shape: Shape, dim: int) -> str | None:
+    values: dict[str, Any] = asdict(shape)  # type: ignore[call-overload]
+    try:
+        TypeAdapter(type(shape)).validate_python(values, strict=True)
+    except ValidationError as error:
+        return "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+    numbers = [np.ravel(np.asarray(v, np.float64)) for v in values.values()]
+    if not np.isfinite(np.concatenate(numbers)).all():
+        return "not finite"
+    wrong = [key for key, v in values.items() if isinstance(v, tuple) and (len(v[0]) if key == "vertices" else len(v)) != dim]
+    return f"{', '.join(wrong)} must have {dim} components" if wrong else None
+
+
+# --- the page that describes the format ---------------------------------------------------------------------------------------------------
+
+
+def format_page() -> str:
+    """Markdown that describes the store, generated from the schema."""
+    meaning = _documented_attributes(Metadata)
+    rows = {
+        "fields": [
+            f"| `{key}` | {'×'.join(f.dims)} | {f.dtype} | {f.unit} | {f.doc}{'' if f.required else ' (optional)'} |"
+            for key, f in FIELDS.items()
+        ],
+        "metadata": [f"| `{key}` | {meaning[key]} |" for key in Metadata.__dataclass_fields__],
+        "materials": [f"| `{name}` | `{p.name}` | {p.unit} | {p.low:g} … {p.high:g} | {p.scale} |" for name, p in MATERIALS.items()],
+    }
+    return _PAGE.format(
+        version=SCHEMA_VERSION,
+        splits=", ".join(f"`{s}`" for s in SPLITS),
+        codes=", ".join(f"{k} = `{name}`" for k, name in enumerate(NODE_TYPES)),
+        boundary=BOUNDARY,
+        groups=", ".join(f"`{g}`" for g in get_args(ParameterGroup)),
+        **{key: "\n".join(lines) for key, lines in rows.items()},
+    )
+
+
+def _documented_attributes(cls: type) -> dict[str, str]:
+    """Names and descriptions under ``Attributes:`` in a Google docstring."""
+    section = inspect.cleandoc(cls.__doc__ or "").split("Attributes:\n", 1)[1]
+    meaning: dict[str, str] = {}
+    for names, text in re.findall(r"^    ([\w, ]+): (.*(?:\n        .*)*)", section, re.MULTILINE):
+        meaning.update(dict.fromkeys(re.split(r",\s*", names), re.sub(r"\s+", " ", text).replace("``", "`").rstrip(".")))
+    return meaning
+
+
+_PAGE = """\
+# The trajectory store
+
+This page is generated: `python -m gpe_pl.data.validate --format-page > data/README.md`. Generated data sets go into this folder and are not
+kept in version control. Check any of them with `python -m gpe_pl.data.validate data`.
+
+Schema version {version}. One HDF5 file per shard, a group per trajectory, SI units, little-endian:
+
+```
+{{data set}}/{{size}}/{{split}}/shard-00000.h5
+    attributes: schema_version, units (JSON), num_trajectories
+    00000/  00001/  …                      a trajectory each
+        attributes: metadata (JSON), shapes (JSON), node_types (JSON), sha256
+        pos  vel  …                        fields, each with its attribute unit
+```
+
+Files are written under a temporary name and renamed, so a file that exists is complete. Equal content gives equal bytes. Every array has a
+fletcher32 checksum per chunk; arrays with frames are cut along them. `sha256` covers names, shapes, types and bytes of all arrays and the
+other three attributes. Text has a fixed length; nothing is compressed, and nothing refers to another file.
+
+Splits: {splits}. The material parameters of the first three have the trained values; those of the last one lie between or outside them, as
+`parameter_group` says ({groups}).
+
+## Fields
+
+| name | axes | type | unit | meaning |
+|---|---|---|---|---|
+{fields}
+
+`node_type` is an index into the attribute `node_types`: {codes}. Dynamic nodes only: `{boundary}` nodes have fields of their own.
+
+## Materials and their parameters
+
+| material | column of `material_params` | unit | accepted | scale |
+|---|---|---|---|---|
+{materials}
+
+## Metadata
+
+| key | meaning |
+|---|---|
+{metadata}
+
+`shapes` holds the geometry that the boundary nodes were sampled from; `gpe_pl.geometry` rebuilds it.
+"""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; returns the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m gpe_pl.data.validate", description="Check stored trajectories.")
+    parser.add_argument("paths", nargs="*", metavar="PATH", help="shard, or folder of shards")
+    parser.add_argument("--format-page", action="store_true", help="print the description of the format as Markdown")
+    options = parser.parse_args(arguments)
+    if options.format_page:
+        print(format_page(), end="")
+        return 0
+    if not options.paths:
+        parser.error("name at least one shard or folder")
+    result = validate(options.paths)
+    for violation in result.violations:
+        print(violation)
+    for group in result.groups.values():
+        print(group)
+    if result.violations:
+        print(f"{len(result.violations)} violations")
+    return 1 if result.violations else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,170 @@
+"""Rollouts of a learned simulator and of the trivial baselines over whole splits: one table of numbers, figures and animations."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from gpe_pl.baselines import Ballistic, ConstantVelocity
+from gpe_pl.containment import Contained
+from gpe_pl.data.dataset import WindowDataset, open_split
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
+from gpe_pl.rollout import Guard, Simulator, rollout
+from gpe_pl.trajectory import Trajectory, iter_trajectories
+
+LEARNED = "learned"
+MAX_SPEED_FACTOR = 20.0
+"""A learned rollout faster than this many times the fastest particle of the ground truth has exploded."""
+ONE_STEP_WINDOWS = 256
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What is evaluated.
+
+    Attributes:
+        splits: of the data set.
+        horizons: in frames; the full length is always added.
+        num_trajectories: per split, from its start; None takes all.
+        containment: put particles that cross a wall back on its surface.
+        num_pictures: trajectories per split that get a figure and an animation.
+    """
+
+    splits: list[str] = field(default_factory=lambda: ["test", "test_unseen"])
+    horizons: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [5, 20, 50, 100])
+    num_trajectories: Annotated[int, Field(ge=1)] | None = None
+    containment: bool = True
+    num_pictures: Annotated[int, Field(ge=0)] = 2
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number of ``metrics.csv``."""
+
+    model: str
+    split: str
+    trajectory: int
+    parameter_group: str
+    parameter: float
+    metric: str
+    horizon: str
+    value: float
+
+
+def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettings, run_dir: Path, label: str = LEARNED) -> list[Row]:
+    """Roll out every trajectory of the splits and write ``metrics.csv``, ``error_curve_*.png``, ``rollout_*.png`` and ``rollout_*.gif``.
+
+    All rollouts start at the first frame with enough history and run to the end of the ground truth. Share outside with containment off is reported as
+    ``share_outside_uncontained``, the share of corrected particle-steps as ``share_corrected``.
+    """
+    rows: list[Row] = []
+    for split in settings.splits:
+        curves: dict[str, list[np.ndarray]] = {label: [], "ballistic": [], "constant_velocity": []}
+        rows += [Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split))]
+        for number, trajectory in enumerate(iter_trajectories(root, split)):
+            if settings.num_trajectories is not None and number >= settings.num_trajectories:
+                break
+            predictions, extra = _predict(simulator, trajectory, settings, label)
+            truth = trajectory.frames(simulator.builder.config.history)
+            values = np.asarray(trajectory.material_params, dtype=np.float64)
+            parameter = float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
+            for model, prediction in predictions.items():
+                curves[model].append(per_frame_mse(prediction, truth))
+                for record in rollout_metrics(prediction, truth, [*settings.horizons, "full"]):
+                    rows.append(
+                        Row(model, split, number, truth.metadata.parameter_group, parameter, record.metric, str(record.horizon), record.value)
+                    )
+            rows += [Row(label, split, number, truth.metadata.parameter_group, parameter, k, "full", v) for k, v in extra.items()]
+            if number < settings.num_pictures:
+                _pictures(run_dir, split, number, truth, {label: predictions[label]})
+        _error_curve(run_dir / f"error_curve_{split}.png", curves, truth.metadata.frame_dt)
+    write_rows(run_dir / "metrics.csv", rows)
+    return rows
+
+
+def _predict(
+    simulator: LearnedSimulator, trajectory: Trajectory, settings: EvaluationSettings, label: str
+) -> tuple[dict[str, Trajectory], dict[str, float]]:
+    history = simulator.builder.config.history
+    truth = trajectory.frames(history)
+    steps, dt = truth.num_frames - 1, truth.metadata.frame_dt
+    start = simulator.initial_state(trajectory, history)
+    speed = float(np.linalg.norm(trajectory.vel, axis=-1).max(initial=0.0))
+    bounds = truth.metadata.bounds
+    size = max(b - a for a, b in bounds)
+    guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, size), bounds=bounds, margin=size)
+    contained = Contained(simulator, dt)
+    inner: Simulator = contained if settings.containment else simulator
+    free = rollout(simulator, start, steps, truth.metadata, guard)
+    prediction = rollout(inner, start, steps, truth.metadata, guard) if settings.containment else free
+    predictions = {label: prediction}
+    for name, baseline in (("ballistic", Ballistic(dt)), ("constant_velocity", ConstantVelocity(dt))):
+        predictions[name] = rollout(baseline, trajectory.state(history, history), steps, truth.metadata)
+    outside = [r.value for r in rollout_metrics(free, truth, ["full"]) if r.metric == "share_outside"]
+    extra = {"share_outside_uncontained": outside[0] if outside else float("nan"), "share_corrected": contained.share_corrected}
+    return predictions, extra
+
+
+def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windows: int = ONE_STEP_WINDOWS) -> float:
+    """Noise-free one-step error over windows spread evenly over a split, relative to predicting free fall."""
+    dataset = WindowDataset(open_split(root, split), simulator.builder)
+    windows = np.unique(np.linspace(0, len(dataset) - 1, min(len(dataset), num_windows)).round().astype(int))
+    metric = OneStepNMSE()
+    with torch.inference_mode():
+        for window in windows:
+            data = dataset[int(window)]
+            for material, value in simulator(data).items():
+                metric.update(value, data[material].target / simulator.acceleration_std.float())
+    return float(metric.compute())
+
+
+def write_rows(path: Path, rows: list[Row]) -> None:
+    """Write rows as CSV, atomically."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".part")
+    with open(temporary, "w", newline="") as handle:
+        writer = csv.DictWriter(handle, fieldnames=list(Row.__dataclass_fields__))
+        writer.writeheader()
+        writer.writerows(asdict(row) for row in rows)
+    os.replace(temporary, path)
+
+
+def read_rows(path: Path) -> Iterator[Row]:
+    """Rows of a ``metrics.csv``."""
+    with open(path, newline="") as handle:
+        for r in csv.DictReader(handle):
+            yield Row(
+                r["model"],
+                r["split"],
+                int(r["trajectory"]),
+                r["parameter_group"],
+                float(r["parameter"]),
+                r["metric"],
+                r["horizon"],
+                float(r["value"]),
+            )
+
+
+def _pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predictions: dict[str, Trajectory]) -> None:
+    from gpe_pl.viz.figures import rollout_figure
+    from gpe_pl.viz.video import write_animation
+
+    stem = run_dir / f"rollout_{split}_{number:02d}"
+    rollout_figure(truth, predictions).savefig(stem.with_suffix(".png"), dpi=150)
+    stride = max(1, truth.num_frames // 60)
+    write_animation(stem.with_suffix(".gif"), truth, predictions, fps=20, stride=stride)
+
+
+def _error_curve(path: Path, curves: dict[str, list[np.ndarray]], frame_dt: float) -> None:
+    from gpe_pl.viz.figures import error_curve_figure
+
+    error_curve_figure(curves, frame_dt).savefig(path, dpi=150)

@@ -1,0 +1,251 @@
+"""Signed distances of boundaries, the same for solvers, containment and pictures.
+
+A ``Shape`` answers ``signed_distance(points)`` in m (positive in free space, negative inside the wall or obstacle) and samples its surface
+into boundary nodes. All shapes take NumPy arrays or torch tensors [..., dim].
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+from array_api_compat import array_namespace, device
+
+Array = Any
+
+
+@runtime_checkable
+class Shape(Protocol):
+    """A rigid boundary with its boundary condition."""
+
+    kind: ClassVar[str]
+    friction: float
+    restitution: float
+
+    def signed_distance(self, points: Array) -> Array: ...
+
+    def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]: ...
+
+
+def _like(values: Sequence[float], points: Array) -> Array:
+    """``values`` with the backend, precision and device of ``points``."""
+    return array_namespace(points).asarray(values, dtype=points.dtype, device=device(points))
+
+
+def _norm(x: Array) -> Array:
+    xp = array_namespace(x)
+    return xp.sqrt(xp.sum(x * x, axis=-1))
+
+
+def _segment(start: np.ndarray, end: np.ndarray, spacing: float) -> np.ndarray:
+    """Points from ``start`` to ``end``, end excluded, no further apart than ``spacing``."""
+    count = max(1, math.ceil(np.linalg.norm(end - start) / spacing - 1e-9))
+    return start + (end - start) * (np.arange(count) / count)[:, None]
+
+
+def _grid(low: list[float], high: list[float], spacing: float) -> np.ndarray:
+    """A regular grid over an axis-aligned face, corners included; shape [points, len(low)]."""
+    axes = [np.linspace(a, b, max(2, math.ceil((b - a) / spacing - 1e-9) + 1)) for a, b in zip(low, high, strict=True)]
+    return np.stack([m.ravel() for m in np.meshgrid(*axes, indexing="ij")], axis=-1)
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A plane wall ``normal · x >= offset`` that closes one side of the domain.
+
+    Attributes:
+        normal: unit normal into free space, along one axis.
+        offset: position of the plane along the normal [m].
+        low, high: corners of the domain [m]; the wall is sampled between them.
+    """
+
+    normal: tuple[float, ...]
+    offset: float
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    friction: float
+    restitution: float = 0.0
+    kind: ClassVar[str] = "wall"
+
+    def signed_distance(self, points: Array) -> Array:
+        axis = int(np.argmax(np.abs(self.normal)))
+        return points[..., axis] * self.normal[axis] - self.offset
+
+    def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        axis = int(np.argmax(np.abs(self.normal)))
+        others = [k for k in range(len(self.normal)) if k != axis]
+        face = _grid([self.low[k] for k in others], [self.high[k] for k in others], spacing)
+        pos = np.empty((len(face), len(self.normal)))
+        pos[:, others] = face
+        pos[:, axis] = self.offset * self.normal[axis]
+        return pos, np.broadcast_to(np.asarray(self.normal, float), pos.shape).copy()
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A solid disc (2D) or ball (3D)."""
+
+    center: tuple[float, ...]
+    radius: float
+    friction: float
+    restitution: float = 0.0
+    kind: ClassVar[str] = "sphere"
+
+    def signed_distance(self, points: Array) -> Array:
+        return _norm(points - _like(self.center, points)) - self.radius
+
+    def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        if len(self.center) == 2:
+            count = max(6, math.ceil(2 * math.pi * self.radius / spacing))
+            angle = 2 * math.pi * np.arange(count) / count
+            normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        else:  # golden-angle spiral: near-uniform density on the sphere
+            count = max(12, math.ceil(4 * math.pi * self.radius**2 / spacing**2))
+            z = 1 - (2 * np.arange(count) + 1) / count
+            angle = np.arange(count) * math.pi * (3 - math.sqrt(5))
+            rho = np.sqrt(1 - z * z)
+            normal = np.stack([rho * np.cos(angle), rho * np.sin(angle), z], axis=-1)
+        return np.asarray(self.center) + self.radius * normal, normal
+
+
+@dataclass(frozen=True)
+class Box:
+    """A solid axis-aligned box."""
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    friction: float
+    restitution: float = 0.0
+    kind: ClassVar[str] = "box"
+
+    def signed_distance(self, points: Array) -> Array:
+        xp = array_namespace(points)
+        low, high = _like(self.low, points), _like(self.high, points)
+        q = xp.abs(points - (low + high) / 2) - (high - low) / 2
+        zero = xp.zeros_like(q)
+        return _norm(xp.maximum(q, zero)) + xp.minimum(xp.max(q, axis=-1), zero[..., 0])
+
+    def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        dim = len(self.low)
+        pos, normals = [], []
+        for axis in range(dim):
+            others = [k for k in range(dim) if k != axis]
+            face = _grid([self.low[k] for k in others], [self.high[k] for k in others], spacing)
+            for side, value in ((-1.0, self.low[axis]), (1.0, self.high[axis])):
+                points = np.empty((len(face), dim))
+                points[:, others] = face
+                points[:, axis] = value
+                normal = np.zeros_like(points)
+                normal[:, axis] = side
+                pos.append(points)
+                normals.append(normal)
+        return np.concatenate(pos), np.concatenate(normals)
+
+
+@dataclass(frozen=True)
+class Polygon:
+    """A solid simple polygon (2D), vertices in counter-clockwise order [m]."""
+
+    vertices: tuple[tuple[float, float], ...]
+    friction: float
+    restitution: float = 0.0
+    kind: ClassVar[str] = "polygon"
+
+    def __post_init__(self) -> None:
+        v = np.asarray(self.vertices, float)
+        if v.ndim != 2 or v.shape[0] < 3 or v.shape[1] != 2:
+            raise ValueError(f"a polygon needs at least 3 vertices [x, y], got {self.vertices}")
+        x, y = v[:, 0], v[:, 1]
+        if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) <= 0:
+            raise ValueError(f"polygon vertices must run counter-clockwise and enclose an area, got {self.vertices}")
+
+    def signed_distance(self, points: Array) -> Array:
+        xp = array_namespace(points)
+        squared = inside = None
+        count = len(self.vertices)
+        for k in range(count):
+            a, b = self.vertices[k], self.vertices[(k + 1) % count]
+            ex, ey = b[0] - a[0], b[1] - a[1]
+            wx, wy = points[..., 0] - a[0], points[..., 1] - a[1]
+            t = xp.clip((wx * ex + wy * ey) / (ex * ex + ey * ey), 0.0, 1.0)
+            d2 = (wx - t * ex) ** 2 + (wy - t * ey) ** 2
+            crosses = ((a[1] > points[..., 1]) != (b[1] > points[..., 1])) & (wx < ex * wy / (ey if ey != 0 else 1.0))
+            squared = d2 if squared is None else xp.minimum(squared, d2)
+            inside = crosses if inside is None else inside ^ crosses
+        return xp.where(inside, -xp.sqrt(squared), xp.sqrt(squared))
+
+    def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        pos, normals = [], []
+        vertices = np.asarray(self.vertices, float)
+        for a, b in zip(vertices, np.roll(vertices, -1, axis=0), strict=True):
+            points = _segment(a, b, spacing)
+            edge = (b - a) / np.linalg.norm(b - a)
+            pos.append(points)
+            normals.append(np.broadcast_to(np.array([edge[1], -edge[0]]), points.shape))
+        return np.concatenate(pos), np.concatenate(normals)
+
+
+SHAPES: dict[str, type] = {cls.kind: cls for cls in (Wall, Sphere, Box, Polygon)}
+
+
+def shape_to_dict(shape: Shape) -> dict[str, Any]:
+    """Plain values from which ``shape_from_dict`` rebuilds the shape."""
+    return {"kind": shape.kind, **asdict(shape)}  # type: ignore[call-overload]
+
+
+def shape_from_dict(values: dict[str, Any]) -> Shape:
+    """Rebuild a shape; raises ``ValueError`` that names an unknown kind or key."""
+    values = dict(values)
+    kind = values.pop("kind", None)
+    if kind not in SHAPES:
+        raise ValueError(f"unknown shape kind {kind!r}; known: {', '.join(SHAPES)}")
+
+    def tuples(value: Any) -> Any:
+        return tuple(tuples(v) for v in value) if isinstance(value, (list, tuple)) else value
+
+    try:
+        return SHAPES[kind](**{key: tuples(value) for key, value in values.items()})
+    except TypeError as error:
+        raise ValueError(f"shape {kind!r}: {error}") from None
+
+
+def signed_distance(shapes: tuple[Shape, ...], points: Array) -> Array:
+    """Distance [m] to the nearest of several shapes, negative inside any of them; +inf without shapes."""
+    xp = array_namespace(points)
+    distance = xp.full(points.shape[:-1], math.inf, dtype=points.dtype, device=device(points))
+    for shape in shapes:
+        distance = xp.minimum(distance, shape.signed_distance(points))
+    return distance
+
+
+def outward_normal(shape: Shape, points: Array, step: float) -> Array:
+    """Direction into free space: the signed distance's gradient by central differences of ``step`` [m], unit length where defined."""
+    xp = array_namespace(points)
+    columns = []
+    for axis in range(points.shape[-1]):
+        offset = _like([step if k == axis else 0.0 for k in range(points.shape[-1])], points)
+        columns.append(shape.signed_distance(points + offset) - shape.signed_distance(points - offset))
+    gradient = xp.stack(columns, axis=-1)
+    length = _norm(gradient)
+    return gradient / xp.where(length > 0, length, xp.ones_like(length))[..., None]
+
+
+def domain_walls(bounds: tuple[tuple[float, float], ...], friction: dict[str, float] | float) -> tuple[Wall, ...]:
+    """The walls of a box-shaped domain.
+
+    Args:
+        bounds: ``(low, high)`` per axis [m].
+        friction: one Coulomb coefficient, or one per wall by name (``x_low``, ``x_high``, ``y_low``, …).
+    """
+    low, high = tuple(b[0] for b in bounds), tuple(b[1] for b in bounds)
+    walls = []
+    for axis in range(len(bounds)):
+        for sign, side in ((1.0, "low"), (-1.0, "high")):
+            normal = tuple(sign if k == axis else 0.0 for k in range(len(bounds)))
+            mu = friction[f"{'xyz'[axis]}_{side}"] if isinstance(friction, dict) else friction
+            offset = low[axis] if sign > 0 else -high[axis]
+            walls.append(Wall(normal, offset, low, high, mu))
+    return tuple(walls)

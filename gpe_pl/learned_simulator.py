@@ -1,0 +1,203 @@
+"""A learned model as a ``Simulator``: builder ∘ standardisation ∘ model ∘ integrator.
+
+Everything that a rollout needs travels in one checkpoint: the model's settings and weights, the statistics of the training data, the graph's settings and
+the data set's metadata.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import inspect
+from collections.abc import Iterable
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch_geometric.data import HeteroData
+
+from gpe_pl import integrators
+from gpe_pl.errors import GpeError
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig, history_of
+from gpe_pl.nn.blocks import Standardize
+from gpe_pl.schema import MATERIALS, FeatureSpec
+from gpe_pl.trajectory import Metadata, State, Trajectory
+
+CHECKPOINT_FORMAT = 1
+
+
+class CheckpointError(GpeError, ValueError):
+    """A checkpoint is missing, damaged, or not one of gpe_pl; the message names the file and what to do."""
+
+
+class GraphStandardizer(nn.Module):
+    """Standardises every feature of a graph with training statistics; odd edge channels are only scaled, so they stay odd."""
+
+    def __init__(self, spec: FeatureSpec) -> None:
+        super().__init__()
+        self.spec = spec
+        self.node = nn.ModuleDict({t: Standardize(c) for t, c in spec.node_channels.items()})
+        self.params = nn.ModuleDict({m: Standardize(c) for m, c in spec.param_channels.items()})
+        self.odd = nn.ModuleDict({"__".join(r): Standardize(spec.odd_channels, centered=False) for r in spec.relations})
+        self.even = nn.ModuleDict({"__".join(r): Standardize(spec.even_channels) for r in spec.relations})
+        self.register_buffer("mass", torch.ones(()))
+
+    @staticmethod
+    def _material_scale(material: str, params: Tensor) -> Tensor:
+        return params.log() if MATERIALS[material].scale == "log" else params
+
+    def fit(self, graphs: list[HeteroData]) -> None:
+        """Set all statistics from graphs of the training split."""
+        for t, standardize in self.node.items():
+            standardize.fit(g[t].x for g in graphs)
+        for m, standardize in self.params.items():
+            standardize.fit(self._material_scale(m, g[m].material_params) for g in graphs)
+        for relation in self.spec.relations:
+            self.odd["__".join(relation)].fit(g[relation].odd for g in graphs)
+            self.even["__".join(relation)].fit(g[relation].even for g in graphs)
+        mass = [g[m].mass for g in graphs for m in self.spec.materials]
+        if sum(len(x) for x in mass):
+            self.mass.copy_(torch.cat(mass).double().mean())
+
+    def forward(self, data: HeteroData) -> HeteroData:
+        """A graph with standardised features; the input is left as it is."""
+        out = copy.copy(data)
+        for t in self.spec.node_types:
+            out[t].x = self.node[t](data[t].x)
+        for m in self.spec.materials:
+            out[m].material_params = self.params[m](self._material_scale(m, data[m].material_params))
+            out[m].mass = data[m].mass / self.mass
+        for relation in self.spec.relations:
+            out[relation].odd = self.odd["__".join(relation)](data[relation].odd)
+            out[relation].even = self.even["__".join(relation)](data[relation].even)
+        return out
+
+
+class LearnedSimulator(nn.Module):
+    """Advances a state by one frame with a learned acceleration.
+
+    Args:
+        model: any ``models.base.Model``; its ``settings`` rebuild it from a checkpoint.
+        builder: makes the graphs.
+    """
+
+    acceleration_std: Tensor
+
+    def __init__(self, model: nn.Module, builder: GraphBuilder) -> None:
+        super().__init__()
+        self.model, self.builder = model, builder
+        self.standardizer = GraphStandardizer(builder.spec)
+        self.register_buffer("acceleration_std", torch.ones((), dtype=torch.float64))
+
+    @torch.no_grad()
+    def fit_statistics(self, graphs: Iterable[HeteroData]) -> None:
+        """Set feature statistics and the acceleration scale (one scalar for all axes and materials, mean zero) from training graphs with ``target``."""
+        graphs = list(graphs)
+        self.standardizer.fit(graphs)
+        target = torch.cat([g[m].target for g in graphs for m in self.builder.spec.materials]).double()
+        rms = target.square().mean().sqrt()
+        if not torch.isfinite(rms) or rms == 0:
+            raise ValueError(f"the training data's accelerations without gravity have rms {float(rms)}; nothing to learn from")
+        self.acceleration_std.copy_(rms)
+
+    def forward(self, data: HeteroData) -> dict[str, Tensor]:
+        """Accelerations without gravity per material, in units of ``acceleration_std``."""
+        return self.model(self.standardizer(data))
+
+    def initial_state(self, trajectory: Trajectory, frame: int) -> State:
+        """The state at a frame with the velocity history that the graph needs, on this model's device.
+
+        Raises:
+            IndexError: too few frames before ``frame``.
+            ValueError: a material parameter, position or velocity is not finite; names the node.
+        """
+        state = trajectory.state(frame, history=self.builder.config.history).to_torch(self.acceleration_std.device)
+        for name, values in (("pos", state.pos), ("velocity", state.velocity_history)):
+            bad = ~torch.isfinite(values).flatten(1).all(dim=1)
+            if bad.any():
+                raise ValueError(f"frame {frame}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
+        for material, spec in MATERIALS.items():
+            if material in self.builder.metadata.materials:
+                rows = torch.nonzero(state.node_type == list(MATERIALS).index(material)).flatten()
+                column = state.material_params[rows, self.builder.metadata.param_names.index(spec.name)]
+                if not torch.isfinite(column).all():
+                    node = int(rows[torch.nonzero(~torch.isfinite(column))[0]])
+                    raise ValueError(f"node {node} ({material}): {spec.name} [{spec.unit}] is not finite")
+        return state
+
+    @torch.inference_mode()
+    def step(self, state: State) -> State:
+        data = self.builder(state)
+        predicted = self(data)
+        acc = state.gravity.expand_as(state.pos).clone()
+        for material, normalized in predicted.items():
+            acc[data[material].node_id] += normalized.double() * self.acceleration_std
+        return self.advance(state, acc)
+
+    def advance(self, state: State, acc: Tensor) -> State:
+        """The next state under a given acceleration [m/s²], gravity included."""
+        dt = self.builder.metadata.frame_dt
+        pos, vel = integrators.advance(state.pos, state.vel, acc, dt)
+        history = torch.cat([history_of(state)[:, 1:], vel[:, None]], dim=1)
+        return replace(state, pos=pos, vel=vel, velocity_history=history, time=state.time + dt)
+
+    # --- checkpoints ----------------------------------------------------------------------------------------------------------------------
+
+    def description(self) -> dict[str, Any]:
+        """Plain values from which ``from_description`` rebuilds this simulator, weights excluded."""
+        cls = type(self.model)
+        return {
+            "format": CHECKPOINT_FORMAT,
+            "model": f"{cls.__module__}.{cls.__qualname__}",
+            "settings": dict(self.model.settings),
+            "graph": asdict(self.builder.config),
+            "metadata": asdict(self.builder.metadata),
+        }
+
+    @classmethod
+    def from_description(cls, values: dict[str, Any]) -> LearnedSimulator:
+        """Rebuild from ``description``; raises ``ValueError`` for anything else."""
+        if values.get("format") != CHECKPOINT_FORMAT:
+            raise ValueError(f"checkpoint format {values.get('format')!r}, this version reads {CHECKPOINT_FORMAT}")
+        builder = GraphBuilder(GraphConfig(**values["graph"]), Metadata(**values["metadata"]))
+        return cls(model_class(values["model"])(builder.spec, **values["settings"]), builder)
+
+    @classmethod
+    def from_checkpoint(cls, path: Path | str, device: Any = "cpu") -> LearnedSimulator:
+        """Load a training checkpoint (averaged weights if the run averaged them), in evaluation mode. Only tensors and plain values are unpickled.
+
+        Raises:
+            CheckpointError: not a readable checkpoint of gpe_pl, or one of another model.
+        """
+        if not Path(path).is_file():
+            raise CheckpointError(f"{path}: no such checkpoint")
+        try:
+            checkpoint = torch.load(path, map_location=device, weights_only=True)
+        except Exception as error:  # torch raises many types for damaged or unsafe files
+            reason = str(error).strip().splitlines()[0][:200]
+            raise CheckpointError(f"{path}: not a safe, complete checkpoint ({type(error).__name__}: {reason})") from None
+        try:
+            simulator = cls.from_description(checkpoint["simulator"])
+            weights = {k.removeprefix("simulator."): v for k, v in checkpoint["state_dict"].items() if k.startswith("simulator.")}
+            simulator.load_state_dict(weights)
+        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            reason = str(error).strip().splitlines()[0][:300] if str(error).strip() else type(error).__name__
+            raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model: {reason}") from None
+        return simulator.to(device).eval()
+
+
+def model_class(target: str) -> type[nn.Module]:
+    """The model class of a dotted name; only classes under ``gpe_pl.models`` are accepted, because names come from files."""
+    module, _, name = target.rpartition(".")
+    if not module.startswith("gpe_pl.models."):
+        raise ValueError(f"model {target!r} is not one of gpe_pl.models")
+    try:
+        cls = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError):
+        raise ValueError(f"model {target!r} does not exist in this version of gpe_pl") from None
+    if not (inspect.isclass(cls) and issubclass(cls, nn.Module)):
+        raise ValueError(f"{target!r} is not a model")
+    return cls

@@ -1,0 +1,368 @@
+"""How far a predicted trajectory is from the ground truth, and how certain that number is.
+
+Three rules hold for every metric of a rollout:
+
+- frame 0 is the shared initial state and never counts; a horizon ``h`` means frames 1 to ``h``, ``"full"`` all frames of the ground truth;
+- a horizon that the trajectory does not reach is left out, never shortened;
+- a rollout that stopped early, or holds a value that is not finite, is infinitely wrong from there on, so that no failure improves a score.
+
+Velocities come from positions (``integrators``) for both trajectories: a solver's own velocities are instantaneous, those of a learned
+simulator are averages over a frame, and free fall alone would set them ``g dt / 2`` apart.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial.distance import cdist
+from torch import Tensor
+from torchmetrics import Metric
+
+from gpe_pl import integrators
+from gpe_pl.rollout import share_outside
+from gpe_pl.trajectory import Metadata, Trajectory
+
+Horizon = int | Literal["full"]
+
+HORIZONS: tuple[Horizon, ...] = (5, 20, 50, 100, "full")
+
+UNITS: dict[str, str] = {
+    "rollout_mse": "m^2",
+    "energy_distance": "m",
+    "momentum_error": "m/s",
+    "angular_momentum_error": "m^2/s",
+    "kinetic_energy_bias": "1",
+    "kinetic_energy_error": "1",
+    "share_outside": "1",
+}
+"""Metrics of ``rollout_metrics`` and their units."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """One number: the value of a metric at a horizon, in the unit given by ``UNITS``."""
+
+    metric: str
+    horizon: Horizon
+    value: float
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A statistic with its confidence interval."""
+
+    estimate: float
+    low: float
+    high: float
+
+
+# --- positions ----------------------------------------------------------------------------------------------------------------------------
+
+
+def displacement(
+    pos: Float[np.ndarray, "*axes dim"], reference: Float[np.ndarray, "*axes dim"], metadata: Metadata
+) -> Float[np.ndarray, "*axes dim"]:
+    """``pos - reference`` [m] in float64; along periodic axes the shortest way around."""
+    difference = pos.astype(np.float64) - reference.astype(np.float64)
+    for axis, (low, high) in enumerate(metadata.bounds):
+        if metadata.periodic[axis]:
+            difference[..., axis] -= (high - low) * np.round(difference[..., axis] / (high - low))
+    return difference
+
+
+def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.ndarray, "frame"]:
+    """Squared position error [m²] of every frame, averaged over nodes and dimensions.
+
+    Returns:
+        One value per frame, frame 0 included (it is zero up to rounding). As long as the ground truth when the rollout stopped early, with
+        ``inf`` from the first missing frame on; as long as the prediction when that was meant to be shorter.
+
+    Raises:
+        ValueError: the trajectories do not describe the same nodes from the same start.
+    """
+    _check_comparable(prediction, ground_truth)
+    frames = prediction.num_frames
+    with np.errstate(invalid="ignore", over="ignore"):  # broken frames are dealt with below
+        error = (displacement(prediction.pos, ground_truth.pos[:frames], ground_truth.metadata) ** 2).mean(axis=(1, 2))
+    missing = ground_truth.num_frames - frames if prediction.termination is not None else 0
+    # A frame after a broken one is worthless even if its numbers happen to be finite.
+    broken = np.logical_or.accumulate(~np.isfinite(error))
+    return np.concatenate([np.where(broken, math.inf, error), np.full(missing, math.inf)])
+
+
+def _check_comparable(prediction: Trajectory, ground_truth: Trajectory) -> None:
+    if prediction.pos.shape[1:] != ground_truth.pos.shape[1:] or not np.array_equal(prediction.node_type, ground_truth.node_type):
+        raise ValueError(
+            f"prediction and ground truth have different nodes: [frame, node, dim] {prediction.pos.shape} and {ground_truth.pos.shape}"
+        )
+    if ground_truth.num_nodes == 0:
+        raise ValueError("a trajectory without nodes has no error")
+    if not math.isclose(prediction.metadata.frame_dt, ground_truth.metadata.frame_dt, rel_tol=1e-6):
+        raise ValueError(f"frame_dt differs: {prediction.metadata.frame_dt:g} s and {ground_truth.metadata.frame_dt:g} s")
+    if prediction.num_frames > ground_truth.num_frames:
+        raise ValueError(
+            f"{prediction.num_frames} predicted frames but only {ground_truth.num_frames} of ground truth; cut with Trajectory.frames"
+        )
+    start = np.abs(displacement(prediction.pos[0], ground_truth.pos[0], ground_truth.metadata)).max()
+    if not start <= 0.01 * ground_truth.metadata.spacing:
+        raise ValueError(
+            f"frame 0 differs by {start:.3g} m: the prediction must start at frame 0 of the ground truth (see Trajectory.frames)"
+        )
+
+
+def _num_steps(horizon: Horizon, ground_truth: Trajectory) -> int:
+    if horizon == "full":
+        return ground_truth.num_frames - 1
+    if isinstance(horizon, str) or horizon < 1:
+        raise ValueError(f"a horizon is a positive number of frames or 'full', got {horizon!r}")
+    return horizon
+
+
+def _reached(horizons: Sequence[Horizon], error: Float[np.ndarray, "frame"], ground_truth: Trajectory) -> Iterator[tuple[Horizon, int]]:
+    """The horizons that a per-frame error covers, each with its number of steps."""
+    for horizon in horizons:
+        steps = _num_steps(horizon, ground_truth)
+        if 1 <= steps < len(error):
+            yield horizon, steps
+
+
+# --- distribution -------------------------------------------------------------------------------------------------------------------------
+
+
+def energy_distance(
+    a: Float[np.ndarray, "node_a dim"],
+    b: Float[np.ndarray, "node_b dim"],
+    mass_a: Float[np.ndarray, "node_a"],
+    mass_b: Float[np.ndarray, "node_b"],
+) -> float:
+    """Energy distance [m] between two clouds of particles that carry mass: ``2 E|A - B| - E|A - A'| - E|B - B'|``.
+
+    It compares where the material is, not which particle is where, so it stays meaningful after chaos has made particle-wise errors
+    meaningless. It is zero for equal distributions only. Exact, without the smoothing length and the stopping rule of a Sinkhorn
+    divergence; O(N²) time, O(N) memory.
+
+    Source: Székely and Rizzo, Energy statistics, J. Stat. Plan. Inference 143 (2013).
+    """
+    between = _mean_distance(a, b, mass_a, mass_b)
+    # Rounding may leave a tiny negative number.
+    return max(0.0, 2 * between - _mean_distance(a, a, mass_a, mass_a) - _mean_distance(b, b, mass_b, mass_b))
+
+
+def _mean_distance(a: np.ndarray, b: np.ndarray, mass_a: np.ndarray, mass_b: np.ndarray) -> float:
+    a, b = a.astype(np.float64), b.astype(np.float64)
+    weight_a, weight_b = mass_a.astype(np.float64) / mass_a.sum(dtype=np.float64), mass_b.astype(np.float64) / mass_b.sum(dtype=np.float64)
+    rows = max(1, 2**22 // len(b))  # blocks of at most 32 MB
+    return float(sum(weight_a[k : k + rows] @ (cdist(a[k : k + rows], b) @ weight_b) for k in range(0, len(a), rows)))
+
+
+def _cloud_distance(prediction: Trajectory, ground_truth: Trajectory, frame: int) -> float:
+    """Energy distance within each material, averaged by mass: materials that swap places are wrong."""
+    mass, types = ground_truth.mass.astype(np.float64), ground_truth.node_type
+    total = 0.0
+    for code in np.unique(types):
+        own = types == code
+        distance = energy_distance(prediction.pos[frame, own], ground_truth.pos[frame, own], mass[own], mass[own])
+        total += distance * float(mass[own].sum())
+    return total / float(mass.sum())
+
+
+# --- conservation -------------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """Per-mass quantities of frames 1, 2, …: momentum [m/s], angular momentum about the centre of mass [m²/s], kinetic energy [J/kg]."""
+
+    momentum: Float[np.ndarray, "frame dim"]
+    angular_momentum: Float[np.ndarray, "frame dim dim"]
+    kinetic_energy: Float[np.ndarray, "frame"]
+
+
+def _motion(trajectory: Trajectory, num_steps: int) -> _Motion:
+    pos, dt = trajectory.pos[: num_steps + 1].astype(np.float64), trajectory.metadata.frame_dt
+    if any(trajectory.metadata.periodic):  # unwrap, so that crossing the seam is no jump
+        steps = displacement(pos[1:], pos[:-1], trajectory.metadata)
+        pos = np.concatenate([pos[:1], pos[:1] + np.cumsum(steps, axis=0)])
+    vel, pos = integrators.velocities(pos, dt), pos[1:]
+    share = trajectory.mass.astype(np.float64) / trajectory.mass.sum(dtype=np.float64)
+    momentum = np.einsum("n,fnd->fd", share, vel)
+    arm = pos - np.einsum("n,fnd->fd", share, pos)[:, None]
+    moment = np.einsum("n,fni,fnj->fij", share, arm, vel)
+    return _Motion(momentum, moment - moment.swapaxes(1, 2), 0.5 * np.einsum("n,fnd,fnd->f", share, vel, vel))
+
+
+def _motion_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps: int) -> dict[str, float]:
+    p, g = _motion(prediction, num_steps), _motion(ground_truth, num_steps)
+    energy = p.kinetic_energy - g.kinetic_energy
+    # Relative to the largest ground-truth energy so far: material at rest has none to divide by.
+    scale = g.kinetic_energy.max()
+    relative = np.divide(energy, scale, out=np.where(energy == 0, 0.0, math.inf), where=scale > 0)
+    # An antisymmetric matrix holds every component of the angular momentum twice.
+    spin = np.sqrt(0.5 * ((p.angular_momentum - g.angular_momentum) ** 2).sum(axis=(1, 2)))
+    return {
+        "momentum_error": float(np.linalg.norm(p.momentum - g.momentum, axis=-1).mean()),
+        "angular_momentum_error": float(spin.mean()),
+        "kinetic_energy_bias": float(relative.mean()),
+        "kinetic_energy_error": float(np.abs(relative).mean()),
+    }
+
+
+# --- one trajectory -----------------------------------------------------------------------------------------------------------------------
+
+
+def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: Sequence[Horizon] = HORIZONS) -> list[Record]:
+    """All metrics of one rollout at all horizons that the ground truth reaches.
+
+    ====================== ====== ====================================================================================================
+    rollout_mse            m²     squared position error, mean over frames 1 … h, nodes and dimensions (the paper's average MSE)
+    energy_distance        m      between the clouds of frame h, per material, averaged by mass
+    momentum_error         m/s    length of the difference in momentum per mass, mean over frames. Gravity and walls act on the
+                                  ground truth too, so only what the prediction adds or loses remains
+    angular_momentum_error m²/s   the same for angular momentum about the cloud's own centre of mass
+    kinetic_energy_bias    1      difference in kinetic energy, mean over frames, over the largest of the ground truth up to h
+    kinetic_energy_error   1      the same of absolute differences
+    share_outside          1      predicted particle-frames deeper than a thousandth of the spacing in a wall or obstacle
+    ====================== ====== ====================================================================================================
+
+    Energy distance and angular momentum are not defined, and left out, in periodic domains.
+
+    Args:
+        prediction: rollout from frame 0 of the ground truth.
+        ground_truth: the same scene from a solver.
+        horizons: numbers of frames, or ``"full"``.
+
+    Raises:
+        ValueError: a horizon that is not positive, or trajectories that do not describe the same nodes from the same start.
+    """
+    error = per_frame_mse(prediction, ground_truth)
+    periodic = any(ground_truth.metadata.periodic)
+    names = [name for name in UNITS if not (periodic and name in ("energy_distance", "angular_momentum_error"))]
+    records = []
+    for horizon, steps in _reached(horizons, error, ground_truth):
+        values = dict.fromkeys(names, math.inf)
+        if np.isfinite(error[: steps + 1]).all():
+            motion = _motion_errors(prediction, ground_truth, steps)
+            values |= {name: motion[name] for name in motion.keys() & values.keys()}
+            values["rollout_mse"] = float(error[1 : steps + 1].mean())
+            values["share_outside"] = share_outside(prediction.frames(1, steps + 1), tolerance=1e-3 * ground_truth.metadata.spacing)
+            if not periodic:
+                values["energy_distance"] = _cloud_distance(prediction, ground_truth, steps)
+        records += [Record(name, horizon, value) for name, value in values.items()]
+    return records
+
+
+# --- over many trajectories ---------------------------------------------------------------------------------------------------------------
+
+
+class OneStepNMSE(Metric):
+    """Noise-free one-step error, ``sum |prediction - target|² / sum |target|²``: 0 is perfect, 1 is what predicting zero achieves.
+
+    Unlike a training loss it does not depend on the noise added in training, so models trained with different noise compare.
+    """
+
+    higher_is_better = False
+    is_differentiable = False
+    full_state_update = False
+
+    squared_error: Tensor
+    squared_target: Tensor
+
+    def __init__(self, **metric_options: Any) -> None:
+        super().__init__(**metric_options)
+        for name in ("squared_error", "squared_target"):
+            self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+
+    def update(self, prediction: Float[Tensor, "node dim"], target: Float[Tensor, "node dim"]) -> None:
+        """Add a batch of nodes; both in the same unit."""
+        if prediction.shape != target.shape:  # broadcasting would give a number, but not an error
+            raise ValueError(f"prediction {list(prediction.shape)} and target {list(target.shape)} differ in shape")
+        prediction, target = prediction.detach().double(), target.detach().double()
+        self.squared_error += ((prediction - target) ** 2).sum()
+        self.squared_target += (target**2).sum()
+
+    def compute(self) -> Float[Tensor, ""]:
+        return self.squared_error / self.squared_target
+
+
+class RolloutMSE(Metric):
+    """Mean over trajectories of ``rollout_mse`` [m²] at several horizons (see ``rollout_metrics``).
+
+    Infinite as soon as one rollout fails; ``bootstrap_interval`` of the records gives medians that do not depend on a single failure.
+
+    Args:
+        horizons: numbers of frames, or ``"full"``.
+    """
+
+    higher_is_better = False
+    is_differentiable = False
+    full_state_update = False
+
+    total: Tensor
+    count: Tensor
+
+    def __init__(self, horizons: Sequence[Horizon] = HORIZONS, **metric_options: Any) -> None:
+        super().__init__(**metric_options)
+        self.horizons = tuple(horizons)
+        self.add_state("total", torch.zeros(len(self.horizons), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("count", torch.zeros(len(self.horizons), dtype=torch.int64), dist_reduce_fx="sum")
+
+    def update(self, prediction: Trajectory, ground_truth: Trajectory) -> None:
+        """Add one trajectory."""
+        error = per_frame_mse(prediction, ground_truth)
+        for horizon, steps in _reached(self.horizons, error, ground_truth):
+            k = self.horizons.index(horizon)
+            self.total[k] += float(error[1 : steps + 1].mean())
+            self.count[k] += 1
+
+    def compute(self) -> dict[str, Tensor]:
+        """``{"rollout_mse@5": …}`` for the horizons that at least one trajectory reached."""
+        mean = self.total / self.count
+        return {f"rollout_mse@{h}": mean[k] for k, h in enumerate(self.horizons) if self.count[k] > 0}
+
+
+def bootstrap_interval(
+    values: Sequence[Sequence[int | float] | np.ndarray] | np.ndarray,
+    statistic: Callable[[Any], Any] = np.median,
+    confidence: float = 0.95,
+    num_resamples: int = 2000,
+    seed: int = 0,
+) -> Interval:
+    """Percentile interval of a statistic that varies with training seed and with test trajectory.
+
+    Seeds and trajectories are resampled independently of each other: all seeds are tested on the same trajectories, and a hard trajectory
+    is hard for all of them, so drawing trajectories anew within each seed would make the interval too narrow. With few seeds (below about
+    five) any bootstrap is optimistic about the spread between seeds.
+
+    Args:
+        values: one row per training seed, one column per test trajectory; ``inf`` marks a failure.
+        statistic: maps values to a number, such as ``np.median``, ``np.mean`` or ``scipy.stats.gmean``.
+        confidence: probability that the interval should cover.
+        num_resamples: bootstrap resamples.
+        seed: of the resampling.
+
+    Raises:
+        ValueError: not a table of numbers, or NaN in it.
+
+    Source: Owen, The pigeonhole bootstrap, Ann. Appl. Stat. 1 (2007).
+    """
+    if not isinstance(values, np.ndarray) and len({len(row) for row in values}) > 1:
+        raise ValueError("every seed needs the same test trajectories, in the same order")
+    table = np.asarray(values, dtype=np.float64)
+    if table.ndim != 2 or table.size == 0 or np.isnan(table).any():
+        raise ValueError(f"values must be numbers [seed, trajectory] without NaN, got shape {list(table.shape)}")
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence lies between 0 and 1, got {confidence}")
+    rng = np.random.default_rng(seed)
+    num_seeds, num_trajectories = table.shape
+    resampled = [
+        statistic(table[np.ix_(rng.integers(num_seeds, size=num_seeds), rng.integers(num_trajectories, size=num_trajectories))].ravel())
+        for _ in range(num_resamples)
+    ]
+    # Order statistics, because interpolation between infinities is not a number.
+    tail = (1 - confidence) / 2
+    low, high = np.quantile(resampled, [tail, 1 - tail], method="inverted_cdf")
+    return Interval(float(statistic(table.ravel())), float(low), float(high))

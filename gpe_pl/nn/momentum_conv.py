@@ -1,0 +1,161 @@
+"""The message-passing layer of GPE: each undirected edge is computed once, its message is added at one end and subtracted at the other.
+
+The message is a two-layer MLP, whose first layer is linear in its parts, so that it factors into products per node and per edge::
+
+    z_ij = A h_i + B h_j + W e_ij + S s_ij + b                       (i target, j source, e odd or latent edge state, s even features)
+
+``directed``    m_ij = C φ(z_ij) + c for both directions of every edge
+``negated``     m_ij = C φ(z_ij) + c and m_ji = −m_ij, the paper's form (section 2.3); it depends on which end is called i, see ``orient``
+``odd``         m_ij = C (φ(z_ij) − φ(z_ji)), antisymmetric whichever end is called i
+``odd_even``    as ``odd``, and D (φ(z_ij) + φ(z_ji)) goes to both ends
+
+A relation between two node types has a direction already, and is ``negated`` unless the layer is ``directed``.
+"""
+
+from typing import Literal, Optional
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor, nn
+from torch.nn import functional
+from torch_geometric.nn import MessagePassing
+
+Interaction = Literal["directed", "negated", "odd", "odd_even"]
+EdgeState = Literal["latent", "geometry"]
+Implementation = Literal["factored", "plain"]
+
+
+def orient(edge_index: Int64[Tensor, "2 edge"], odd: Float[Tensor, "edge odd"]) -> tuple[Tensor, Tensor]:
+    """Turn every edge so that its first non-zero odd channel is positive: a rule of geometry, independent of node labels.
+
+    The first odd channels are the displacement x_i − x_j, so the target is the end with the larger x, then y, then z; coincident nodes are told apart
+    by their relative velocity where it is a feature. Pairs without any difference keep their order.
+    """
+    nonzero = odd != 0
+    first = nonzero & (torch.cumsum(nonzero, dim=1) == 1)
+    negative = (odd * first).sum(dim=1) < 0
+    edge_index = torch.where(negative, edge_index.flip(0), edge_index)
+    return edge_index, torch.where(negative[:, None], -odd, odd)
+
+
+class MomentumConv(MessagePassing):
+    """Messages of one relation, summed at both ends.
+
+    Args:
+        hidden_channels: node and message channels.
+        edge_channels: channels of the edge state ``e``.
+        even_channels: channels of ``s``; only used by ``odd`` and ``odd_even``.
+        interaction: see the module's text; relations between two types accept only ``directed`` and ``negated``.
+        implementation: ``factored`` multiplies per node before gathering; ``plain`` multiplies the concatenation per edge. Same parameters, same result.
+    """
+
+    def __init__(
+        self,
+        hidden_channels: int,
+        edge_channels: int,
+        even_channels: int,
+        interaction: Interaction,
+        implementation: Implementation = "factored",
+    ) -> None:
+        super().__init__(aggr="sum", flow="source_to_target")
+        self.is_odd = interaction in ("odd", "odd_even")
+        self.interaction = interaction
+        self.implementation = implementation
+        self.widths = [hidden_channels, hidden_channels, edge_channels, even_channels if self.is_odd else 0]
+        self.lin_in = nn.Linear(sum(self.widths), hidden_channels)
+        self.act = nn.PReLU()
+        self.lin_out = nn.Linear(hidden_channels, hidden_channels, bias=not self.is_odd)
+        self.lin_even = nn.Linear(hidden_channels, hidden_channels, bias=False) if interaction == "odd_even" else None
+
+    def forward(
+        self,
+        h_source: Float[Tensor, "source hidden"],
+        h_target: Float[Tensor, "target hidden"],
+        edge_index: Int64[Tensor, "2 edge"],
+        e: Float[Tensor, "directed_edge state"],
+        s: Float[Tensor, "edge even"],
+        with_messages: bool = True,
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Sums at the target nodes, at the source nodes, and the messages m_ij per edge.
+
+        Without ``with_messages`` the last linear map is applied after the sum (it commutes), once per node instead of once per edge; the messages are
+        then None. In a relation of one type with itself pass the same tensor twice and add the two sums.
+        """
+        size = (h_source.shape[0], h_target.shape[0])
+        if self.implementation == "plain":
+            terms = {"a": (h_source, h_target), "b": (None, None), "e": e, "s": s}
+        else:
+            a, b, w, v = self.lin_in.weight.split(self.widths, dim=1)
+            both = self.interaction != "negated"  # also z_ji is needed
+            at = functional.linear(h_target, a, self.lin_in.bias)
+            bs = functional.linear(h_source, b)
+            same = h_source is h_target
+            as_ = (at if same else functional.linear(h_source, a, self.lin_in.bias)) if both else None
+            bt = (bs if same else functional.linear(h_target, b)) if both else None
+            terms = {
+                "a": (as_, at),
+                "b": (bs, bt),
+                "e": functional.linear(e, w),
+                "s": functional.linear(s, v) if self.is_odd and self.widths[3] else None,
+            }
+        return self.propagate(edge_index, size=size, with_messages=with_messages, **terms)
+
+    # PyG's code generator reads these signatures and understands Optional, not unions written with |
+    def message(
+        self, a_i: Optional[Tensor], a_j: Optional[Tensor], b_i: Optional[Tensor], b_j: Optional[Tensor], e: Tensor, s: Optional[Tensor]
+    ) -> tuple[Tensor, Optional[Tensor]]:
+        """φ(z_ij), and φ(z_ji) where the interaction needs it."""
+        hidden = self._hidden_plain if self.implementation == "plain" else self._hidden_factored
+        if self.interaction == "negated":
+            return hidden(a_i, b_j, a_j, e, s, 1), None
+        forward, reverse, sign = (*e.chunk(2), 1) if self.interaction == "directed" else (e, e, -1)
+        return hidden(a_i, b_j, a_j, forward, s, 1), hidden(a_j, b_i, a_i, reverse, s, sign)
+
+    def _hidden_plain(self, h_self: Tensor, _: Tensor | None, h_other: Tensor, e: Tensor, s: Tensor, sign: int) -> Tensor:
+        e = e if sign == 1 else -e
+        return self.act(self.lin_in(torch.cat([h_self, h_other, e, s] if self.is_odd else [h_self, h_other, e], dim=1)))
+
+    def _hidden_factored(self, a_self: Tensor, b_other: Tensor, _: Tensor | None, e: Tensor, s: Tensor | None, sign: int) -> Tensor:
+        z = a_self + b_other
+        z.add_(e, alpha=sign)  # in place: at these sizes a new buffer costs more than the sum
+        return self.act(z if s is None else z.add_(s))
+
+    def aggregate(
+        self,
+        inputs: tuple[Tensor, Optional[Tensor]],
+        edge_index_i: Tensor,
+        edge_index_j: Tensor,
+        size_i: int,
+        size_j: int,
+        with_messages: bool,
+    ) -> tuple[Tensor, Tensor, Optional[Tensor]]:
+        """Sums at targets and sources: +m and −m, or for ``directed`` each its own."""
+        forward, reverse = inputs
+        x = forward - reverse if self.is_odd else forward
+        messages = None
+        if with_messages:
+            x = messages = self.lin_out(x)
+        if self.interaction == "directed":
+            y, sign = self.lin_out(reverse) if with_messages else reverse, 1
+            if with_messages:
+                messages = torch.cat([x, y])
+        else:
+            y, sign = x, -1
+        at_target = self._sum(x, edge_index_i, size_i, 1, with_messages)
+        at_source = self._sum(y, edge_index_j, size_j, sign, with_messages)
+        if self.lin_even is not None:
+            even = forward + reverse
+            at_target = at_target + self.lin_even(even.new_zeros(size_i, even.shape[1]).index_add(0, edge_index_i, even))
+            at_source = at_source + self.lin_even(even.new_zeros(size_j, even.shape[1]).index_add(0, edge_index_j, even))
+        return at_target, at_source, messages
+
+    def _sum(self, x: Tensor, index: Tensor, size: int, sign: int, are_messages: bool) -> Tensor:
+        """±Σ of messages, or of activations that the last linear map then turns into messages."""
+        total = x.new_zeros(size, x.shape[1]).index_add_(0, index, x, alpha=sign)
+        if are_messages:
+            return total
+        total = functional.linear(total, self.lin_out.weight)
+        if self.lin_out.bias is None:
+            return total
+        degree = x.new_zeros(size).index_add_(0, index, x.new_ones(index.shape[0]), alpha=sign)
+        return total + degree[:, None] * self.lin_out.bias

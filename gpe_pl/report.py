@@ -1,0 +1,190 @@
+"""From the runs of a sweep to one table and one figure: what differs between the runs becomes the axes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gpe_pl.evaluation import LEARNED, Row, read_rows
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.metrics import bootstrap_interval
+from gpe_pl.timing import paired_ratio, paired_times
+
+TABLE_HORIZONS = ("20", "100", "full")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run: its folder, its flattened configuration and its rows."""
+
+    folder: Path
+    config: dict[str, Any]
+    rows: list[Row]
+
+
+def finished_runs(folder: Path) -> list[Run]:
+    """All finished runs below a folder, in order of their paths."""
+    runs = []
+    for path in sorted(folder.rglob("metrics.csv")):
+        config = path.parent / "config.json"
+        if config.exists() and "log" not in path.parent.parts:
+            runs.append(Run(path.parent, dict(_flatten(json.loads(config.read_text()))), list(read_rows(path))))
+    return runs
+
+
+def _flatten(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _flatten(item, f"{path}.{key}" if path else str(key))
+    else:
+        yield path, value if not isinstance(value, list) else json.dumps(value)
+
+
+def axes_of(runs: list[Run]) -> list[str]:
+    """Configuration keys whose values differ between runs, ``seed`` last."""
+    keys = sorted({k for r in runs for k in r.config})
+    different = [k for k in keys if len({json.dumps(r.config.get(k)) for r in runs}) > 1]
+    return sorted(different, key=lambda k: (k == "seed", k))
+
+
+def report_sweep(folder: Path) -> None:
+    """Write ``table.csv``, ``table.md`` and ``validation_loss.png`` for the finished runs below a folder."""
+    runs = finished_runs(folder)
+    if not runs:
+        return
+    axes = [a for a in axes_of(runs) if a != "seed"]
+    variants: dict[tuple[str, ...], list[Run]] = defaultdict(list)
+    for run in runs:
+        variants[tuple(str(run.config.get(a)) for a in axes)].append(run)
+    _write_csv(folder / "table.csv", axes, runs)
+    ratios = forward_time_ratios(variants)
+    _replace(folder / "table.md", _markdown(axes, variants, ratios))
+    curves = {", ".join(v) or LEARNED: [validation_curve(r.folder) for r in members] for v, members in variants.items()}
+    curves = {k: [c for c in v if len(c[0])] for k, v in curves.items()}
+    if all(curves.values()):
+        from gpe_pl.viz.figures import validation_loss_figure
+
+        validation_loss_figure(curves).savefig(folder / "validation_loss.png", dpi=150)
+
+
+def _column(axis: str) -> str:
+    return axis.rpartition(".")[2]
+
+
+def _groups(row: Row) -> list[str]:
+    """Splits that a row counts for; unseen parameters also apart by where they lie."""
+    return [row.split, f"{row.split}/{row.parameter_group}"] if row.parameter_group in ("interpolated", "extrapolated") else [row.split]
+
+
+def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
+    """One line per variant, seed, split, metric and horizon: the mean over trajectories."""
+    lines: list[list[Any]] = []
+    for run in runs:
+        key = [run.config.get(a) for a in axes]
+        groups: dict[tuple[str, str, str], list[float]] = defaultdict(list)
+        for row in run.rows:
+            if row.model == LEARNED:
+                for split in _groups(row):
+                    groups[split, row.metric, row.horizon].append(row.value)
+        steps, losses = validation_curve(run.folder)
+        if len(steps):
+            groups["val", "one_step_nmse", "1"].append(float(losses[-1]))
+        lines += [[*key, run.config.get("seed"), *group, float(np.mean(values))] for group, values in sorted(groups.items())]
+    temporary = path.with_suffix(".part")
+    with open(temporary, "w", newline="") as handle:
+        writer = csv.writer(handle)
+        writer.writerow([*(_column(a) for a in axes), "seed", "split", "metric", "horizon", "value"])
+        writer.writerows(lines)
+    os.replace(temporary, path)
+
+
+def _replace(path: Path, text: str) -> None:
+    temporary = path.with_suffix(".part")
+    temporary.write_text(text)
+    os.replace(temporary, path)
+
+
+def validation_curve(run_dir: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and one-step validation loss of a run, over all its starts."""
+    points: dict[int, float] = {}
+    for path in sorted(run_dir.glob("log/version_*/metrics.csv"), key=lambda p: int(p.parent.name.partition("_")[2])):
+        with open(path, newline="") as handle:
+            for line in csv.DictReader(handle):
+                if line.get("val/one_step_nmse"):
+                    points[int(line["step"]) + 1] = float(line["val/one_step_nmse"])
+    steps = sorted(points)
+    return np.array(steps), np.array([points[s] for s in steps])
+
+
+def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon: str) -> list[list[float]]:
+    """One list of per-trajectory values per run."""
+    table = []
+    for run in runs:
+        rows = [r for r in run.rows if r.model == model and r.metric == metric and r.horizon == horizon and split in _groups(r)]
+        table.append([r.value for r in sorted(rows, key=lambda r: r.trajectory)])
+    return [t for t in table if t]
+
+
+def _interval(values: list[list[float]], scale: float = 1.0) -> str:
+    if not values:
+        return "–"
+    i = bootstrap_interval(values, statistic=np.mean)
+    return f"{i.estimate * scale:.3g} [{i.low * scale:.3g}, {i.high * scale:.3g}]"
+
+
+def forward_time_ratios(variants: dict[tuple[str, ...], list[Run]], num_rounds: int = 30) -> dict[tuple[str, ...], float]:
+    """Forward time of each variant's trained model over that of the first, as the median of paired ratios on one graph; empty for a single variant."""
+    from gpe_pl.suites.speed import synthetic_graph
+
+    if len(variants) < 2:
+        return {}
+    names = {v: "/".join(v) for v in variants}
+    alternatives = {}
+    for v, members in variants.items():
+        simulator = LearnedSimulator.from_checkpoint(members[0].folder / "checkpoints" / "best.ckpt")
+        builder, graph = synthetic_graph(600, 6000)
+        if builder.spec != simulator.builder.spec:
+            return {}
+        alternatives[names[v]] = torch.inference_mode()(lambda s=simulator, g=graph: s(g))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    times = paired_times(alternatives, num_rounds)
+    torch.set_num_threads(threads)
+    first = names[next(iter(variants))]
+    return {v: paired_ratio(times, names[v], first) for v in variants}
+
+
+def _markdown(axes: list[str], variants: dict[tuple[str, ...], list[Run]], ratios: dict[tuple[str, ...], float]) -> str:
+    any_run = next(iter(variants.values()))[0]
+    splits = sorted({s for r in any_run.rows for s in _groups(r)})
+    names = [_column(a) for a in axes] or ["model"]
+    header = [*names, "seeds", "val one-step nMSE"]
+    header += [f"{split}: rollout MSE@{h} ×1e-3 [m²]" for split in splits for h in TABLE_HORIZONS]
+    header += ["test momentum error@full [m/s]", "forward time (paired ratio)"]
+    lines = ["| " + " | ".join(header) + " |", "|" + "---|" * len(header)]
+    for key, runs in variants.items():
+        losses = [loss[-1] for _, loss in (validation_curve(r.folder) for r in runs) if len(loss)]
+        cells = [*(key or (LEARNED,)), str(len(runs)), f"{np.mean(losses):.4f}" if losses else "–"]
+        cells += [_interval(values_by_seed(runs, LEARNED, s, "rollout_mse", h), 1e3) for s in splits for h in TABLE_HORIZONS]
+        cells.append(_interval(values_by_seed(runs, LEARNED, "test", "momentum_error", "full")))
+        cells.append(f"{ratios[key]:.2f}" if key in ratios else "–")
+        lines.append("| " + " | ".join(cells) + " |")
+    for baseline in sorted({r.model for r in any_run.rows} - {LEARNED}):
+        cells = [baseline, *[""] * (len(names) - 1), "–", "–"]
+        cells += [_interval(values_by_seed([any_run], baseline, s, "rollout_mse", h), 1e3) for s in splits for h in TABLE_HORIZONS]
+        cells += [_interval(values_by_seed([any_run], baseline, "test", "momentum_error", "full")), "–"]
+        lines.append("| " + " | ".join(cells) + " |")
+    note = (
+        "Means over trajectories and seeds with 95 % bootstrap intervals over both. rollout MSE@h: mean over frames 1 … h, nodes and axes. "
+        "Forward time: trained models on one graph of 600 nodes, paired, relative to the first row."
+    )
+    return "\n".join([*lines, "", note, ""])

@@ -1,0 +1,127 @@
+"""Names shared by every layer: node types, relations, material parameters and stored fields.
+
+This module imports nothing but the standard library, so that solvers, store and models can agree on names without depending on each other.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+SCHEMA_VERSION = 1
+"""Version of the HDF5 layout; a reader refuses any other."""
+
+STICKY = 1.0e6
+"""Coulomb friction coefficient that stands for a no-slip boundary (any value this large or larger is no-slip)."""
+
+
+@dataclass(frozen=True)
+class MaterialParameter:
+    """One continuous parameter of a material.
+
+    Attributes:
+        name: column name in ``material_params``.
+        unit: unit of the stored value.
+        low: smallest value that the solvers accept.
+        high: largest value that the solvers accept.
+        scale: how the parameter enters a model: ``linear``, or ``log`` for parameters that span decades.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    scale: Literal["linear", "log"]
+
+
+MATERIALS: dict[str, MaterialParameter] = {
+    "sand": MaterialParameter("friction_angle", "deg", 0.0, 60.0, "linear"),
+    "snow": MaterialParameter("hardening_coefficient", "1", 0.0, 30.0, "linear"),
+    "fluid": MaterialParameter("kinematic_viscosity", "m^2/s", 1e-6, 10.0, "log"),
+    "elastomer": MaterialParameter("youngs_modulus", "Pa", 1e3, 1e8, "log"),
+    "solid": MaterialParameter("youngs_modulus", "Pa", 1e3, 1e9, "log"),
+}
+"""Dynamic node types with their material parameter; the order fixes the integer codes of ``node_type``."""
+
+BOUNDARY = "boundary"
+NODE_TYPES: tuple[str, ...] = (*MATERIALS, BOUNDARY)
+RADIUS = "radius"
+
+EdgeType = tuple[str, str, str]
+"""``(source node type, relation, target node type)``."""
+
+SPLITS: tuple[str, ...] = ("train", "val", "test", "test_unseen")
+ParameterGroup = Literal["seen", "interpolated", "extrapolated"]
+
+
+def node_code(name: str) -> int:
+    """Integer code of a node type, as stored in ``node_type``."""
+    return NODE_TYPES.index(name)
+
+
+def param_names(materials: tuple[str, ...]) -> tuple[str, ...]:
+    """Column names of ``material_params`` for a data set with these materials, without repetition, in schema order."""
+    return tuple(dict.fromkeys(MATERIALS[m].name for m in MATERIALS if m in materials))
+
+
+def radius_relations(materials: tuple[str, ...]) -> tuple[EdgeType, ...]:
+    """Every ``radius`` relation that a data set with these materials can have.
+
+    Each unordered pair of node types appears once; ``boundary`` is always the source and has no relation with itself.
+    """
+    names = [m for m in MATERIALS if m in materials]
+    pairs = [(a, RADIUS, b) for i, a in enumerate(names) for b in names[i:]]
+    return (*pairs, *((BOUNDARY, RADIUS, m) for m in names))
+
+
+@dataclass(frozen=True)
+class Field:
+    """A stored array: its dimensions, in the order of its axes, its unit and its meaning."""
+
+    dims: tuple[str, ...]
+    dtype: str
+    unit: str
+    doc: str
+    required: bool = True
+
+
+FIELDS: dict[str, Field] = {
+    "pos": Field(("frame", "node", "dim"), "float32", "m", "positions of the dynamic nodes"),
+    "vel": Field(("frame", "node", "dim"), "float32", "m/s", "velocities of the dynamic nodes as the solver has them at that frame"),
+    "node_type": Field(("node",), "uint8", "1", "index into the attribute node_types"),
+    "mass": Field(("node",), "float32", "kg", "mass (per metre of depth in 2D)"),
+    "material_params": Field(("node", "param"), "float32", "per column", "columns as in param_names; NaN where one does not apply"),
+    "boundary_pos": Field(("one", "boundary_node", "dim"), "float32", "m", "positions of the boundary nodes"),
+    "boundary_vel": Field(("one", "boundary_node", "dim"), "float32", "m/s", "velocities of the boundary nodes"),
+    "boundary_normal": Field(("one", "boundary_node", "dim"), "float32", "1", "unit normals that point into free space"),
+    "boundary_friction": Field(("boundary_node",), "float32", "1", f"Coulomb coefficient; {STICKY:g} or more is no-slip"),
+    "boundary_restitution": Field(("boundary_node",), "float32", "1", "fraction of the normal velocity that a bounce returns"),
+    "rest_pos": Field(("node", "dim"), "float32", "m", "undeformed positions of mesh nodes", required=False),
+    "cells": Field(("cell", "corner"), "int32", "1", "node indices of each mesh cell", required=False),
+    "stress": Field(("frame", "node", "stress"), "float32", "Pa", "Cauchy stress, upper triangle by rows", required=False),
+}
+
+
+@dataclass(frozen=True)
+class FeatureSpec:
+    """Channel counts of a data set's graphs: everything a model needs to know to build its layers.
+
+    Attributes:
+        dim: space dimension.
+        materials: dynamic node types, in schema order.
+        node_channels: channels of ``x`` per node type, ``boundary`` included.
+        param_channels: material parameters per material.
+        relations: edge types that can occur.
+        odd_channels: edge channels that change sign when source and target swap; the first ``dim`` are the relative displacement.
+        even_channels: edge channels that do not.
+    """
+
+    dim: int
+    materials: tuple[str, ...]
+    node_channels: dict[str, int]
+    param_channels: dict[str, int]
+    relations: tuple[EdgeType, ...]
+    odd_channels: int
+    even_channels: int
+
+    @property
+    def node_types(self) -> tuple[str, ...]:
+        return (*self.materials, BOUNDARY)

@@ -1,0 +1,65 @@
+"""Callbacks: weight averaging with warm-up, and rollouts as validation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback, WeightAveraging
+
+from gpe_pl.containment import Contained
+from gpe_pl.metrics import per_frame_mse
+from gpe_pl.rollout import Guard, rollout
+from gpe_pl.trajectory import Trajectory
+
+
+class WarmAverage(WeightAveraging):
+    """Exponential moving average of the weights, used for validation, checkpoints and the final model.
+
+    The decay grows as (1 + n) / (10 + n) up to ``decay``, so that short runs are not dominated by their first steps.
+    """
+
+    def __init__(self, decay: float = 0.999) -> None:
+        def average(averaged: list[torch.Tensor], current: list[torch.Tensor], num_averaged: Any) -> None:
+            n = int(num_averaged)
+            floats = [(a, c) for a, c in zip(averaged, current, strict=True) if a.is_floating_point()]
+            torch._foreach_lerp_([a for a, _ in floats], [c for _, c in floats], 1 - min(decay, (1 + n) / (10 + n)))
+
+        super().__init__(multi_avg_fn=average)
+
+
+class RolloutValidation(Callback):
+    """Rolls the current (averaged) model out on validation trajectories and logs the position MSE as ``val/rollout_mse``.
+
+    Stands before ``WarmAverage`` in the list of callbacks, so that it sees the averaged weights.
+
+    Args:
+        trajectories: ground truth.
+        num_steps: rollout length in frames.
+    """
+
+    def __init__(self, trajectories: list[Trajectory], num_steps: int) -> None:
+        self.trajectories, self.num_steps = trajectories, num_steps
+
+    def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        simulator: Any = pl_module.simulator
+        if trainer.sanity_checking:
+            return
+        was_training = simulator.training
+        simulator.eval()
+        values = [self._mse(simulator, t) for t in self.trajectories]
+        simulator.train(was_training)
+        pl_module.log("val/rollout_mse", float(torch.tensor(values).mean()))
+
+    def _mse(self, simulator: Any, trajectory: Trajectory) -> float:
+        history = simulator.builder.config.history
+        truth = trajectory.frames(history, history + self.num_steps + 1)
+        contained = Contained(simulator, truth.metadata.frame_dt)
+        bounds = truth.metadata.bounds
+        guard = Guard(bounds=bounds, margin=max(b - a for a, b in bounds), max_speed=1e3)
+        prediction = rollout(contained, simulator.initial_state(trajectory, history), truth.num_frames - 1, truth.metadata, guard)
+        error = per_frame_mse(prediction, truth)
+        worst = max(b - a for a, b in bounds) ** 2  # a rollout that stopped early counts as lost from there on
+        good = error[: prediction.num_frames]
+        return float((good[1:].sum() + worst * (truth.num_frames - prediction.num_frames)) / (truth.num_frames - 1))

@@ -1,0 +1,127 @@
+"""``LightningModule``: one-step loss, optimiser, learning-rate decay, and an early, clear stop when numbers go bad."""
+
+from __future__ import annotations
+
+import logging
+import math
+import shutil
+from typing import Annotated, Any, Literal
+
+import lightning as L
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch_geometric.data import HeteroData
+
+from gpe_pl.errors import GpeError
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.metrics import OneStepNMSE
+
+Schedule = Literal["cosine", "exponential"]
+Compile = Literal["auto", "on", "off"]
+
+COMPILE_PAYS_AFTER = 3000
+"""Steps from which ``compile: auto`` repays the time that compilation takes."""
+
+log = logging.getLogger(__name__)
+
+
+class TrainingError(GpeError, RuntimeError):
+    """Training cannot go on; the message names step, trajectories and frames."""
+
+
+class TrainingModule(L.LightningModule):
+    """Trains a ``LearnedSimulator`` on one-step accelerations.
+
+    The loss is the mean squared error of the normalised acceleration over all dynamic nodes and axes, which for a fixed frame interval is the paper's MSE of
+    the next position up to a constant.
+
+    Args:
+        simulator: with statistics set.
+        num_steps: optimiser steps of the whole run; the schedule ends there.
+        learning_rate: at the start, in Adam.
+        final_learning_rate: at the end.
+        schedule: ``exponential`` decays geometrically (paper: 5e-5 to 1e-6); ``cosine`` warms up and follows a half cosine (short budgets).
+        warmup_steps: linear warm-up of the ``cosine`` schedule.
+        compile: ``torch.compile`` the model: ``auto`` does so when the run is long enough and a C++ compiler is found.
+    """
+
+    def __init__(
+        self,
+        simulator: LearnedSimulator,
+        num_steps: Annotated[int, Field(ge=1)],
+        learning_rate: Annotated[float, Field(gt=0)] = 1e-3,
+        final_learning_rate: Annotated[float, Field(gt=0)] = 1e-5,
+        schedule: Schedule = "cosine",
+        warmup_steps: Annotated[int, Field(ge=0)] = 100,
+        compile: Compile = "auto",  # noqa: A002
+    ) -> None:
+        super().__init__()
+        self.simulator = simulator
+        self.num_steps, self.schedule, self.warmup_steps = num_steps, schedule, warmup_steps
+        self.learning_rate, self.final_learning_rate = learning_rate, final_learning_rate
+        self.compile_mode: Compile = compile
+        self.val_nmse = OneStepNMSE()
+
+    def configure_optimizers(self) -> Any:
+        optimizer = torch.optim.Adam(self.simulator.parameters(), lr=self.learning_rate, fused=True)
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": torch.optim.lr_scheduler.LambdaLR(optimizer, self.learning_rate_factor), "interval": "step"},
+        }
+
+    def learning_rate_factor(self, step: int) -> float:
+        """Learning rate at a step over ``learning_rate``."""
+        ratio = self.final_learning_rate / self.learning_rate
+        if self.schedule == "exponential":
+            return ratio ** (min(step, self.num_steps) / self.num_steps)
+        if step < self.warmup_steps:
+            return (step + 1) / self.warmup_steps
+        progress = min(1.0, (step - self.warmup_steps) / max(1, self.num_steps - self.warmup_steps))
+        return ratio + (1 - ratio) * 0.5 * (1 + math.cos(math.pi * progress))
+
+    def on_fit_start(self) -> None:
+        wanted = self.compile_mode == "on" or (self.compile_mode == "auto" and self.num_steps - self.global_step >= COMPILE_PAYS_AFTER)
+        if not wanted:
+            return
+        if self.compile_mode == "auto" and not any(shutil.which(c) for c in ("c++", "g++", "clang++", "cl")):
+            log.warning("compile: auto found no C++ compiler, training runs without torch.compile")
+            return
+        model = self.simulator.model
+        if hasattr(model, "compute"):
+            model.compute = torch.compile(model.compute, dynamic=True)
+
+    def on_fit_end(self) -> None:
+        self.simulator.model.__dict__.pop("compute", None)  # back to the plain method
+
+    def loss(self, batch: HeteroData) -> Tensor:
+        """Mean squared error of the normalised accelerations."""
+        predicted = self.simulator(batch)
+        errors = [(predicted[m] - self._normalized(batch[m].target)).square() for m in predicted]
+        return torch.cat(errors).mean()
+
+    def training_step(self, batch: HeteroData, batch_idx: int) -> Tensor:
+        loss = self.loss(batch)
+        if not torch.isfinite(loss):
+            windows = ", ".join(f"({t}, {f})" for t, f in zip(batch.trajectory.tolist(), batch.frame.tolist(), strict=True))
+            raise TrainingError(
+                f"step {self.global_step}: the loss is {loss.item()} for (trajectory, frame) = {windows}; "
+                "the last good checkpoint is kept. Lower training.learning_rate, or validate the data with `python -m gpe_pl.data.validate`"
+            )
+        self.log("train/loss", loss, batch_size=1)
+        return loss
+
+    def validation_step(self, batch: HeteroData, batch_idx: int) -> None:
+        predicted = self.simulator(batch)
+        for material, value in predicted.items():
+            self.val_nmse.update(value, self._normalized(batch[material].target))
+
+    def on_validation_epoch_end(self) -> None:
+        self.log("val/one_step_nmse", self.val_nmse.compute())
+        self.val_nmse.reset()
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["simulator"] = self.simulator.description()
+
+    def _normalized(self, target: Tensor) -> Tensor:
+        return target / self.simulator.acceleration_std.to(target.dtype)

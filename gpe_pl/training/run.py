@@ -1,0 +1,178 @@
+"""One training run in a folder: start, resume, or recognise that it is finished."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import lightning as L
+import torch
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.loggers import CSVLogger, Logger
+from pydantic import Field
+
+from gpe_pl.data.datamodule import TrajectoryDataModule
+from gpe_pl.data.noise import NoiseKind
+from gpe_pl.errors import GpeError
+from gpe_pl.training.callbacks import RolloutValidation, WarmAverage
+from gpe_pl.training.module import Compile, Schedule, TrainingModule
+
+log = logging.getLogger(__name__)
+
+
+class RunError(GpeError, RuntimeError):
+    """A run folder cannot be used; the message says why and what to do."""
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """Everything about the optimisation; see ``TrainingModule``, ``TrajectoryDataModule`` and ``data.noise`` for the meaning of each value."""
+
+    num_steps: Annotated[int, Field(ge=1)]
+    batch_size: Annotated[int, Field(ge=1)] = 2
+    learning_rate: Annotated[float, Field(gt=0)] = 1e-3
+    final_learning_rate: Annotated[float, Field(gt=0)] = 1e-5
+    schedule: Schedule = "cosine"
+    warmup_steps: Annotated[int, Field(ge=0)] = 100
+    gradient_clip: Annotated[float, Field(gt=0)] = 1.0
+    ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999
+    noise: NoiseKind = "velocity"
+    noise_std: Annotated[float, Field(ge=0, le=100)] = 0.3
+    compile: Compile = "auto"
+    val_interval: Annotated[int, Field(ge=1)] = 1000
+    num_val_rollouts: Annotated[int, Field(ge=1)] = 4
+    val_rollout_steps: Annotated[int, Field(ge=1)] = 100
+
+
+@dataclass(frozen=True)
+class TrainerSettings:
+    """Where the training runs."""
+
+    accelerator: Literal["cpu", "gpu", "auto"] = "cpu"
+    devices: Annotated[int, Field(ge=1)] = 1
+    num_threads: Annotated[int, Field(ge=1)] | None = None
+    num_workers: Annotated[int, Field(ge=0)] = 0
+    progress: bool = True
+
+
+@dataclass(frozen=True)
+class LoggerSettings:
+    """Where the metrics go; files in the run's folder are always written."""
+
+    kind: Literal["csv", "wandb"] = "csv"
+    project: str = "gpe_pl"
+    mode: Literal["online", "offline", "disabled"] | None = None
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    def loggers(self, run_dir: Path) -> list[Logger]:
+        """CSV under ``run_dir/log``, one version per start of the run, and W&B if asked for (offline without an API key)."""
+        loggers: list[Logger] = [CSVLogger(run_dir, name="log", flush_logs_every_n_steps=200)]
+        if self.kind == "wandb":
+            from lightning.pytorch.loggers import WandbLogger
+
+            has_key = bool(os.environ.get("WANDB_API_KEY"))
+            mode = self.mode or ("online" if has_key else "offline")
+            loggers.append(WandbLogger(project=self.project, save_dir=run_dir, id=run_id(run_dir), resume="allow", mode=mode))
+        return loggers
+
+
+def run_id(run_dir: Path) -> str:
+    """An identifier that a resumed run finds again; written once."""
+    path = run_dir / "run_id"
+    if not path.exists():
+        path.write_text(os.urandom(6).hex())
+    return path.read_text().strip()
+
+
+def claim(run_dir: Path, config: dict[str, Any]) -> None:
+    """Take a folder for a run with this configuration.
+
+    Raises:
+        RunError: the folder holds a run with another configuration; names the first differing key.
+    """
+    run_dir.mkdir(parents=True, exist_ok=True)
+    path = run_dir / "config.json"
+    if path.exists():
+        try:
+            before = json.loads(path.read_text())
+        except json.JSONDecodeError:
+            raise RunError(f"{path} is damaged; delete the folder {run_dir} or choose another name=…") from None
+        different = sorted(_differences(before, config))
+        if different:
+            raise RunError(
+                f"{run_dir} holds a run with another configuration ({'; '.join(different[:3])}); choose another name=… or delete the folder"
+            )
+        return
+    temporary = path.with_suffix(".part")
+    temporary.write_text(json.dumps(config, indent=1, sort_keys=True))
+    os.replace(temporary, path)
+
+
+def _differences(a: Any, b: Any, path: str = "") -> list[str]:
+    if isinstance(a, dict) and isinstance(b, dict):
+        return [d for k in sorted({*a, *b}) for d in _differences(a.get(k), b.get(k), f"{path}.{k}" if path else k)]
+    return [] if a == b else [f"{path}: {a!r} there, {b!r} now"]
+
+
+def train(
+    module: TrainingModule,
+    datamodule: TrajectoryDataModule,
+    training: TrainingSettings,
+    trainer_settings: TrainerSettings,
+    loggers: list[Logger],
+    run_dir: Path,
+) -> Path:
+    """Train to ``num_steps``, resuming from ``checkpoints/last.ckpt`` if there is one; returns the checkpoint with the best validation rollout."""
+    folder = run_dir / "checkpoints"
+    last = folder / "last.ckpt"
+    best = ModelCheckpoint(
+        folder,
+        filename="best",
+        monitor="val/rollout_mse",
+        mode="min",
+        save_top_k=1,
+        save_last=True,
+        save_on_train_epoch_end=False,
+        enable_version_counter=False,
+    )
+    steps = min(training.val_rollout_steps, datamodule.val_trajectories(1)[0].num_frames - datamodule.builder.config.history - 1)
+    callbacks: list[Callback] = [
+        RolloutValidation(datamodule.val_trajectories(training.num_val_rollouts), steps),
+        WarmAverage(training.ema_decay),
+        LearningRateMonitor(),
+        best,
+    ]
+    if trainer_settings.progress:
+        callbacks.append(TQDMProgressBar(refresh_rate=50))
+    trainer = L.Trainer(
+        accelerator=trainer_settings.accelerator,
+        devices=trainer_settings.devices,
+        max_steps=training.num_steps,
+        max_epochs=-1,
+        val_check_interval=min(training.val_interval, training.num_steps),
+        check_val_every_n_epoch=None,
+        gradient_clip_val=training.gradient_clip,
+        num_sanity_val_steps=0,
+        callbacks=callbacks,
+        logger=loggers,
+        log_every_n_steps=min(50, training.num_steps),
+        enable_progress_bar=trainer_settings.progress,
+        enable_model_summary=False,
+    )
+    if last.exists():
+        log.info("resuming from %s", last)
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    trainer.fit(module, datamodule, ckpt_path=str(last) if last.exists() else None, weights_only=True)
+    if trainer.interrupted:
+        raise RunError(f"interrupted; run the same command again to resume from {last}")
+    return folder / "best.ckpt"
+
+
+def set_threads(settings: TrainerSettings) -> None:
+    """PyTorch's threads in this process."""
+    if settings.num_threads is not None:
+        torch.set_num_threads(settings.num_threads)

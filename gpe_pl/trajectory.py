@@ -1,0 +1,538 @@
+"""``State``, ``Trajectory`` and ``Metadata``, and the HDF5 store: the only contract between solvers and learners.
+
+A shard is one HDF5 file with a group per trajectory. It is written under a temporary name and renamed, so a reader never sees half of one.
+Every array is chunked with a fletcher32 checksum, and each group carries a SHA-256 digest of all its arrays and attributes. Text is stored
+with a fixed length: HDF5 keeps text of variable length outside its checksums, where one flipped bit can hang the library.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from gpe_pl import integrators
+from gpe_pl.errors import GpeError
+from gpe_pl.geometry import Shape, shape_from_dict, shape_to_dict
+from gpe_pl.schema import FIELDS, NODE_TYPES, SCHEMA_VERSION, node_code
+
+Array = Any
+"""A NumPy array or a torch tensor."""
+
+
+class StoreError(GpeError, ValueError):
+    """A file of the store is missing, damaged or of another schema; the message names file, trajectory and field."""
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """Dense boundary nodes with their boundary condition, and the geometry they were sampled from.
+
+    Attributes:
+        pos: positions [boundary_node, dim] in m.
+        vel: velocities [boundary_node, dim] in m/s.
+        normal: unit normals [boundary_node, dim] into free space.
+        friction: Coulomb coefficient [boundary_node]; ``schema.STICKY`` or more is no-slip.
+        restitution: fraction of the normal velocity that a bounce returns [boundary_node].
+        shapes: analytic geometry, for signed distances.
+    """
+
+    pos: Array
+    vel: Array
+    normal: Array
+    friction: Array
+    restitution: Array
+    shapes: tuple[Shape, ...] = ()
+
+    @classmethod
+    def sample(cls, shapes: tuple[Shape, ...], spacing: float, dim: int) -> Boundary:
+        """Sample shapes into nodes at most ``spacing`` [m] apart; nodes that lie inside another shape are left out."""
+        pos, normal, friction, restitution = [np.empty((0, dim))], [np.empty((0, dim))], [np.empty(0)], [np.empty(0)]
+        for shape in shapes:
+            p, n = shape.sample(spacing)
+            for other in shapes:
+                if other is not shape:
+                    keep = other.signed_distance(p) > -1e-9 * max(1.0, spacing)
+                    p, n = p[keep], n[keep]
+            pos.append(p)
+            normal.append(n)
+            friction.append(np.full(len(p), shape.friction))
+            restitution.append(np.full(len(p), shape.restitution))
+        x = np.concatenate(pos)
+        return cls(x, np.zeros_like(x), np.concatenate(normal), np.concatenate(friction), np.concatenate(restitution), tuple(shapes))
+
+    @classmethod
+    def empty(cls, dim: int) -> Boundary:
+        """No boundary at all."""
+        return cls.sample((), 1.0, dim)
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything a ``Simulator`` needs to know at one instant; arrays of one backend.
+
+    Attributes:
+        pos: positions of the dynamic nodes [node, dim] in m.
+        vel: velocities [node, dim] in m/s.
+        node_type: codes of ``schema.NODE_TYPES`` [node].
+        mass: [node] in kg.
+        material_params: [node, param], columns named by ``Metadata.param_names``, NaN where not applicable.
+        boundary: boundary nodes and their conditions.
+        gravity: external acceleration [dim] in m/s².
+        velocity_history: the last velocities [node, history, dim], oldest first, the last one equal to ``vel``; None for solvers.
+        time: seconds since the start.
+        internal: opaque part of a solver (deformation gradient, …), carried so that a restart equals a run-through.
+    """
+
+    pos: Array
+    vel: Array
+    node_type: Array
+    mass: Array
+    material_params: Array
+    boundary: Boundary
+    gravity: Array
+    velocity_history: Array | None = None
+    time: float = 0.0
+    internal: Any = None
+
+    @property
+    def num_nodes(self) -> int:
+        return self.pos.shape[0]
+
+    @property
+    def dim(self) -> int:
+        return self.pos.shape[1]
+
+    def to_torch(self, device: Any = "cpu") -> State:
+        """The same state as float64 tensors on a device (``internal`` is dropped: it belongs to a solver)."""
+        import torch
+
+        def tensor(x: Array) -> Any:
+            if isinstance(x, np.ndarray):  # a copy: stored arrays may be read-only
+                x = torch.from_numpy(x.astype(np.float64 if np.issubdtype(x.dtype, np.floating) else np.int64))
+            return x.to(device, torch.float64 if x.is_floating_point() else torch.int64)
+
+        b = self.boundary
+        boundary = replace(b, **{name: tensor(getattr(b, name)) for name in ("pos", "vel", "normal", "friction", "restitution")})
+        arrays = {name: tensor(getattr(self, name)) for name in ("pos", "vel", "node_type", "mass", "material_params", "gravity")}
+        history = None if self.velocity_history is None else tensor(self.velocity_history)
+        return replace(self, **arrays, boundary=boundary, velocity_history=history, internal=None)
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What is known about a trajectory besides its arrays. Lengths in m, times in s.
+
+    Attributes:
+        dataset: name of the data set.
+        materials: every material that occurs anywhere in the data set (fixes the node types of all its graphs).
+        param_names: column names of ``material_params``.
+        frame_dt: time between stored frames.
+        solver_dt: largest solver substep, 0 where there is none.
+        spacing: rest spacing of neighbouring nodes.
+        connectivity_radius: neighbour radius that sees what the solver's kernel sees.
+        bounds: ``(low, high)`` per axis of the domain.
+        periodic: per axis.
+        gravity: external acceleration [m/s²].
+        seed: seed of the scene, -1 where unknown.
+        split: split that the trajectory belongs to.
+        parameter_group: whether the material parameter is among the trained values (``seen``), between or outside them.
+        solver, solver_version, config: provenance; ``config`` is JSON.
+    """
+
+    dataset: str
+    materials: tuple[str, ...]
+    param_names: tuple[str, ...]
+    frame_dt: float
+    spacing: float
+    connectivity_radius: float
+    bounds: tuple[tuple[float, float], ...]
+    gravity: tuple[float, ...]
+    periodic: tuple[bool, ...] = ()
+    solver_dt: float = 0.0
+    seed: int = -1
+    split: str = ""
+    parameter_group: str = "seen"
+    solver: str = ""
+    solver_version: str = ""
+    config: str = "{}"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "materials", tuple(self.materials))
+        object.__setattr__(self, "param_names", tuple(self.param_names))
+        object.__setattr__(self, "bounds", tuple((float(a), float(b)) for a, b in self.bounds))
+        object.__setattr__(self, "gravity", tuple(float(g) for g in self.gravity))
+        object.__setattr__(self, "periodic", tuple(bool(p) for p in self.periodic) or (False,) * len(self.bounds))
+
+    @property
+    def dim(self) -> int:
+        return len(self.bounds)
+
+
+@dataclass(frozen=True)
+class Termination:
+    """Why a rollout stopped early: reason code, the first frame that is not good, and the node that shows it (-1: none in particular)."""
+
+    reason: str
+    frame: int
+    node: int
+    message: str
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Frames of one scene; NumPy arrays.
+
+    Attributes:
+        metadata: provenance and physical constants.
+        pos, vel: [frame, node, dim] in m and m/s.
+        node_type, mass: [node].
+        material_params: [node, param].
+        boundary: static boundary nodes.
+        rest_pos, cells: reference configuration of meshes.
+        stress: Cauchy stress [frame, node, components] in Pa.
+        termination: set when a rollout stopped before its last frame.
+    """
+
+    metadata: Metadata
+    pos: np.ndarray
+    vel: np.ndarray
+    node_type: np.ndarray
+    mass: np.ndarray
+    material_params: np.ndarray
+    boundary: Boundary
+    rest_pos: np.ndarray | None = None
+    cells: np.ndarray | None = None
+    stress: np.ndarray | None = None
+    termination: Termination | None = field(default=None, compare=False)
+
+    @property
+    def num_frames(self) -> int:
+        return self.pos.shape[0]
+
+    @property
+    def num_nodes(self) -> int:
+        return self.pos.shape[1]
+
+    def state(self, frame: int, history: int = 0) -> State:
+        """The state at a frame.
+
+        With ``history`` > 0 the velocities are those of a learned simulator: differences of the last ``history + 1`` stored positions in
+        float64. Without it they are the stored ones.
+
+        Raises:
+            IndexError: ``frame`` is out of range, or lacks ``history`` frames before it.
+        """
+        if not history <= frame < self.num_frames:
+            raise IndexError(f"frame {frame} with history {history} is outside the {self.num_frames} frames of this trajectory")
+        gravity = np.asarray(self.metadata.gravity)
+        pos, vel, past = self.pos[frame].astype(np.float64), self.vel[frame].astype(np.float64), None
+        if history:
+            window = self.pos[frame - history : frame + 1].astype(np.float64)
+            past = np.ascontiguousarray(integrators.velocities(window, self.metadata.frame_dt).swapaxes(0, 1))
+            vel = past[:, -1]
+        return State(
+            pos, vel, self.node_type, self.mass, self.material_params, self.boundary, gravity, past, frame * self.metadata.frame_dt
+        )
+
+    def frames(self, start: int, stop: int | None = None) -> Trajectory:
+        """The frames ``start:stop`` as a trajectory of their own."""
+        stress = None if self.stress is None else self.stress[start:stop]
+        return replace(self, pos=self.pos[start:stop], vel=self.vel[start:stop], stress=stress)
+
+
+# --- HDF5 ---------------------------------------------------------------------------------------------------------------------------------
+
+
+def _fields_of(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    b = trajectory.boundary
+    arrays: dict[str, Any] = {
+        "pos": trajectory.pos,
+        "vel": trajectory.vel,
+        "node_type": trajectory.node_type,
+        "mass": trajectory.mass,
+        "material_params": trajectory.material_params,
+        "boundary_pos": b.pos[None],
+        "boundary_vel": b.vel[None],
+        "boundary_normal": b.normal[None],
+        "boundary_friction": b.friction,
+        "boundary_restitution": b.restitution,
+        "rest_pos": trajectory.rest_pos,
+        "cells": trajectory.cells,
+        "stress": trajectory.stress,
+    }
+    return {k: np.ascontiguousarray(v, dtype=FIELDS[k].dtype) for k, v in arrays.items() if v is not None}
+
+
+def _attributes_of(trajectory: Trajectory) -> dict[str, str]:
+    m = trajectory.metadata
+    meta = json.dumps(asdict(m), sort_keys=True)
+    shapes = json.dumps([shape_to_dict(s) for s in trajectory.boundary.shapes], sort_keys=True)
+    return {"metadata": meta, "shapes": shapes, "node_types": json.dumps(NODE_TYPES)}
+
+
+def digest(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
+    """SHA-256 over names, shapes, types and bytes of all arrays and attributes of a trajectory."""
+    sha = hashlib.sha256()
+    for name, text in sorted(attributes.items()):
+        sha.update(f"{name}={text};".encode())
+    for name, array in sorted(arrays.items()):
+        sha.update(f"{name}:{array.dtype.str}:{array.shape};".encode())
+        sha.update(np.ascontiguousarray(array).tobytes())
+    return sha.hexdigest()
+
+
+def _chunks(array: np.ndarray, dims: tuple[str, ...]) -> tuple[int, ...]:
+    """Whole arrays in one chunk, except that frames are cut into chunks of about 256 kB."""
+    if dims[0] != "frame":
+        return tuple(max(1, n) for n in array.shape)
+    frame_bytes = max(1, array[:1].nbytes)
+    return (max(1, min(array.shape[0], 2**18 // frame_bytes)), *(max(1, n) for n in array.shape[1:]))
+
+
+def write_shard(path: Path | str, trajectories: Iterable[Trajectory], names: Iterable[str] | None = None) -> None:
+    """Write trajectories into one file, atomically: the file appears complete or not at all.
+
+    Args:
+        path: target file; an existing one is replaced.
+        trajectories: consumed one by one.
+        names: group names; by default ``00000, 00001, …``.
+
+    Raises:
+        ValueError: ``names`` are fewer than the trajectories.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    name_of = iter(names) if names is not None else (f"{k:05d}" for k in range(10**9))
+    try:
+        # track_times off and the libver pinned: equal content gives equal bytes
+        with h5py.File(temporary, "w", libver=("v110", "v110"), track_order=False) as file:
+            file.attrs["schema_version"] = SCHEMA_VERSION
+            _write_text(file, "units", json.dumps({k: f.unit for k, f in FIELDS.items()}, sort_keys=True))
+            count = 0
+            for trajectory in trajectories:
+                name = next(name_of, None)
+                if name is None:
+                    raise ValueError(f"{path}: {count} names for more than {count} trajectories")
+                arrays, attributes = _fields_of(trajectory), _attributes_of(trajectory)
+                group = file.create_group(name)
+                for key, text in attributes.items():
+                    _write_text(group, key, text)
+                _write_text(group, "sha256", digest(arrays, attributes))
+                for key, array in arrays.items():
+                    empty = array.size == 0
+                    options = {} if empty else {"chunks": _chunks(array, FIELDS[key].dims), "fletcher32": True}
+                    dataset = group.create_dataset(key, data=array, track_times=False, **options)
+                    _write_text(dataset, "unit", FIELDS[key].unit)
+                count += 1
+            file.attrs["num_trajectories"] = count
+        with open(temporary, "rb") as handle:
+            os.fsync(handle.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _write_text(owner: h5py.HLObject, key: str, text: str) -> None:
+    owner.attrs.create(key, np.bytes_(text.encode()))
+
+
+@contextmanager
+def open_shard(path: Path | str) -> Iterator[h5py.File]:
+    """Open a shard of this schema version for reading; whatever HDF5 raises on a damaged file becomes a ``StoreError``."""
+    path = Path(path)
+    if not path.is_file():
+        raise StoreError(f"{path}: no such file; generate data with `python -m gpe_pl.simulate`")
+    try:
+        with h5py.File(path, "r") as file:
+            version = file.attrs.get("schema_version")
+            if not isinstance(version, np.integer) or version != SCHEMA_VERSION:
+                raise StoreError(
+                    f"{path}: schema version {version}, this version of gpe_pl reads {SCHEMA_VERSION}; regenerate or convert the data"
+                )
+            yield file
+    except StoreError:
+        raise
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:  # all of these come out of HDF5 and h5py
+        raise StoreError(f"{path}: not a readable HDF5 file (damaged or truncated: {error}); delete it and run simulate again") from error
+
+
+def _where(group: h5py.Group) -> str:
+    return f"{group.file.filename}:{group.name.lstrip('/')}"
+
+
+def open_group(file: h5py.File, name: str) -> h5py.Group:
+    """The group of one trajectory."""
+    if name not in file:
+        raise StoreError(f"{file.filename}: no trajectory {name!r}; it has {len(file)} trajectories")
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink) or not isinstance(file[name], h5py.Group):
+        raise StoreError(f"{file.filename}: {name!r} is not a trajectory of this file; delete the shard and run simulate again")
+    return file[name]
+
+
+def read_text(group: h5py.Group, key: str) -> str:
+    """A text attribute of a trajectory."""
+    if key not in group.attrs:
+        raise StoreError(f"{_where(group)}: attribute {key!r} is missing; delete the shard and run simulate again")
+    stored = group.attrs.get_id(key)
+    if stored.shape != () or stored.dtype.kind != "S":  # text of variable length has kind "O" and is not safe to read from a damaged file
+        raise StoreError(f"{_where(group)}: attribute {key!r} is {stored.dtype}{list(stored.shape)}, expected text of fixed length")
+    return group.attrs[key].decode()
+
+
+def read_field(group: h5py.Group, key: str, frames: slice | None = None) -> np.ndarray:
+    """One stored array, compared with ``schema.FIELDS`` before any of it is read; only ``frames`` of it where it has frames."""
+    spec, where = FIELDS[key], f"{_where(group)}: field {key!r}"
+    if key not in group:
+        raise StoreError(f"{where} is missing; delete the shard and run simulate again")
+    dataset = group[key] if isinstance(group.get(key, getlink=True), h5py.HardLink) else None
+    if not isinstance(dataset, h5py.Dataset) or dataset.is_virtual or dataset.external:
+        raise StoreError(f"{where} is not an array inside this file; a shard must not refer to other files")
+    if dataset.shape is None or len(dataset.shape) != len(spec.dims) or dataset.dtype != np.dtype(spec.dtype):
+        raise StoreError(f"{where} is {dataset.dtype}{list(dataset.shape or ())}, expected {spec.dtype} [{', '.join(spec.dims)}]")
+    if dataset.id.get_storage_size() < dataset.nbytes:  # nothing is compressed: a huge shape without data must not fill the memory
+        raise StoreError(f"{where} declares {dataset.nbytes} bytes but the file holds {dataset.id.get_storage_size()}")
+    try:
+        return dataset[frames] if frames is not None and spec.dims[0] == "frame" else dataset[()]
+    except (OSError, RuntimeError):
+        raise StoreError(f"{where} is damaged (checksum mismatch); delete the shard and run simulate again") from None
+
+
+def size_conflicts(arrays: dict[str, np.ndarray], metadata: Metadata) -> list[str]:
+    """Fields whose shape contradicts the metadata or an earlier field; one sentence each."""
+    sizes = {"one": 1, "dim": metadata.dim, "param": len(metadata.param_names)}
+    conflicts = []
+    for key, array in arrays.items():
+        for axis, size in zip(FIELDS[key].dims, array.shape, strict=True):
+            if sizes.setdefault(axis, size) != size:
+                conflicts.append(f"field {key!r} has size {size} along {axis!r}, expected {sizes[axis]}")
+    return conflicts
+
+
+def trajectory_names(path: Path | str) -> list[str]:
+    """Group names of a shard, in order."""
+    with open_shard(path) as file:
+        return sorted(file)
+
+
+def read_metadata(path: Path | str, name: str) -> Metadata:
+    """Only the metadata of one trajectory."""
+    with open_shard(path) as file:
+        return metadata_of(open_group(file, name))
+
+
+def metadata_of(group: h5py.Group) -> Metadata:
+    """The metadata of a trajectory's group; every key must be there with the right type, and no other."""
+    try:
+        text = read_text(group, "metadata")
+        values = json.loads(text)
+        known = {f.name for f in fields(Metadata)}
+        if not isinstance(values, dict) or set(values) != known:
+            raise ValueError(f"keys {sorted(set(values) ^ known)} missing or unknown")
+        return TypeAdapter(Metadata).validate_json(text, strict=True)
+    except StoreError:
+        raise
+    except ValidationError as error:
+        wrong = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        raise StoreError(f"{_where(group)}: metadata unreadable: {wrong}") from None
+    except (ValueError, TypeError, RecursionError) as error:
+        raise StoreError(f"{_where(group)}: metadata unreadable: {error}") from None
+
+
+def shapes_of(group: h5py.Group) -> tuple[Shape, ...]:
+    """The obstacle and wall geometry of a trajectory's group."""
+    try:
+        return tuple(shape_from_dict(s) for s in json.loads(read_text(group, "shapes")))
+    except StoreError:
+        raise
+    except (ValueError, TypeError, RecursionError) as error:
+        raise StoreError(f"{_where(group)}: attribute 'shapes' is unreadable: {error}") from None
+
+
+def node_types_of(group: h5py.Group) -> tuple[str, ...]:
+    """The names behind the integers of ``node_type`` in a trajectory's group; all of them are in ``schema.NODE_TYPES``."""
+    try:
+        names = tuple(json.loads(read_text(group, "node_types")))
+    except StoreError:
+        raise
+    except (ValueError, TypeError, RecursionError) as error:
+        raise StoreError(f"{_where(group)}: attribute 'node_types' is unreadable: {error}") from None
+    unknown = [name for name in names if name not in NODE_TYPES]
+    if unknown:
+        raise StoreError(f"{_where(group)}: attribute 'node_types' names {unknown}; known: {', '.join(NODE_TYPES)}")
+    return names
+
+
+def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: slice | None = None) -> Trajectory:
+    """Read one trajectory.
+
+    Args:
+        path: shard.
+        name: group name.
+        frames: only these frames, without reading the others; not together with ``verify``.
+        verify: recompute the SHA-256 digest (HDF5's own checksums are always verified).
+
+    Raises:
+        StoreError: file, group or field missing, wrong shape or type, or a checksum that does not match.
+    """
+    if verify and frames is not None:
+        raise ValueError("the digest covers all frames: pass verify or frames, not both")
+    with open_shard(path) as file:
+        group = open_group(file, name)
+        metadata = metadata_of(group)
+        arrays = {key: read_field(group, key, frames) for key, spec in FIELDS.items() if spec.required or key in group}
+        if verify:
+            attributes = {key: read_text(group, key) for key in ("metadata", "shapes", "node_types")}
+            if digest(arrays, attributes) != read_text(group, "sha256"):
+                raise StoreError(f"{path}:{name}: SHA-256 digest does not match the content; delete the shard and run simulate again")
+        for conflict in size_conflicts(arrays, metadata):
+            raise StoreError(f"{path}:{name}: {conflict}")
+        shapes, names = shapes_of(group), node_types_of(group)
+    codes = arrays["node_type"]
+    if codes.size and codes.max() >= len(names):
+        raise StoreError(f"{path}:{name}: node {codes.argmax()} has node_type {codes.max()}, but there are {len(names)} node types")
+    boundary = Boundary(
+        arrays["boundary_pos"][0],
+        arrays["boundary_vel"][0],
+        arrays["boundary_normal"][0],
+        arrays["boundary_friction"],
+        arrays["boundary_restitution"],
+        shapes,
+    )
+    return Trajectory(
+        metadata,
+        arrays["pos"],
+        arrays["vel"],
+        np.array([node_code(n) for n in names], dtype=np.uint8)[codes],
+        arrays["mass"],
+        arrays["material_params"],
+        boundary,
+        rest_pos=arrays.get("rest_pos"),
+        cells=arrays.get("cells"),
+        stress=arrays.get("stress"),
+    )
+
+
+def shards(root: Path | str, split: str) -> list[Path]:
+    """Shard files of a split under a data set's folder, in order; raises ``StoreError`` when there is none."""
+    found = sorted((Path(root) / split).glob("shard-*.h5"))
+    if not found:
+        raise StoreError(f"{root}: no shards of split {split!r}; generate them with `python -m gpe_pl.simulate`")
+    return found
+
+
+def iter_trajectories(root: Path | str, split: str) -> Iterator[Trajectory]:
+    """All trajectories of a split, one at a time."""
+    for path in shards(root, split):
+        for name in trajectory_names(path):
+            yield read_trajectory(path, name)

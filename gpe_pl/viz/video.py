@@ -1,0 +1,136 @@
+"""Animations of a rollout beside the ground truth: GIF always, MP4 where imageio-ffmpeg is installed."""
+
+import os
+from collections.abc import Iterator, Mapping
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from PIL import Image
+
+from gpe_pl.trajectory import Trajectory
+from gpe_pl.viz.panel import COLOR_MAPS, INK, REFERENCE, ColorBy, Panel, color_scale, view
+
+PANEL_PIXELS = 360
+DPI = 100
+
+
+def write_animation(
+    path: Path | str,
+    ground_truth: Trajectory,
+    predictions: Mapping[str, Trajectory],
+    fps: int | float = 25,
+    stride: int = 1,
+    color: ColorBy = "height",
+) -> None:
+    """Write the ground truth and predictions side by side; the file appears complete or not at all.
+
+    Args:
+        path: ends in ``.gif`` or ``.mp4``.
+        ground_truth: sets the length.
+        predictions: rollouts from frame 0 of the ground truth, by the name of their panel.
+        fps: frames per second of the animation; a GIF rounds the time of a frame to 10 ms.
+        stride: show every so many frames of the trajectory.
+        color: ``height`` colours particles by where they started, ``error`` predicted ones by their distance from the ground truth.
+
+    Raises:
+        ValueError: another file type, a stride or frame rate that is not positive, or a GIF with more than 50 frames per second.
+        ModuleNotFoundError: MP4 without imageio-ffmpeg.
+    """
+    path = Path(path)
+    if path.suffix not in (".gif", ".mp4"):
+        raise ValueError(f"{path}: an animation ends in .gif or .mp4")
+    if stride < 1 or fps <= 0:
+        raise ValueError(f"stride and fps must be positive, got {stride} and {fps}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        images = _images(ground_truth, dict(predictions), stride, color)
+        if path.suffix == ".gif":
+            _write_gif(temporary, images, fps, _palette(color))
+        else:
+            _write_mp4(temporary, images, fps)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _images(ground_truth: Trajectory, predictions: dict[str, Trajectory], stride: int, color: ColorBy) -> Iterator[np.ndarray]:
+    """RGB images [height, width, 3], one per shown frame. Boundaries and titles are drawn once and restored below the particles."""
+    frames = range(0, ground_truth.num_frames, stride)
+    scale = color_scale(ground_truth, predictions, frames, color)
+    rows = {"ground truth": ground_truth, **predictions}
+    low, high = view(ground_truth)
+    aspect = (high[1] - low[1]) / (high[0] - low[0]) if len(low) == 2 else 0.9
+
+    title, gap = 28, 8
+    width = len(rows) * PANEL_PIXELS + (len(rows) + 1) * gap
+    height = round(PANEL_PIXELS * aspect) + title + gap
+    width, height = width + width % 2, height + height % 2  # H.264 wants even sizes
+    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    panels = []
+    for k, name in enumerate(rows):
+        left = gap + k * (PANEL_PIXELS + gap)
+        box = (left / width, gap / height, PANEL_PIXELS / width, PANEL_PIXELS * aspect / height)
+        panels.append(Panel(figure, box, ground_truth, color, scale))
+        figure.text((left + PANEL_PIXELS / 2) / width, 1 - title / 2 / height, name, ha="center", va="center", fontsize=10, color=INK)
+    clock = figure.text(gap / width, 1 - title / 2 / height, "", ha="left", va="center", fontsize=9, color=INK)
+
+    moving = [*(artist for panel in panels for artist in panel.artists), clock]
+    for artist in moving:
+        artist.set_animated(True)
+    canvas.draw()
+    background = canvas.copy_from_bbox(figure.bbox)
+    for frame in frames:
+        canvas.restore_region(background)
+        for panel, trajectory in zip(panels, rows.values(), strict=True):
+            panel.show_frame(trajectory, ground_truth, frame, color)
+        clock.set_text(f"{frame * ground_truth.metadata.frame_dt:.2f} s")
+        for artist in moving:
+            figure.draw_artist(artist)
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def _palette(color: ColorBy) -> Image.Image:
+    """The 256 colours of a GIF: greys, and the colours of particles, whole and mixed with white as at their edges.
+
+    Fixed beforehand, because a palette made from the first frame lacks what appears later, and one for every frame flickers.
+    """
+    hues = np.concatenate([COLOR_MAPS[color](np.linspace(0, 1, 68))[:, :3], [to_rgb(REFERENCE)]])
+    mixed = [1 - part * (1 - hues) for part in (1.0, 0.65, 0.3)]
+    # Nearest colours are looked up approximately: nothing next to white, so that paper stays white.
+    greys = np.append(np.linspace(0, 0.9, 255 - 3 * len(hues)), 1.0)[:, None].repeat(3, axis=1)
+    image = Image.new("P", (1, 1))
+    image.putpalette(np.round(255 * np.concatenate([*mixed, greys])).astype(np.uint8).tobytes())
+    return image
+
+
+def _write_gif(path: Path, images: Iterator[np.ndarray], fps: int | float, palette: Image.Image) -> None:
+    if fps > 50:
+        raise ValueError(f"a GIF shows at most 50 frames per second, got {fps:g}; raise stride or write an MP4")
+    pictures = (Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    # The format counts in hundredths of a second.
+    next(pictures).save(path, format="GIF", save_all=True, append_images=pictures, duration=10 * round(100 / fps), loop=0)
+
+
+def _write_mp4(path: Path, images: Iterator[np.ndarray], fps: int | float) -> None:
+    try:
+        import imageio_ffmpeg
+    except ImportError:
+        raise ModuleNotFoundError("MP4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or write a .gif") from None
+    first = next(images)
+    size = (first.shape[1], first.shape[0])
+    # With its index in front a browser starts playing before the end has arrived.
+    writer = imageio_ffmpeg.write_frames(
+        str(path), size, fps=fps, codec="libx264", quality=8, macro_block_size=2, output_params=["-movflags", "+faststart"]
+    )
+    try:
+        writer.send(None)
+        for image in chain([first], images):
+            writer.send(np.ascontiguousarray(image))
+    finally:
+        writer.close()

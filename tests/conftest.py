@@ -1,0 +1,79 @@
+"""Small states and reference computations that several tests share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpe_pl.geometry import Box, domain_walls
+from gpe_pl.schema import node_code
+from gpe_pl.trajectory import Boundary, Metadata, Trajectory, write_shard
+
+
+def make_trajectory(seed: int = 0, num_frames: int = 6, num_nodes: int = 12, **metadata: object) -> Trajectory:
+    """A sound trajectory of sand in a unit box with walls and an obstacle; the motion is random, not physical."""
+    rng = np.random.default_rng(seed)
+    bounds = ((0.0, 1.0), (0.0, 1.0))
+    values = {
+        "dataset": "grains",
+        "materials": ("sand",),
+        "param_names": ("friction_angle",),
+        "frame_dt": 0.01,
+        "spacing": 0.1,
+        "connectivity_radius": 0.15,
+        "bounds": bounds,
+        "gravity": (0.0, -9.81),
+        "solver_dt": 1e-4,
+        "seed": seed,
+        "split": "train",
+        "solver": "random",
+        "solver_version": "1",
+    }
+    boundary = Boundary.sample((*domain_walls(bounds, 0.4), Box((0.4, 0.0), (0.6, 0.1), 0.2)), 0.1, 2)
+    arrays = {name: getattr(boundary, name).astype(np.float32) for name in ("pos", "vel", "normal", "friction", "restitution")}
+    return Trajectory(
+        Metadata(**{**values, **metadata}),  # type: ignore[arg-type]
+        rng.uniform(0.2, 0.8, (num_frames, num_nodes, 2)).astype(np.float32),
+        rng.normal(size=(num_frames, num_nodes, 2)).astype(np.float32),
+        np.full(num_nodes, node_code("sand"), np.uint8),
+        np.full(num_nodes, 2.5, np.float32),
+        np.full((num_nodes, 1), 30.0, np.float32),
+        replace(boundary, **arrays),
+    )
+
+
+@pytest.fixture
+def trajectory() -> Trajectory:
+    return make_trajectory()
+
+
+@pytest.fixture
+def new_trajectory() -> Callable[..., Trajectory]:
+    """Makes more of them: ``new_trajectory(seed, num_frames=…, split=…)``."""
+    return make_trajectory
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    """A data set's folder with two trajectories for training and one of each other split."""
+    root = tmp_path / "grains"
+    write_shard(root / "train" / "shard-00000.h5", [make_trajectory(seed) for seed in (0, 1)])
+    for seed, split in enumerate(("val", "test", "test_unseen"), start=2):
+        group = "extrapolated" if split == "test_unseen" else "seen"
+        write_shard(root / split / "shard-00000.h5", [make_trajectory(seed, split=split, parameter_group=group)])
+    return root
+
+
+@pytest.fixture
+def brute_force_radius() -> Callable[[np.ndarray, np.ndarray, float], set[tuple[int, int]]]:
+    """Reference neighbour search: all pairs (source, target) no further apart than the radius, by float64 distances."""
+
+    def pairs(source: np.ndarray, target: np.ndarray, radius: float) -> set[tuple[int, int]]:
+        offset = np.asarray(source, np.float64)[:, None] - np.asarray(target, np.float64)[None]
+        return {(int(i), int(j)) for i, j in np.argwhere((offset**2).sum(-1) <= radius**2)}
+
+    return pairs

@@ -1,0 +1,98 @@
+"""Small states and graphs that tests build on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch_geometric.data import HeteroData
+
+from gpe_pl.geometry import domain_walls
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.schema import STICKY, node_code, param_names
+from gpe_pl.trajectory import Boundary, Metadata, State
+
+SPACING = 0.05
+
+
+def metadata(materials: tuple[str, ...] = ("sand",), dim: int = 2, radius: float = 0.12) -> Metadata:
+    """Metadata of a unit box with these materials."""
+    return Metadata(
+        dataset="test",
+        materials=materials,
+        param_names=param_names(materials),
+        frame_dt=0.005,
+        spacing=SPACING,
+        connectivity_radius=radius,
+        bounds=((0.0, 1.0),) * dim,
+        gravity=(0.0,) * (dim - 1) + (-9.81,),
+    )
+
+
+def state(
+    num_nodes: int = 40,
+    materials: tuple[str, ...] = ("sand",),
+    history: int = 1,
+    seed: int = 0,
+    walls: bool = True,
+    dim: int = 2,
+    low: float = 0.02,
+    high: float = 0.45,
+) -> State:
+    """A random cloud of the given materials near a corner of the box; node order is random."""
+    rng = np.random.default_rng(seed)
+    pos = rng.uniform(low, high, (num_nodes, dim))
+    past = rng.normal(scale=1.0, size=(num_nodes, history, dim))
+    names = param_names(materials)
+    node_type = np.array([node_code(materials[k % len(materials)]) for k in range(num_nodes)], dtype=np.uint8)
+    params = np.full((num_nodes, len(names)), np.nan)
+    for k in range(num_nodes):
+        params[k, names.index(param_names((materials[k % len(materials)],))[0])] = rng.uniform(1.0, 40.0)
+    sides = [f"{axis}_{side}" for axis in "xyz"[:dim] for side in ("low", "high")]
+    shapes = domain_walls(((0.0, 1.0),) * dim, {n: STICKY if k % 2 else 0.3 for k, n in enumerate(sides)}) if walls else ()
+    return State(
+        pos,
+        past[:, -1],
+        node_type,
+        rng.uniform(0.5, 2.0, num_nodes),
+        params,
+        Boundary.sample(shapes, SPACING, dim),
+        np.array(metadata(materials, dim).gravity),
+        past,
+    )
+
+
+def builder(materials: tuple[str, ...] = ("sand",), dim: int = 2, **config: object) -> GraphBuilder:
+    """A graph builder for such states."""
+    return GraphBuilder(GraphConfig(**config), metadata(materials, dim))  # type: ignore[arg-type]
+
+
+def graph(materials: tuple[str, ...] = ("sand",), dtype: torch.dtype = torch.float64, **settings: object) -> HeteroData:
+    """A graph of a random state with features of the given precision."""
+    return to_dtype(builder(materials)(state(materials=materials, **settings).to_torch()), dtype)  # type: ignore[arg-type]
+
+
+def to_dtype(data: HeteroData, dtype: torch.dtype) -> HeteroData:
+    """The same graph with all floating-point features in another precision."""
+    out = data.clone()
+    for store in out.stores:
+        for key, value in store.items():
+            if isinstance(value, torch.Tensor) and value.is_floating_point():
+                store[key] = value.to(dtype)
+    return out
+
+
+def permuted(s: State, order: np.ndarray) -> State:
+    """The same state with its nodes in another order."""
+    assert s.velocity_history is not None
+    return replace(
+        s,
+        pos=s.pos[order],
+        vel=s.vel[order],
+        node_type=s.node_type[order],
+        mass=s.mass[order],
+        material_params=s.material_params[order],
+        velocity_history=s.velocity_history[order],
+    )

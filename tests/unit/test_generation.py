@@ -1,0 +1,237 @@
+"""Generation is resumable, reproducible, and refuses to mix data sets."""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpe_pl import generation
+from gpe_pl.generation import DatasetSpec, GenerationError, generate, generate_trajectory, parameter_value, scene_seed
+from gpe_pl.schema import SPLITS
+from gpe_pl.solvers.mpm import MPM
+from gpe_pl.solvers.scenes import SceneConfig
+from gpe_pl.trajectory import iter_trajectories, read_trajectory
+
+SCENE = SceneConfig(bounds=((0, 1), (0, 1)), grid_spacing=1 / 16, num_particles=40)
+SPEC = DatasetSpec(
+    name="sand",
+    size="smoke",
+    material="sand",
+    seen_values=(20, 30, 40),
+    interpolated_values=(25, 35),
+    extrapolated_values=(15, 45),
+    num_train=5,
+    num_val=2,
+    num_test=2,
+    num_test_unseen=6,
+    num_frames=10,
+    trajectories_per_shard=2,
+    seed=1,
+    scene=SCENE,
+    solver=MPM(bounds=SCENE.bounds, grid_spacing=SCENE.grid_spacing),
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The data set, generated without interruption."""
+    return generate(tmp_path_factory.mktemp("data"), SPEC)
+
+
+def contents(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(Path(folder).rglob("*")) if p.is_file()}
+
+
+def test_layout(folder):
+    names = set(contents(folder))
+    assert {"dataset.json", "statistics.json", "train/shard-00000.h5", "train/shard-00002.h5", "test_unseen/shard-00002.h5"} <= names
+    assert len(names) == 2 + 3 + 1 + 1 + 3
+    for split, count in SPEC.counts.items():
+        trajectories = list(iter_trajectories(folder, split))
+        assert len(trajectories) == count
+        assert all(t.num_frames == SPEC.num_frames and t.metadata.split == split for t in trajectories)
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_resume_equals_uninterrupted(folder, tmp_path, num_workers):
+    """Lose shards, damage one, leave a half-written file behind: the next run restores the same bytes."""
+    again = generate(tmp_path, SPEC, num_workers)
+    assert contents(again) == contents(folder)
+    (again / "train" / "shard-00001.h5").unlink()
+    (again / "statistics.json").unlink()
+    damaged = again / "val" / "shard-00000.h5"
+    damaged.write_bytes(damaged.read_bytes()[:100])
+    (again / "val" / ".shard-00000.h5.123.part").write_bytes(b"half")
+    kept = (again / "train" / "shard-00000.h5").stat().st_mtime_ns
+    generate(tmp_path, SPEC, num_workers)
+    assert contents(again) == contents(folder)
+    assert (again / "train" / "shard-00000.h5").stat().st_mtime_ns == kept
+
+
+def test_killed_run_resumes(folder, tmp_path):
+    """SIGKILL in the middle, then again: the same bytes as an uninterrupted run."""
+    script = (
+        "import json, sys, time\n"
+        "from gpe_pl.generation import DatasetSpec, generate\n"
+        "spec = json.loads(sys.argv[2])\n"
+        "generate(sys.argv[1], DatasetSpec(**spec), 1, lambda done, total: (print(done, flush=True), time.sleep(0.2)))\n"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path), json.dumps(asdict(SPEC))]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(generation.__file__).parents[1])
+    for line in process.stdout:
+        if int(line) >= 4:
+            os.kill(process.pid, signal.SIGKILL)
+            break
+    process.wait()
+    partial = tmp_path / SPEC.name / SPEC.size
+    assert process.returncode == -signal.SIGKILL
+    assert 0 < len(list(partial.rglob("*.h5"))) < 8 and not (partial / "statistics.json").exists()
+    seen = []
+    generate(tmp_path, SPEC, on_progress=lambda done, total: seen.append((done, total)))
+    assert contents(partial) == contents(folder)
+    assert seen[0][0] >= 4 and seen[-1] == (15, 15)
+
+
+def test_complete_data_set_is_left_alone(folder):
+    before = {p: p.stat().st_mtime_ns for p in folder.rglob("*")}
+    seen = []
+    generate(folder.parents[1], SPEC, on_progress=lambda done, total: seen.append((done, total)))
+    assert {p: p.stat().st_mtime_ns for p in folder.rglob("*")} == before
+    assert seen == [(15, 15)]
+
+
+def test_other_spec_is_refused_by_key(folder):
+    other = replace(SPEC, seed=2, solver=replace(SPEC.solver, cfl=0.4))
+    with pytest.raises(GenerationError, match=r"seed is 1, now 2; solver\.cfl is 0\.5, now 0\.4") as error:
+        generate(folder.parents[1], other)
+    assert "Delete the folder" in str(error.value)
+
+
+def test_folder_with_foreign_shards_is_refused(tmp_path):
+    shard = tmp_path / "sand" / "smoke" / "train" / "shard-00000.h5"
+    shard.parent.mkdir(parents=True)
+    shard.write_bytes(b"")
+    with pytest.raises(GenerationError, match=r"holds shards but no dataset\.json"):
+        generate(tmp_path, SPEC)
+
+
+def test_trajectory_is_a_pure_function(folder):
+    stored = read_trajectory(folder / "train" / "shard-00001.h5", "00003", verify=True)
+    again = generate_trajectory(SPEC, "train", 3)
+    np.testing.assert_array_equal(stored.pos, again.pos.astype(np.float32))
+    assert stored.metadata == again.metadata and stored.metadata.seed == scene_seed(SPEC, "train", 3)
+
+
+def test_seeds_differ():
+    seeds = [scene_seed(replace(SPEC, seed=s), split, i) for s in range(3) for split in SPLITS for i in range(50)]
+    assert len(set(seeds)) == len(seeds)
+
+
+def test_parameter_groups_are_marked(folder):
+    groups = {}
+    for trajectory in iter_trajectories(folder, "test_unseen"):
+        groups.setdefault(trajectory.metadata.parameter_group, []).append(float(trajectory.material_params[0, 0]))
+    assert groups == {"interpolated": [25.0, 35.0, 25.0], "extrapolated": [15.0, 45.0, 15.0]}
+    for split in ("train", "val", "test"):
+        for trajectory in iter_trajectories(folder, split):
+            assert trajectory.metadata.parameter_group == "seen" and trajectory.material_params[0, 0] in SPEC.seen_values
+    assert [parameter_value(SPEC, "train", i)[0] for i in range(4)] == [20, 30, 40, 20]
+
+
+def test_statistics_are_of_the_train_split(folder):
+    dt, gravity = SPEC.solver.frame_dt, np.array(SCENE.gravity)
+    vel, acc, params = [], [], []
+    for t in iter_trajectories(folder, "train"):
+        v = np.diff(t.pos.astype(np.float64), axis=0) / dt
+        vel.append(v.ravel())
+        acc.append((np.diff(v, axis=0) / dt - gravity).ravel())
+        params.append(t.material_params.astype(np.float64).ravel())
+    statistics = json.loads((folder / "statistics.json").read_text())
+    assert statistics["velocity_std"] == pytest.approx(np.sqrt(np.mean(np.concatenate(vel) ** 2)))
+    assert statistics["acceleration_std"] == pytest.approx(np.sqrt(np.mean(np.concatenate(acc) ** 2)))
+    angle = statistics["material_params"]["friction_angle"]
+    assert angle["mean"] == pytest.approx(np.mean(np.concatenate(params)))
+    assert angle["std"] == pytest.approx(np.std(np.concatenate(params)))
+    assert (statistics["num_trajectories"], statistics["num_frames"], statistics["num_nodes"]) == (5, 50, 200)
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_failure_names_split_index_and_seed(tmp_path, num_workers):
+    spec = replace(SPEC, solver=replace(SPEC.solver, max_substeps=1))
+    with pytest.raises(GenerationError, match=r"split train, index \d, seed \d+: explosion: frame 1") as error:
+        generate(tmp_path, spec, num_workers)
+    assert (error.value.split, error.value.seed) == ("train", scene_seed(spec, "train", error.value.index))
+    assert not list(tmp_path.rglob("*.h5")) and not list(tmp_path.rglob("*.part"))
+
+
+def test_small_disk_is_refused_before_anything_is_written(tmp_path):
+    with pytest.raises(GenerationError, match="GiB free"):
+        generate(tmp_path, replace(SPEC, num_train=10**9))
+    assert not list(tmp_path.rglob("*.h5"))
+
+
+def test_disk_estimate_is_near_the_truth(folder):
+    written = sum(p.stat().st_size for p in folder.rglob("*.h5")) / sum(SPEC.counts.values())
+    assert 0.7 * written < generation._bytes_per_trajectory(SPEC) < 2 * written
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seen_values": ()}, "seen_values"),
+        ({"seen_values": (20, 90)}, "outside"),
+        ({"interpolated_values": (50,)}, "inside"),
+        ({"extrapolated_values": (30.5,)}, "outside the range"),
+        ({"interpolated_values": (30,)}, "among seen_values"),
+        ({"interpolated_values": ()}, "needs interpolated_values"),
+        ({"num_train": 0}, "num_train"),
+        ({"name": "../evil"}, "name"),
+        ({"solver": MPM(bounds=SCENE.bounds, grid_spacing=1 / 32)}, "scene.grid_spacing"),
+    ],
+)
+def test_invalid_spec_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        replace(SPEC, **change)
+
+
+def test_spec_survives_json():
+    assert DatasetSpec(**json.loads(json.dumps(asdict(SPEC)))) == SPEC
+
+
+def share_settled(trajectory, time):
+    """Fraction of particles that have left free flight (velocity off the initial ballistic one by more than 0.1 m/s) by ``time`` [s]."""
+    frame = math.ceil(time / trajectory.metadata.frame_dt)
+    elapsed = np.arange(frame + 1)[:, None, None] * trajectory.metadata.frame_dt
+    ballistic = trajectory.vel[0] + elapsed * np.array(trajectory.metadata.gravity)
+    return float(np.mean(np.any(np.linalg.norm(trajectory.vel[: frame + 1] - ballistic, axis=-1) > 0.1, axis=0)))
+
+
+def test_contact_is_not_rare():
+    """Within 0.25 s at least half of the particles have met a wall, an obstacle or others, on average over scenes, in default scenes."""
+    scene = SceneConfig(bounds=((0, 1), (0, 1)), grid_spacing=1 / 32, num_particles=320)
+    solver = MPM(bounds=scene.bounds, grid_spacing=scene.grid_spacing)
+    spec = replace(SPEC, scene=scene, solver=solver, num_frames=52)
+    shares = [share_settled(generate_trajectory(spec, "train", i), 0.25) for i in range(20)]
+    assert np.mean(shares) > 0.8 and np.mean(np.array(shares) > 0.5) >= 0.9
+
+
+def test_start_is_free_flight():
+    """The measure above is 0 while nothing touches, so it cannot pass by accident."""
+    state_dt = SPEC.solver.frame_dt
+    trajectories = [generate_trajectory(SPEC, "train", i) for i in range(5)]
+    assert min(share_settled(t, 2 * state_dt) for t in trajectories) == 0.0
+
+
+def test_progress_bar_reports(folder, capsys):
+    started = time.time()
+    with generation.progress_bar("sand") as progress:
+        progress(3, 4)
+    assert "3/4" in capsys.readouterr().out and time.time() - started < 60

@@ -1,0 +1,167 @@
+"""The loop: the oracle reproduces a trajectory, and a guard keeps the good frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import torch
+
+from gpe_pl import integrators
+from gpe_pl.rollout import Guard, Replay, SimulationError, Simulator, rollout, share_outside, states
+from gpe_pl.trajectory import State, Termination, Trajectory
+
+New = Callable[..., Trajectory]
+
+
+@dataclass(frozen=True)
+class FreeFall:
+    """Constant acceleration; spoils one node of the frame ``spoil_frame``."""
+
+    dt: float
+    spoil_frame: int = -1
+    spoil: Callable[[State], State] = lambda state: state
+
+    def step(self, state: State) -> State:
+        pos, vel = integrators.advance(state.pos, state.vel, state.gravity, self.dt)
+        new = replace(state, pos=pos, vel=vel, time=state.time + self.dt)
+        return self.spoil(new) if round(new.time / self.dt) == self.spoil_frame else new
+
+
+def spoiled(key: str, node: int, value: float) -> Callable[[State], State]:
+    def spoil(state: State) -> State:
+        array = getattr(state, key).copy()
+        array[node, 1] = value
+        return replace(state, **{key: array})
+
+    return spoil
+
+
+def test_oracle(trajectory: Trajectory) -> None:
+    replay = Replay(trajectory)
+    assert isinstance(replay, Simulator)
+    result = rollout(replay, trajectory.state(0), trajectory.num_frames - 1, trajectory.metadata, Guard(bounds=trajectory.metadata.bounds))
+    for key in ("pos", "vel", "node_type", "mass", "material_params"):
+        np.testing.assert_array_equal(getattr(result, key), getattr(trajectory, key), err_msg=key)
+    for key in ("pos", "vel", "normal", "friction", "restitution"):
+        np.testing.assert_array_equal(getattr(result.boundary, key), getattr(trajectory.boundary, key), err_msg=key)
+    assert result.metadata == trajectory.metadata
+    assert result.termination is None
+
+
+def test_oracle_survives_hundreds_of_inexact_time_steps(new_trajectory: New) -> None:
+    long = new_trajectory(num_frames=700, num_nodes=1, frame_dt=1 / 3)
+    np.testing.assert_array_equal(rollout(Replay(long), long.state(0), 699, long.metadata).pos, long.pos)
+
+
+def test_no_steps(trajectory: Trajectory) -> None:
+    result = rollout(Replay(trajectory), trajectory.state(2), 0, trajectory.metadata)
+    np.testing.assert_array_equal(result.pos, trajectory.pos[2:3])
+
+
+@pytest.mark.parametrize(
+    ("reason", "spoil", "message"),
+    [
+        ("nan", spoiled("pos", 3, np.nan), "frame 4: node 3 has a position or velocity that is not finite"),
+        ("nan", spoiled("vel", 0, -np.inf), "frame 4: node 0 "),
+        ("escape", spoiled("pos", 5, -0.3), "frame 4: node 5 is 0.3 m outside"),
+        ("escape", spoiled("pos", 6, 1.5), "frame 4: node 6 is 0.5 m outside"),
+        ("explosion", spoiled("vel", 11, 80.0), "frame 4: node 11 moves at 80"),
+    ],
+)
+def test_guard_keeps_the_good_frames(trajectory: Trajectory, reason: str, spoil: Callable[[State], State], message: str) -> None:
+    start = replace(trajectory.state(0), vel=np.zeros((12, 2)))
+    guard = Guard(max_speed=50, bounds=trajectory.metadata.bounds, margin=0.1)
+    sound = rollout(FreeFall(0.01), start, 8, trajectory.metadata, guard)
+    assert sound.termination is None
+    assert sound.num_frames == 9
+    result = rollout(FreeFall(0.01, 4, spoil), start, 8, trajectory.metadata, guard)
+    assert result.termination is not None
+    assert (result.termination.reason, result.termination.frame) == (reason, 4)
+    assert message in result.termination.message
+    assert f"node {result.termination.node} " in result.termination.message
+    np.testing.assert_array_equal(result.pos, sound.pos[:4])
+    np.testing.assert_array_equal(result.vel, sound.vel[:4])
+
+
+def test_solver_that_refuses_ends_the_rollout(trajectory: Trajectory) -> None:
+    def refuse(state: State) -> State:
+        raise SimulationError("element inverted", reason="inverted", node=7)
+
+    result = rollout(FreeFall(0.01, 3, refuse), trajectory.state(0), 8, trajectory.metadata)
+    assert result.termination == Termination("inverted", 3, 7, "frame 3: element inverted")
+    assert result.num_frames == 3
+
+
+def test_other_errors_are_not_hidden(trajectory: Trajectory) -> None:
+    def fail(state: State) -> State:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        rollout(FreeFall(0.01, 3, fail), trajectory.state(0), 8, trajectory.metadata)
+
+
+def test_guard_on_torch(trajectory: Trajectory) -> None:
+    state = trajectory.state(0).to_torch()
+    guard = Guard(max_speed=50, bounds=trajectory.metadata.bounds)
+    assert guard.check(state, 1) is None
+    pos = state.pos.clone()
+    pos[4, 0] = torch.nan
+    stop = guard.check(replace(state, pos=pos), 1)
+    assert stop is not None
+    assert (stop.reason, stop.node) == ("nan", 4)
+
+
+def test_guard_of_no_nodes(new_trajectory: New) -> None:
+    empty = new_trajectory(num_nodes=0)
+    assert Guard(max_speed=1, bounds=empty.metadata.bounds).check(empty.state(0), 1) is None
+
+
+@pytest.mark.parametrize("limits", [{"max_speed": 0.0}, {"max_speed": -1.0}, {"margin": -0.1}, {"check_every": 0}])
+def test_guard_refuses_impossible_limits(limits: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match="must be positive"):
+        Guard(**limits)  # type: ignore[arg-type]
+
+
+def test_on_frame_sees_every_new_state(trajectory: Trajectory) -> None:
+    seen: list[int] = []
+
+    def see(frame: int, state: State) -> None:
+        np.testing.assert_array_equal(state.pos, trajectory.pos[frame])
+        seen.append(frame)
+
+    rollout(Replay(trajectory), trajectory.state(0), 5, trajectory.metadata, on_frame=see)
+    assert seen == [1, 2, 3, 4, 5]
+
+
+def test_states_holds_one_state_at_a_time(trajectory: Trajectory) -> None:
+    stream = states(FreeFall(0.01), trajectory.state(0), 10**12)
+    first, second = next(stream), next(stream)
+    assert isinstance(first, State)
+    assert isinstance(second, State)
+    assert second.time == pytest.approx(0.02)
+
+
+def test_frames_do_not_share_memory_with_the_simulator(trajectory: Trajectory) -> None:
+    """A simulator may reuse its arrays."""
+    state = trajectory.state(0)
+
+    class InPlace:
+        def step(self, state: State) -> State:
+            state.pos[...] += 1.0
+            return state
+
+    start = state.pos.copy()
+    result = rollout(InPlace(), state, 3, trajectory.metadata)
+    np.testing.assert_array_equal(result.pos, np.stack([start + k for k in range(4)]))
+
+
+def test_share_outside(trajectory: Trajectory) -> None:
+    pos = np.full_like(trajectory.pos, 0.3)
+    pos[0, :3, 1] = -0.05  # 3 of 72 below the floor
+    moved = replace(trajectory, pos=pos)
+    assert share_outside(moved) == pytest.approx(3 / 72)
+    assert share_outside(moved, tolerance=0.06) == 0.0
+    assert share_outside(replace(moved, boundary=replace(moved.boundary, shapes=()))) == 0.0

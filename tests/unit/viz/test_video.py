@@ -1,0 +1,92 @@
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gpe_pl.viz.video import write_animation
+
+
+def frames_of(path) -> list[np.ndarray]:
+    with Image.open(path) as image:
+        frames = []
+        for k in range(image.n_frames):
+            image.seek(k)
+            frames.append(np.asarray(image.convert("RGB")).astype(int))
+        return frames
+
+
+def particles(image) -> np.ndarray:
+    """Row and column of the coloured pixels."""
+    return np.argwhere(np.ptp(image, axis=-1) > 40)
+
+
+def test_gif_has_every_frame_and_particles_fall_in_both_panels(tmp_path, ground_truth, prediction):
+    path = tmp_path / "new" / "rollout.gif"
+    write_animation(path, ground_truth, {"GPE": prediction}, fps=20)
+    frames = frames_of(path)
+    assert len(frames) == ground_truth.num_frames
+    middle = frames[0].shape[1] // 2
+    for panel in (slice(None, middle), slice(middle, None)):
+        first, last = particles(frames[0][:, panel]), particles(frames[-1][:, panel])
+        assert len(first) > 100 and len(last) > 100
+        assert last[:, 0].mean() > first[:, 0].mean() + 20
+    assert [p.name for p in path.parent.iterdir()] == ["rollout.gif"]
+    with Image.open(path) as image:
+        assert image.info["duration"] == 50 and image.info["loop"] == 0
+
+
+def test_moved_particles_leave_no_trace(tmp_path, ground_truth):
+    write_animation(tmp_path / "a.gif", ground_truth, {})
+    write_animation(tmp_path / "b.gif", ground_truth, {}, stride=ground_truth.num_frames - 1)
+    last = frames_of(tmp_path / "a.gif")[-1]
+    assert (last == frames_of(tmp_path / "b.gif")[-1]).all()
+    assert tuple(last[40, 20]) == (255, 255, 255) or tuple(last[-3, 3]) == (255, 255, 255)
+
+
+def test_stride_skips_frames_and_errors_have_colours(tmp_path, ground_truth, prediction):
+    write_animation(tmp_path / "a.gif", ground_truth, {"GPE": prediction}, stride=5, color="error")
+    frames = frames_of(tmp_path / "a.gif")
+    assert len(frames) == 3
+    right = frames[-1][:, frames[-1].shape[1] // 2 :]
+    assert ((right[..., 0] > 200) & (right[..., 2] < 120)).any()  # large errors are yellow, which the first frame lacks
+
+
+def test_a_stopped_rollout_empties_its_panel(tmp_path, ground_truth, stopped):
+    write_animation(tmp_path / "a.gif", ground_truth, {"GPE": stopped})
+    frames = frames_of(tmp_path / "a.gif")
+    assert len(frames) == ground_truth.num_frames
+    right = frames[-1][:, frames[-1].shape[1] // 2 :]
+    assert len(particles(right)) == 0 and (right < 150).any()
+
+
+def test_mp4_can_be_read_back(tmp_path, ground_truth, prediction):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    path = tmp_path / "a.mp4"
+    write_animation(path, ground_truth, {"GPE": prediction})
+    assert ffmpeg.count_frames_and_secs(str(path))[0] == ground_truth.num_frames
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_mp4_without_ffmpeg_names_what_to_install(tmp_path, ground_truth, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ModuleNotFoundError, match="pip install imageio-ffmpeg"):
+        write_animation(tmp_path / "a.mp4", ground_truth, {})
+
+
+def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path, ground_truth, prediction, monkeypatch):
+    path = tmp_path / "a.gif"
+    path.write_bytes(b"old")
+    monkeypatch.setattr("gpe_pl.viz.panel.Panel.show_frame", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        write_animation(path, ground_truth, {"GPE": prediction})
+    assert path.read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [("a.avi", {}, "gif or .mp4"), ("a.gif", {"stride": 0}, "stride"), ("a.gif", {"fps": 0}, "fps"), ("a.gif", {"fps": 60}, "50 frames")],
+)
+def test_senseless_requests_are_refused(tmp_path, ground_truth, name, options, message):
+    with pytest.raises(ValueError, match=message):
+        write_animation(tmp_path / name, ground_truth, {}, **options)
