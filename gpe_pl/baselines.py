@@ -6,7 +6,11 @@ from array_api_compat import array_namespace
 
 from gpe_pl import integrators
 from gpe_pl.geometry import signed_distance
-from gpe_pl.trajectory import State
+from gpe_pl.trajectory import Array, State
+
+TOUCH = 1e-6
+"""Distance [m] below which a node at rest counts as touching a boundary."""
+NUM_BISECTIONS = 30
 
 
 @dataclass(frozen=True)
@@ -27,15 +31,23 @@ class Ballistic:
 
     def step(self, state: State) -> State:
         xp = array_namespace(state.pos)
+        shapes = state.boundary.shapes
         pos, vel = integrators.advance(state.pos, state.vel, state.gravity, self.dt)
-        outside = (signed_distance(state.boundary.shapes, pos) <= 0)[:, None]
-        stuck = outside | xp.all(state.vel == 0, axis=-1, keepdims=True)  # a node at exact rest has stuck before
-        # stop on the surface: the fraction of the step after which the distance is used up
-        before = signed_distance(state.boundary.shapes, state.pos)
-        after = signed_distance(state.boundary.shapes, pos)
-        fraction = xp.clip(before / xp.where(before > after, before - after, xp.ones_like(before)), 0.0, 1.0)[:, None]
-        pos = xp.where(outside, state.pos + fraction * (pos - state.pos), pos)
-        at_rest = stuck & ~outside
-        pos = xp.where(at_rest, state.pos, pos)
-        vel = xp.where(stuck, xp.zeros_like(vel), vel)
+        stuck = xp.all(state.vel == 0, axis=-1) & (signed_distance(shapes, state.pos) < TOUCH)
+        hit = (signed_distance(shapes, pos) <= 0) & ~stuck
+        if bool(xp.any(hit)):
+            pos = xp.where(hit[:, None], self._touchdown(state, pos), pos)
+        pos = xp.where(stuck[:, None], state.pos, pos)
+        vel = xp.where((hit | stuck)[:, None], xp.zeros_like(vel), vel)
         return replace(state, pos=pos, vel=vel, velocity_history=None, time=state.time + self.dt)
+
+    @staticmethod
+    def _touchdown(state: State, end: Array) -> Array:
+        """The last free points on the straight paths from the state's positions to ``end``, by bisection."""
+        xp = array_namespace(end)
+        free, inside = state.pos, end
+        for _ in range(NUM_BISECTIONS):
+            middle = (free + inside) / 2
+            is_free = (signed_distance(state.boundary.shapes, middle) >= 0)[:, None]
+            free, inside = xp.where(is_free, middle, free), xp.where(is_free, inside, middle)
+        return free

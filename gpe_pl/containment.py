@@ -17,6 +17,7 @@ TOLERANCE = 1e-6
 def contain(state: State, dt: float) -> tuple[State, Array]:
     """Move penetrating nodes along the surface normal back to the surface of the boundary's shapes.
 
+    Where surfaces meet so narrowly that this does not lead out, a node returns to where the step began.
     Velocities, and the last entry of the velocity history, change by displacement / ``dt``, so that they still are differences of positions.
 
     Args:
@@ -38,6 +39,8 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
         for shape in shapes:
             depth = xp.clip(-shape.signed_distance(moved), 0.0, None)
             moved = moved + depth[:, None] * outward_normal(shape, moved, step=1e-6)
+    caught = signed_distance(shapes, moved) < -TOLERANCE
+    moved = xp.where(caught[:, None], pos[rows] - state.vel[rows] * dt, moved)
     new_pos, vel = xp.asarray(pos, copy=True), xp.asarray(state.vel, copy=True)
     new_pos[rows] = moved
     vel[rows] = vel[rows] + (moved - pos[rows]) / dt

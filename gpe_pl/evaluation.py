@@ -18,7 +18,8 @@ from gpe_pl.containment import Contained
 from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
-from gpe_pl.rollout import Guard, Simulator, rollout
+from gpe_pl.rollout import Guard, Simulator, rollout, share_outside
+from gpe_pl.schema import Split
 from gpe_pl.trajectory import Trajectory, iter_trajectories
 
 LEARNED = "learned"
@@ -39,7 +40,7 @@ class EvaluationSettings:
         num_pictures: trajectories per split that get a figure and an animation.
     """
 
-    splits: list[str] = field(default_factory=lambda: ["test", "test_unseen"])
+    splits: Annotated[list[Split], Field(min_length=1)] = field(default_factory=lambda: ["test", "test_unseen"])
     horizons: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [5, 20, 50, 100])
     num_trajectories: Annotated[int, Field(ge=1)] | None = None
     containment: bool = True
@@ -109,8 +110,10 @@ def _predict(
     predictions = {label: prediction}
     for name, baseline in (("ballistic", Ballistic(dt)), ("constant_velocity", ConstantVelocity(dt))):
         predictions[name] = rollout(baseline, trajectory.state(history, history), steps, truth.metadata)
-    outside = [r.value for r in rollout_metrics(free, truth, ["full"]) if r.metric == "share_outside"]
-    extra = {"share_outside_uncontained": outside[0] if outside else float("nan"), "share_corrected": contained.share_corrected}
+    extra = {
+        "share_outside_uncontained": share_outside(free.frames(1), tolerance=1e-3 * truth.metadata.spacing),
+        "share_corrected": contained.share_corrected,
+    }
     return predictions, extra
 
 

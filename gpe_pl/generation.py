@@ -216,7 +216,7 @@ def _bytes_per_trajectory(spec: DatasetSpec) -> int:
     dim = len(spec.scene.bounds)
     node_frames = 2 * 4 * dim * spec.scene.num_particles * spec.num_frames
     boundary = 64 * sum(math.ceil((high - low) / spec.scene.spacing) for low, high in spec.scene.bounds) * 2
-    return node_frames + boundary + 2**15
+    return node_frames + boundary + 2**13
 
 
 def dataset_bytes(spec: DatasetSpec) -> int:

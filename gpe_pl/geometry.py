@@ -22,8 +22,12 @@ class Shape(Protocol):
     """A rigid boundary with its boundary condition."""
 
     kind: ClassVar[str]
-    friction: float
-    restitution: float
+
+    @property
+    def friction(self) -> float: ...
+
+    @property
+    def restitution(self) -> float: ...
 
     def signed_distance(self, points: Array) -> Array: ...
 
@@ -100,7 +104,7 @@ class Sphere:
     def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
         if len(self.center) == 2:
             count = max(6, math.ceil(2 * math.pi * self.radius / spacing))
-            angle = 2 * math.pi * np.arange(count) / count
+            angle: np.ndarray = 2 * math.pi * np.arange(count) / count
             normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         else:  # golden-angle spiral: near-uniform density on the sphere
             count = max(12, math.ceil(4 * math.pi * self.radius**2 / spacing**2))

@@ -183,21 +183,29 @@ class LearnedSimulator(nn.Module):
             simulator = cls.from_description(checkpoint["simulator"])
             weights = {k.removeprefix("simulator."): v for k, v in checkpoint["state_dict"].items() if k.startswith("simulator.")}
             simulator.load_state_dict(weights)
-        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-            reason = str(error).strip().splitlines()[0][:300] if str(error).strip() else type(error).__name__
+        except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
             raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model: {reason}") from None
         return simulator.to(device).eval()
 
 
+class UnknownModelError(GpeError, ValueError):
+    """A dotted name that is not a model of this package."""
+
+
 def model_class(target: str) -> type[nn.Module]:
-    """The model class of a dotted name; only classes under ``gpe_pl.models`` are accepted, because names come from files."""
+    """The model class of a dotted name; only classes under ``gpe_pl.models`` are accepted, because names come from files.
+
+    Raises:
+        UnknownModelError: any other name.
+    """
     module, _, name = target.rpartition(".")
     if not module.startswith("gpe_pl.models."):
-        raise ValueError(f"model {target!r} is not one of gpe_pl.models")
+        raise UnknownModelError(f"model {target!r} is not one of gpe_pl.models")
     try:
         cls = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError):
-        raise ValueError(f"model {target!r} does not exist in this version of gpe_pl") from None
+        raise UnknownModelError(f"model {target!r} does not exist in this version of gpe_pl") from None
     if not (inspect.isclass(cls) and issubclass(cls, nn.Module)):
-        raise ValueError(f"{target!r} is not a model")
+        raise UnknownModelError(f"{target!r} is not a model")
     return cls

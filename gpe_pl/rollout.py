@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -15,7 +15,7 @@ from array_api_compat import array_namespace
 
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import signed_distance
-from gpe_pl.trajectory import Metadata, State, Termination, Trajectory
+from gpe_pl.trajectory import Boundary, Metadata, State, Termination, Trajectory
 
 
 @runtime_checkable
@@ -137,7 +137,8 @@ def rollout(
         if on_frame is not None:
             on_frame(frame, item)
     b = state.boundary
-    boundary = replace(b, **{name: _numpy(getattr(b, name)) for name in ("pos", "vel", "normal", "friction", "restitution")})
+    pos_b, vel_b, normal, friction, restitution = (_numpy(x) for x in (b.pos, b.vel, b.normal, b.friction, b.restitution))
+    boundary = Boundary(pos_b, vel_b, normal, friction, restitution, b.shapes)
     return Trajectory(
         metadata,
         np.stack(pos),

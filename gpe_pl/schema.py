@@ -4,7 +4,7 @@ This module imports nothing but the standard library, so that solvers, store and
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 SCHEMA_VERSION = 1
 """Version of the HDF5 layout; a reader refuses any other."""
@@ -48,7 +48,8 @@ RADIUS = "radius"
 EdgeType = tuple[str, str, str]
 """``(source node type, relation, target node type)``."""
 
-SPLITS: tuple[str, ...] = ("train", "val", "test", "test_unseen")
+Split = Literal["train", "val", "test", "test_unseen"]
+SPLITS: tuple[str, ...] = get_args(Split)
 ParameterGroup = Literal["seen", "interpolated", "extrapolated"]
 
 

@@ -77,3 +77,11 @@ def brute_force_radius() -> Callable[[np.ndarray, np.ndarray, float], set[tuple[
         return {(int(i), int(j)) for i, j in np.argwhere((offset**2).sum(-1) <= radius**2)}
 
     return pairs
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _one_thread() -> None:
+    """Small tensors run faster on one thread, and results do not depend on the machine's cores."""
+    import torch
+
+    torch.set_num_threads(1)

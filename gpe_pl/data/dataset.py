@@ -5,7 +5,7 @@ A sample is a pure function of (split, seed, sample number): runs resume exactly
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl import integrators
 from gpe_pl.data.noise import Noise
 from gpe_pl.graphs.builder import GraphBuilder
-from gpe_pl.trajectory import State, Trajectory, read_trajectory, shards, trajectory_names
+from gpe_pl.trajectory import State, StoreError, Trajectory, open_group, open_shard, read_trajectory, shards
 
 CACHE_BYTES = 2 * 1024**3
 """Splits smaller than this are held in memory; larger ones are read from disk window by window."""
@@ -45,12 +45,20 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
     hold = 2 * sum(p.stat().st_size for p in paths) <= cache_bytes
     stored = []
     for path in paths:
-        for name in trajectory_names(path):
-            trajectory = read_trajectory(path, name)
-            for array in (trajectory.pos, trajectory.vel, trajectory.node_type, trajectory.mass, trajectory.material_params):
-                array.setflags(write=False)
-            stored.append(StoredTrajectory(path, name, trajectory.num_frames, trajectory if hold else None))
+        with open_shard(path) as file:
+            lengths = {name: open_group(file, name)["pos"].shape[0] for name in sorted(file)}
+        for name, num_frames in lengths.items():
+            held = _read_only(read_trajectory(path, name)) if hold else None
+            stored.append(StoredTrajectory(path, name, num_frames, held))
     return stored
+
+
+def _read_only(trajectory: Trajectory) -> Trajectory:
+    """The same trajectory; writing to its arrays raises."""
+    for array in (*vars(trajectory).values(), *vars(trajectory.boundary).values()):
+        if isinstance(array, np.ndarray):
+            array.setflags(write=False)
+    return trajectory
 
 
 class WindowDataset(Dataset[HeteroData]):
@@ -65,6 +73,9 @@ class WindowDataset(Dataset[HeteroData]):
         noise: applied to inputs; None for evaluation.
         velocity_unit: acceleration std × frame interval [m/s], the unit of velocity noise.
         seed: of the noise.
+
+    Raises:
+        StoreError: no trajectory is long enough, or a window holds a position that is not finite.
     """
 
     def __init__(
@@ -81,7 +92,8 @@ class WindowDataset(Dataset[HeteroData]):
         counts = [max(0, t.num_frames - history - 1) for t in trajectories]
         self.ends = np.cumsum(counts)
         if not len(self.ends) or self.ends[-1] == 0:
-            raise ValueError(f"no trajectory is longer than the {history + 2} frames that a window with history {history} needs")
+            longest = max((t.num_frames for t in trajectories), default=0)
+            raise StoreError(f"no trajectory has the {history + 2} frames that graph.history={history} needs; the longest has {longest}")
 
     def __len__(self) -> int:
         return int(self.ends[-1])
@@ -100,6 +112,10 @@ class WindowDataset(Dataset[HeteroData]):
         trajectory = self.trajectories[number].window(frame - history, frame + 2)
         dt = trajectory.metadata.frame_dt
         pos = trajectory.pos.astype(np.float64)
+        if not np.isfinite(pos).all():
+            bad, node = np.argwhere(~np.isfinite(pos))[0, :2]
+            where = f"{self.trajectories[number].path}:{self.trajectories[number].name}: frame {frame - history + bad}, node {node}"
+            raise StoreError(f"{where}: the position is not finite; see `python -m gpe_pl.data.validate`")
         if self.noise is not None:
             rng = np.random.default_rng((self.seed, sample))
             pos = self.noise.apply(pos, self.velocity_unit, dt, rng)
@@ -135,7 +151,7 @@ class StepSampler(Sampler[tuple[int, int]]):
         start: called when iteration begins; the number of samples already consumed.
     """
 
-    def __init__(self, num_windows: int, seed: int, start=lambda: 0) -> None:  # noqa: ANN001
+    def __init__(self, num_windows: int, seed: int, start: Callable[[], int] = lambda: 0) -> None:
         self.num_windows, self.seed, self.start = num_windows, seed, start
 
     def __iter__(self) -> Iterator[tuple[int, int]]:

@@ -86,7 +86,7 @@ class Group:
     def __str__(self) -> str:
         m = self.metadata
 
-        def span(values: Iterable[float]) -> str:
+        def span(values: Iterable[float] | Iterable[int]) -> str:
             low, high = min(values), max(values)
             return f"{low:.6g}" if low == high else f"{low:.6g} … {high:.6g}"
 
@@ -328,7 +328,7 @@ def _check_boundary(m: Metadata, arrays: dict[str, np.ndarray], shapes: tuple[Sh
 def _bad_shape(shape: Shape, dim: int) -> str | None:
     values: dict[str, Any] = asdict(shape)  # type: ignore[call-overload]
     try:
-        TypeAdapter(type(shape)).validate_python(values, strict=True)
+        TypeAdapter(type(shape)).validate_json(json.dumps(values), strict=True)
     except ValidationError as error:
         return "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
     numbers = [np.ravel(np.asarray(v, np.float64)) for v in values.values()]

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
+from gpe_pl.errors import GpeError
 from gpe_pl.graphs.features import (
     GraphConfig,
     Scales,
@@ -24,8 +25,12 @@ from gpe_pl.graphs.features import (
     scales_of,
 )
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
-from gpe_pl.schema import BOUNDARY, MATERIALS, FeatureSpec, node_code
+from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES, FeatureSpec, node_code
 from gpe_pl.trajectory import Metadata, State
+
+
+class GraphError(GpeError, ValueError):
+    """A state does not fit the data set whose graphs are built; the message says how."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,7 @@ class GraphBuilder:
 
     def __post_init__(self) -> None:
         if any(self.metadata.periodic):
-            raise ValueError(f"data set {self.metadata.dataset!r} has periodic axes, which the graph builder does not support")
+            raise GraphError(f"data set {self.metadata.dataset!r} has periodic axes, which the graph builder does not support")
 
     @property
     def scales(self) -> Scales:
@@ -55,16 +60,17 @@ class GraphBuilder:
         """Build the graph of a state of float64 tensors.
 
         Raises:
-            ValueError: the state holds a node type that the data set does not have, or lacks velocity history.
+            GraphError: the state holds a node type that the data set does not have, or lacks velocity history.
         """
         scales, spec = self.scales, self.spec
         history = history_of(state)
         if history.shape[1] != self.config.history:
-            raise ValueError(f"state has a history of {history.shape[1]} velocities, the graph needs {self.config.history}")
+            raise GraphError(f"state has a history of {history.shape[1]} velocities, the graph needs {self.config.history}")
         rows = {m: self._rows(state, m) for m in spec.materials}
         if sum(len(r) for r in rows.values()) != state.num_nodes:
-            known = ", ".join(spec.materials)
-            raise ValueError(f"state has nodes of a material that is not among the data set's materials ({known})")
+            present = {NODE_TYPES[code] for code in state.node_type.unique().tolist()}
+            unknown, known = ", ".join(sorted(present - {*spec.materials})), ", ".join(spec.materials)
+            raise GraphError(f"state has nodes of {unknown}; the data set {self.metadata.dataset!r} has {known}")
 
         pos = {m: state.pos[r] for m, r in rows.items()}
         vel = {m: state.vel[r] for m, r in rows.items()}

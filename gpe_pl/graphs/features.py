@@ -36,7 +36,7 @@ class GraphConfig:
     """
 
     features: Features = "contact"
-    history: Annotated[int, Field(ge=1, le=20)] = 1
+    history: Annotated[int, Field(ge=1, le=20)] = 5
     connectivity_radius: Annotated[float, Field(gt=0)] | None = None
     trim_boundary: bool = True
 
@@ -81,10 +81,15 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
 
 
 def material_features(velocity_history: Float64[Tensor, "node history dim"], gravity: Float64[Tensor, " dim"], scales: Scales) -> Tensor:
-    """Velocities and external acceleration of dynamic nodes [node, (history + 1) · dim]."""
+    """Motion and external acceleration of dynamic nodes [node, (history + 1) · dim].
+
+    The history enters as the last velocity and the velocity changes before it: the same content as the velocities, but a change is a tenth of a velocity
+    and would drown in its scale.
+    """
     n = velocity_history.shape[0]
-    flat = velocity_history.flatten(1) / scales.velocity
-    return torch.cat([flat, (gravity / scales.acceleration).expand(n, -1)], dim=1).float()
+    changes = velocity_history[:, 1:] - velocity_history[:, :-1]
+    motion = torch.cat([velocity_history[:, -1:], changes.flip(1)], dim=1).flatten(1) / scales.velocity
+    return torch.cat([motion, (gravity / scales.acceleration).expand(n, -1)], dim=1).float()
 
 
 def boundary_features(boundary: Boundary, scales: Scales) -> Tensor:

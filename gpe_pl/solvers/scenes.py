@@ -46,7 +46,7 @@ class SceneConfig:
         drop_height: range of the gap between a body and the floor [m].
         max_speed: of a body along each axis [m/s]; upward at most a quarter of it.
         sticky_probability: of a wall or obstacle to be no-slip.
-        slip_probability: of a wall or obstacle to be frictionless; all others obey Coulomb's law.
+        slip_probability: of a side wall, ceiling or obstacle to be frictionless; all others obey Coulomb's law.
         coulomb_friction: range of Coulomb coefficients.
         connectivity_cells: recommended connectivity radius in grid cells.
     """
@@ -144,16 +144,18 @@ def sample_scene(config: SceneConfig, material: str, value: float, seed: int) ->
     )
 
 
-def _friction(config: SceneConfig, rng: np.random.Generator) -> float:
+def _friction(config: SceneConfig, rng: np.random.Generator, may_slip: bool = True) -> float:
     kind, coulomb = rng.random(), rng.uniform(*config.coulomb_friction)
     if kind < config.sticky_probability:
         return STICKY
-    return 0.0 if kind < config.sticky_probability + config.slip_probability else float(coulomb)
+    slips = may_slip and kind < config.sticky_probability + config.slip_probability
+    return 0.0 if slips else float(coulomb)
 
 
 def _walls(config: SceneConfig, rng: np.random.Generator) -> tuple[Shape, ...]:
     names = [f"{axis}_{side}" for axis in "xyz"[: len(config.bounds)] for side in ("low", "high")]
-    return domain_walls(config.bounds, {name: _friction(config, rng) for name in names})
+    floor = f"{'xyz'[len(config.bounds) - 1]}_low"  # on a frictionless floor sand slides for ever and no pile comes to rest
+    return domain_walls(config.bounds, {name: _friction(config, rng, may_slip=name != floor) for name in names})
 
 
 def _obstacles(config: SceneConfig, rng: np.random.Generator) -> tuple[Shape, ...]:

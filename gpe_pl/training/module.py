@@ -87,9 +87,17 @@ class TrainingModule(L.LightningModule):
         if self.compile_mode == "auto" and not any(shutil.which(c) for c in ("c++", "g++", "clang++", "cl")):
             log.warning("compile: auto found no C++ compiler, training runs without torch.compile")
             return
-        model = self.simulator.model
-        if hasattr(model, "compute"):
-            model.compute = torch.compile(model.compute, dynamic=True)
+        model: Any = self.simulator.model
+        plain = model.compute
+        compiled = torch.compile(plain, dynamic=True)
+
+        def compute(x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: dict[Any, tuple[Tensor, ...]]) -> Any:
+            # only training steps, and no sizes of one, which the compiler would specialise on: else it recompiles until it gives up
+            sizes = [t.shape[0] for t in x.values()] + [odd.shape[0] for _, odd, _ in edges.values()]
+            usable = torch.is_grad_enabled() and min(sizes, default=0) > 1
+            return (compiled if usable else plain)(x, params, mass, edges)
+
+        model.compute = compute
 
     def on_fit_end(self) -> None:
         self.simulator.model.__dict__.pop("compute", None)  # back to the plain method

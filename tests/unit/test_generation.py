@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -174,7 +173,7 @@ def test_failure_names_split_index_and_seed(tmp_path, num_workers):
 
 def test_small_disk_is_refused_before_anything_is_written(tmp_path):
     with pytest.raises(GenerationError, match="GiB free"):
-        generate(tmp_path, replace(SPEC, num_train=10**9))
+        generate(tmp_path, replace(SPEC, num_frames=10**12))
     assert not list(tmp_path.rglob("*.h5"))
 
 
@@ -231,7 +230,6 @@ def test_start_is_free_flight():
 
 
 def test_progress_bar_reports(folder, capsys):
-    started = time.time()
     with generation.progress_bar("sand") as progress:
         progress(3, 4)
-    assert "3/4" in capsys.readouterr().out and time.time() - started < 60
+    assert "3/4" in capsys.readouterr().out

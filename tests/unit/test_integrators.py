@@ -38,8 +38,9 @@ def test_symplectic_euler_by_hand() -> None:
 
 def test_numpy_equals_torch() -> None:
     pos = np.random.default_rng(0).normal(size=(5, 3, 2))
-    np.testing.assert_array_equal(velocities(torch.from_numpy(pos), 0.01).numpy(), velocities(pos, 0.01))
-    for a, b in zip(advance(*map(torch.from_numpy, pos[:3]), 0.01), advance(*pos[:3], 0.01), strict=True):
+    tensor = torch.from_numpy(pos)
+    np.testing.assert_array_equal(velocities(tensor, 0.01).numpy(), velocities(pos, 0.01))
+    for a, b in zip(advance(tensor[0], tensor[1], tensor[2], 0.01), advance(pos[0], pos[1], pos[2], 0.01), strict=True):
         np.testing.assert_array_equal(a.numpy(), b)
 
 

@@ -73,7 +73,7 @@ def test_no_steps(trajectory: Trajectory) -> None:
 )
 def test_guard_keeps_the_good_frames(trajectory: Trajectory, reason: str, spoil: Callable[[State], State], message: str) -> None:
     start = replace(trajectory.state(0), vel=np.zeros((12, 2)))
-    guard = Guard(max_speed=50, bounds=trajectory.metadata.bounds, margin=0.1)
+    guard = Guard(max_speed=50.0, bounds=trajectory.metadata.bounds, margin=0.1)
     sound = rollout(FreeFall(0.01), start, 8, trajectory.metadata, guard)
     assert sound.termination is None
     assert sound.num_frames == 9
@@ -105,7 +105,7 @@ def test_other_errors_are_not_hidden(trajectory: Trajectory) -> None:
 
 def test_guard_on_torch(trajectory: Trajectory) -> None:
     state = trajectory.state(0).to_torch()
-    guard = Guard(max_speed=50, bounds=trajectory.metadata.bounds)
+    guard = Guard(max_speed=50.0, bounds=trajectory.metadata.bounds)
     assert guard.check(state, 1) is None
     pos = state.pos.clone()
     pos[4, 0] = torch.nan
@@ -116,7 +116,7 @@ def test_guard_on_torch(trajectory: Trajectory) -> None:
 
 def test_guard_of_no_nodes(new_trajectory: New) -> None:
     empty = new_trajectory(num_nodes=0)
-    assert Guard(max_speed=1, bounds=empty.metadata.bounds).check(empty.state(0), 1) is None
+    assert Guard(max_speed=1.0, bounds=empty.metadata.bounds).check(empty.state(0), 1) is None
 
 
 @pytest.mark.parametrize("limits", [{"max_speed": 0.0}, {"max_speed": -1.0}, {"margin": -0.1}, {"check_every": 0}])

@@ -1,0 +1,62 @@
+# Everything runs in .venv, which the first target that needs it creates.
+PYTHON ?= python3
+VENV ?= .venv
+PYTEST_ARGS ?=
+ARGS ?=
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help install fit test test-all check lint types contracts format-page format bench notebooks clean
+
+help: ## list the targets
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  %-12s %s\n", $$1, $$2}'
+
+install: $(INSTALLED) ## create .venv with the tested versions (again when pyproject.toml or constraints.txt change)
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "Python 3.11 or newer is needed; name one with: make PYTHON=/path/to/python3.11"; exit 1; }
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	@touch $@
+
+fit: install ## momentum ablation of the paper: generates data, trains, evaluates, reports (ARGS="size=tiny" and the like)
+	$(BIN)/python -m gpe_pl.fit experiment=ablation_momentum $(ARGS)
+
+test: install ## fast tests (PYTEST_ARGS="-n 4" and the like)
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+test-all: install ## all tests, analytic physics and notebooks included
+	$(BIN)/python -m pytest -m "" $(PYTEST_ARGS)
+
+check: lint types contracts format-page ## everything that needs no run: style, types, import contracts, generated pages
+
+lint: install ## style and formatting
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: install ## static types of gpe_pl and tests
+	$(BIN)/mypy
+
+contracts: install ## which module may import which
+	$(BIN)/lint-imports --no-logo
+
+format-page: install ## data/README.md describes the store as it is
+	$(BIN)/python -m gpe_pl.data.validate --format-page | diff -u data/README.md - || \
+		{ echo "run: python -m gpe_pl.data.validate --format-page > data/README.md"; exit 1; }
+
+format: install ## rewrite the code in the project's style, and the generated pages
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/python -m gpe_pl.data.validate --format-page > data/README.md
+
+bench: install ## speed of the message-passing layers, simulators and data path
+	$(BIN)/python -m gpe_pl.benchmark suite=speed $(ARGS)
+
+notebooks: install ## execute every notebook from start to end
+	$(BIN)/python -m pytest -m notebook $(PYTEST_ARGS)
+
+clean: ## remove caches and build products; data sets, runs and .venv stay
+	rm -rf build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	find gpe_pl tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,108 @@
+"""What may be imported where: the contracts in pyproject.toml, and what a reader of data must not have to load."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+MODULES = sorted((ROOT / "gpe_pl").rglob("*.py"))
+
+# Where the name of a distribution is not the name that one imports.
+IMPORT_NAMES = {"hydra-core": "hydra", "pillow": "PIL", "array-api-compat": "array_api_compat", "torch-geometric": "torch_geometric"}
+PARTS_OF_OTHERS = {"mpl_toolkits": "matplotlib"}
+
+
+def dotted(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def loaded_by(*modules: str) -> set[str]:
+    """Top-level names in ``sys.modules`` of a fresh interpreter that imports these modules."""
+    script = f"import json, sys, {', '.join(modules)}; print(json.dumps(sorted({{m.partition('.')[0] for m in sys.modules}})))"
+    child = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert child.returncode == 0, child.stderr
+    return set(json.loads(child.stdout.splitlines()[-1]))
+
+
+def test_import_contracts() -> None:
+    command = [str(Path(sys.executable).with_name("lint-imports")), "--no-cache"]
+    child = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert child.returncode == 0, child.stdout + child.stderr
+
+
+def test_data_can_be_read_and_made_without_torch() -> None:
+    solvers = [dotted(path) for path in MODULES if "solvers" in path.parts]
+    without = ("gpe_pl.schema", "gpe_pl.geometry", "gpe_pl.trajectory", "gpe_pl.rollout", "gpe_pl.containment", "gpe_pl.data.validate")
+    assert {"torch", "torch_geometric", "lightning", "hydra", "matplotlib", "wandb"} & loaded_by(*without, *solvers) == set()
+
+
+def test_schema_imports_only_the_standard_library() -> None:
+    tree = ast.parse((ROOT / "gpe_pl" / "schema.py").read_text())
+    assert top_level_imports(tree) <= set(sys.stdlib_module_names)
+
+
+def top_level_imports(tree: ast.Module) -> set[str]:
+    """First parts of what a module imports when it is imported, without what only type checkers see."""
+    names: set[str] = set()
+    pending: list[ast.AST] = [tree]
+    while pending:
+        node = pending.pop()
+        if isinstance(node, ast.Import):
+            names.update(alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            names.add((node.module or "").partition(".")[0])
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            pending.extend(node.orelse)
+        elif not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)):
+            pending.extend(ast.iter_child_nodes(node))
+    return names
+
+
+@pytest.mark.parametrize("path", MODULES, ids=dotted)
+def test_no_optional_dependency_at_module_level(path: Path) -> None:
+    """Whoever installs the package without extras can import all of it."""
+    required = {re.split(r"[<>=!~\[; ]", text, maxsplit=1)[0] for text in PROJECT["dependencies"]}
+    allowed = {IMPORT_NAMES.get(name, name) for name in required} | set(sys.stdlib_module_names) | {"gpe_pl"}
+    used = {PARTS_OF_OTHERS.get(name, name) for name in top_level_imports(ast.parse(path.read_text()))}
+    assert used <= allowed, f"{dotted(path)} imports {sorted(used - allowed)}, which pyproject.toml does not require"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=dotted)
+def test_imports_are_absolute_and_explicit(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{dotted(path)}:{node.lineno}: relative import"
+            assert all(alias.name != "*" for alias in node.names), f"{dotted(path)}:{node.lineno}: import *"
+
+
+def test_top_level_imports_sees_what_runs_at_import() -> None:
+    source = """
+import a.b
+from c import d
+from typing import TYPE_CHECKING
+if TYPE_CHECKING:
+    import e
+try:
+    import f
+except ImportError:
+    import g
+class X:
+    import h
+def later():
+    import i
+"""
+    assert top_level_imports(ast.parse(source)) == {"a", "c", "typing", "f", "g", "h"}
+
+
+def test_the_import_test_can_fail() -> None:
+    assert "torch" in loaded_by("gpe_pl.nn.blocks")

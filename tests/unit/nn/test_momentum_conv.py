@@ -1,0 +1,101 @@
+"""The layer by itself: both sides of a bipartite relation, summation before or after the last linear map, the orientation rule."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch_geometric.nn import MessagePassing
+
+from gpe_pl.nn.momentum_conv import MomentumConv, orient
+
+DOUBLE = torch.float64
+KINDS = ["directed", "negated", "odd", "odd_even"]
+
+
+def problem(interaction: str, num_source: int = 7, num_target: int = 5, num_edges: int = 20) -> tuple[torch.Tensor, ...]:
+    g = torch.Generator().manual_seed(0)
+    edges = torch.stack([torch.randint(num_source, (num_edges,), generator=g), torch.randint(num_target, (num_edges,), generator=g)])
+    rows = 2 * num_edges if interaction == "directed" else num_edges
+    shapes = ((num_source, 8), (num_target, 8), (rows, 6), (num_edges, 3))
+    hs, ht, e, s = (torch.randn(shape, generator=g, dtype=DOUBLE) for shape in shapes)
+    return hs, ht, edges, e, s
+
+
+def make(interaction: str, implementation: str = "factored") -> MomentumConv:
+    torch.manual_seed(0)
+    return MomentumConv(8, 6, 3, interaction, implementation).double()  # type: ignore[arg-type]
+
+
+def test_is_a_message_passing_layer() -> None:
+    assert isinstance(make("odd"), MessagePassing)
+
+
+@pytest.mark.parametrize("implementation", ["factored", "plain"])
+@pytest.mark.parametrize("interaction", KINDS)
+def test_sums_equal_a_loop_over_edges(interaction: str, implementation: str) -> None:
+    conv = make(interaction, implementation)
+    hs, ht, edges, e, s = problem(interaction)
+    at_target, at_source, messages = conv(hs, ht, edges, e, s)
+    want_target, want_source = torch.zeros_like(ht), torch.zeros_like(hs)
+    num_edges = edges.shape[1]
+
+    def phi(a: torch.Tensor, b: torch.Tensor, state: torch.Tensor, even: torch.Tensor) -> torch.Tensor:
+        parts = [a, b, state, even] if conv.is_odd else [a, b, state]
+        return conv.act(conv.lin_in(torch.cat(parts)))
+
+    for n in range(num_edges):
+        j, i = edges[:, n].tolist()
+        forward = phi(ht[i], hs[j], e[n], s[n])
+        if interaction == "directed":
+            reverse = phi(hs[j], ht[i], e[num_edges + n], s[n])
+            want_target[i] += conv.lin_out(forward)
+            want_source[j] += conv.lin_out(reverse)
+            continue
+        if conv.is_odd:
+            reverse = phi(hs[j], ht[i], -e[n], s[n])
+            m = conv.lin_out(forward - reverse)
+        else:
+            m = conv.lin_out(forward)
+        torch.testing.assert_close(messages[n], m)
+        want_target[i] += m
+        want_source[j] -= m
+        if conv.lin_even is not None:
+            want_target[i] += conv.lin_even(forward + reverse)
+            want_source[j] += conv.lin_even(forward + reverse)
+    torch.testing.assert_close(at_target, want_target)
+    torch.testing.assert_close(at_source, want_source)
+
+
+@pytest.mark.parametrize("interaction", KINDS)
+def test_last_linear_map_commutes_with_the_sum(interaction: str) -> None:
+    conv = make(interaction)
+    with_messages = conv(*problem(interaction))
+    without = conv(*problem(interaction), with_messages=False)
+    assert without[2] is None
+    for a, b in zip(with_messages[:2], without[:2], strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("interaction", ["negated", "odd"])
+def test_what_one_end_gains_the_other_loses(interaction: str) -> None:
+    at_target, at_source, _ = make(interaction)(*problem(interaction))
+    assert at_target.sum(dim=0).norm() > 0.1
+    torch.testing.assert_close(at_target.sum(dim=0), -at_source.sum(dim=0))
+
+
+def test_no_edges_give_zero_sums() -> None:
+    for interaction in KINDS:
+        hs, ht, _, e, s = problem(interaction, num_edges=0)
+        at_target, at_source, _ = make(interaction)(hs, ht, torch.empty(2, 0, dtype=torch.int64), e, s)
+        assert at_target.shape == ht.shape and at_source.shape == hs.shape
+        assert not at_target.any() and not at_source.any()
+
+
+def test_orientation_rule() -> None:
+    edges = torch.tensor([[0, 1, 2, 3, 4], [5, 6, 7, 8, 9]])
+    odd = torch.tensor([[1.0, -2.0], [-1.0, 2.0], [0.0, -3.0], [0.0, 3.0], [0.0, 0.0]])
+    index, out = orient(edges, odd)
+    assert index.tolist() == [[0, 6, 7, 3, 4], [5, 1, 2, 8, 9]]
+    assert out.tolist() == [[1.0, -2.0], [1.0, -2.0], [0.0, 3.0], [0.0, 3.0], [0.0, 0.0]]
+    again, same = orient(index.flip(0), -out)
+    assert torch.equal(again[:, :4], index[:, :4]) and torch.equal(same[:4], out[:4])
