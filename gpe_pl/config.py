@@ -11,13 +11,14 @@ import os
 import re
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import is_dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
@@ -34,6 +35,14 @@ class ConfigError(GpeError, ValueError):
     """A config value is not allowed; the message names key, value and what is allowed."""
 
 
+@dataclass(frozen=True)
+class Paths:
+    """Folders, relative to the current one: generated and imported data sets, and results."""
+
+    data: str
+    runs: str
+
+
 def construct(target: Callable[..., T], settings: Mapping[str, Any], path: str, **given: Any) -> T:
     """Call ``target(**settings, **given)`` after checking ``settings`` against the types and ranges of its signature.
 
@@ -46,37 +55,49 @@ def construct(target: Callable[..., T], settings: Mapping[str, Any], path: str, 
     Raises:
         ConfigError: unknown or missing key, wrong type or value out of range.
     """
+    return bind(target, settings, path, *given)(**given)
+
+
+def bind(target: Callable[..., T], settings: Mapping[str, Any], path: str, *later: str) -> Callable[..., T]:
+    """``construct`` in two steps: checks the settings now, calls the target when the arguments ``later`` are known."""
     annotated = target.__init__ if inspect.isclass(target) and not is_dataclass(target) else target
     hints = get_type_hints(annotated, include_extras=True)
     fields: dict[str, Any] = {}
     for name, parameter in inspect.signature(target).parameters.items():
-        if name not in given:
+        if name not in later:
             default = ... if parameter.default is inspect.Parameter.empty else parameter.default
             fields[name] = (hints.get(name, Any), default)
     values = OmegaConf.to_container(settings, resolve=True) if isinstance(settings, DictConfig) else dict(settings)
     unknown = set(values) - set(fields)
     if unknown:
         raise ConfigError(f"{path}.{min(unknown)}: unknown key; valid keys: {', '.join(fields)}")
-    config = ConfigDict(extra="forbid", arbitrary_types_allowed=True, protected_namespaces=())
+    config = ConfigDict(extra="forbid", arbitrary_types_allowed=True, protected_namespaces=(), allow_inf_nan=False)
     checker = create_model("Settings", __config__=config, **fields)
     try:
         checked = checker(**values)
     except ValidationError as error:
         raise ConfigError(_one_line(error, path)) from None
-    try:
-        return target(**{name: getattr(checked, name) for name in fields}, **given)
-    except ValueError as error:
-        if isinstance(error, GpeError):
-            raise
-        raise ConfigError(f"{path}: {error}") from error
+
+    def call(**given: Any) -> T:
+        try:
+            return target(**{name: getattr(checked, name) for name in checked.model_fields_set}, **given)
+        except ValidationError as error:  # of a class that checks how its values fit together
+            raise ConfigError(_one_line(error, path)) from None
+        except ValueError as error:
+            if isinstance(error, GpeError):
+                raise
+            raise ConfigError(f"{path}: {error}") from error
+
+    return call
 
 
 def _one_line(error: ValidationError, path: str) -> str:
     parts = []
     for e in error.errors():
         key = ".".join([path, *(str(k) for k in e["loc"] if isinstance(k, (str, int)))])
-        value = "" if e["type"] == "missing" else f"={e['input']!r}"
-        message = e["msg"][0].lower() + e["msg"][1:]
+        value = f"={e['input']!r}" if e["loc"] and e["type"] != "missing" else ""
+        message = e["msg"].removeprefix("Value error, ")
+        message = message if message[:2].isupper() else message[0].lower() + message[1:]
         parts.append(f"{key}{value}: {message}")
     return "; ".join(dict.fromkeys(parts))
 
@@ -88,11 +109,14 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
     """
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], Any]:
-        verbose = os.environ.get("HYDRA_FULL_ERROR") == "1"
+        verbose, is_composed = os.environ.get("HYDRA_FULL_ERROR") == "1", False
 
         def run(cfg: DictConfig) -> Any:
+            nonlocal is_composed
+            is_composed = True
             try:
                 OmegaConf.resolve(cfg)
+                construct(Paths, cfg.paths, "paths")
                 return task(cfg)
             except (GpeError, OmegaConfBaseException) as error:
                 if verbose:
@@ -105,8 +129,8 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             os.environ["HYDRA_FULL_ERROR"] = "1"  # let exceptions reach us instead of Hydra's own report
             try:
                 return hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
-            except (HydraException, OmegaConfBaseException) as error:
-                if verbose:
+            except (HydraException, OmegaConfBaseException, ValueError) as error:
+                if verbose or (is_composed and isinstance(error, ValueError)):
                     raise
                 _fail(ConfigError(explain(error, config_name, sys.argv[1:])))
 
@@ -125,12 +149,14 @@ def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
     text = " ".join(str(error).split())
     match = re.search(r"Could not override '([^']+)'", text)
     if match is None:
-        return re.sub(r" ?Config search path:.*| ?Set the environment variable.*", "", text)
+        override = getattr(error, "override", None)  # of a syntax error
+        text = re.sub(r" ?Config search path:.*| ?Set the environment variable.*| See https://.*", "", text)
+        return f"{override}: {text}" if override and override not in text else text
     key = match.group(1).partition("@")[0].lstrip("+~")
     parent, _, leaf = key.rpartition(".")
-    if "Could not find" in text or "In '" in text:
+    if key.startswith("hydra."):
         return text
-    others = [o for o in overrides if "=" in o and not o.startswith(("-", "hydra")) and o.partition("=")[0].lstrip("+~") != key]
+    others = [_first_choice(o) for o in overrides if "=" in o and not o.startswith(("-", "hydra")) and o.partition("=")[0].lstrip("+~") != key]
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
@@ -139,19 +165,36 @@ def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
                 parent = parent.rpartition(".")[0]  # the misspelling is higher up
                 leaf = key.removeprefix(f"{parent}.").partition(".")[0]
             node = OmegaConf.select(node, parent) if parent else node
-            keys = ", ".join(sorted(str(k) for k in node))
+            keys = ", ".join(sorted({*map(str, node), *(() if parent else _groups(config_name))}))
     except (HydraException, OmegaConfBaseException):
         return text
     return f"{key}: unknown key {leaf!r}; valid keys{f' of {parent}' if parent else ''}: {keys}"
 
 
-def output_dir() -> Path:
-    """Folder of the running job."""
-    return Path(HydraConfig.get().runtime.output_dir)
+def _first_choice(override: str) -> str:
+    """The first of the values that an override sweeps over."""
+    parsed = OverridesParser.create().parse_override(override)
+    return f"{override.partition('=')[0]}={next(parsed.sweep_string_iterator())}" if parsed.is_sweep_override() else override
 
 
-class SweepReport(Callback):
-    """Aggregates the runs of a sweep when it ends: tables and figures in the sweep's folder."""
+def _groups(config_name: str) -> set[str]:
+    """The config groups that a command takes."""
+    defaults = OmegaConf.load(CONF / f"{config_name}.yaml").defaults
+    return {str(group) for entry in defaults if isinstance(entry, DictConfig) for group in entry}
+
+
+def output_dir(cfg: DictConfig) -> Path:
+    """Folder of the running job; without one, as in a notebook, that of a single run."""
+    return Path(HydraConfig.get().runtime.output_dir) if HydraConfig.initialized() else Path(cfg.paths.runs) / cfg.name
+
+
+class Report(Callback):
+    """Aggregates what a command has run, a single run or a sweep, when it ends: tables and figures in the folder of the results."""
+
+    def on_run_end(self, config: DictConfig, **_: Any) -> None:
+        from gpe_pl.report import report_sweep
+
+        report_sweep(Path(config.hydra.run.dir))
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         from gpe_pl.report import report_sweep

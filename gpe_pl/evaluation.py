@@ -20,6 +20,7 @@ from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
 from gpe_pl.rollout import Guard, Simulator, rollout, share_outside
 from gpe_pl.schema import Split
+from gpe_pl.schema import Split
 from gpe_pl.trajectory import Trajectory, iter_trajectories
 
 LEARNED = "learned"
@@ -67,6 +68,7 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     All rollouts start at the first frame with enough history and run to the end of the ground truth. Share outside with containment off is reported as
     ``share_outside_uncontained``, the share of corrected particle-steps as ``share_corrected``.
     """
+    run_dir.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     for split in settings.splits:
         curves: dict[str, list[np.ndarray]] = {label: [], "ballistic": [], "constant_velocity": []}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from gpe_pl.config import ConfigError, construct, entry_point, output_dir
+from gpe_pl.config import ConfigError, bind, construct, entry_point, output_dir
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -24,17 +24,17 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.training.module import TrainingModule
     from gpe_pl.training.run import LoggerSettings, TrainerSettings, TrainingSettings, claim, set_threads, train
 
-    if not (isinstance(cfg.seed, int) and cfg.seed >= 0):
+    if type(cfg.seed) is not int or cfg.seed < 0:
         raise ConfigError(f"seed={cfg.seed!r}: must be an integer of at least 0")
     training = construct(TrainingSettings, cfg.training, "training")
     trainer = construct(TrainerSettings, cfg.trainer, "trainer")
     evaluation = construct(EvaluationSettings, cfg.evaluation, "evaluation")
     graph = construct(GraphConfig, cfg.graph, "graph")
     logger = construct(LoggerSettings, cfg.logger, "logger")
-    model = {k: v for k, v in cfg.model.items() if k != "_target_"}
+    new_model = bind(model_class(cfg.model._target_), {k: v for k, v in cfg.model.items() if k != "_target_"}, "model", "spec")
     noise = Noise(training.noise, training.noise_std)
 
-    run_dir = output_dir()
+    run_dir = output_dir(cfg)
     root = ensure_data(cfg)
     settings = OmegaConf.to_container(cfg, resolve=True)
     claim(run_dir, {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training", "evaluation")})
@@ -42,8 +42,7 @@ def fit(cfg: DictConfig) -> float:
         set_threads(trainer)
         L.seed_everything(cfg.seed, verbose=False)
         datamodule = TrajectoryDataModule(root, graph, noise, training.batch_size, cfg.seed, trainer.num_workers)
-        network = construct(model_class(cfg.model._target_), model, "model", spec=datamodule.builder.spec)
-        simulator = LearnedSimulator(network, datamodule.builder)
+        simulator = LearnedSimulator(new_model(spec=datamodule.builder.spec), datamodule.builder)
         simulator.fit_statistics(datamodule.statistics_sample())
         names = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "compile")
         module = TrainingModule(simulator, **{n: getattr(training, n) for n in names})

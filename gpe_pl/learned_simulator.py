@@ -33,6 +33,10 @@ class CheckpointError(GpeError, ValueError):
     """A checkpoint is missing, damaged, or not one of gpe_pl; the message names the file and what to do."""
 
 
+class SceneError(GpeError, ValueError):
+    """A scene does not fit a trained simulator, or holds values that are not finite."""
+
+
 class GraphStandardizer(nn.Module):
     """Standardises every feature of a graph with training statistics; odd edge channels are only scaled, so they stay odd."""
 
@@ -112,20 +116,26 @@ class LearnedSimulator(nn.Module):
 
         Raises:
             IndexError: too few frames before ``frame``.
-            ValueError: a material parameter, position or velocity is not finite; names the node.
+            SceneError: another frame interval, dimension or material than in training, or a value that is not finite; names the node.
         """
+        own, scene = self.builder.metadata, trajectory.metadata
+        if abs(scene.frame_dt - own.frame_dt) > 1e-6 * own.frame_dt or scene.dim != own.dim or scene.param_names != own.param_names:
+            raise SceneError(
+                f"the model was trained with frame_dt={own.frame_dt:g} s in {own.dim}D on {', '.join(own.materials)}; "
+                f"the scene has frame_dt={scene.frame_dt:g} s in {scene.dim}D and {', '.join(scene.materials)}"
+            )
         state = trajectory.state(frame, history=self.builder.config.history).to_torch(self.acceleration_std.device)
         for name, values in (("pos", state.pos), ("velocity", state.velocity_history)):
             bad = ~torch.isfinite(values).flatten(1).all(dim=1)
             if bad.any():
-                raise ValueError(f"frame {frame}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
+                raise SceneError(f"frame {frame}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
         for material, spec in MATERIALS.items():
             if material in self.builder.metadata.materials:
                 rows = torch.nonzero(state.node_type == list(MATERIALS).index(material)).flatten()
                 column = state.material_params[rows, self.builder.metadata.param_names.index(spec.name)]
                 if not torch.isfinite(column).all():
                     node = int(rows[torch.nonzero(~torch.isfinite(column))[0]])
-                    raise ValueError(f"node {node} ({material}): {spec.name} [{spec.unit}] is not finite")
+                    raise SceneError(f"node {node} ({material}): {spec.name} [{spec.unit}] is not finite")
         return state
 
     @torch.inference_mode()
@@ -177,16 +187,18 @@ class LearnedSimulator(nn.Module):
         try:
             checkpoint = torch.load(path, map_location=device, weights_only=True)
         except Exception as error:  # torch raises many types for damaged or unsafe files
-            reason = str(error).strip().splitlines()[0][:200]
-            raise CheckpointError(f"{path}: not a safe, complete checkpoint ({type(error).__name__}: {reason})") from None
+            raise CheckpointError(f"{path}: not a safe, complete checkpoint ({_reason(error)})") from None
         try:
             simulator = cls.from_description(checkpoint["simulator"])
             weights = {k.removeprefix("simulator."): v for k, v in checkpoint["state_dict"].items() if k.startswith("simulator.")}
             simulator.load_state_dict(weights)
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-            reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
-            raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model: {reason}") from None
+            raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model ({_reason(error)})") from None
         return simulator.to(device).eval()
+
+
+def _reason(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
 
 
 class UnknownModelError(GpeError, ValueError):

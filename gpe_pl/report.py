@@ -77,6 +77,16 @@ def report_sweep(folder: Path) -> None:
         validation_loss_figure(curves).savefig(folder / "validation_loss.png", dpi=150)
 
 
+def summary(rows: list[Row]) -> str:
+    """Mean over trajectories of every metric, as plain text: one line per model, split, metric and horizon."""
+    groups: dict[tuple[str, str, str, str], list[float]] = defaultdict(list)
+    for row in rows:
+        for split in _groups(row):
+            groups[row.model, split, row.metric, row.horizon].append(row.value)
+    lines = [f"{model:18} {split:25} {metric:28} {horizon:>5} {np.mean(v):12.5g}" for (model, split, metric, horizon), v in groups.items()]
+    return "\n".join([f"{'model':18} {'split':25} {'metric':28} {'frame':>5} {'mean':>12}", *lines])
+
+
 def _column(axis: str) -> str:
     return axis.rpartition(".")[2]
 

@@ -85,3 +85,11 @@ def _one_thread() -> None:
     import torch
 
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def tiny_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A generated data set for training runs of seconds (``tests.runs``); shared, so never written to."""
+    from tests.runs import generate_tiny
+
+    return generate_tiny(tmp_path_factory.mktemp("data"))

@@ -66,7 +66,7 @@ def state(
 
 def builder(materials: tuple[str, ...] = ("sand",), dim: int = 2, **config: object) -> GraphBuilder:
     """A graph builder for such states."""
-    return GraphBuilder(GraphConfig(**config), metadata(materials, dim))  # type: ignore[arg-type]
+    return GraphBuilder(GraphConfig(**{"history": 1, **config}), metadata(materials, dim))  # type: ignore[arg-type]
 
 
 def graph(materials: tuple[str, ...] = ("sand",), dtype: torch.dtype = torch.float64, **settings: object) -> HeteroData:
@@ -96,3 +96,12 @@ def permuted(s: State, order: np.ndarray) -> State:
         material_params=s.material_params[order],
         velocity_history=s.velocity_history[order],
     )
+
+
+def assert_equal_graphs(a: HeteroData, b: HeteroData) -> None:
+    """Equal stores with equal values, bit for bit."""
+    assert (a.node_types, a.edge_types) == (b.node_types, b.edge_types)
+    for store, other in zip(a.stores, b.stores, strict=True):
+        assert set(store.keys()) == set(other.keys())
+        for key, value in store.items():
+            assert torch.equal(torch.as_tensor(value), torch.as_tensor(other[key])), key

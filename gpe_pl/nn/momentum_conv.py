@@ -85,7 +85,7 @@ class MomentumConv(MessagePassing):
         if self.implementation == "plain":
             terms = {"a": (h_source, h_target), "b": (None, None), "e": e, "s": s}
         else:
-            a, b, w, v = self.lin_in.weight.split(self.widths, dim=1)
+            a, b, w, _ = self.lin_in.weight.split(self.widths, dim=1)
             both = self.interaction != "negated"  # also z_ji is needed
             at = functional.linear(h_target, a, self.lin_in.bias)
             bs = functional.linear(h_source, b)
@@ -96,7 +96,7 @@ class MomentumConv(MessagePassing):
                 "a": (as_, at),
                 "b": (bs, bt),
                 "e": functional.linear(e, w),
-                "s": functional.linear(s, v) if self.is_odd and self.widths[3] else None,
+                "s": s if self.is_odd and self.widths[3] else None,
             }
         return self.propagate(edge_index, size=size, with_messages=with_messages, **terms)
 
@@ -105,20 +105,32 @@ class MomentumConv(MessagePassing):
         self, a_i: Optional[Tensor], a_j: Optional[Tensor], b_i: Optional[Tensor], b_j: Optional[Tensor], e: Tensor, s: Optional[Tensor]
     ) -> tuple[Tensor, Optional[Tensor]]:
         """φ(z_ij), and φ(z_ji) where the interaction needs it."""
-        hidden = self._hidden_plain if self.implementation == "plain" else self._hidden_factored
+        if self.implementation == "plain":
+            return self._odd_plain(a_i, a_j, e, s) if self.is_odd else self._plain(a_i, a_j, e)
         if self.interaction == "negated":
-            return hidden(a_i, b_j, a_j, e, s, 1), None
+            return self._factored(a_i, b_j, e, s), None
         forward, reverse, sign = (*e.chunk(2), 1) if self.interaction == "directed" else (e, e, -1)
-        return hidden(a_i, b_j, a_j, forward, s, 1), hidden(a_j, b_i, a_i, reverse, s, sign)
+        return self._factored(a_i, b_j, forward, s), self._factored(a_j, b_i, reverse, s, sign)
 
-    def _hidden_plain(self, h_self: Tensor, _: Tensor | None, h_other: Tensor, e: Tensor, s: Tensor, sign: int) -> Tensor:
-        e = e if sign == 1 else -e
-        return self.act(self.lin_in(torch.cat([h_self, h_other, e, s] if self.is_odd else [h_self, h_other, e], dim=1)))
+    def _plain(self, h_i: Tensor, h_j: Tensor, e: Tensor) -> tuple[Tensor, Tensor | None]:
+        if self.interaction == "negated":
+            return self.act(self.lin_in(torch.cat([h_i, h_j, e], dim=1))), None
+        forward, reverse = e.chunk(2)
+        return self.act(self.lin_in(torch.cat([h_i, h_j, forward], dim=1))), self.act(self.lin_in(torch.cat([h_j, h_i, reverse], dim=1)))
 
-    def _hidden_factored(self, a_self: Tensor, b_other: Tensor, _: Tensor | None, e: Tensor, s: Tensor | None, sign: int) -> Tensor:
+    def _odd_plain(self, h_i: Tensor, h_j: Tensor, e: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+        """z_ij and z_ji as even part ± odd part, so that even without factoring every edge is multiplied once."""
+        a, b, w, v = self.lin_in.weight.split(self.widths, dim=1)
+        even = functional.linear(torch.cat([h_i + h_j, s], dim=1), torch.cat([(a + b) / 2, v], dim=1), self.lin_in.bias)
+        odd = functional.linear(torch.cat([h_i - h_j, e], dim=1), torch.cat([(a - b) / 2, w], dim=1))
+        return self.act(even + odd), self.act(even - odd)
+
+    def _factored(self, a_self: Tensor, b_other: Tensor, e: Tensor, s: Tensor | None, sign: int = 1) -> Tensor:
         z = a_self + b_other
         z.add_(e, alpha=sign)  # in place: at these sizes a new buffer costs more than the sum
-        return self.act(z if s is None else z.add_(s))
+        if s is not None:
+            z.addmm_(s, self.lin_in.weight[:, -self.widths[3] :].t())
+        return self.act(z)
 
     def aggregate(
         self,

@@ -67,7 +67,7 @@ def synthetic_graph(num_nodes: int, num_edges: int, seed: int = 0) -> tuple[Grap
         Boundary.empty(2),
         np.array(metadata.gravity),
     )
-    builder = GraphBuilder(GraphConfig(), metadata)
+    builder = GraphBuilder(GraphConfig(history=1), metadata)
     return builder, builder(state.to_torch())
 
 

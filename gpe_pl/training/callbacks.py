@@ -23,8 +23,10 @@ class WarmAverage(WeightAveraging):
     def __init__(self, decay: float = 0.999) -> None:
         def average(averaged: list[torch.Tensor], current: list[torch.Tensor], num_averaged: Any) -> None:
             n = int(num_averaged)
-            floats = [(a, c) for a, c in zip(averaged, current, strict=True) if a.is_floating_point()]
-            torch._foreach_lerp_([a for a, _ in floats], [c for _, c in floats], 1 - min(decay, (1 + n) / (10 + n)))
+            if averaged[0].is_floating_point():  # all of one call have one type
+                torch._foreach_lerp_(averaged, current, 1 - min(decay, (1 + n) / (10 + n)))
+            else:
+                torch._foreach_copy_(averaged, current)
 
         super().__init__(multi_avg_fn=average)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,6 +13,7 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint, TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger, Logger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
 from gpe_pl.data.datamodule import TrajectoryDataModule
@@ -66,11 +67,10 @@ class LoggerSettings:
     kind: Literal["csv", "wandb"] = "csv"
     project: str = "gpe_pl"
     mode: Literal["online", "offline", "disabled"] | None = None
-    extra: dict[str, Any] = field(default_factory=dict)
 
     def loggers(self, run_dir: Path) -> list[Logger]:
         """CSV under ``run_dir/log``, one version per start of the run, and W&B if asked for (offline without an API key)."""
-        loggers: list[Logger] = [CSVLogger(run_dir, name="log", flush_logs_every_n_steps=200)]
+        loggers: list[Logger] = [CSVLogger(run_dir, name="log", flush_logs_every_n_steps=1)]
         if self.kind == "wandb":
             from lightning.pytorch.loggers import WandbLogger
 
@@ -89,14 +89,14 @@ def run_id(run_dir: Path) -> str:
 
 
 def claim(run_dir: Path, config: dict[str, Any]) -> None:
-    """Take a folder for a run with this configuration.
+    """Take a folder for a run with this configuration; one that has saved nothing yet leaves the folder free.
 
     Raises:
         RunError: the folder holds a run with another configuration; names the first differing key.
     """
     run_dir.mkdir(parents=True, exist_ok=True)
     path = run_dir / "config.json"
-    if path.exists():
+    if path.exists() and any((run_dir / name).exists() for name in ("checkpoints/last.ckpt", "metrics.csv")):
         try:
             before = json.loads(path.read_text())
         except json.JSONDecodeError:
@@ -148,27 +148,31 @@ def train(
     ]
     if trainer_settings.progress:
         callbacks.append(TQDMProgressBar(refresh_rate=50))
-    trainer = L.Trainer(
-        accelerator=trainer_settings.accelerator,
-        devices=trainer_settings.devices,
-        max_steps=training.num_steps,
-        max_epochs=-1,
-        val_check_interval=min(training.val_interval, training.num_steps),
-        check_val_every_n_epoch=None,
-        gradient_clip_val=training.gradient_clip,
-        num_sanity_val_steps=0,
-        callbacks=callbacks,
-        logger=loggers,
-        log_every_n_steps=min(50, training.num_steps),
-        enable_progress_bar=trainer_settings.progress,
-        enable_model_summary=False,
-    )
+    try:
+        trainer = L.Trainer(
+            accelerator=trainer_settings.accelerator,
+            devices=trainer_settings.devices,
+            max_steps=training.num_steps,
+            max_epochs=-1,
+            val_check_interval=min(training.val_interval, training.num_steps),
+            check_val_every_n_epoch=None,
+            gradient_clip_val=training.gradient_clip,
+            num_sanity_val_steps=0,
+            callbacks=callbacks,
+            logger=loggers,
+            log_every_n_steps=min(50, training.num_steps),
+            enable_progress_bar=trainer_settings.progress,
+            enable_model_summary=False,
+        )
+    except MisconfigurationException as error:
+        raise RunError(f"trainer.accelerator={trainer_settings.accelerator}, trainer.devices={trainer_settings.devices}: {error}") from None
     if last.exists():
         log.info("resuming from %s", last)
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    trainer.fit(module, datamodule, ckpt_path=str(last) if last.exists() else None, weights_only=True)
-    if trainer.interrupted:
-        raise RunError(f"interrupted; run the same command again to resume from {last}")
+    try:
+        trainer.fit(module, datamodule, ckpt_path=str(last) if last.exists() else None, weights_only=True)
+    except SystemExit:  # Lightning's answer to Ctrl-C
+        raise RunError(f"interrupted; run the same command again to resume from {last}") from None
     return folder / "best.ckpt"
 
 

@@ -1,0 +1,44 @@
+"""Copy results of runs into ``docs/results`` and the tables there into the README, so that no number is typed by hand.
+
+``python docs/embed_results.py RUN_FOLDER NAME`` takes the table, the figures and the first animation of a finished run or sweep;
+``python docs/embed_results.py`` only renews the README; ``--check`` fails if the README differs from ``docs/results``.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parent
+README = DOCS.parent / "README.md"
+BLOCK = re.compile(r"(<!-- begin (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+FILES = ("table.md", "table.csv", "validation_loss.png", "metrics.csv", "config.json", "results.json", "error_curve_*.png", "rollout_test_*.png", "rollout_*_00.gif")
+
+
+def embedded(text: str) -> str:
+    """The text with every marked block replaced by the file that it names."""
+    return BLOCK.sub(lambda m: m[1] + (DOCS.parent / m[2]).read_text().rstrip() + "\n" + m[3], text)
+
+
+def collect(run: Path, name: str) -> None:
+    """Copy what is worth citing of a run into ``docs/results/{name}``."""
+    target = DOCS / "results" / name
+    target.mkdir(parents=True, exist_ok=True)
+    for pattern in FILES:
+        for path in sorted(run.glob(pattern)):
+            shutil.copy(path, target / path.name)
+
+
+def main(arguments: list[str]) -> int:
+    if arguments == ["--check"]:
+        return int(embedded(README.read_text()) != README.read_text())
+    if arguments:
+        collect(Path(arguments[0]), arguments[1])
+    README.write_text(embedded(README.read_text()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

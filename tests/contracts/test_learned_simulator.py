@@ -1,0 +1,345 @@
+"""A learned model as a simulator: the oracle through its integrator, the same graph as in training, checkpoints that are safe to open."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gpe_pl import integrators
+from gpe_pl.containment import Contained
+from gpe_pl.data.dataset import WindowDataset, open_split
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator, UnknownModelError, model_class
+from gpe_pl.models.gpe import GPE
+from gpe_pl.rollout import Guard, rollout
+from gpe_pl.trajectory import State, Trajectory, iter_trajectories, write_shard
+from tests import scenes
+
+HISTORIES = (1, 2, 5)
+
+
+def builder_of(trajectory: Trajectory, history: int = 2, **config: Any) -> GraphBuilder:
+    return GraphBuilder(GraphConfig(history=history, **config), trajectory.metadata)
+
+
+def learned(build: GraphBuilder, seed: int = 0, **settings: Any) -> LearnedSimulator:
+    torch.manual_seed(seed)
+    return LearnedSimulator(GPE(build.spec, **{"num_message_passing_steps": 2, "hidden_channels": 8, **settings}), build).eval()
+
+
+def silenced(simulator: LearnedSimulator) -> LearnedSimulator:
+    """The same simulator with a network that always answers zero."""
+    with torch.no_grad():
+        for p in simulator.model.parameters():
+            p.zero_()
+    return simulator
+
+
+@pytest.mark.parametrize("history", HISTORIES)
+def test_oracle(new_trajectory: Callable[..., Trajectory], history: int) -> None:
+    """Signature test: true accelerations through the learned simulator's integrator are the ground truth."""
+    truth = new_trajectory(num_frames=120)
+    simulator = learned(builder_of(truth, history))
+    dt, pos = truth.metadata.frame_dt, truth.pos.astype(np.float64)
+    vel = integrators.velocities(pos, dt)
+    acc = integrators.acceleration(vel[1:], vel[:-1], dt)  # acc[k] takes frame k + 1 to k + 2
+
+    class Oracle:
+        def step(self, state: State) -> State:
+            frame = round(state.time / dt)
+            return simulator.advance(state, torch.from_numpy(acc[frame - 1]))
+
+    start = simulator.initial_state(truth, history)
+    result = rollout(Oracle(), start, truth.num_frames - 1 - history, truth.metadata)
+    assert result.num_frames == truth.num_frames - history
+    np.testing.assert_allclose(result.pos, pos[history:], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(result.vel, vel[history - 1 :], rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("features", ["paper", "contact"])
+@pytest.mark.parametrize("history", HISTORIES)
+def test_training_and_rollout_build_the_same_graph(
+    tmp_path: Path, new_trajectory: Callable[..., Trajectory], history: int, features: Any
+) -> None:
+    """Signature test: all stores of a training item without noise equal, bit for bit, those that the rollout builds from the same frames."""
+    write_shard(tmp_path / "long" / "train" / "shard-00000.h5", [new_trajectory(k, num_frames=history + 4) for k in range(2)])
+    trajectories = list(iter_trajectories(tmp_path / "long", "train"))
+    simulator = learned(builder_of(trajectories[0], history, features=features))
+    seen: list[Any] = []
+    simulator.model.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    windows = WindowDataset(open_split(tmp_path / "long", "train"), simulator.builder)
+    for k in range(len(windows)):
+        item = windows[k]
+        state = simulator.initial_state(trajectories[item.trajectory], item.frame)
+        built = simulator.builder(state)
+        bare = item.clone()
+        del bare.trajectory, bare.frame
+        for material in simulator.builder.spec.materials:
+            del bare[material].target
+        scenes.assert_equal_graphs(bare, built)
+        simulator.step(state)  # the graph that the model itself sees
+        scenes.assert_equal_graphs(seen.pop(), simulator.standardizer(bare))
+    assert len(windows) == 2 * 3
+
+
+@pytest.mark.parametrize("history", HISTORIES)
+def test_a_step_shifts_the_history(history: int) -> None:
+    build = scenes.builder(history=history)
+    simulator = learned(build)
+    state = scenes.state(history=history).to_torch()
+    after = simulator.step(state)
+    assert after.velocity_history is not None
+    assert state.velocity_history is not None
+    assert after.velocity_history.shape == state.velocity_history.shape
+    assert torch.equal(after.velocity_history[:, :-1], state.velocity_history[:, 1:])
+    assert torch.equal(after.velocity_history[:, -1], after.vel)
+    dt = build.metadata.frame_dt
+    torch.testing.assert_close(after.pos, state.pos + dt * after.vel, rtol=0, atol=1e-15)
+    assert after.time == pytest.approx(dt)
+    assert not torch.equal(after.vel, state.vel + dt * state.gravity)  # the network answered
+
+
+@pytest.mark.parametrize("materials", [("sand",), ("sand", "snow")])
+def test_a_silent_network_falls_freely(materials: tuple[str, ...]) -> None:
+    build = scenes.builder(materials, history=1)
+    simulator = silenced(learned(build))
+    simulator.acceleration_std.fill_(123.0)
+    state = scenes.state(30, materials).to_torch()
+    dt, steps = build.metadata.frame_dt, 20
+    after = state
+    for _ in range(steps):
+        after = simulator.step(after)
+    n = torch.tensor(steps, dtype=torch.float64)
+    torch.testing.assert_close(after.vel, state.vel + n * dt * state.gravity, rtol=1e-12, atol=1e-12)
+    expected = state.pos + n * dt * state.vel + dt**2 * state.gravity * n * (n + 1) / 2  # symplectic Euler
+    torch.testing.assert_close(after.pos, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_the_networks_answer_is_in_units_of_the_acceleration_scale() -> None:
+    build = scenes.builder(("sand", "snow"), history=1)
+    simulator = learned(build)
+    state = scenes.state(30, ("sand", "snow")).to_torch()
+    weak = simulator.step(state).vel
+    free = state.vel + build.metadata.frame_dt * state.gravity
+    simulator.acceleration_std.fill_(10.0)
+    torch.testing.assert_close(simulator.step(state).vel - free, 10 * (weak - free), rtol=1e-6, atol=1e-12)
+
+
+def test_standardizing_leaves_the_graph_as_it_is() -> None:
+    build = scenes.builder(("sand", "fluid"), history=1)
+    graph = build(scenes.state(30, ("sand", "fluid")).to_torch())
+    before = graph.clone()
+    simulator = learned(build)
+    simulator.standardizer.fit([graph])
+    simulator(graph)
+    scenes.assert_equal_graphs(graph, before)
+
+
+def test_statistics_make_features_and_targets_of_order_one() -> None:
+    build = scenes.builder(("sand", "fluid"), history=1)
+    graphs = [build(scenes.state(60, ("sand", "fluid"), seed=k).to_torch()) for k in range(3)]
+    for graph in graphs:
+        for m in ("sand", "fluid"):
+            graph[m].target = 7.0 * torch.randn(graph[m].x.shape[0], 2, generator=torch.Generator().manual_seed(0))
+    simulator = learned(build)
+    simulator.fit_statistics(graphs)
+    targets = torch.cat([g[m].target for g in graphs for m in ("sand", "fluid")])
+    assert float(simulator.acceleration_std) == pytest.approx(float(targets.square().mean().sqrt()), rel=1e-6)
+    standard = [simulator.standardizer(g) for g in graphs]
+    odd = torch.cat([g["sand", "radius", "fluid"].odd for g in standard])
+    torch.testing.assert_close(odd.square().mean(0), torch.ones(6), rtol=1e-4, atol=1e-4)
+    params = torch.cat([g["fluid"].material_params for g in standard])  # log scale
+    assert float(params.mean()) == pytest.approx(0, abs=1e-4)
+    assert float(params.std()) == pytest.approx(1, rel=0.02)
+    assert float(torch.cat([g[m].mass for g in standard for m in ("sand", "fluid")]).mean()) == pytest.approx(1, rel=1e-5)
+
+
+@pytest.mark.parametrize("value", [0.0, float("nan")])
+def test_targets_that_teach_nothing_are_refused(value: float) -> None:
+    build = scenes.builder(history=1)
+    graph = build(scenes.state().to_torch())
+    graph["sand"].target = torch.full((40, 2), value)
+    with pytest.raises(ValueError, match="nothing to learn from"):
+        learned(build).fit_statistics([graph])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: replace(t, pos=_with(t.pos, (3, 5, 0), np.nan)), "frame 3: node 5 has a pos that is not finite"),
+        (lambda t: replace(t, pos=_with(t.pos, (2, 5, 0), np.inf)), "frame 3: node 5 has a velocity that is not finite"),
+        (lambda t: replace(t, material_params=_with(t.material_params, (4, 0), np.nan)), r"node 4 \(sand\): friction_angle \[deg\] is not finite"),
+    ],
+)
+def test_an_initial_state_that_is_not_finite_names_the_node(trajectory: Trajectory, change: Callable[[Trajectory], Trajectory], message: str) -> None:
+    simulator = learned(builder_of(trajectory))
+    with pytest.raises(ValueError, match=message):
+        simulator.initial_state(change(trajectory), 3)
+    with pytest.raises(IndexError):
+        simulator.initial_state(trajectory, 1)
+
+
+def _with(array: np.ndarray, index: tuple[int, ...], value: float) -> np.ndarray:
+    array = array.copy()
+    array[index] = value
+    return array
+
+
+def test_a_contained_rollout_ends_inside_and_a_guarded_one_with_a_reason(trajectory: Trajectory) -> None:
+    simulator = silenced(learned(builder_of(trajectory)))
+    start = simulator.initial_state(trajectory, 2)
+    free = rollout(simulator, start, 200, trajectory.metadata, Guard(bounds=trajectory.metadata.bounds, margin=1.0))
+    assert free.termination is not None
+    assert free.termination.reason == "escape"
+    contained = Contained(simulator, trajectory.metadata.frame_dt)
+    inside = rollout(contained, start, 50, trajectory.metadata, Guard(bounds=trajectory.metadata.bounds, margin=1e-5))
+    assert inside.termination is None
+    assert contained.share_corrected > 0
+
+
+# --- checkpoints ---------------------------------------------------------------------------------------------------------------------------
+
+
+def save(simulator: LearnedSimulator, path: Path, /, **changes: Any) -> Path:
+    weights = {f"simulator.{k}": v for k, v in simulator.state_dict().items()}
+    torch.save({"simulator": simulator.description(), "state_dict": weights, **changes}, path)
+    return path
+
+
+@pytest.fixture
+def simulator() -> LearnedSimulator:
+    build = scenes.builder(("sand", "snow"), history=2)
+    simulator = learned(build, interaction="odd", decoder="pair")
+    graph = build(scenes.state(40, ("sand", "snow"), history=2).to_torch())
+    for m in ("sand", "snow"):
+        graph[m].target = torch.full_like(graph[m].x[:, :2], 3.0)
+    simulator.fit_statistics([graph])
+    return simulator
+
+
+def test_a_checkpoint_rebuilds_the_simulator(simulator: LearnedSimulator, tmp_path: Path) -> None:
+    again = LearnedSimulator.from_checkpoint(save(simulator.train(), tmp_path / "a.ckpt"))
+    assert not again.training
+    assert again.builder == simulator.builder
+    assert again.model.settings == simulator.model.settings
+    assert again.description() == simulator.description()
+    state = scenes.state(40, ("sand", "snow"), history=2).to_torch()
+    a, b = simulator.eval().step(state), again.step(state)
+    assert torch.equal(a.pos, b.pos)
+    assert torch.equal(a.vel, b.vel)
+    assert float(again.acceleration_std) == pytest.approx(3.0)
+
+
+def test_a_description_is_plain_values(simulator: LearnedSimulator) -> None:
+    def check(value: Any) -> None:
+        if isinstance(value, dict):
+            [check(v) for v in (*value.keys(), *value.values())]
+        elif isinstance(value, (list, tuple)):
+            [check(v) for v in value]
+        else:
+            assert value is None or type(value) in (str, int, float, bool)
+
+    check(simulator.description())
+    assert LearnedSimulator.from_description(simulator.description()).builder == simulator.builder
+
+
+class Payload:
+    """Creates a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("writer", [torch.save, lambda value, path: Path(path).write_bytes(pickle.dumps(value))], ids=["torch", "pickle"])
+def test_code_in_a_checkpoint_does_not_run(simulator: LearnedSimulator, tmp_path: Path, writer: Callable[[Any, Path], Any]) -> None:
+    trace, path = tmp_path / "trace", tmp_path / "evil.ckpt"
+    writer({"simulator": Payload(trace), "state_dict": {}}, path)
+    with pytest.raises(CheckpointError, match="evil.ckpt: not a safe, complete checkpoint"):
+        LearnedSimulator.from_checkpoint(path)
+    assert not trace.exists()
+    torch.load(path, weights_only=False) if writer is torch.save else pickle.loads(path.read_bytes())
+    assert trace.exists()  # the payload works
+
+
+@pytest.mark.parametrize("case", ["missing", "folder", "text", "empty", "truncated", "flipped"])
+def test_a_damaged_checkpoint_is_named(simulator: LearnedSimulator, tmp_path: Path, case: str) -> None:
+    path = save(simulator, tmp_path / "a.ckpt")
+    content = path.read_bytes()
+    path.unlink()
+    if case == "folder":
+        path.mkdir()
+    elif case != "missing":
+        middle = content[:2000] + bytes(b ^ 0xFF for b in content[2000:2400]) + content[2400:]
+        path.write_bytes({"text": b"hello\n", "empty": b"", "truncated": content[: len(content) // 2], "flipped": middle}[case])
+    with pytest.raises(CheckpointError, match="a.ckpt: (no such|not a safe|not a) ") as caught:
+        LearnedSimulator.from_checkpoint(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"simulator": 3}, "not a checkpoint of gpe_pl"),
+        ({"simulator": {}}, "format None, this version reads 1"),
+        ({"simulator": {"format": 2}}, "format 2, this version reads 1"),
+        ({"simulator": {"format": 1}}, "KeyError: 'graph'"),
+        ({"state_dict": {}}, "Missing key"),
+    ],
+)
+def test_a_checkpoint_of_something_else_says_so(simulator: LearnedSimulator, tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(CheckpointError, match=message):
+        LearnedSimulator.from_checkpoint(save(simulator, tmp_path / "a.ckpt", **changes))
+
+
+@pytest.mark.parametrize("content", [torch.zeros(3), [1, 2], {}, 5, "text", None])
+def test_a_file_of_torch_that_is_no_checkpoint_says_so(tmp_path: Path, content: Any) -> None:
+    torch.save(content, tmp_path / "a.ckpt")
+    with pytest.raises(CheckpointError, match="not a checkpoint of gpe_pl"):
+        LearnedSimulator.from_checkpoint(tmp_path / "a.ckpt")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("settings", {"hidden_channels": 16}, "size mismatch"),
+        ("settings", {"width": 8}, "unexpected keyword argument 'width'"),
+        ("graph", {"history": 3}, "size mismatch"),
+        ("metadata", {"dataset": "x"}, "missing"),
+        ("model", "os.system", "not one of gpe_pl.models"),
+        ("model", "gpe_pl.models.gpe.torch", "is not a model"),
+        ("model", "gpe_pl.models.gpe.Nothing", "does not exist"),
+        ("model", "gpe_pl.models.nothing.GPE", "does not exist"),
+    ],
+)
+def test_a_description_of_another_model_is_refused(simulator: LearnedSimulator, tmp_path: Path, key: str, value: Any, message: str) -> None:
+    description = simulator.description()
+    if key == "settings":
+        value = {**description["settings"], **value}
+    with pytest.raises(CheckpointError, match=message):
+        LearnedSimulator.from_checkpoint(save(simulator, tmp_path / "a.ckpt", simulator={**description, key: value}))
+
+
+def test_only_models_of_the_package_are_looked_up() -> None:
+    assert model_class("gpe_pl.models.gpe.GPE") is GPE
+    for name in ("torch.nn.Linear", "gpe_pl.nn.blocks.MLP", "GPE", ""):
+        with pytest.raises(UnknownModelError):
+            model_class(name)
+
+
+def test_gradients_reach_the_model_through_the_standardized_graph(simulator: LearnedSimulator) -> None:
+    graph = simulator.builder(scenes.state(40, ("sand", "snow"), history=2).to_torch())
+    loss: Tensor = sum(v.square().sum() for v in simulator(graph).values())  # type: ignore[assignment]
+    loss.backward()
+    assert sum(float(p.grad.abs().sum()) for p in simulator.parameters() if p.grad is not None) > 0

@@ -1,0 +1,41 @@
+"""Every experiment composes, has a name of its own, and trains and evaluates on data of seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gpe_pl.config import CONF
+from gpe_pl.evaluation import read_rows
+from gpe_pl.fit import fit
+from tests.runs import compose, first_choices, tiny
+
+EXPERIMENTS = sorted(p.stem for p in (CONF / "experiment").glob("*.yaml"))
+
+
+def test_there_are_experiments() -> None:
+    assert {"ablation_momentum", "sand"} <= set(EXPERIMENTS)
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_an_experiment_states_its_own_name(experiment: str) -> None:
+    assert compose("fit", f"experiment={experiment}").name == experiment
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_an_experiment_trains_and_evaluates(experiment: str, tiny_data: Path, tmp_path: Path) -> None:
+    cfg = tiny(tiny_data, tmp_path, f"experiment={experiment}", *first_choices(experiment))
+    value = fit(cfg)
+    rows = list(read_rows(tmp_path / experiment / "metrics.csv"))
+    assert {r.split for r in rows} == set(cfg.evaluation.splits)
+    full = [r.value for r in rows if (r.model, r.split, r.metric, r.horizon) == ("learned", cfg.evaluation.splits[0], "rollout_mse", "full")]
+    assert value == pytest.approx(sum(full) / len(full))
+    assert 0 < value < 10
+
+
+def test_the_ablation_sweeps_every_interaction_over_seeds() -> None:
+    hydra = compose("fit", "experiment=ablation_momentum", hydra_config=True).hydra
+    assert hydra.mode.name == "MULTIRUN"
+    assert hydra.sweeper.params["model.interaction"].split(",") == ["directed", "negated", "odd", "odd_even"]
+    assert len(str(hydra.sweeper.params.seed).split(",")) >= 2

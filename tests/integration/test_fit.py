@@ -1,0 +1,290 @@
+"""``fit`` from start to end: resuming is exact, finished runs stay, folders are not mixed, bad numbers stop early, sweeps are reported."""
+
+from __future__ import annotations
+
+import csv
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import DictConfig
+
+from gpe_pl.data.datamodule import TrajectoryDataModule
+from gpe_pl.evaluation import read_rows
+from gpe_pl.fit import fit
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.report import report_sweep, validation_curve
+from gpe_pl.training.module import TrainingError, TrainingModule
+from gpe_pl.training.run import RunError, claim
+from gpe_pl.trajectory import StoreError
+from tests.runs import tiny
+
+STEPS = ("training.num_steps=6", "training.val_interval=2", "training.warmup_steps=2")
+
+
+class Killed(BaseException):
+    """Stands for the end of the process."""
+
+
+@pytest.fixture
+def losses(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[float]]:
+    """Training losses by step, one per time that the step was taken."""
+    seen: dict[int, list[float]] = {}
+    plain = TrainingModule.training_step
+
+    def training_step(self: TrainingModule, batch: Any, batch_idx: int) -> torch.Tensor:
+        loss = plain(self, batch, batch_idx)
+        seen.setdefault(self.global_step, []).append(loss.item())
+        return loss
+
+    monkeypatch.setattr(TrainingModule, "training_step", training_step)
+    return seen
+
+
+def interrupt(patch: pytest.MonkeyPatch, step: int, error: type[BaseException]) -> None:
+    """Training steps raise when they reach this step."""
+    plain = TrainingModule.loss
+
+    def loss(self: TrainingModule, batch: Any) -> torch.Tensor:
+        if self.global_step == step:
+            raise error
+        return plain(self, batch)
+
+    patch.setattr(TrainingModule, "loss", loss)
+
+
+def checkpoint(cfg: DictConfig, name: str = "last") -> dict[str, Any]:
+    return torch.load(Path(cfg.paths.runs) / cfg.name / "checkpoints" / f"{name}.ckpt", weights_only=True)
+
+
+def assert_equal(a: Any, b: Any, path: str = "") -> None:
+    """Nested values with tensors, bit for bit."""
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), path
+        for key in a:
+            assert_equal(a[key], b[key], f"{path}.{key}")
+    elif isinstance(a, (list, tuple)):
+        assert len(a) == len(b), path
+        for k, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_equal(x, y, f"{path}[{k}]")
+    elif isinstance(a, torch.Tensor):
+        assert a.dtype == b.dtype, path
+        assert a.numpy().tobytes() == b.numpy().tobytes(), path
+    else:
+        assert a == b, path
+
+
+STATE = ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers", "global_step", "simulator")
+
+
+@pytest.mark.parametrize("killed_at", [1, 3, 5])
+def test_a_resumed_run_equals_an_uninterrupted_one(
+    tiny_data: Path, tmp_path: Path, losses: dict[int, list[float]], killed_at: int
+) -> None:
+    whole = tiny(tiny_data, tmp_path, "name=whole", *STEPS)
+    value = fit(whole)
+    expected = {step: taken[0] for step, taken in losses.items()}
+    assert sorted(expected) == list(range(6))
+    losses.clear()
+
+    parts = tiny(tiny_data, tmp_path, "name=parts", *STEPS)
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt(patch, killed_at, Killed)
+        with pytest.raises(Killed):
+            fit(parts)
+    saved = killed_at // 2 * 2
+    assert (tmp_path / "parts" / "checkpoints" / "last.ckpt").exists() == (saved > 0)
+    assert not (tmp_path / "parts" / "metrics.csv").exists()
+    assert fit(parts) == value
+    again = [step for step in range(6) if len(losses[step]) == 2]
+    assert again == list(range(saved, killed_at))  # only what came after the last checkpoint is done again
+    assert {step: set(taken) for step, taken in losses.items()} == {step: {loss} for step, loss in expected.items()}
+    for name in ("last", "best"):
+        a, b = checkpoint(whole, name), checkpoint(parts, name)
+        assert set(STATE) <= set(a)
+        assert_equal({k: a[k] for k in STATE}, {k: b[k] for k in STATE})
+    assert_equal(*([v.tolist() for v in validation_curve(tmp_path / name)] for name in ("whole", "parts")))
+    assert len(validation_curve(tmp_path / "whole")[0]) == 3
+    assert (tmp_path / "whole" / "metrics.csv").read_bytes() == (tmp_path / "parts" / "metrics.csv").read_bytes()
+
+
+@pytest.mark.slow
+def test_worker_processes_change_no_weight(tiny_data: Path, tmp_path: Path) -> None:
+    configs = [tiny(tiny_data, tmp_path, f"name=workers{n}", f"trainer.num_workers={n}", *STEPS) for n in (0, 2)]
+    values = [fit(cfg) for cfg in configs]
+    assert values[0] == values[1]
+    assert_equal(*(checkpoint(cfg)["state_dict"] for cfg in configs))
+
+
+def test_the_seed_matters_and_nothing_else_is_random(tiny_data: Path, tmp_path: Path) -> None:
+    configs = [tiny(tiny_data, tmp_path, f"name=run{k}", f"seed={seed}") for k, seed in enumerate((0, 0, 1))]
+    values = [fit(cfg) for cfg in configs]
+    assert values[0] == values[1] != values[2]
+
+
+def test_a_run_killed_while_evaluating_trains_no_further(tiny_data: Path, tmp_path: Path, losses: dict[int, list[float]]) -> None:
+    cfg = tiny(tiny_data, tmp_path)
+    value = fit(cfg)
+    (tmp_path / "fit" / "metrics.csv").unlink()
+    losses.clear()
+    assert fit(cfg) == value
+    assert not losses
+
+
+def test_a_finished_run_is_left_as_it_is(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cfg = tiny(tiny_data, tmp_path)
+    value = fit(cfg)
+    files = {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in tmp_path.rglob("*") if p.is_file()}
+    monkeypatch.setattr(TrajectoryDataModule, "__init__", lambda *_, **__: pytest.fail("opened the data"))
+    assert fit(cfg) == value
+    assert {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in tmp_path.rglob("*") if p.is_file()} == files
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("model.interaction=odd", r"model.interaction: 'negated' there, 'odd' now"),
+        ("seed=4", r"seed: 0 there, 4 now"),
+        ("training.learning_rate=0.5", r"training.learning_rate: 0.001 there, 0.5 now"),
+        ("evaluation.containment=false", r"evaluation.containment: True there, False now"),
+    ],
+)
+def test_another_config_in_the_same_folder_is_refused(tiny_data: Path, tmp_path: Path, override: str, message: str) -> None:
+    cfg = tiny(tiny_data, tmp_path, "model.interaction=negated")
+    (tmp_path / "fit" / "checkpoints").mkdir(parents=True)
+    claim(tmp_path / "fit", _claimed(cfg))
+    (tmp_path / "fit" / "checkpoints" / "last.ckpt").touch()
+    with pytest.raises(RunError, match=message) as caught:
+        fit(tiny(tiny_data, tmp_path, "model.interaction=negated", override))
+    assert str(tmp_path / "fit") in str(caught.value)
+    assert not (tmp_path / "fit" / "log").exists()
+
+
+def _claimed(cfg: DictConfig) -> dict[str, Any]:
+    from omegaconf import OmegaConf
+
+    values: Any = OmegaConf.to_container(cfg, resolve=True)
+    return {k: values[k] for k in ("seed", "size", "data", "graph", "model", "training", "evaluation")}
+
+
+def test_a_folder_in_which_nothing_was_saved_is_free(tiny_data: Path, tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="graph.history=19 needs"):
+        fit(tiny(tiny_data, tmp_path, "graph.history=19"))
+    assert fit(tiny(tiny_data, tmp_path)) > 0
+    (tmp_path / "fit" / "config.json").write_text("{")
+    with pytest.raises(RunError, match="config.json is damaged"):
+        fit(tiny(tiny_data, tmp_path))
+
+
+@pytest.fixture
+def _sigint() -> Iterator[None]:
+    before = signal.getsignal(signal.SIGINT)
+    yield
+    signal.signal(signal.SIGINT, before)  # Lightning leaves it ignored
+
+
+@pytest.mark.usefixtures("_sigint")
+def test_ctrl_c_says_how_to_go_on(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    interrupt(monkeypatch, 3, KeyboardInterrupt)
+    with pytest.raises(RunError, match=r"interrupted; run the same command again to resume from .*last.ckpt"):
+        fit(tiny(tiny_data, tmp_path, *STEPS))
+    assert (tmp_path / "fit" / "checkpoints" / "last.ckpt").exists()
+
+
+def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One material parameter that is not finite reaches the loss only when its trajectory is drawn."""
+    cfg = tiny(tiny_data, tmp_path, *STEPS, "training.num_steps=60")
+    plain = TrainingModule.training_step
+
+    def training_step(self: TrainingModule, batch: Any, batch_idx: int) -> torch.Tensor:
+        if self.global_step == 4:  # from now on
+            data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
+            stored = data.train_set.trajectories[1]
+            params = np.full_like(stored.held.material_params, np.nan)
+            data.train_set.trajectories[1] = replace(stored, held=replace(stored.held, material_params=params))
+        return plain(self, batch, batch_idx)
+
+    monkeypatch.setattr(TrainingModule, "training_step", training_step)
+    with pytest.raises(TrainingError, match=r"step \d+: the loss is nan for \(trajectory, frame\) = .*\(1, \d+\).*last good checkpoint is kept") as caught:
+        fit(cfg)
+    step = int(str(caught.value).split(":")[0].removeprefix("step "))
+    assert 4 < step < 20
+    kept = checkpoint(cfg)
+    assert kept["global_step"] == step // 2 * 2
+    assert all(torch.isfinite(w).all() for k in ("state_dict", "current_model_state") for w in kept[k].values())
+    assert not (tmp_path / "fit" / "metrics.csv").exists()
+
+
+def test_a_position_that_is_not_finite_stops_the_run_and_is_named(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = TrajectoryDataModule.train_dataloader
+
+    def train_dataloader(self: TrajectoryDataModule) -> Any:
+        stored = self.train_set.trajectories[1]
+        assert stored.held is not None
+        pos = stored.held.pos.copy()
+        pos[12, 7] = np.nan
+        self.train_set.trajectories[1] = replace(stored, held=replace(stored.held, pos=pos))
+        return plain(self)
+
+    monkeypatch.setattr(TrajectoryDataModule, "train_dataloader", train_dataloader)
+    with pytest.raises(StoreError, match="shard-00000.h5:00001: frame 12, node 7: the position is not finite"):
+        fit(tiny(tiny_data, tmp_path, "training.num_steps=40", "training.val_interval=40"))
+
+
+def test_metrics_hold_the_model_and_the_baselines(tiny_data: Path, tmp_path: Path) -> None:
+    fit(tiny(tiny_data, tmp_path, "evaluation.num_pictures=1"))
+    rows = list(read_rows(tmp_path / "fit" / "metrics.csv"))
+    for split, groups in (("test", {"seen"}), ("test_unseen", {"interpolated", "extrapolated"})):
+        mse = [r for r in rows if r.split == split and r.metric == "rollout_mse"]
+        assert {r.model for r in mse} == {"learned", "ballistic", "constant_velocity"}
+        assert {r.horizon for r in mse} == {"5", "full"}
+        assert {r.parameter_group for r in mse} == groups
+        assert all(np.isfinite(r.value) and r.value >= 0 and np.isfinite(r.parameter) for r in mse)
+        assert (tmp_path / "fit" / f"error_curve_{split}.png").stat().st_size > 1000
+        for suffix in ("png", "gif"):
+            assert (tmp_path / "fit" / f"rollout_{split}_00.{suffix}").stat().st_size > 1000
+    extra = {r.metric for r in rows if r.model == "learned"}
+    assert {"one_step_nmse", "share_outside_uncontained", "share_corrected", "momentum_error"} <= extra
+    ballistic = {(r.split, r.trajectory): r.value for r in rows if (r.model, r.metric, r.horizon) == ("ballistic", "rollout_mse", "full")}
+    assert len(ballistic) == 3
+    assert len(set(ballistic.values())) == 3
+
+
+def test_a_trained_checkpoint_holds_the_averaged_weights(tiny_data: Path, tmp_path: Path) -> None:
+    cfg = tiny(tiny_data, tmp_path, *STEPS)
+    fit(cfg)
+    best = checkpoint(cfg, "best")
+    simulator = LearnedSimulator.from_checkpoint(tmp_path / "fit" / "checkpoints" / "best.ckpt")
+    weights = {f"simulator.{k}": v for k, v in simulator.state_dict().items()}
+    assert_equal(weights, best["state_dict"])
+    assert any(not torch.equal(best["state_dict"][k], best["current_model_state"][k]) for k in weights)
+    assert float(simulator.acceleration_std) != 1.0
+
+
+def test_a_sweep_ends_with_table_and_plot(tiny_data: Path, tmp_path: Path) -> None:
+    for interaction in ("negated", "odd"):
+        for seed in (0, 1):
+            fit(tiny(tiny_data, tmp_path, f"name='log/model.interaction={interaction}/seed={seed}'", f"model.interaction={interaction}", f"seed={seed}"))
+    folder = tmp_path / "log"  # a folder's name must not matter
+    report_sweep(folder)
+    with open(folder / "table.csv", newline="") as handle:
+        reader = csv.DictReader(handle)
+        assert reader.fieldnames == ["interaction", "seed", "split", "metric", "horizon", "value"]
+        rows = list(reader)
+    assert {(r["interaction"], r["seed"]) for r in rows} == {(i, s) for i in ("negated", "odd") for s in "01"}
+    assert {r["split"] for r in rows} == {"val", "test", "test_unseen", "test_unseen/interpolated", "test_unseen/extrapolated"}
+    assert len({tuple(list(r.values())[:-1]) for r in rows}) == len(rows)
+    chosen = {r["metric"]: float(r["value"]) for r in rows if (r["interaction"], r["seed"], r["split"], r["horizon"]) == ("odd", "1", "test_unseen", "full")}
+    run = list(read_rows(folder / "model.interaction=odd" / "seed=1" / "metrics.csv"))
+    values = [r.value for r in run if (r.model, r.split, r.metric, r.horizon) == ("learned", "test_unseen", "rollout_mse", "full")]
+    assert chosen["rollout_mse"] == pytest.approx(np.mean(values))
+    val = {(r["interaction"], r["seed"]): float(r["value"]) for r in rows if r["split"] == "val"}
+    assert val["negated", "0"] == validation_curve(folder / "model.interaction=negated" / "seed=0")[1][-1]
+    table = (folder / "table.md").read_text()
+    assert all(f"| {name} |" in table for name in ("negated", "odd", "ballistic", "constant_velocity"))
+    assert (folder / "validation_loss.png").stat().st_size > 1000

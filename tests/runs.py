@@ -1,0 +1,53 @@
+"""Training runs of seconds: composed configs and the smallest data set that has everything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf
+
+from gpe_pl.config import CONF
+from gpe_pl.generation import generate
+from gpe_pl.simulate import dataset_spec
+
+DATA = [
+    "size=tiny",
+    *(f"data.sizes.tiny.{key}={value}" for key, value in {
+        "num_train": 2, "num_val": 1, "num_test": 1, "num_test_unseen": 2, "num_frames": 20, "num_particles": 30, "trajectories_per_shard": 2,
+    }.items()),
+]  # fmt: skip
+RUN = [
+    *("size.num_message_passing_steps=1", "size.hidden_channels=8", "graph.history=2"),
+    *("training.num_steps=2", "training.val_interval=1", "training.num_val_rollouts=1", "training.val_rollout_steps=3"),
+    *("trainer.progress=false", "trainer.num_threads=1", "evaluation.num_pictures=0", "evaluation.horizons=[5]"),
+]
+
+
+def compose(name: str, *overrides: str, hydra_config: bool = False) -> DictConfig:
+    """A config as an entry point sees it."""
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = hydra.compose(name, list(overrides), return_hydra_config=hydra_config)
+    if not hydra_config:
+        OmegaConf.resolve(cfg)
+    return cfg
+
+
+def tiny(data: Path, runs: Path, *overrides: str) -> DictConfig:
+    """The config of a run of two steps on the tiny data set."""
+    return compose("fit", *DATA, *RUN, f"paths.data={data}", f"paths.runs={runs}", *overrides)
+
+
+def generate_tiny(folder: Path) -> Path:
+    """The tiny data set, generated in this process; returns ``folder``."""
+    generate(folder, dataset_spec(compose("simulate", *DATA)), 1)
+    return folder
+
+
+def first_choices(experiment: str) -> list[str]:
+    """The first value of every axis that an experiment sweeps over."""
+    params: Any = compose("fit", f"experiment={experiment}", hydra_config=True).hydra.sweeper.params
+    return [f"{key}={str(values).split(',')[0]}" for key, values in (params or {}).items()]

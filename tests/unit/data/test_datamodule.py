@@ -1,0 +1,93 @@
+"""The data module: endless, resumable training batches, a fixed validation sample, statistics of the noisy inputs."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from gpe_pl.data.datamodule import TrajectoryDataModule
+from gpe_pl.data.noise import Noise
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.trajectory import StoreError
+
+
+@pytest.fixture
+def root(store: Path) -> Path:
+    (store / "statistics.json").write_text(json.dumps({"acceleration_std": 50.0}))
+    return store
+
+
+def datamodule(root: Path, step: int = 0, **settings: Any) -> TrajectoryDataModule:
+    module = TrajectoryDataModule(root, GraphConfig(history=2), Noise("velocity", 0.5), **{"batch_size": 2, "seed": 1, **settings})
+    module.trainer = SimpleNamespace(global_step=step)  # type: ignore[assignment]
+    return module
+
+
+def first_batches(module: TrajectoryDataModule, count: int) -> list[Any]:
+    return list(itertools.islice(module.train_dataloader(), count))
+
+
+def test_a_resumed_loader_continues_the_sequence(root: Path) -> None:
+    whole = first_batches(datamodule(root), 8)
+    resumed = first_batches(datamodule(root, step=3), 5)
+    for a, b in zip(whole[3:], resumed, strict=True):
+        assert torch.equal(a["sand"].x, b["sand"].x)
+        assert torch.equal(a["sand"].target, b["sand"].target)
+        assert torch.equal(a["sand", "radius", "sand"].edge_index, b["sand", "radius", "sand"].edge_index)
+    places = [(int(t), int(f)) for batch in whole[:3] for t, f in zip(batch.trajectory, batch.frame, strict=True)]
+    assert sorted(places) == [(t, f) for t in (0, 1) for f in (2, 3, 4)]  # one pass
+
+
+def test_worker_processes_change_nothing(root: Path) -> None:
+    for a, b in zip(first_batches(datamodule(root), 4), first_batches(datamodule(root, num_workers=2), 4), strict=True):
+        assert torch.equal(a["sand"].x, b["sand"].x)
+        assert torch.equal(a["sand"].target, b["sand"].target)
+
+
+def test_validation_windows_are_fixed_and_free_of_noise(root: Path) -> None:
+    module = datamodule(root)
+    for _ in range(2):
+        frames = torch.cat([b.frame for b in module.val_dataloader()]).tolist()
+        assert frames == [2, 3, 4]
+    batch = next(iter(module.val_dataloader()))
+    clean = torch.cat([module.val_set[k]["sand"].target for k in range(3)])
+    assert module.val_set.noise is None
+    assert torch.equal(batch["sand"].target, clean)
+    few = datamodule(root, num_val_windows=2)
+    assert [b.frame.tolist() for b in few.val_dataloader()] == [[2, 4]]
+
+
+def test_statistics_are_those_of_noisy_inputs(root: Path) -> None:
+    module = datamodule(root)
+    sample = list(module.statistics_sample(4))
+    assert len(sample) == 4
+    assert [int(s.frame) for s in sample] == [module.train_set.locate(k)[1] for k in (0, 2, 3, 5)]
+    assert module.train_set.velocity_unit == pytest.approx(50.0 * module.metadata.frame_dt)
+    clean = TrajectoryDataModule(root, GraphConfig(history=2), Noise("velocity", 0.0))
+    assert not torch.equal(sample[0]["sand"].x, next(clean.statistics_sample(4))["sand"].x)
+
+
+def test_validation_trajectories_come_from_the_validation_split(root: Path) -> None:
+    assert [t.metadata.split for t in datamodule(root).val_trajectories(3)] == ["val"]
+
+
+@pytest.mark.parametrize("content", [None, "", "{"])
+def test_missing_statistics_are_a_readable_error(root: Path, content: str | None) -> None:
+    path = root / "statistics.json"
+    path.unlink()
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(StoreError, match=r"statistics.json: cannot be read .* run `python -m gpe_pl.simulate`"):
+        datamodule(root)
+
+
+def test_a_missing_split_is_named(root: Path) -> None:
+    (root / "val" / "shard-00000.h5").unlink()
+    with pytest.raises(StoreError, match="no shards of split 'val'"):
+        datamodule(root)

@@ -1,0 +1,170 @@
+"""Samples are pure functions of their number, never change what is stored, and have the target that the integrator needs."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gpe_pl import integrators
+from gpe_pl.data.dataset import StepSampler, StoredTrajectory, WindowDataset, open_split
+from gpe_pl.data.noise import Noise
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.trajectory import StoreError, Trajectory, read_trajectory, write_shard
+from tests.scenes import assert_equal_graphs
+
+NOISE = Noise("velocity", 0.5)
+
+
+def dataset(root: Path, history: int = 2, noise: Noise | None = NOISE, seed: int = 3, cache_bytes: int = 2**30) -> WindowDataset:
+    stored = open_split(root, "train", cache_bytes)
+    return WindowDataset(stored, GraphBuilder(GraphConfig(history=history), stored[0].window(0, 1).metadata), noise, 10.0, seed)
+
+
+def arrays_of(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    owners = {"": trajectory, "boundary.": trajectory.boundary}
+    return {f"{prefix}{k}": v for prefix, owner in owners.items() for k, v in vars(owner).items() if isinstance(v, np.ndarray)}
+
+
+@pytest.mark.parametrize("cache_bytes", [0, 2**30])
+@pytest.mark.parametrize("kind", ["paper", "velocity"])
+def test_an_epoch_with_noise_changes_nothing_that_is_stored(store: Path, kind: str, cache_bytes: int) -> None:
+    def files() -> dict[str, str]:
+        return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(store.rglob("*")) if p.is_file()}
+
+    data = dataset(store, noise=Noise(kind, 0.5), cache_bytes=cache_bytes)  # type: ignore[arg-type]
+    held = [t.held for t in data.trajectories if t.held is not None]
+    assert len(held) == (2 if cache_bytes else 0)
+    on_disk, in_memory = files(), copy.deepcopy([arrays_of(t) for t in held])
+    for sample, window in itertools.islice(StepSampler(len(data), 0), len(data)):
+        item = data[sample, window]
+        for node_store in item.node_stores:  # what comes out may be changed without harm
+            node_store.x.zero_()
+        item["sand"].material_params.fill_(-1.0)
+    assert files() == on_disk
+    for trajectory, before in zip(held, in_memory, strict=True):
+        for key, value in arrays_of(trajectory).items():
+            assert value.tobytes() == before[key].tobytes(), key
+
+
+def test_held_arrays_cannot_be_written(store: Path) -> None:
+    for stored in open_split(store, "train"):
+        assert stored.held is not None
+        arrays = arrays_of(stored.held)
+        assert {"pos", "vel", "mass", "boundary.pos", "boundary.friction"} <= set(arrays)
+        for key, value in {**arrays, "window": stored.window(1, 3).pos}.items():
+            with pytest.raises(ValueError, match="read-only"):
+                value[...] = 0
+            assert not value.flags.writeable, key
+
+
+def test_a_sample_is_a_pure_function_of_split_seed_and_number(store: Path) -> None:
+    data = dataset(store)
+    first = data[7, 2]
+    for other in (0, 5, 1):
+        data[other, other]
+    assert_equal_graphs(data[7, 2], first)
+    assert_equal_graphs(dataset(store)[7, 2], first)
+    for different in (dataset(store, seed=4)[7, 2], data[8, 2], data[7, 3]):
+        assert not torch.equal(different["sand"].target, first["sand"].target)
+    assert_equal_graphs(data[2], data[2, 2])
+
+
+@pytest.mark.parametrize("history", [1, 2, 4])
+def test_windows_cover_every_frame_with_a_past_and_a_future(store: Path, history: int) -> None:
+    data = dataset(store, history)
+    places = [data.locate(k) for k in range(len(data))]
+    assert places == [(t, frame) for t in (0, 1) for frame in range(history, 5)]
+    for k, (number, frame) in enumerate(places):
+        assert (data[k].trajectory, data[k].frame) == (number, frame)
+
+
+@pytest.mark.parametrize("history", [1, 3])
+def test_without_noise_the_target_is_the_integrators_acceleration(store: Path, history: int) -> None:
+    data = dataset(store, history, noise=None)
+    for k in range(len(data)):
+        number, frame = data.locate(k)
+        trajectory = read_trajectory(store / "train" / "shard-00000.h5", f"{number:05d}")
+        dt, pos = trajectory.metadata.frame_dt, trajectory.pos.astype(np.float64)
+        vel = integrators.velocities(pos[frame - 1 : frame + 2], dt)
+        expected = integrators.acceleration(vel[1], vel[0], dt) - np.array(trajectory.metadata.gravity)
+        graph = data[k]["sand"]
+        np.testing.assert_allclose(graph.target, expected[graph.node_id], rtol=1e-6)
+
+
+def test_with_noise_graph_and_target_belong_to_the_same_window(store: Path) -> None:
+    """Velocity noise: last velocity plus target is the true next velocity, in the units of the features."""
+    noisy, clean = dataset(store), dataset(store, noise=None)
+    scales, gravity = noisy.builder.scales, torch.tensor([0.0, -9.81])
+    for k in range(len(noisy)):
+        a, b = noisy[k]["sand"], clean[k]["sand"]
+        assert (a.x[:, :2] != b.x[:, :2]).all()
+        after = [s.x[:, :2] * scales.velocity + (s.target + gravity) * scales.frame_dt for s in (a, b)]
+        torch.testing.assert_close(after[0], after[1], rtol=1e-4, atol=1e-3)
+
+
+def test_windows_read_from_disk_equal_held_ones(store: Path) -> None:
+    held, read = dataset(store), dataset(store, cache_bytes=0)
+    assert len(held) == len(read)
+    assert all(t.held is None for t in read.trajectories)
+    for k in range(len(held)):
+        assert_equal_graphs(held[k + 5, k], read[k + 5, k])
+
+
+def test_trajectories_that_are_too_short_are_skipped(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> None:
+    lengths = (3, 6, 4, 5)
+    write_shard(tmp_path / "train" / "shard-00000.h5", [new_trajectory(k, num_frames=n) for k, n in enumerate(lengths)])
+    data = dataset(tmp_path, history=3)
+    assert [data.locate(k) for k in range(len(data))] == [(1, 3), (1, 4), (3, 3)]
+    with pytest.raises(StoreError, match=r"no trajectory has the 7 frames that graph.history=5 needs; the longest has 6"):
+        dataset(tmp_path, history=5)
+
+
+def test_a_position_that_is_not_finite_is_named(store: Path) -> None:
+    data = dataset(store, noise=None)
+    held = data.trajectories[1].held
+    assert held is not None
+    pos = held.pos.copy()
+    pos[4, 7, 1] = np.nan
+    data.trajectories[1] = replace(data.trajectories[1], held=replace(held, pos=pos))
+    assert torch.isfinite(data[3]["sand"].x).all()  # windows that do not touch it
+    with pytest.raises(StoreError, match=r"shard-00000.h5:00001: frame 4, node 7: the position is not finite"):
+        data[5]
+
+
+@pytest.mark.parametrize("num_windows", [1, 7, 10])
+def test_step_sampler_covers_each_epoch_once_in_another_order(num_windows: int) -> None:
+    drawn = list(itertools.islice(StepSampler(num_windows, seed=5), 3 * num_windows))
+    assert [sample for sample, _ in drawn] == list(range(3 * num_windows))
+    epochs = [[w for _, w in drawn[k * num_windows : (k + 1) * num_windows]] for k in range(3)]
+    assert all(sorted(e) == list(range(num_windows)) for e in epochs)
+    if num_windows > 1:
+        assert epochs[0] != epochs[1]
+        assert epochs[0] != [w for _, w in itertools.islice(StepSampler(num_windows, seed=6), num_windows)]
+
+
+@pytest.mark.parametrize("start", [0, 1, 6, 7, 8, 20])
+def test_step_sampler_starts_anywhere(start: int) -> None:
+    whole = list(itertools.islice(StepSampler(7, seed=5), 40))
+    assert list(itertools.islice(StepSampler(7, seed=5, start=lambda: start), 15)) == whole[start : start + 15]
+
+
+def test_step_sampler_asks_for_its_start_when_iteration_begins() -> None:
+    consumed = [0]
+    sampler = StepSampler(7, seed=5, start=lambda: consumed[0])
+    consumed[0] = 12
+    assert next(iter(sampler))[0] == 12
+
+
+def test_opening_a_split_reads_no_frames_that_are_not_held(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gpe_pl.data.dataset.read_trajectory", lambda *_, **__: pytest.fail("read a trajectory"))
+    stored = open_split(store, "train", cache_bytes=0)
+    assert [(type(s), s.name, s.num_frames) for s in stored] == [(StoredTrajectory, "00000", 6), (StoredTrajectory, "00001", 6)]

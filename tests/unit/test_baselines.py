@@ -1,0 +1,90 @@
+"""The trivial simulators: free fall that sticks, and straight motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gpe_pl.baselines import Ballistic, ConstantVelocity
+from gpe_pl.geometry import Box, Polygon, Shape, Sphere, domain_walls, signed_distance
+from gpe_pl.rollout import rollout
+from gpe_pl.trajectory import Boundary, State
+from tests import scenes
+
+DT, G = 0.01, -9.81
+WALLS = domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.3)
+OBSTACLES = (Sphere((0.3, 0.3), 0.15, 0.3), Box((0.6, -0.1), (0.8, 0.2), 0.3), Polygon(((0.5, 0.6), (0.8, 0.65), (0.6, 0.85)), 0.3))
+
+
+def state(pos: np.ndarray, vel: np.ndarray, shapes: tuple[Shape, ...] = ()) -> State:
+    s = scenes.state(len(pos), walls=False)
+    return replace(s, pos=pos, vel=vel, velocity_history=None, boundary=Boundary.sample(shapes, 0.1, 2))
+
+
+def cloud(shapes: tuple[Shape, ...], count: int = 500) -> State:
+    rng = np.random.default_rng(0)
+    pos = rng.uniform(size=(4 * count, 2))
+    pos = pos[signed_distance(shapes, pos) > 0.01][:count]
+    return state(pos, rng.normal(scale=2.0, size=pos.shape), shapes)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+def test_constant_velocity(backend: str) -> None:
+    start = cloud(WALLS)
+    result = rollout(ConstantVelocity(DT), start.to_torch() if backend == "torch" else start, 30, scenes.metadata())
+    for k in (1, 30):
+        np.testing.assert_allclose(result.pos[k], start.pos + k * DT * start.vel, atol=1e-12)
+        np.testing.assert_array_equal(result.vel[k], start.vel)
+    assert (result.pos[30] < 0).any()  # walls are ignored
+
+
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+@pytest.mark.parametrize("at_rest", [False, True])
+def test_ballistic_is_free_fall_where_nothing_is_in_the_way(backend: str, at_rest: bool) -> None:
+    start = cloud(())
+    start = replace(start, vel=np.zeros_like(start.vel)) if at_rest else start
+    result = rollout(Ballistic(DT), start.to_torch() if backend == "torch" else start, 40, scenes.metadata())
+    for k in (1, 7, 40):
+        fall = np.array([0.0, G])
+        np.testing.assert_allclose(result.vel[k], start.vel + k * DT * fall, atol=1e-11)
+        np.testing.assert_allclose(result.pos[k], start.pos + k * DT * start.vel + DT**2 * fall * k * (k + 1) / 2, atol=1e-11)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+@pytest.mark.parametrize("shapes", [WALLS, WALLS + OBSTACLES], ids=["walls", "obstacles"])
+def test_ballistic_never_enters_a_wall_and_sticks_where_it_touches(shapes: tuple[Shape, ...], backend: str) -> None:
+    start = cloud(shapes)
+    result = rollout(Ballistic(DT), start.to_torch() if backend == "torch" else start, 120, scenes.metadata())
+    distance = signed_distance(shapes, result.pos)
+    assert distance.min() >= 0
+    at_rest = (result.vel == 0).all(axis=-1)
+    assert at_rest[-1].all()  # after 1.2 s everything has landed
+    assert distance[-1].max() < 1e-6
+    assert not at_rest[0].any()
+    landed = at_rest.argmax(axis=0)
+    for node, frame in enumerate(landed):
+        assert (result.pos[frame:, node] == result.pos[frame, node]).all()
+        assert (result.vel[frame:, node] == 0).all()
+
+
+def test_ballistic_stops_on_its_path() -> None:
+    start = state(np.array([[0.2, 0.03]]), np.array([[2.0, -4.0]]), WALLS)
+    after = Ballistic(DT).step(start)
+    velocity = np.array([2.0, -4.0 + G * DT])
+    time = -0.03 / velocity[1]
+    np.testing.assert_allclose(after.pos[0], [0.2 + 2.0 * time, 0.0], atol=1e-9)
+    np.testing.assert_array_equal(after.vel, 0.0)
+    assert after.time == pytest.approx(DT)
+
+
+def test_a_node_at_rest_on_a_wall_stays_there() -> None:
+    shapes = WALLS + OBSTACLES
+    start = state(np.array([[0.5, 0.0], [0.0, 0.7], [0.5, 1.0], [0.3, 0.45]]), np.zeros((4, 2)), shapes)
+    result = rollout(Ballistic(DT), start, 10, scenes.metadata())
+    np.testing.assert_array_equal(result.pos[-1], start.pos)
+
+
+def test_ballistic_of_no_nodes() -> None:
+    assert Ballistic(DT).step(state(np.empty((0, 2)), np.empty((0, 2)), WALLS)).pos.shape == (0, 2)

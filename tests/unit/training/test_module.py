@@ -1,0 +1,160 @@
+"""Loss, learning-rate schedules and weight averaging against their formulas."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import lightning as L
+import pytest
+import torch
+from torch import nn
+from torch_geometric.data import Batch, HeteroData
+
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
+from gpe_pl.training.callbacks import WarmAverage
+from gpe_pl.training.module import TrainingError, TrainingModule
+from tests import scenes
+
+MATERIALS = ("sand", "snow")
+
+
+def module(num_steps: int = 1000, **settings: Any) -> TrainingModule:
+    build = scenes.builder(MATERIALS, history=1)
+    torch.manual_seed(0)
+    simulator = LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=8), build)
+    simulator.acceleration_std.fill_(5.0)
+    return TrainingModule(simulator, num_steps, **settings)
+
+
+def batch(count: int = 2) -> HeteroData:
+    graphs = []
+    for k in range(count):
+        graph = scenes.builder(MATERIALS, history=1)(scenes.state(20 + 6 * k, MATERIALS, seed=k).to_torch())
+        for m in MATERIALS:
+            graph[m].target = torch.randn(graph[m].x.shape[0], 2, generator=torch.Generator().manual_seed(k))
+        graph.trajectory, graph.frame = 7 + k, 30 + k
+        graphs.append(graph)
+    return Batch.from_data_list(graphs)
+
+
+def rates(m: TrainingModule, steps: list[int]) -> list[float]:
+    return [m.learning_rate * m.learning_rate_factor(s) for s in steps]
+
+
+def test_the_papers_schedule_decays_geometrically() -> None:
+    m = module(1000, schedule="exponential", learning_rate=5e-5, final_learning_rate=1e-6, warmup_steps=100)
+    assert rates(m, [0, 500, 1000]) == pytest.approx([5e-5, math.sqrt(5e-5 * 1e-6), 1e-6])
+    assert rates(m, [5000]) == pytest.approx([1e-6])
+    ratios = [m.learning_rate_factor(s + 1) / m.learning_rate_factor(s) for s in range(0, 1000, 97)]
+    assert ratios == pytest.approx([ratios[0]] * len(ratios))
+
+
+def test_the_cosine_schedule_warms_up_and_ends_at_the_final_rate() -> None:
+    m = module(1000, schedule="cosine", learning_rate=1e-3, final_learning_rate=1e-5, warmup_steps=100)
+    assert rates(m, [0, 49, 99]) == pytest.approx([1e-5, 5e-4, 1e-3])  # linear
+    assert rates(m, [100, 550, 1000, 2000]) == pytest.approx([1e-3, (1e-3 + 1e-5) / 2, 1e-5, 1e-5])
+    falling = rates(m, list(range(100, 1001)))
+    assert all(a > b for a, b in zip(falling, falling[1:], strict=False))
+
+
+@pytest.mark.parametrize("schedule", ["cosine", "exponential"])
+@pytest.mark.parametrize(("num_steps", "warmup_steps"), [(1, 0), (1, 100), (100, 100), (50, 100), (10, 0)])
+def test_every_rate_is_positive_and_at_most_the_initial_one(schedule: Any, num_steps: int, warmup_steps: int) -> None:
+    m = module(num_steps, schedule=schedule, warmup_steps=warmup_steps)
+    assert all(0 < m.learning_rate_factor(s) <= 1 for s in range(num_steps + 1))
+
+
+def test_the_optimizer_follows_the_schedule() -> None:
+    m = module(10, schedule="exponential", learning_rate=1e-2, final_learning_rate=1e-4)
+    configured = m.configure_optimizers()
+    optimizer, scheduler = configured["optimizer"], configured["lr_scheduler"]["scheduler"]
+    assert configured["lr_scheduler"]["interval"] == "step"
+    seen = []
+    for _ in range(10):
+        seen.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        scheduler.step()
+    assert seen == pytest.approx(rates(m, list(range(10))))
+    assert {id(p) for g in optimizer.param_groups for p in g["params"]} == {id(p) for p in m.simulator.parameters()}
+
+
+def test_the_loss_is_the_mean_over_all_nodes_and_axes_of_both_materials() -> None:
+    m, data = module(), batch()
+    predicted = m.simulator(data)
+    errors = [float((predicted[t][i, d].detach() - data[t].target[i, d] / 5.0) ** 2) for t in MATERIALS for i in range(data[t].x.shape[0]) for d in (0, 1)]
+    assert len(errors) == 2 * (20 + 26)
+    assert m.loss(data).item() == pytest.approx(sum(errors) / len(errors), rel=1e-5)
+
+
+def test_the_validation_error_is_relative_to_predicting_free_fall() -> None:
+    m, data = module(), batch()
+    with torch.no_grad():
+        for p in m.simulator.model.parameters():
+            p.zero_()
+    m.validation_step(data, 0)
+    assert float(m.val_nmse.compute()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_a_loss_that_is_not_finite_names_step_trajectories_and_frames(value: float) -> None:
+    m, data = module(), batch()
+    data["sand"].target[3, 1] = value
+    m._trainer = SimpleNamespace(global_step=41)  # type: ignore[assignment]
+    with pytest.raises(TrainingError, match=rf"step 41: the loss is {value} for \(trajectory, frame\) = \(7, 30\), \(8, 31\); the last good checkpoint"):
+        m.training_step(data, 0)
+
+
+# --- weight averaging ----------------------------------------------------------------------------------------------------------------------
+
+
+def averaging(model: Network, decay: float) -> WarmAverage:
+    callback = WarmAverage(decay)
+    callback.setup(L.Trainer(logger=False, enable_checkpointing=False), model, "fit")
+    return callback
+
+
+def update(callback: WarmAverage, model: Network, step: int) -> None:
+    callback.on_train_batch_end(SimpleNamespace(global_step=step), model, None, None, step - 1)  # type: ignore[arg-type]
+
+
+class Network(L.LightningModule):
+    """Weights, a constant of another precision, and an integer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.weight = nn.Parameter(torch.randn(2, 3))
+        self.register_buffer("scale", torch.tensor(2.0, dtype=torch.float64))
+        self.register_buffer("count", torch.tensor(3))
+
+
+def test_averaging_constant_weights_changes_nothing() -> None:
+    model = Network()
+    before = {k: v.clone() for k, v in model.state_dict().items()}
+    callback = averaging(model, 0.999)
+    for step in range(1, 20):
+        update(callback, model, step)
+    assert callback._average_model is not None
+    for key, value in callback._average_model.module.state_dict().items():
+        assert torch.equal(value, before[key]), key
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.3, 0.999])
+def test_the_decay_warms_up(decay: float) -> None:
+    model = Network()
+    callback = averaging(model, decay)
+    expected = None
+    for step in range(1, 30):
+        with torch.no_grad():
+            model.weight.fill_(float(step))
+        update(callback, model, step)
+        n = step - 1  # averages so far; the first is a copy
+        d = min(decay, (1 + n) / (10 + n))
+        expected = float(step) if expected is None else d * expected + (1 - d) * step
+        assert callback._average_model is not None
+        torch.testing.assert_close(callback._average_model.module.weight, torch.full((2, 3), expected), rtol=1e-5, atol=1e-6)
+    assert expected is not None
+    assert expected == 29 if decay == 0 else 1 < expected < 29
