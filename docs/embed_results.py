@@ -14,7 +14,10 @@ from pathlib import Path
 DOCS = Path(__file__).resolve().parent
 README = DOCS.parent / "README.md"
 BLOCK = re.compile(r"(<!-- begin (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
-FILES = ("table.md", "table.csv", "validation_loss.png", "metrics.csv", "config.json", "results.json", "error_curve_*.png", "rollout_test_*.png", "rollout_*_00.gif")
+FILES = (
+    *("table.md", "table.csv", "metrics.csv", "config.json", "results.json"),
+    *("validation_loss.png", "error_curve_*.png", "rollout_test_*.png", "rollout_*_00.gif"),
+)
 
 
 def embedded(text: str) -> str:
@@ -32,6 +35,7 @@ def collect(run: Path, name: str) -> None:
 
 
 def main(arguments: list[str]) -> int:
+    """Collect, embed or check; the exit status."""
     if arguments == ["--check"]:
         return int(embedded(README.read_text()) != README.read_text())
     if arguments:

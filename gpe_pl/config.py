@@ -156,7 +156,9 @@ def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
     parent, _, leaf = key.rpartition(".")
     if key.startswith("hydra."):
         return text
-    others = [_first_choice(o) for o in overrides if "=" in o and not o.startswith(("-", "hydra")) and o.partition("=")[0].lstrip("+~") != key]
+    others = [
+        _first_choice(o) for o in overrides if "=" in o and not o.startswith(("-", "hydra")) and o.partition("=")[0].lstrip("+~") != key
+    ]
     GlobalHydra.instance().clear()
     try:
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):

@@ -20,7 +20,6 @@ from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
 from gpe_pl.rollout import Guard, Simulator, rollout, share_outside
 from gpe_pl.schema import Split
-from gpe_pl.schema import Split
 from gpe_pl.trajectory import Trajectory, iter_trajectories
 
 LEARNED = "learned"
@@ -84,7 +83,16 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
                 curves[model].append(per_frame_mse(prediction, truth))
                 for record in rollout_metrics(prediction, truth, [*settings.horizons, "full"]):
                     rows.append(
-                        Row(model, split, number, truth.metadata.parameter_group, parameter, record.metric, str(record.horizon), record.value)
+                        Row(
+                            model,
+                            split,
+                            number,
+                            truth.metadata.parameter_group,
+                            parameter,
+                            record.metric,
+                            str(record.horizon),
+                            record.value,
+                        )
                     )
             rows += [Row(label, split, number, truth.metadata.parameter_group, parameter, k, "full", v) for k, v in extra.items()]
             if number < settings.num_pictures:

@@ -102,13 +102,17 @@ class DatasetSpec:
         for key in ("seen_values", "interpolated_values", "extrapolated_values"):
             for value in getattr(self, key):
                 if not parameter.low <= value <= parameter.high:
-                    raise ValueError(f"{key}: {parameter.name} = {value} is outside [{parameter.low:g}, {parameter.high:g}] {parameter.unit}")
+                    raise ValueError(
+                        f"{key}: {parameter.name} = {value} is outside [{parameter.low:g}, {parameter.high:g}] {parameter.unit}"
+                    )
         unseen = {*self.interpolated_values, *self.extrapolated_values}
         if unseen & set(self.seen_values):
             raise ValueError(f"unseen values {sorted(unseen & set(self.seen_values))} are among seen_values")
         low, high = min(self.seen_values), max(self.seen_values)
         if any(not low < v < high for v in self.interpolated_values) or any(low <= v <= high for v in self.extrapolated_values):
-            raise ValueError(f"interpolated_values must lie inside and extrapolated_values outside the range [{low}, {high}] of seen_values")
+            raise ValueError(
+                f"interpolated_values must lie inside and extrapolated_values outside the range [{low}, {high}] of seen_values"
+            )
         if self.num_test_unseen and not (self.interpolated_values and self.extrapolated_values):
             raise ValueError("num_test_unseen > 0 needs interpolated_values and extrapolated_values")
 
@@ -284,7 +288,8 @@ def generate(root: Path | str, spec: DatasetSpec, num_workers: int = 1, on_progr
 @contextlib.contextmanager
 def progress_bar(description: str) -> Iterator[Progress]:
     """A bar with the remaining time in the terminal; yields what ``generate`` takes as ``on_progress``."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress as Bar, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Bar(*columns) as bar:
@@ -371,7 +376,9 @@ def _run(pool: Executor | None, function: Callable[..., Any], arguments: list[tu
         for future in as_completed(futures):
             yield future.result()
     except BrokenProcessPool:
-        raise GenerationError("a worker process died (killed, or out of memory); run simulate again to resume, with fewer workers") from None
+        raise GenerationError(
+            "a worker process died (killed, or out of memory); run simulate again to resume, with fewer workers"
+        ) from None
     finally:
         for future in futures:
             future.cancel()

@@ -12,7 +12,7 @@ import inspect
 from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -40,6 +40,8 @@ class SceneError(GpeError, ValueError):
 class GraphStandardizer(nn.Module):
     """Standardises every feature of a graph with training statistics; odd edge channels are only scaled, so they stay odd."""
 
+    mass: Tensor
+
     def __init__(self, spec: FeatureSpec) -> None:
         super().__init__()
         self.spec = spec
@@ -55,13 +57,17 @@ class GraphStandardizer(nn.Module):
 
     def fit(self, graphs: list[HeteroData]) -> None:
         """Set all statistics from graphs of the training split."""
-        for t, standardize in self.node.items():
-            standardize.fit(g[t].x for g in graphs)
-        for m, standardize in self.params.items():
-            standardize.fit(self._material_scale(m, g[m].material_params) for g in graphs)
+
+        def fit(module: nn.Module, values: Iterable[Tensor]) -> None:
+            cast(Standardize, module).fit(values)
+
+        for t, module in self.node.items():
+            fit(module, (g[t].x for g in graphs))
+        for m, module in self.params.items():
+            fit(module, (self._material_scale(m, g[m].material_params) for g in graphs))
         for relation in self.spec.relations:
-            self.odd["__".join(relation)].fit(g[relation].odd for g in graphs)
-            self.even["__".join(relation)].fit(g[relation].even for g in graphs)
+            fit(self.odd["__".join(relation)], (g[relation].odd for g in graphs))
+            fit(self.even["__".join(relation)], (g[relation].even for g in graphs))
         mass = [g[m].mass for g in graphs for m in self.spec.materials]
         if sum(len(x) for x in mass):
             self.mass.copy_(torch.cat(mass).double().mean())
@@ -125,7 +131,7 @@ class LearnedSimulator(nn.Module):
                 f"the scene has frame_dt={scene.frame_dt:g} s in {scene.dim}D and {', '.join(scene.materials)}"
             )
         state = trajectory.state(frame, history=self.builder.config.history).to_torch(self.acceleration_std.device)
-        for name, values in (("pos", state.pos), ("velocity", state.velocity_history)):
+        for name, values in (("pos", state.pos), ("velocity", history_of(state))):
             bad = ~torch.isfinite(values).flatten(1).all(dim=1)
             if bad.any():
                 raise SceneError(f"frame {frame}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
@@ -162,7 +168,7 @@ class LearnedSimulator(nn.Module):
         return {
             "format": CHECKPOINT_FORMAT,
             "model": f"{cls.__module__}.{cls.__qualname__}",
-            "settings": dict(self.model.settings),
+            "settings": dict(cast(Any, self.model).settings),
             "graph": asdict(self.builder.config),
             "metadata": asdict(self.builder.metadata),
         }

@@ -183,7 +183,15 @@ def _markdown(axes: list[str], variants: dict[tuple[str, ...], list[Run]], ratio
 
 
 def _training_table(names: list[str], variants: dict[tuple[str, ...], list[Run]], ratios: dict[tuple[str, ...], float]) -> list[str]:
-    header = [*names, "seeds", "validation loss (one-step nMSE)", "forward time", "momentum error, test [m/s]", "outside without containment", "corrected"]
+    header = [
+        *names,
+        "seeds",
+        "validation loss (one-step nMSE)",
+        "forward time",
+        "momentum error, test [m/s]",
+        "outside without containment",
+        "corrected",
+    ]
     lines = _row(header), "|" + "---|" * len(header)
     rows = []
     for key, runs in variants.items():
@@ -211,12 +219,16 @@ def _training_table(names: list[str], variants: dict[tuple[str, ...], list[Run]]
 def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]], first: Run) -> list[str]:
     found = {s for r in first.rows for s in _groups(r)}
     splits = [s for s in sorted(found) if not any(other.startswith(f"{s}/") for other in found)]
-    horizons = sorted({r.horizon for r in first.rows if r.metric == "rollout_mse"}, key=lambda h: (h == "full", h.zfill(6)))[-TABLE_HORIZONS:]
+    horizons = sorted({r.horizon for r in first.rows if r.metric == "rollout_mse"}, key=lambda h: (h == "full", h.zfill(6)))[
+        -TABLE_HORIZONS:
+    ]
     columns = [(s, h) for s in splits for h in horizons]
     baselines = sorted({r.model for r in first.rows} - {LEARNED})
     header = [*names, *(f"{s} @{h}" for s, h in columns)]
     lines = [_row(header), "|" + "---|" * len(header)]
-    best = {c: min((_mean(values_by_seed([first], b, c[0], "rollout_mse", c[1])) for b in baselines), default=float("nan")) for c in columns}
+    best = {
+        c: min((_mean(values_by_seed([first], b, c[0], "rollout_mse", c[1])) for b in baselines), default=float("nan")) for c in columns
+    }
     for key, runs in variants.items():
         cells = []
         for split, horizon in columns:

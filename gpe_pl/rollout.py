@@ -51,16 +51,14 @@ class Guard:
     Attributes:
         max_speed: m/s.
         bounds: ``(low, high)`` per axis of the region that nodes may not leave by more than ``margin`` [m].
-        check_every: frames between checks (each check is one pass over the nodes).
     """
 
     max_speed: float = math.inf
     bounds: tuple[tuple[float, float], ...] = ()
     margin: float = 0.0
-    check_every: int = 1
 
     def __post_init__(self) -> None:
-        if self.max_speed <= 0 or self.check_every < 1 or self.margin < 0:
+        if self.max_speed <= 0 or self.margin < 0:
             raise ValueError(f"guard limits must be positive, got {self}")
 
     def check(self, state: State, frame: int) -> Termination | None:
@@ -98,7 +96,7 @@ def states(simulator: Simulator, state: State, num_steps: int, guard: Guard | No
         except SimulationError as error:
             yield Termination(error.reason, frame, error.node, f"frame {frame}: {error}")
             return
-        if guard is not None and frame % guard.check_every == 0:
+        if guard is not None:
             stop = guard.check(state, frame)
             if stop is not None:
                 yield stop

@@ -72,7 +72,9 @@ class TrajectoryDataModule(L.LightningDataModule):
         return [t for t, _ in zip(iter_trajectories(self.root, "val"), range(count), strict=False)]
 
     def train_dataloader(self) -> DataLoader:
-        sampler = StepSampler(len(self.train_set), self.seed, start=lambda: self.trainer.global_step * self.batch_size)
+        trainer = self.trainer
+        assert trainer is not None
+        sampler = StepSampler(len(self.train_set), self.seed, start=lambda: trainer.global_step * self.batch_size)
         return DataLoader(
             self.train_set,
             batch_size=self.batch_size,
@@ -94,4 +96,3 @@ def _spread(length: int, count: int) -> np.ndarray:
 
 def _one_thread(_: int) -> None:
     torch.set_num_threads(1)
-

@@ -72,7 +72,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
     return FeatureSpec(
         dim=dim,
         materials=materials,
-        node_channels={**{m: (config.history + 1) * dim for m in materials}, BOUNDARY: 2 * dim + 2},
+        node_channels={**dict.fromkeys(materials, (config.history + 1) * dim), BOUNDARY: 2 * dim + 2},
         param_channels={m: len(param_names((m,))) for m in materials},
         relations=radius_relations(materials),
         odd_channels=dim if config.features == "paper" else 3 * dim,

@@ -8,7 +8,7 @@ Encoder, processor and decoder over typed nodes and relations, one parameter set
     a_i   = f_d(h_i)                                     or a sum of antisymmetric pair forces over the true mass
 """
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import torch
 from jaxtyping import Float
@@ -183,14 +183,14 @@ class GPE(nn.Module):
             total: dict[str, Tensor] = {}
             for relation, (edge_index, _, even) in edges.items():
                 source, _, target = relation
-                conv = self.convs[step][_key(relation)]
+                conv = cast(nn.ModuleDict, self.convs[step])[_key(relation)]
                 at_target, at_source, messages = conv(h[source], h[target], edge_index, e[relation], even, with_messages)
                 total[target] = total[target] + at_target if target in total else at_target
                 if not (last and source == BOUNDARY):
                     total[source] = total[source] + at_source if source in total else at_source
                 if with_messages:
                     e[relation] = e[relation] + messages
-            for node_type, update in self.updates[step].items():
+            for node_type, update in cast(nn.ModuleDict, self.updates[step]).items():
                 if node_type in h:
                     incoming = total[node_type] if node_type in total else torch.zeros_like(h[node_type])
                     h[node_type] = h[node_type] + update(incoming)

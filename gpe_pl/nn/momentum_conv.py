@@ -12,7 +12,7 @@ The message is a two-layer MLP, whose first layer is linear in its parts, so tha
 A relation between two node types has a direction already, and is ``negated`` unless the layer is ``directed``.
 """
 
-from typing import Literal, Optional
+from typing import Any, Literal, Optional
 
 import torch
 from jaxtyping import Float, Int64
@@ -23,6 +23,7 @@ from torch_geometric.nn import MessagePassing
 Interaction = Literal["directed", "negated", "odd", "odd_even"]
 EdgeState = Literal["latent", "geometry"]
 Implementation = Literal["factored", "plain"]
+MaybeTensor = Optional[Tensor]  # noqa: UP045 - PyG's code generator reads the signatures below and does not understand unions written with |
 
 
 def orient(edge_index: Int64[Tensor, "2 edge"], odd: Float[Tensor, "edge odd"]) -> tuple[Tensor, Tensor]:
@@ -100,32 +101,33 @@ class MomentumConv(MessagePassing):
             }
         return self.propagate(edge_index, size=size, with_messages=with_messages, **terms)
 
-    # PyG's code generator reads these signatures and understands Optional, not unions written with |
     def message(
-        self, a_i: Optional[Tensor], a_j: Optional[Tensor], b_i: Optional[Tensor], b_j: Optional[Tensor], e: Tensor, s: Optional[Tensor]
-    ) -> tuple[Tensor, Optional[Tensor]]:
+        self, a_i: MaybeTensor, a_j: MaybeTensor, b_i: MaybeTensor, b_j: MaybeTensor, e: Tensor, s: MaybeTensor
+    ) -> tuple[Tensor, MaybeTensor]:
         """φ(z_ij), and φ(z_ji) where the interaction needs it."""
         if self.implementation == "plain":
             return self._odd_plain(a_i, a_j, e, s) if self.is_odd else self._plain(a_i, a_j, e)
         if self.interaction == "negated":
             return self._factored(a_i, b_j, e, s), None
-        forward, reverse, sign = (*e.chunk(2), 1) if self.interaction == "directed" else (e, e, -1)
-        return self._factored(a_i, b_j, forward, s), self._factored(a_j, b_i, reverse, s, sign)
+        if self.interaction == "directed":
+            forward, reverse = e.chunk(2)
+            return self._factored(a_i, b_j, forward, s), self._factored(a_j, b_i, reverse, s)
+        return self._factored(a_i, b_j, e, s), self._factored(a_j, b_i, e, s, sign=-1)
 
-    def _plain(self, h_i: Tensor, h_j: Tensor, e: Tensor) -> tuple[Tensor, Tensor | None]:
+    def _plain(self, h_i: Any, h_j: Any, e: Tensor) -> tuple[Tensor, Tensor | None]:
         if self.interaction == "negated":
             return self.act(self.lin_in(torch.cat([h_i, h_j, e], dim=1))), None
         forward, reverse = e.chunk(2)
         return self.act(self.lin_in(torch.cat([h_i, h_j, forward], dim=1))), self.act(self.lin_in(torch.cat([h_j, h_i, reverse], dim=1)))
 
-    def _odd_plain(self, h_i: Tensor, h_j: Tensor, e: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+    def _odd_plain(self, h_i: Any, h_j: Any, e: Tensor, s: Any) -> tuple[Tensor, Tensor]:
         """z_ij and z_ji as even part ± odd part, so that even without factoring every edge is multiplied once."""
         a, b, w, v = self.lin_in.weight.split(self.widths, dim=1)
         even = functional.linear(torch.cat([h_i + h_j, s], dim=1), torch.cat([(a + b) / 2, v], dim=1), self.lin_in.bias)
         odd = functional.linear(torch.cat([h_i - h_j, e], dim=1), torch.cat([(a - b) / 2, w], dim=1))
         return self.act(even + odd), self.act(even - odd)
 
-    def _factored(self, a_self: Tensor, b_other: Tensor, e: Tensor, s: Tensor | None, sign: int = 1) -> Tensor:
+    def _factored(self, a_self: Any, b_other: Any, e: Tensor, s: Tensor | None, sign: int = 1) -> Tensor:
         z = a_self + b_other
         z.add_(e, alpha=sign)  # in place: at these sizes a new buffer costs more than the sum
         if s is not None:
@@ -134,17 +136,17 @@ class MomentumConv(MessagePassing):
 
     def aggregate(
         self,
-        inputs: tuple[Tensor, Optional[Tensor]],
+        inputs: tuple[Tensor, Any],
         edge_index_i: Tensor,
         edge_index_j: Tensor,
         size_i: int,
         size_j: int,
         with_messages: bool,
-    ) -> tuple[Tensor, Tensor, Optional[Tensor]]:
+    ) -> tuple[Tensor, Tensor, MaybeTensor]:
         """Sums at targets and sources: +m and −m, or for ``directed`` each its own."""
         forward, reverse = inputs
         x = forward - reverse if self.is_odd else forward
-        messages = None
+        messages: Any = None
         if with_messages:
             x = messages = self.lin_out(x)
         if self.interaction == "directed":

@@ -157,7 +157,9 @@ class MPM:
         for axis, (low, high) in enumerate(self.bounds):
             cells = (high - low) / self.grid_spacing
             if not (math.isfinite(cells) and cells > 0.5 and abs(cells - round(cells)) < 1e-6 * cells):
-                raise ValueError(f"bounds[{axis}] = ({low}, {high}) must span a whole number of grid cells of {self.grid_spacing} m, got {cells:g}")
+                raise ValueError(
+                    f"bounds[{axis}] = ({low}, {high}) must span a whole number of grid cells of {self.grid_spacing} m, got {cells:g}"
+                )
         unknown = [m for m in self.materials if m not in laws.LAWS]
         if unknown or not self.materials:
             raise ValueError(f"MPM has no law for material {', '.join(unknown) or '(none)'}; known: {', '.join(laws.LAWS)}")
@@ -199,7 +201,12 @@ class MPM:
         if status != OK:
             raise self._error(status, node, pos, vel)
         return replace(
-            state, pos=pos, vel=vel, velocity_history=None, time=state.time + self.frame_dt, internal=MPMInternal(deformation, affine, plastic)
+            state,
+            pos=pos,
+            vel=vel,
+            velocity_history=None,
+            time=state.time + self.frame_dt,
+            internal=MPMInternal(deformation, affine, plastic),
         )
 
     @property

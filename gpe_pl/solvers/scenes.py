@@ -16,7 +16,7 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gpe_pl.geometry import Box, Polygon, Shape, Sphere, domain_walls, signed_distance
-from gpe_pl.schema import MATERIALS, STICKY, node_code, param_names
+from gpe_pl.schema import STICKY, node_code, param_names
 from gpe_pl.trajectory import Boundary, Metadata, State
 
 PositiveFloat = Annotated[float, Field(gt=0)]

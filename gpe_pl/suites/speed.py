@@ -14,12 +14,13 @@ from torch_geometric.data import HeteroData
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.models.gpe import GPE
+from gpe_pl.nn.momentum_conv import Implementation, Interaction
 from gpe_pl.schema import node_code, param_names
 from gpe_pl.timing import paired_ratio, paired_times
 from gpe_pl.trajectory import Boundary, Metadata, State
 
-INTERACTIONS = ("directed", "negated", "odd", "odd_even")
-IMPLEMENTATIONS = ("plain", "factored")
+INTERACTIONS: tuple[Interaction, ...] = ("directed", "negated", "odd", "odd_even")
+IMPLEMENTATIONS: tuple[Implementation, ...] = ("plain", "factored")
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ class TrainingModule(L.LightningModule):
         final_learning_rate: Annotated[float, Field(gt=0)] = 1e-5,
         schedule: Schedule = "cosine",
         warmup_steps: Annotated[int, Field(ge=0)] = 100,
-        compile: Compile = "auto",  # noqa: A002
+        compile: Compile = "auto",
     ) -> None:
         super().__init__()
         self.simulator = simulator
@@ -65,10 +65,9 @@ class TrainingModule(L.LightningModule):
 
     def configure_optimizers(self) -> Any:
         optimizer = torch.optim.Adam(self.simulator.parameters(), lr=self.learning_rate, fused=True)
-        return {
-            "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": torch.optim.lr_scheduler.LambdaLR(optimizer, self.learning_rate_factor), "interval": "step"},
-        }
+        # a plain function: of anything else the scheduler stores the attributes in checkpoints
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self.learning_rate_factor(step))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def learning_rate_factor(self, step: int) -> float:
         """Learning rate at a step over ``learning_rate``."""

@@ -1,0 +1,122 @@
+"""Every notebook runs from start to end, on results made as a user makes them, and is stored without outputs."""
+
+from __future__ import annotations
+
+import functools
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import pytest
+
+ROOT = Path(__file__).parents[2]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+MOMENTUM = ROOT / "notebooks" / "momentum_ablation.ipynb"
+MAX_CELLS = 12
+
+# The whole ablation, as small as it goes: every split and both kinds of unseen parameters, few particles, frames and steps.
+MINIATURE = (
+    *("data.sizes.tiny.num_train=2", "data.sizes.tiny.num_val=1", "data.sizes.tiny.num_test=2", "data.sizes.tiny.num_test_unseen=2"),
+    *("data.sizes.tiny.num_frames=30", "data.sizes.tiny.num_particles=40"),
+    *("model.hidden_channels=8", "model.num_message_passing_steps=1"),
+    *("training.num_steps=4", "training.val_interval=2", "training.warmup_steps=0", "training.compile=off"),
+    *("training.num_val_rollouts=1", "training.val_rollout_steps=5"),
+    *("evaluation.horizons=[5,20]", "evaluation.num_pictures=0", "trainer.progress=false"),
+)
+
+
+@pytest.fixture(scope="module")
+def ablation(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with ``data`` and ``runs`` of a finished miniature of the momentum ablation."""
+    folder = tmp_path_factory.mktemp("ablation")
+    command = [
+        sys.executable,
+        "-m",
+        "gpe_pl.fit",
+        "experiment=ablation_momentum",
+        f"paths.data={folder / 'data'}",
+        f"paths.runs={folder / 'runs'}",
+    ]
+    child = subprocess.run([*command, *MINIATURE], capture_output=True, text=True, cwd=ROOT, env=_environment(), check=False)
+    assert child.returncode == 0, child.stdout[-2000:] + child.stderr[-2000:]
+    return folder
+
+
+def _environment() -> dict[str, str]:
+    return os.environ | {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg", "PYTHONPATH": str(ROOT)}
+
+
+def _execute(path: Path, folder: Path, runs: Path, data: Path) -> Any:
+    """Execute a copy of a notebook with the running interpreter; returns the copy, which also stays in ``folder``, with its outputs."""
+    from ipykernel.kernelspec import write_kernel_spec
+    from nbclient import NotebookClient
+
+    write_kernel_spec(folder / "jupyter" / "kernels" / "python3")  # one that a user has installed may be another interpreter
+    copy = Path(shutil.copy(path, folder))
+    notebook = nbformat.read(copy, as_version=4)
+    own = {"JUPYTER_PATH": folder / "jupyter", "IPYTHONDIR": folder / "ipython", "GPE_RUNS": runs, "GPE_DATA": data}
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        for key, value in {**_environment(), **own}.items():
+            monkeypatch.setenv(key, str(value))
+        client = NotebookClient(notebook, timeout=120, kernel_name="python3", resources={"metadata": {"path": str(folder)}})
+        try:
+            client.execute()
+        finally:
+            nbformat.write(notebook, copy)
+    return notebook
+
+
+@pytest.fixture(scope="module")
+def executed(ablation: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Any]:
+    """Gives a notebook with its outputs on the miniature; executes each only once."""
+    return functools.cache(lambda path: _execute(path, tmp_path_factory.mktemp(path.stem), ablation / "runs", ablation / "data"))
+
+
+def _outputs(notebook: Any) -> list[Any]:
+    return [output for cell in notebook.cells for output in cell.get("outputs", ())]
+
+
+@pytest.mark.notebook
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_notebook_runs_without_a_warning(path: Path, executed: Callable[[Path], Any]) -> None:
+    before = path.read_bytes()
+    assert [output.text for output in _outputs(executed(path)) if output.get("name") == "stderr"] == []
+    assert path.read_bytes() == before
+
+
+@pytest.mark.notebook
+def test_momentum_ablation_shows_all_interactions(executed: Callable[[Path], Any]) -> None:
+    data = [output.data for output in _outputs(executed(MOMENTUM)) if "data" in output]
+    assert sum("image/png" in d for d in data) == 3
+    tables = [d["text/html"] for d in data if "text/html" in d]
+    assert len(tables) == 3
+    for interaction in ("directed", "negated", "odd", "odd_even"):
+        assert all(f">{interaction}<" in table for table in tables)
+
+
+@pytest.mark.notebook
+def test_momentum_ablation_without_results_says_how_to_make_them(tmp_path: Path) -> None:
+    from nbclient.exceptions import CellExecutionError
+
+    with pytest.raises(CellExecutionError, match="no finished ablation.*make fit") as error:
+        _execute(MOMENTUM, tmp_path, tmp_path / "runs", tmp_path / "data")
+    assert str(tmp_path / "runs" / "ablation_momentum") in str(error.value)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
+def test_notebook_is_small_and_stored_without_outputs(path: Path) -> None:
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    assert len(notebook.cells) <= MAX_CELLS
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(cell.outputs == [] and cell.execution_count is None for cell in code)
+    assert notebook.metadata.kernelspec.name == "python3"
+
+
+def test_the_momentum_ablation_has_a_notebook() -> None:
+    assert MOMENTUM in NOTEBOOKS
