@@ -67,7 +67,7 @@ def bind(target: Callable[..., T], settings: Mapping[str, Any], path: str, *late
         if name not in later:
             default = ... if parameter.default is inspect.Parameter.empty else parameter.default
             fields[name] = (hints.get(name, Any), default)
-    values = OmegaConf.to_container(settings, resolve=True) if isinstance(settings, DictConfig) else dict(settings)
+    values: Any = OmegaConf.to_container(settings, resolve=True) if isinstance(settings, DictConfig) else dict(settings)
     unknown = set(values) - set(fields)
     if unknown:
         raise ConfigError(f"{path}.{min(unknown)}: unknown key; valid keys: {', '.join(fields)}")

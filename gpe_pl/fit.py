@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gpe_pl.config import ConfigError, bind, construct, entry_point, output_dir
 
@@ -36,7 +36,7 @@ def fit(cfg: DictConfig) -> float:
 
     run_dir = output_dir(cfg)
     root = ensure_data(cfg)
-    settings = OmegaConf.to_container(cfg, resolve=True)
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
     claim(run_dir, {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training", "evaluation")})
     if not (run_dir / "metrics.csv").exists():
         set_threads(trainer)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -35,8 +35,9 @@ class Settings:
     num_threads: Annotated[int, Field(ge=1)] = 1
 
 
-def synthetic_graph(num_nodes: int, num_edges: int, seed: int = 0) -> tuple[GraphBuilder, HeteroData]:
+def synthetic_graph(num_nodes: int, num_edges: int, config: GraphConfig, seed: int = 0) -> tuple[GraphBuilder, HeteroData]:
     """A layer of sand without walls: a jittered lattice whose radius is chosen to give about ``num_edges`` undirected edges."""
+    config = replace(config, connectivity_radius=None)
     rng = np.random.default_rng(seed)
     side = int(np.ceil(np.sqrt(num_nodes)))
     lattice = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)[:num_nodes]
@@ -59,23 +60,25 @@ def synthetic_graph(num_nodes: int, num_edges: int, seed: int = 0) -> tuple[Grap
         bounds=((0.0, 1.0), (0.0, 1.0)),
         gravity=(0.0, -9.81),
     )
+    past = rng.normal(size=(num_nodes, config.history, 2))
     state = State(
         pos,
-        rng.normal(size=pos.shape),
+        past[:, -1],
         np.full(num_nodes, node_code("sand"), dtype=np.uint8),
         np.ones(num_nodes),
         np.full((num_nodes, 1), 30.0),
         Boundary.empty(2),
         np.array(metadata.gravity),
+        past,
     )
-    builder = GraphBuilder(GraphConfig(history=1), metadata)
+    builder = GraphBuilder(config, metadata)
     return builder, builder(state.to_torch())
 
 
 def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
     """Records ``forward_time`` [s] and paired ratios against ``directed``, and a Markdown table."""
     torch.set_num_threads(settings.num_threads)
-    builder, graph = synthetic_graph(settings.num_nodes, settings.num_edges)
+    builder, graph = synthetic_graph(settings.num_nodes, settings.num_edges, GraphConfig())
     edges = sum(graph[r].edge_index.shape[1] for r in builder.spec.relations)
 
     alternatives: dict[str, Callable[[], Any]] = {}

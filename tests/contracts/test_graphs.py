@@ -75,8 +75,7 @@ def test_pairs_exactly_at_the_radius_are_neighbours(radius: float, brute_force_r
     s = replace(scenes.state(len(grid), walls=False), pos=grid)
     build = builder(connectivity_radius=radius)
     assert assert_edges_are_exact(build, s, brute_force_radius) == (40 if radius == 0.125 else 40 + 32 + 30)
-    floor = Boundary.sample((), 0.125, 2)
-    floor = replace(floor, **{k: np.zeros((1, 2)) for k in ("pos", "vel")}, normal=np.array([[0.0, 1.0]]), friction=np.zeros(1), restitution=np.zeros(1))
+    floor = Boundary(np.zeros((1, 2)), np.zeros((1, 2)), np.array([[0.0, 1.0]]), np.zeros(1), np.zeros(1))
     beside = replace(scenes.state(2), pos=np.array([[radius, 0.0], [np.nextafter(radius, 1), 0.0]]), boundary=floor)
     assert edges_of(build(beside.to_torch()), (BOUNDARY, "radius", "sand")) == [(0, 0)]
 
@@ -201,7 +200,9 @@ def test_trimming_the_boundary_changes_no_prediction() -> None:
     s = scenes.state(40, TWO).to_torch()
     a, b = full(s), trimmed(s)
     assert 0 < b[BOUNDARY].num_nodes < a[BOUNDARY].num_nodes
-    assert torch.unique(torch.cat([b[e].edge_index[0] for e in b.edge_types if e[0] == BOUNDARY])).tolist() == list(range(b[BOUNDARY].num_nodes))
+    assert torch.unique(torch.cat([b[e].edge_index[0] for e in b.edge_types if e[0] == BOUNDARY])).tolist() == list(
+        range(b[BOUNDARY].num_nodes)
+    )
     torch.manual_seed(0)
     model = GPE(full.spec, num_message_passing_steps=2, hidden_channels=8).double()
     x, y = model(scenes.to_dtype(a, torch.float64)), model(scenes.to_dtype(b, torch.float64))

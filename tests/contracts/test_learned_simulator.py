@@ -177,10 +177,15 @@ def test_targets_that_teach_nothing_are_refused(value: float) -> None:
     [
         (lambda t: replace(t, pos=_with(t.pos, (3, 5, 0), np.nan)), "frame 3: node 5 has a pos that is not finite"),
         (lambda t: replace(t, pos=_with(t.pos, (2, 5, 0), np.inf)), "frame 3: node 5 has a velocity that is not finite"),
-        (lambda t: replace(t, material_params=_with(t.material_params, (4, 0), np.nan)), r"node 4 \(sand\): friction_angle \[deg\] is not finite"),
+        (
+            lambda t: replace(t, material_params=_with(t.material_params, (4, 0), np.nan)),
+            r"node 4 \(sand\): friction_angle \[deg\] is not finite",
+        ),
     ],
 )
-def test_an_initial_state_that_is_not_finite_names_the_node(trajectory: Trajectory, change: Callable[[Trajectory], Trajectory], message: str) -> None:
+def test_an_initial_state_that_is_not_finite_names_the_node(
+    trajectory: Trajectory, change: Callable[[Trajectory], Trajectory], message: str
+) -> None:
     simulator = learned(builder_of(trajectory))
     with pytest.raises(ValueError, match=message):
         simulator.initial_state(change(trajectory), 3)
@@ -242,9 +247,10 @@ def test_a_checkpoint_rebuilds_the_simulator(simulator: LearnedSimulator, tmp_pa
 def test_a_description_is_plain_values(simulator: LearnedSimulator) -> None:
     def check(value: Any) -> None:
         if isinstance(value, dict):
-            [check(v) for v in (*value.keys(), *value.values())]
+            check([*value.keys(), *value.values()])
         elif isinstance(value, (list, tuple)):
-            [check(v) for v in value]
+            for item in value:
+                check(item)
         else:
             assert value is None or type(value) in (str, int, float, bool)
 

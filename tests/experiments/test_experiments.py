@@ -29,7 +29,9 @@ def test_an_experiment_trains_and_evaluates(experiment: str, tiny_data: Path, tm
     value = fit(cfg)
     rows = list(read_rows(tmp_path / experiment / "metrics.csv"))
     assert {r.split for r in rows} == set(cfg.evaluation.splits)
-    full = [r.value for r in rows if (r.model, r.split, r.metric, r.horizon) == ("learned", cfg.evaluation.splits[0], "rollout_mse", "full")]
+    full = [
+        r.value for r in rows if (r.model, r.split, r.metric, r.horizon) == ("learned", cfg.evaluation.splits[0], "rollout_mse", "full")
+    ]
     assert value == pytest.approx(sum(full) / len(full))
     assert 0 < value < 10
 

@@ -82,10 +82,8 @@ def assert_equal(a: Any, b: Any, path: str = "") -> None:
 STATE = ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers", "global_step", "simulator")
 
 
-@pytest.mark.parametrize("killed_at", [1, 3, 5])
-def test_a_resumed_run_equals_an_uninterrupted_one(
-    tiny_data: Path, tmp_path: Path, losses: dict[int, list[float]], killed_at: int
-) -> None:
+@pytest.mark.parametrize("killed_at", [1, 5])
+def test_a_resumed_run_equals_an_uninterrupted_one(tiny_data: Path, tmp_path: Path, losses: dict[int, list[float]], killed_at: int) -> None:
     whole = tiny(tiny_data, tmp_path, "name=whole", *STEPS)
     value = fit(whole)
     expected = {step: taken[0] for step, taken in losses.items()}
@@ -108,8 +106,9 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
         a, b = checkpoint(whole, name), checkpoint(parts, name)
         assert set(STATE) <= set(a)
         assert_equal({k: a[k] for k in STATE}, {k: b[k] for k in STATE})
-    assert_equal(*([v.tolist() for v in validation_curve(tmp_path / name)] for name in ("whole", "parts")))
-    assert len(validation_curve(tmp_path / "whole")[0]) == 3
+    curves = [[v.tolist() for v in validation_curve(tmp_path / name)] for name in ("whole", "parts")]
+    assert curves[0] == curves[1]
+    assert curves[0][0] == [2, 4, 6]
     assert (tmp_path / "whole" / "metrics.csv").read_bytes() == (tmp_path / "parts" / "metrics.csv").read_bytes()
 
 
@@ -173,8 +172,8 @@ def _claimed(cfg: DictConfig) -> dict[str, Any]:
 
 
 def test_a_folder_in_which_nothing_was_saved_is_free(tiny_data: Path, tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="graph.history=19 needs"):
-        fit(tiny(tiny_data, tmp_path, "graph.history=19"))
+    with pytest.raises(StoreError, match="graph.history=11 needs"):
+        fit(tiny(tiny_data, tmp_path, "graph.history=11"))
     assert fit(tiny(tiny_data, tmp_path)) > 0
     (tmp_path / "fit" / "config.json").write_text("{")
     with pytest.raises(RunError, match="config.json is damaged"):
@@ -196,7 +195,9 @@ def test_ctrl_c_says_how_to_go_on(tiny_data: Path, tmp_path: Path, monkeypatch: 
     assert (tmp_path / "fit" / "checkpoints" / "last.ckpt").exists()
 
 
-def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """One material parameter that is not finite reaches the loss only when its trajectory is drawn."""
     cfg = tiny(tiny_data, tmp_path, *STEPS, "training.num_steps=60")
     plain = TrainingModule.training_step
@@ -210,7 +211,9 @@ def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(tiny_data: Pa
         return plain(self, batch, batch_idx)
 
     monkeypatch.setattr(TrainingModule, "training_step", training_step)
-    with pytest.raises(TrainingError, match=r"step \d+: the loss is nan for \(trajectory, frame\) = .*\(1, \d+\).*last good checkpoint is kept") as caught:
+    with pytest.raises(
+        TrainingError, match=r"step \d+: the loss is nan for \(trajectory, frame\) = .*\(1, \d+\).*last good checkpoint is kept"
+    ) as caught:
         fit(cfg)
     step = int(str(caught.value).split(":")[0].removeprefix("step "))
     assert 4 < step < 20
@@ -227,12 +230,12 @@ def test_a_position_that_is_not_finite_stops_the_run_and_is_named(tiny_data: Pat
         stored = self.train_set.trajectories[1]
         assert stored.held is not None
         pos = stored.held.pos.copy()
-        pos[12, 7] = np.nan
+        pos[8, 7] = np.nan
         self.train_set.trajectories[1] = replace(stored, held=replace(stored.held, pos=pos))
         return plain(self)
 
     monkeypatch.setattr(TrajectoryDataModule, "train_dataloader", train_dataloader)
-    with pytest.raises(StoreError, match="shard-00000.h5:00001: frame 12, node 7: the position is not finite"):
+    with pytest.raises(StoreError, match="shard-00000.h5:00001: frame 8, node 7: the position is not finite"):
         fit(tiny(tiny_data, tmp_path, "training.num_steps=40", "training.val_interval=40"))
 
 
@@ -269,7 +272,15 @@ def test_a_trained_checkpoint_holds_the_averaged_weights(tiny_data: Path, tmp_pa
 def test_a_sweep_ends_with_table_and_plot(tiny_data: Path, tmp_path: Path) -> None:
     for interaction in ("negated", "odd"):
         for seed in (0, 1):
-            fit(tiny(tiny_data, tmp_path, f"name='log/model.interaction={interaction}/seed={seed}'", f"model.interaction={interaction}", f"seed={seed}"))
+            fit(
+                tiny(
+                    tiny_data,
+                    tmp_path,
+                    f"name='log/model.interaction={interaction}/seed={seed}'",
+                    f"model.interaction={interaction}",
+                    f"seed={seed}",
+                )
+            )
     folder = tmp_path / "log"  # a folder's name must not matter
     report_sweep(folder)
     with open(folder / "table.csv", newline="") as handle:
@@ -279,7 +290,11 @@ def test_a_sweep_ends_with_table_and_plot(tiny_data: Path, tmp_path: Path) -> No
     assert {(r["interaction"], r["seed"]) for r in rows} == {(i, s) for i in ("negated", "odd") for s in "01"}
     assert {r["split"] for r in rows} == {"val", "test", "test_unseen", "test_unseen/interpolated", "test_unseen/extrapolated"}
     assert len({tuple(list(r.values())[:-1]) for r in rows}) == len(rows)
-    chosen = {r["metric"]: float(r["value"]) for r in rows if (r["interaction"], r["seed"], r["split"], r["horizon"]) == ("odd", "1", "test_unseen", "full")}
+    chosen = {
+        r["metric"]: float(r["value"])
+        for r in rows
+        if (r["interaction"], r["seed"], r["split"], r["horizon"]) == ("odd", "1", "test_unseen", "full")
+    }
     run = list(read_rows(folder / "model.interaction=odd" / "seed=1" / "metrics.csv"))
     values = [r.value for r in run if (r.model, r.split, r.metric, r.horizon) == ("learned", "test_unseen", "rollout_mse", "full")]
     assert chosen["rollout_mse"] == pytest.approx(np.mean(values))

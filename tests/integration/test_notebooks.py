@@ -108,6 +108,17 @@ def test_momentum_ablation_without_results_says_how_to_make_them(tmp_path: Path)
     assert str(tmp_path / "runs" / "ablation_momentum") in str(error.value)
 
 
+@pytest.mark.notebook
+def test_momentum_ablation_half_done_names_what_is_missing(ablation: Path, tmp_path: Path) -> None:
+    from nbclient.exceptions import CellExecutionError
+
+    runs = shutil.copytree(ablation / "runs", tmp_path / "runs")
+    for path in runs.rglob("model.interaction=odd"):
+        shutil.rmtree(path)
+    with pytest.raises(CellExecutionError, match="no finished run of odd. Run `make fit` again"):
+        _execute(MOMENTUM, tmp_path, runs, ablation / "data")
+
+
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 def test_notebook_is_small_and_stored_without_outputs(path: Path) -> None:
     notebook = nbformat.read(path, as_version=4)

@@ -14,8 +14,12 @@ from gpe_pl.trajectory import Boundary, State
 from tests import scenes
 
 DT, G = 0.01, -9.81
-WALLS = domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.3)
-OBSTACLES = (Sphere((0.3, 0.3), 0.15, 0.3), Box((0.6, -0.1), (0.8, 0.2), 0.3), Polygon(((0.5, 0.6), (0.8, 0.65), (0.6, 0.85)), 0.3))
+WALLS: tuple[Shape, ...] = domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.3)
+OBSTACLES: tuple[Shape, ...] = (
+    Sphere((0.3, 0.3), 0.15, 0.3),
+    Box((0.6, -0.1), (0.8, 0.2), 0.3),
+    Polygon(((0.5, 0.6), (0.8, 0.65), (0.6, 0.85)), 0.3),
+)
 
 
 def state(pos: np.ndarray, vel: np.ndarray, shapes: tuple[Shape, ...] = ()) -> State:

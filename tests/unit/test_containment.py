@@ -39,7 +39,9 @@ def moved(shapes: tuple[Shape, ...], before: np.ndarray, after: np.ndarray, hist
     return replace(s, pos=after, vel=vel, velocity_history=past, boundary=boundary)
 
 
-def steps_from_free_space(shapes: tuple[Shape, ...], length: float, count: int = 3000, seed: int = 0, dim: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def steps_from_free_space(
+    shapes: tuple[Shape, ...], length: float, count: int = 3000, seed: int = 0, dim: int = 2
+) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     before = rng.uniform(0, 1, (4 * count, dim))
     before = before[signed_distance(shapes, before) > 0][:count]
@@ -48,7 +50,9 @@ def steps_from_free_space(shapes: tuple[Shape, ...], length: float, count: int =
 
 @pytest.mark.parametrize("backend", ["numpy", "torch"])
 @pytest.mark.parametrize("length", [0.01, 0.05, 0.3])
-@pytest.mark.parametrize("shapes", [WALLS, WALLS + OBSTACLES, WALLS + HOUSES, WALLS + WEDGES], ids=["walls", "obstacles", "houses", "wedges"])
+@pytest.mark.parametrize(
+    "shapes", [WALLS, WALLS + OBSTACLES, WALLS + HOUSES, WALLS + WEDGES], ids=["walls", "obstacles", "houses", "wedges"]
+)
 def test_no_node_is_inside_afterwards(shapes: tuple[Shape, ...], length: float, backend: str) -> None:
     before, after = steps_from_free_space(shapes, length)
     state = moved(shapes, before, after, history=2)

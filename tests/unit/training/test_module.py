@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from types import SimpleNamespace
 from typing import Any
@@ -57,7 +58,7 @@ def test_the_cosine_schedule_warms_up_and_ends_at_the_final_rate() -> None:
     assert rates(m, [0, 49, 99]) == pytest.approx([1e-5, 5e-4, 1e-3])  # linear
     assert rates(m, [100, 550, 1000, 2000]) == pytest.approx([1e-3, (1e-3 + 1e-5) / 2, 1e-5, 1e-5])
     falling = rates(m, list(range(100, 1001)))
-    assert all(a > b for a, b in zip(falling, falling[1:], strict=False))
+    assert all(a > b for a, b in itertools.pairwise(falling))
 
 
 @pytest.mark.parametrize("schedule", ["cosine", "exponential"])
@@ -84,7 +85,12 @@ def test_the_optimizer_follows_the_schedule() -> None:
 def test_the_loss_is_the_mean_over_all_nodes_and_axes_of_both_materials() -> None:
     m, data = module(), batch()
     predicted = m.simulator(data)
-    errors = [float((predicted[t][i, d].detach() - data[t].target[i, d] / 5.0) ** 2) for t in MATERIALS for i in range(data[t].x.shape[0]) for d in (0, 1)]
+    errors = [
+        float((predicted[t][i, d].detach() - data[t].target[i, d] / 5.0) ** 2)
+        for t in MATERIALS
+        for i in range(data[t].x.shape[0])
+        for d in (0, 1)
+    ]
     assert len(errors) == 2 * (20 + 26)
     assert m.loss(data).item() == pytest.approx(sum(errors) / len(errors), rel=1e-5)
 
@@ -103,7 +109,9 @@ def test_a_loss_that_is_not_finite_names_step_trajectories_and_frames(value: flo
     m, data = module(), batch()
     data["sand"].target[3, 1] = value
     m._trainer = SimpleNamespace(global_step=41)  # type: ignore[assignment]
-    with pytest.raises(TrainingError, match=rf"step 41: the loss is {value} for \(trajectory, frame\) = \(7, 30\), \(8, 31\); the last good checkpoint"):
+    with pytest.raises(
+        TrainingError, match=rf"step 41: the loss is {value} for \(trajectory, frame\) = \(7, 30\), \(8, 31\); the last good checkpoint"
+    ):
         m.training_step(data, 0)
 
 

@@ -1,0 +1,294 @@
+"""Whatever is wrong in a config: one line that names it and says what is allowed, exit code 2, no traceback."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Annotated, Any, Literal
+
+import hydra
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from pydantic import Field
+
+from gpe_pl.config import CONF, ConfigError, bind, construct, entry_point, explain, output_dir
+from gpe_pl.errors import GpeError
+from gpe_pl.fit import fit
+from gpe_pl.learned_simulator import UnknownModelError
+from gpe_pl.simulate import dataset_spec
+from tests.runs import compose
+
+ROOT = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True)
+class Inner:
+    size: Annotated[int, Field(ge=1)]
+    kind: Literal["a", "b"] = "a"
+    rate: Annotated[float, Field(gt=0)] | None = 0.5
+    names: list[str] = field(default_factory=lambda: ["x"])
+
+    def __post_init__(self) -> None:
+        if self.kind == "b" and self.size > 5:
+            raise ValueError("size must be at most 5 for kind b")
+
+
+class Network:
+    def __init__(self, spec: Any, width: Annotated[int, Field(ge=1)] = 3, *, deep: bool = False) -> None:
+        self.spec, self.width, self.deep = spec, width, deep
+
+
+# --- construct -----------------------------------------------------------------------------------------------------------------------------
+
+
+def test_construct_checks_and_converts() -> None:
+    made = construct(Inner, OmegaConf.create({"size": "3", "kind": "b", "rate": None, "names": ["p", "q"]}), "inner")
+    assert made == Inner(3, "b", None, ["p", "q"])
+    assert construct(Inner, {"size": 2}, "inner") == Inner(2)
+    network = construct(Network, {"width": 7}, "model", spec=SimpleNamespace())
+    assert (network.width, network.deep) == (7, False)
+
+
+def test_construct_resolves_interpolations() -> None:
+    cfg = OmegaConf.create({"n": 4, "inner": {"size": "${n}"}})
+    assert construct(Inner, cfg.inner, "inner").size == 4
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"size": 0}, "inner.size=0: input should be greater than or equal to 1"),
+        ({"size": "many"}, "inner.size='many': input should be a valid integer, unable to parse string as an integer"),
+        ({"size": 1.5}, "inner.size=1.5: input should be a valid integer, got a number with a fractional part"),
+        ({"size": None}, "inner.size=None: input should be a valid integer"),
+        ({}, "inner.size: field required"),
+        ({"size": 1, "kind": "c"}, "inner.kind='c': input should be 'a' or 'b'"),
+        ({"size": 1, "rate": -1.0}, "inner.rate=-1.0: input should be greater than 0"),
+        ({"size": 1, "rate": float("inf")}, "inner.rate=inf: input should be a finite number"),
+        ({"size": 1, "names": ["x", 3]}, "inner.names.1=3: input should be a valid string"),
+        ({"size": 1, "sise": 2}, "inner.sise: unknown key; valid keys: size, kind, rate, names"),
+        ({"size": 0, "kind": "c"}, "inner.size=0: input should be greater than or equal to 1; inner.kind='c': input should be 'a' or 'b'"),
+        ({"size": 9, "kind": "b"}, "inner: size must be at most 5 for kind b"),
+    ],
+)
+def test_construct_names_key_value_and_what_is_allowed(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        construct(Inner, settings, "inner")
+    assert str(caught.value) == message
+
+
+def test_a_given_argument_is_no_key() -> None:
+    with pytest.raises(ConfigError, match="model.spec: unknown key; valid keys: width, deep"):
+        construct(Network, {"spec": 3}, "model", spec=SimpleNamespace())
+
+
+def test_bind_checks_before_anything_is_built() -> None:
+    with pytest.raises(ConfigError, match="model.width=0"):
+        bind(Network, {"width": 0}, "model", "spec")
+    network = bind(Network, {"width": 2}, "model", "spec")(spec="later")
+    assert (network.spec, network.width) == ("later", 2)
+
+
+def test_typed_errors_pass_through_construct() -> None:
+    class Special(GpeError, ValueError):
+        pass
+
+    def target(x: int) -> None:
+        raise Special("as it is")
+
+    with pytest.raises(Special, match="^as it is$"):
+        construct(target, {"x": 1}, "path")
+
+
+# --- composition ---------------------------------------------------------------------------------------------------------------------------
+
+
+def complaint(name: str, *overrides: str) -> str:
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"), pytest.raises(HydraException) as caught:
+        hydra.compose(name, list(overrides), return_hydra_config=True)
+    return explain(caught.value, name, list(overrides))
+
+
+@pytest.mark.parametrize(
+    ("name", "override", "words"),
+    [
+        ("fit", "trianing.num_steps=5", ["trianing.num_steps: unknown key 'trianing'; valid keys: ", "training", "experiment"]),
+        ("fit", "training.num_stpes=5", ["training.num_stpes: unknown key 'num_stpes'; valid keys of training: ", "num_steps"]),
+        ("fit", "model.interation=odd", ["unknown key 'interation'; valid keys of model: ", "interaction"]),
+        ("fit", "data.scene.num_partcles=3", ["unknown key 'num_partcles'; valid keys of data.scene: ", "num_particles"]),
+        ("fit", "data.sizes.tiny.num_trian=3", ["unknown key 'num_trian'; valid keys of data.sizes.tiny: ", "num_train"]),
+        ("fit", "data.sizes.tyni.num_train=3", ["unknown key 'tyni'; valid keys of data.sizes: ", "tiny"]),
+        ("fit", "experimnt=sand", ["unknown key 'experimnt'; valid keys: ", " experiment,"]),
+        ("fit", "modle=gpe", ["unknown key 'modle'; valid keys: ", " model,"]),
+        ("fit", "model=gep", ["'model/gep'", "gpe"]),
+        ("fit", "experiment=snad", ["'experiment/snad'", "ablation_momentum", "sand"]),
+        ("fit", "size=tyni", ["'size/tyni'", "paper small tiny"]),
+        ("fit", "~training.num_stpes", ["training.num_stpes"]),
+        ("fit", "a=b=c", ["a=b=c: "]),
+        ("fit", "num_steps", ["'num_steps' missing EQUAL"]),
+        ("fit", "hydra.swep.dir=x", ["hydra.swep.dir"]),
+        ("simulate", "data.sede=3", ["unknown key 'sede'; valid keys of data: ", "seed"]),
+        ("simulate", "num_wrokers=3", ["unknown key 'num_wrokers'; valid keys: ", "num_workers"]),
+        ("benchmark", "suite.num_nods=3", ["unknown key 'num_nods'; valid keys of suite: ", "num_nodes"]),
+        ("benchmark", "suite=sped", ["'suite/sped'", "speed"]),
+    ],
+)
+def test_a_misspelling_gets_the_valid_ones(name: str, override: str, words: list[str]) -> None:
+    line = complaint(name, override)
+    assert all(word in line for word in words), line
+    assert "\n" not in line
+    assert "See https" not in line
+
+
+def test_the_keys_are_those_of_the_chosen_groups() -> None:
+    line = complaint("fit", "logger=wandb", "logger.projct=x")
+    assert "valid keys of logger: kind, mode, project" in line
+
+
+def test_a_misspelling_beside_a_sweep_gets_the_valid_ones() -> None:
+    """In a multi-run, Hydra composes one job but ``sys.argv`` still holds the sweep."""
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"), pytest.raises(HydraException) as caught:
+        hydra.compose("fit", ["model.interation=odd", "seed=0"])
+    line = explain(
+        caught.value, "fit", ["-m", "model.interation=odd,negated", "seed=0,1", "evaluation.splits=[test,val]", "size=tiny,small"]
+    )
+    assert "valid keys of model: " in line
+
+
+# --- values, by the entry points' own checks -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("training.num_steps=0", "training.num_steps=0: input should be greater than or equal to 1"),
+        ("training.num_steps=", "training.num_steps='': input should be a valid integer"),
+        ("training.noise=papr", "training.noise='papr': input should be 'paper' or 'velocity'"),
+        ("training.learning_rate=inf", "training.learning_rate=inf: input should be a finite number"),
+        ("model.interaction=ood", "model.interaction='ood': input should be 'directed', 'negated', 'odd' or 'odd_even'"),
+        ("model.hidden_channels=-1", "model.hidden_channels=-1: input should be greater"),
+        ("+model.foo=1", "model.foo: unknown key; valid keys: interaction"),
+        ("+training.foo=1", "training.foo: unknown key; valid keys: num_steps"),
+        ("graph.history=0", "graph.history=0: input should be greater"),
+        ("evaluation.splits=[tset]", "evaluation.splits.0='tset': input should be 'train', 'val', 'test' or 'test_unseen'"),
+        ("evaluation.splits=[]", r"evaluation.splits=\[\]: list should have at least 1 item"),
+        ("seed=-1", "seed=-1: must be an integer of at least 0"),
+        ("seed=first", "seed='first': must be an integer of at least 0"),
+        ("logger.kind=tb", "logger.kind='tb': input should be 'csv' or 'wandb'"),
+        ("trainer.num_workers=-1", "trainer.num_workers=-1: input should be greater"),
+    ],
+)
+def test_fit_names_the_value_before_it_does_anything(override: str, message: str, tmp_path: Path) -> None:
+    cfg = compose("fit", override, f"paths.data={tmp_path / 'data'}", f"paths.runs={tmp_path / 'runs'}")
+    with pytest.raises(ConfigError, match=f"^{message}"):
+        fit(cfg)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("target", ["gpe_pl.models.gpe.GEP", "os.system", "3"])
+def test_fit_takes_only_models(target: str, tmp_path: Path) -> None:
+    with pytest.raises(UnknownModelError, match=f"model '{target}'"):
+        fit(compose("fit", f"model._target_='{target}'", f"paths.data={tmp_path}", f"paths.runs={tmp_path}"))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("data.num_train=0", "data.num_train=0: input should be greater than or equal to 1"),
+        ("data.seen_values=[20,100]", r"data: seen_values: friction_angle = 100.0 is outside \[0, 60\] deg$"),
+        ("data.interpolated_values=[20.0]", r"data: unseen values \[20.0\] are among seen_values$"),
+        ("data.material=snad", "data.solver: MPM has no law for material snad; known: sand"),
+        ("data.name=a/b", "data.name='a/b': string should match pattern"),
+        ("data.solver.cfl=0", "data.solver.cfl=0: input should be greater than 0"),
+        ("data.scene.gravity=[0,down]", "data.scene.gravity.1='down': input should be a valid number"),
+        ("+data.solver.foo=1", "data.solver.foo: unknown key; valid keys: "),
+    ],
+)
+def test_a_data_set_names_the_value(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{message}") as caught:
+        dataset_spec(compose("simulate", override))
+    assert len(str(caught.value)) < 400
+
+
+# --- entry points --------------------------------------------------------------------------------------------------------------------------
+
+
+def call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, task: Callable[[DictConfig], Any], *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["command", f"paths.runs={tmp_path}", *arguments])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)  # forgotten again after the test
+    GlobalHydra.instance().clear()
+    entry_point("benchmark")(task)()
+
+
+@pytest.mark.parametrize(
+    ("task", "arguments", "line"),
+    [
+        (lambda cfg: None, ["suit=speed"], "error: suit: unknown key 'suit'; valid keys: paths, suite"),
+        (lambda cfg: None, ["suite=3"], "error: Config group override must be a string or a list. Got int"),
+        (lambda cfg: None, ["paths.data=null"], "error: paths.data=None: input should be a valid string"),
+        (lambda cfg: None, ["suite.name=${nothing}"], "error: Interpolation key 'nothing' not found"),
+        (lambda cfg: construct(Inner, {"size": cfg.suite.num_nodes}, "suite"), ["suite.num_nodes=0"], "error: suite.size=0: input should"),
+    ],
+)
+def test_an_entry_point_fails_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, task: Any, arguments: list[str], line: str
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        call(monkeypatch, tmp_path, task, *arguments)
+    assert caught.value.code == 2
+    output = capsys.readouterr()
+    assert output.err.startswith(line)
+    assert output.err.count("\n") == 1
+    assert output.out == ""
+
+
+def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def task(_: DictConfig) -> None:
+        raise ValueError("a bug, not a setting")
+
+    with pytest.raises(ValueError, match="a bug"):
+        call(monkeypatch, tmp_path, task)
+
+
+def test_without_hydra_the_output_lies_under_runs(tmp_path: Path) -> None:
+    assert output_dir(OmegaConf.create({"paths": {"runs": str(tmp_path)}, "name": "x"})) == tmp_path / "x"
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "line"),
+    [
+        (
+            "fit",
+            ["-m", "model.interation=odd,negated", "seed=0,1"],
+            "error: model.interation: unknown key 'interation'; valid keys of model: ",
+        ),
+        ("fit", ["experiment=ablation_momentum", "training.num_steps=-1"], "error: training.num_steps=-1: input should be greater"),
+        ("simulate", ["num_workers=0"], "error: num_workers=0: must be null (one per core) or an integer of at least 1"),
+        pytest.param(
+            *("benchmark", ["suite.num_rounds=none"], "error: suite.num_rounds='none': input should be a valid integer"),
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_commands_fail_in_one_line(tmp_path: Path, command: str, arguments: list[str], line: str) -> None:
+    child = subprocess.run(
+        [sys.executable, "-m", f"gpe_pl.{command}", *arguments, f"paths.runs={tmp_path}", f"paths.data={tmp_path}"],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert child.returncode == 2
+    errors = child.stderr.splitlines()
+    assert len(errors) == 1
+    assert errors[0].startswith(line)
+    assert "Traceback" not in child.stdout + child.stderr
