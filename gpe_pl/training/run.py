@@ -129,22 +129,17 @@ def train(
     """Train to ``num_steps``, resuming from ``checkpoints/last.ckpt`` if there is one; returns the checkpoint with the best validation rollout."""
     folder = run_dir / "checkpoints"
     last = folder / "last.ckpt"
-    best = ModelCheckpoint(
-        folder,
-        filename="best",
-        monitor="val/rollout_mse",
-        mode="min",
-        save_top_k=1,
-        save_last=True,
-        save_on_train_epoch_end=False,
-        enable_version_counter=False,
-    )
+    options: dict[str, Any] = {"save_top_k": 1, "save_on_train_epoch_end": False, "enable_version_counter": False}
+    best = ModelCheckpoint(folder, filename="best", monitor="val/rollout_mse", mode="min", **options)
+    # not save_last, which writes only when the best one changes; and after it, so that it knows the best one so far
+    latest = ModelCheckpoint(folder, filename="last", **options)
     steps = min(training.val_rollout_steps, datamodule.val_trajectories(1)[0].num_frames - datamodule.builder.config.history - 1)
     callbacks: list[Callback] = [
         RolloutValidation(datamodule.val_trajectories(training.num_val_rollouts), steps),
         WarmAverage(training.ema_decay),
         LearningRateMonitor(),
         best,
+        latest,
     ]
     if trainer_settings.progress:
         callbacks.append(TQDMProgressBar(refresh_rate=50))
