@@ -389,7 +389,7 @@ def _run(pool: Executor | None, function: Callable[..., Any], arguments: list[tu
 
 def _moments(path: Path) -> tuple[str, dict[str, Any]]:
     """Sums over one shard from which the statistics follow."""
-    sums = {"velocity": [0, 0.0], "acceleration": [0, 0.0], "params": None, "nodes": 0, "frames": 0, "trajectories": 0}
+    sums: dict[str, Any] = {"velocity": [0, 0.0], "acceleration": [0, 0.0], "params": None, "nodes": 0, "frames": 0, "trajectories": 0}
     for name in trajectory_names(path):
         trajectory = read_trajectory(path, name)
         dt = trajectory.metadata.frame_dt

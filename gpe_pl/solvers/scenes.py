@@ -182,7 +182,7 @@ def _obstacles(config: SceneConfig, rng: np.random.Generator) -> tuple[Shape, ..
         else:
             turn = angle + 2 * math.pi * np.arange(sides) / sides
             vertices = center + radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-            obstacles.append(Polygon(tuple(_floats(v) for v in vertices), friction))
+            obstacles.append(Polygon(tuple((float(x), float(y)) for x, y in vertices), friction))
     return tuple(obstacles)
 
 

@@ -18,7 +18,7 @@ from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import FeatureSpec
 from tests import scenes
 
-Factory = Callable[[FeatureSpec], torch.nn.Module]
+Factory = Callable[[FeatureSpec], Any]
 
 
 def gpe(**settings: Any) -> Factory:
@@ -42,7 +42,7 @@ def make(request: pytest.FixtureRequest) -> Factory:
     return MODELS[request.param]
 
 
-def predict(model: torch.nn.Module, data: HeteroData, num_nodes: int) -> torch.Tensor:
+def predict(model: Any, data: HeteroData, num_nodes: int) -> torch.Tensor:
     """Predictions in the order of the state's nodes."""
     out = torch.full((num_nodes, model.spec.dim), float("nan"), dtype=torch.float64)
     for material, value in model(data).items():
@@ -130,13 +130,9 @@ def test_bodies_out_of_reach_do_not_feel_each_other(make: Factory) -> None:
     build = scenes.builder()
     near, far = scenes.state(20, walls=False, seed=1), scenes.state(15, walls=False, seed=2)
     far = replace(far, pos=far.pos + 10.0)
-    both = replace(
-        near,
-        **{
-            name: np.concatenate([getattr(near, name), getattr(far, name)])
-            for name in ("pos", "vel", "node_type", "mass", "material_params", "velocity_history")
-        },
-    )
+    names = ("pos", "vel", "node_type", "mass", "material_params", "velocity_history")
+    joined: dict[str, Any] = {name: np.concatenate([getattr(near, name), getattr(far, name)]) for name in names}
+    both = replace(near, **joined)
     model = make(build.spec)
     alone = predict(model, scenes.to_dtype(build(near.to_torch()), torch.float64), 20)
     together = predict(model, scenes.to_dtype(build(both.to_torch()), torch.float64), 35)
@@ -147,6 +143,7 @@ def test_bodies_out_of_reach_do_not_feel_each_other(make: Factory) -> None:
 def test_degenerate_geometry_is_finite_with_finite_gradients(make: Factory, case: str) -> None:
     build = scenes.builder()
     s = scenes.state({"one": 1, "two coincident at rest": 2, "none": 0}.get(case, 12), walls=case != "one")
+    assert s.velocity_history is not None
     pos, past = s.pos.copy(), s.velocity_history.copy()
     if case == "coincident":
         pos[1:4] = pos[0]

@@ -157,7 +157,11 @@ HOSTILE = {
     "no mass": ("input", 13, lambda s: poke(s, "mass", 13, 0.0)),
     "parameter out of range": ("input", 14, lambda s: poke(s, "material_params", 14, 90.0)),
     "parameter nan": ("input", 15, lambda s: poke(s, "material_params", 15, math.nan)),
-    "unknown material": ("input", 16, lambda s: replace(s, node_type=np.where(np.arange(s.num_nodes) == 16, 2, s.node_type).astype(np.uint8))),
+    "unknown material": (
+        "input",
+        16,
+        lambda s: replace(s, node_type=np.where(np.arange(s.num_nodes) == 16, 2, s.node_type).astype(np.uint8)),
+    ),
     "wrong dimension": ("input", -1, lambda s: replace(s, pos=np.ones((s.num_nodes, 3)))),
     "missing velocity": ("input", -1, lambda s: replace(s, vel=s.vel[:-1])),
     "nan gravity": ("nan", -1, lambda s: replace(s, gravity=np.array([0.0, math.nan]))),

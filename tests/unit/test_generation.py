@@ -85,6 +85,7 @@ def test_killed_run_resumes(folder, tmp_path):
     )
     command = [sys.executable, "-c", script, str(tmp_path), json.dumps(asdict(SPEC))]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(generation.__file__).parents[1])
+    assert process.stdout is not None
     for line in process.stdout:
         if int(line) >= 4:
             os.kill(process.pid, signal.SIGKILL)
@@ -135,7 +136,7 @@ def test_seeds_differ():
 
 
 def test_parameter_groups_are_marked(folder):
-    groups = {}
+    groups: dict[str, list[float]] = {}
     for trajectory in iter_trajectories(folder, "test_unseen"):
         groups.setdefault(trajectory.metadata.parameter_group, []).append(float(trajectory.material_params[0, 0]))
     assert groups == {"interpolated": [25.0, 35.0, 25.0], "extrapolated": [15.0, 45.0, 15.0]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from tests import scenes
 DOUBLE = torch.float64
 
 
-def algorithm_1(model: GPE, data: HeteroData) -> dict[str, Tensor]:
+def algorithm_1(model: Any, data: HeteroData) -> dict[str, Tensor]:
     """The paper's pseudo-code, edge by edge, in its own order: encoder, processor with m_ji = −m_ij, decoder. Latent edge states."""
     directed = model.interaction == "directed"
     h: dict[tuple[str, int], Tensor] = {}

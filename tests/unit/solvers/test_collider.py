@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from gpe_pl.geometry import Box, Polygon, Sphere, domain_walls, outward_normal, signed_distance
+from gpe_pl.geometry import Box, Polygon, Shape, Sphere, domain_walls, outward_normal, signed_distance
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers.mpm import MPM, _push_out
 from gpe_pl.trajectory import Boundary, State
 
 BOUNDS = ((0.0, 1.0), (0.0, 1.0))
-SHAPES = {
+SHAPES: dict[str, Shape] = {
     "sphere": Sphere((0.5, 0.5), 0.2, 0.3),
     "box": Box((0.3, 0.4), (0.7, 0.6), 0.3),
     "triangle": Polygon(((0.3, 0.3), (0.7, 0.35), (0.5, 0.7)), 0.3),

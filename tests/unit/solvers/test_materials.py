@@ -93,7 +93,9 @@ def test_expanded_sand_must_close_before_it_bears_pressure():
     assert gap == pytest.approx(2 * math.log(1.1 * 0.95)) and not stress.any()
 
 
-@pytest.mark.parametrize("deformation", [np.zeros((2, 2)), np.diag([1.0, 0.0]), np.array([[1.0, 1.0], [1.0, 1.0]]), -np.eye(2), np.diag([1e-200, 1.0])])
+@pytest.mark.parametrize(
+    "deformation", [np.zeros((2, 2)), np.diag([1.0, 0.0]), np.array([[1.0, 1.0], [1.0, 1.0]]), -np.eye(2), np.diag([1e-200, 1.0])]
+)
 def test_degenerate_deformation_gives_finite_stress(deformation):
     new, plastic, stress = respond(deformation, 0.0, 0.3)
     assert np.all(np.isfinite(new)) and np.isfinite(plastic) and np.all(np.isfinite(stress))

@@ -3,13 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gpe_pl.geometry import Box, Polygon, Sphere, domain_walls
+from gpe_pl.geometry import Box, Polygon, Shape, Sphere, domain_walls
 from gpe_pl.trajectory import Boundary, Metadata, Termination, Trajectory
 
 
 def falling(dim: int, num_frames: int = 12, noise: float = 0.0) -> Trajectory:
     bounds = ((0.0, 1.0),) * dim
-    shapes = domain_walls(bounds, 0.5)
+    shapes: tuple[Shape, ...] = domain_walls(bounds, 0.5)
     if dim == 2:
         shapes += (Sphere((0.5, 0.2), 0.1, 0.3), Box((0.8, 0.0), (0.9, 0.1), 0.3), Polygon(((0.0, 0.0), (0.2, 0.0), (0.0, 0.2)), 0.3))
     axis = 0.4 + 0.03 * np.arange(5)

@@ -10,7 +10,7 @@ from gpe_pl.viz.video import write_animation
 def frames_of(path) -> list[np.ndarray]:
     with Image.open(path) as image:
         frames = []
-        for k in range(image.n_frames):
+        for k in range(getattr(image, "n_frames", 1)):
             image.seek(k)
             frames.append(np.asarray(image.convert("RGB")).astype(int))
         return frames
