@@ -8,6 +8,8 @@ function of a symmetric 2x2 tensor with principal values f₁ >= f₂ is ::
     f(b) = (f₁ + f₂)/2 I + (f₁ - f₂)/2 [[c, s], [s, -c]],   (c, s) = (cos 2θ, sin 2θ)
 
 with θ the principal angle, so neither a singular value decomposition nor an angle is ever computed.
+
+Numba's disk cache watches each file by itself: after editing a law, delete ``solvers/__pycache__``, or kernels elsewhere keep the old law.
 """
 
 from __future__ import annotations

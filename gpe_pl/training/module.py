@@ -62,6 +62,7 @@ class TrainingModule(L.LightningModule):
         self.learning_rate, self.final_learning_rate = learning_rate, final_learning_rate
         self.compile_mode: Compile = compile
         self.val_nmse = OneStepNMSE()
+        self._windows: list[tuple[int, int]] = []  # (trajectory, frame) of the current batch
 
     def configure_optimizers(self) -> Any:
         optimizer = torch.optim.Adam(self.simulator.parameters(), lr=self.learning_rate, fused=True)
@@ -109,14 +110,24 @@ class TrainingModule(L.LightningModule):
 
     def training_step(self, batch: HeteroData, batch_idx: int) -> Tensor:
         loss = self.loss(batch)
-        if not torch.isfinite(loss):
-            windows = ", ".join(f"({t}, {f})" for t, f in zip(batch.trajectory.tolist(), batch.frame.tolist(), strict=True))
-            raise TrainingError(
-                f"step {self.global_step}: the loss is {loss.item()} for (trajectory, frame) = {windows}; "
-                "the last good checkpoint is kept. Lower training.learning_rate, or validate the data with `python -m gpe_pl.data.validate`"
-            )
+        self._windows = list(zip(batch.trajectory.tolist(), batch.frame.tolist(), strict=True))
+        self._stop_unless_finite("loss", loss)
         self.log("train/loss", loss, batch_size=1)
         return loss
+
+    def configure_gradient_clipping(
+        self, optimizer: torch.optim.Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
+    ) -> None:
+        """Clip by norm, and stop before a gradient that is not finite spoils the weights."""
+        norm = torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), math.inf if gradient_clip_val is None else gradient_clip_val)
+        self._stop_unless_finite("gradient norm", norm)
+
+    def _stop_unless_finite(self, name: str, value: Tensor) -> None:
+        if not torch.isfinite(value):
+            raise TrainingError(
+                f"step {self.global_step}: the {name} is {value.item()} for (trajectory, frame) = {', '.join(map(str, self._windows))}; "
+                "the last good checkpoint is kept. Lower training.learning_rate, or validate the data with `python -m gpe_pl.data.validate`"
+            )
 
     def validation_step(self, batch: HeteroData, batch_idx: int) -> None:
         predicted = self.simulator(batch)

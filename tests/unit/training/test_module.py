@@ -166,3 +166,15 @@ def test_the_decay_warms_up(decay: float) -> None:
         torch.testing.assert_close(callback._average_model.module.weight, torch.full((2, 3), expected), rtol=1e-5, atol=1e-6)
     assert expected is not None
     assert expected == 29 if decay == 0 else 1 < expected < 29
+
+
+def test_a_gradient_that_is_not_finite_stops_the_step() -> None:
+    """An infinite slope at a finite loss: the weights must not see it."""
+    m = module()
+    parameter = next(p for p in m.simulator.parameters() if p.requires_grad)
+    before = parameter.detach().clone()
+    parameter.grad = torch.full_like(parameter, float("nan"))
+    m._windows = [(3, 17)]
+    with pytest.raises(TrainingError, match=r"gradient norm is nan for \(trajectory, frame\) = \(3, 17\)"):
+        m.configure_gradient_clipping(torch.optim.Adam(m.parameters()), 1.0)
+    assert torch.equal(parameter, before)
