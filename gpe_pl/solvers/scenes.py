@@ -168,7 +168,6 @@ def _obstacles(config: SceneConfig, rng: np.random.Generator) -> tuple[Shape, ..
         radius, angle, sides = rng.uniform(*config.obstacle_radius), rng.uniform(0, 2 * math.pi), int(rng.integers(3, 7))
         kind, friction, share = rng.integers(3), _friction(config, rng), rng.uniform(0.3, 0.7)
         room_low, room_high = low + radius + gap, high - radius - gap
-        room_high[1] = min(room_high[1], 0.5 * (low[1] + high[1]))  # higher up, nothing ever meets them
         if np.any(room_low > room_high):
             continue
         center = rng.uniform(room_low, room_high)
