@@ -5,13 +5,15 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import pkgutil
 import platform
 import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpe_pl.config import construct, entry_point
+import gpe_pl.suites
+from gpe_pl.config import ConfigError, construct, entry_point
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -35,6 +37,9 @@ def environment() -> dict[str, Any]:
 
 def benchmark(cfg: DictConfig) -> None:
     """Run one suite and write ``results.json`` and ``table.md``."""
+    suites = sorted(m.name for m in pkgutil.iter_modules(gpe_pl.suites.__path__))
+    if cfg.suite.name not in suites:
+        raise ConfigError(f"suite.name={cfg.suite.name!r}: must be one of {', '.join(suites)}")
     suite = importlib.import_module(f"gpe_pl.suites.{cfg.suite.name}")
     settings = construct(suite.Settings, {k: v for k, v in cfg.suite.items() if k != "name"}, "suite")
     records, table = suite.run(settings)

@@ -10,6 +10,7 @@ import inspect
 import os
 import re
 import sys
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
@@ -117,6 +118,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             try:
                 OmegaConf.resolve(cfg)
                 construct(Paths, cfg.paths, "paths")
+                _check_top_level(cfg, config_name)
                 return task(cfg)
             except (GpeError, OmegaConfBaseException) as error:
                 if verbose:
@@ -173,6 +175,15 @@ def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
     return f"{key}: unknown key {leaf!r}; valid keys{f' of {parent}' if parent else ''}: {keys}"
 
 
+def _check_top_level(cfg: DictConfig, config_name: str) -> None:
+    known = {*_groups(config_name), *(str(k) for k in OmegaConf.load(CONF / f"{config_name}.yaml"))} - {"defaults", "hydra"}
+    wrong = {str(k) for k in cfg} ^ (known - {"experiment"})
+    if wrong:
+        raise ConfigError(f"{min(wrong)}: unknown or missing key; valid keys: {', '.join(sorted(known))}")
+    if "name" in cfg and not (isinstance(cfg.name, str) and cfg.name.strip()):
+        raise ConfigError(f"name={cfg.name!r}: must be the name of a folder for the results")
+
+
 def _first_choice(override: str) -> str:
     """The first of the values that an override sweeps over."""
     parsed = OverridesParser.create().parse_override(override)
@@ -194,11 +205,19 @@ class Report(Callback):
     """Aggregates what a command has run, a single run or a sweep, when it ends: tables and figures in the folder of the results."""
 
     def on_run_end(self, config: DictConfig, **_: Any) -> None:
-        from gpe_pl.report import report_sweep
-
-        report_sweep(Path(config.hydra.run.dir))
+        self._report(Path(config.hydra.run.dir), is_sweep=False)
 
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        from gpe_pl.report import report_sweep
+        self._report(Path(config.hydra.sweep.dir), is_sweep=True)
 
-        report_sweep(Path(config.hydra.sweep.dir))
+    def _report(self, folder: Path, is_sweep: bool) -> None:
+        """Ends the process on failure: Hydra turns an exception of a callback into a warning, and the command would seem to have succeeded."""
+        try:
+            from gpe_pl.report import report, report_sweep
+
+            (report_sweep if is_sweep else report)(folder)
+        except GpeError as error:
+            _fail(error)
+        except Exception:
+            traceback.print_exc()
+            sys.exit(1)

@@ -12,14 +12,14 @@ if TYPE_CHECKING:
 
 
 def evaluate_checkpoint(cfg: DictConfig) -> None:
-    """Roll a trained model out on one split of a data set, of its own by default; numbers and pictures go to ``{paths.runs}/{name}``."""
+    """Roll a trained model out on one split of a data set; numbers and pictures go to ``{paths.runs}/{name}``."""
     from gpe_pl.evaluation import EvaluationSettings, evaluate
     from gpe_pl.learned_simulator import LearnedSimulator
     from gpe_pl.report import summary
     from gpe_pl.simulate import ensure_data
 
-    if cfg.checkpoint is None:
-        raise ConfigError("checkpoint=… is missing: name a checkpoint of a run, such as runs/sand/checkpoints/best.ckpt")
+    if not isinstance(cfg.checkpoint, str):
+        raise ConfigError(f"checkpoint={cfg.checkpoint!r}: name a checkpoint of a run, such as runs/sand/checkpoints/best.ckpt")
     settings = construct(EvaluationSettings, {**cfg.evaluation, "splits": [cfg.split]}, "evaluation")
     simulator = LearnedSimulator.from_checkpoint(cfg.checkpoint)
     root = ensure_data(cfg)

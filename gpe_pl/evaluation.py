@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import logging
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
@@ -14,13 +15,15 @@ import torch
 from pydantic import Field
 
 from gpe_pl.baselines import Ballistic, ConstantVelocity
-from gpe_pl.containment import Contained
+from gpe_pl.containment import TOLERANCE, Contained
 from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
 from gpe_pl.rollout import Guard, Simulator, rollout, share_outside
 from gpe_pl.schema import Split
 from gpe_pl.trajectory import Trajectory, iter_trajectories
+
+log = logging.getLogger(__name__)
 
 LEARNED = "learned"
 MAX_SPEED_FACTOR = 20.0
@@ -79,6 +82,9 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
             truth = trajectory.frames(simulator.builder.config.history)
             values = np.asarray(trajectory.material_params, dtype=np.float64)
             parameter = float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
+            stop = predictions[label].termination
+            if stop is not None:
+                log.warning("%s %d stopped: %s, %s", split, number, stop.reason, stop.message)
             for model, prediction in predictions.items():
                 curves[model].append(per_frame_mse(prediction, truth))
                 for record in rollout_metrics(prediction, truth, [*settings.horizons, "full"]):
@@ -121,10 +127,18 @@ def _predict(
     for name, baseline in (("ballistic", Ballistic(dt)), ("constant_velocity", ConstantVelocity(dt))):
         predictions[name] = rollout(baseline, trajectory.state(history, history), steps, truth.metadata)
     extra = {
-        "share_outside_uncontained": share_outside(free.frames(1), tolerance=1e-3 * truth.metadata.spacing),
+        "share_outside_uncontained": _share_outside(free, 1, steps, tolerance=1e-3 * truth.metadata.spacing),
+        "share_outside_at_end": _share_outside(prediction, steps, steps, tolerance=TOLERANCE),
+        "num_good_frames": float(prediction.num_frames - 1),
         "share_corrected": contained.share_corrected,
     }
     return predictions, extra
+
+
+def _share_outside(prediction: Trajectory, first: int, last: int, tolerance: float) -> float:
+    """Share of particle-frames inside a wall or obstacle in frames ``first … last``; those that a stopped rollout lacks count as outside."""
+    wanted, good = last - first + 1, prediction.frames(first, last + 1)
+    return (share_outside(good, tolerance) * good.num_frames + wanted - good.num_frames) / wanted
 
 
 def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windows: int = ONE_STEP_WINDOWS) -> float:

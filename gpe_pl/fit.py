@@ -47,7 +47,8 @@ def fit(cfg: DictConfig) -> float:
         names = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "compile")
         module = TrainingModule(simulator, **{n: getattr(training, n) for n in names})
         best = train(module, datamodule, training, trainer, logger.loggers(run_dir), run_dir)
-        evaluate(LearnedSimulator.from_checkpoint(best), root, evaluation, run_dir)
+        device = "cuda" if trainer.accelerator == "gpu" else "cpu"
+        evaluate(LearnedSimulator.from_checkpoint(best, device), root, evaluation, run_dir)
 
     values = [
         r.value

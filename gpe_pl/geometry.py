@@ -149,6 +149,38 @@ class Box:
         return np.concatenate(pos), np.concatenate(normals)
 
 
+def _require_simple(vertices: np.ndarray) -> None:
+    """Raise ``ValueError`` if the outline [vertex, 2] has an edge without length, or edges that touch elsewhere than at their common vertex."""
+    count, shortest = len(vertices), 1e-12 * float(np.max(np.ptp(vertices, axis=0)))
+    edges = np.roll(vertices, -1, axis=0) - vertices
+    for k in range(count):
+        if np.linalg.norm(edges[k]) <= shortest:
+            raise ValueError(f"polygon vertices {k} and {(k + 1) % count} coincide at {vertices[k].tolist()}")
+
+    def side(k: int, point: np.ndarray) -> float:
+        """On which side of edge k the point lies: left (1), right (-1) or on its line (0)."""
+        x, y = point - vertices[k]
+        return float(np.sign(edges[k, 0] * y - edges[k, 1] * x))
+
+    def holds(k: int, point: np.ndarray) -> bool:
+        along = float(np.dot(point - vertices[k], edges[k]))
+        return side(k, point) == 0 and 0 <= along <= float(np.dot(edges[k], edges[k]))
+
+    for i in range(count):
+        for j in range(i + 1, count):
+            a, b, c, d = vertices[i], vertices[(i + 1) % count], vertices[j], vertices[(j + 1) % count]
+            if j == i + 1 or (i == 0 and j == count - 1):  # neighbours share a vertex; neither may hold the other's far end
+                far_i, far_j = (a, d) if j == i + 1 else (b, c)
+                crosses = holds(i, far_j) or holds(j, far_i)
+            else:
+                crosses = side(i, c) * side(i, d) < 0 and side(j, a) * side(j, b) < 0
+                crosses = crosses or holds(i, c) or holds(i, d) or holds(j, a) or holds(j, b)
+            if crosses:
+                raise ValueError(
+                    f"polygon edges {i} ({a.tolist()} to {b.tolist()}) and {j} ({c.tolist()} to {d.tolist()}) intersect; the outline must be simple"
+                )
+
+
 @dataclass(frozen=True)
 class Polygon:
     """A solid simple polygon (2D), vertices in counter-clockwise order [m]."""
@@ -162,6 +194,7 @@ class Polygon:
         v = np.asarray(self.vertices, float)
         if v.ndim != 2 or v.shape[0] < 3 or v.shape[1] != 2:
             raise ValueError(f"a polygon needs at least 3 vertices [x, y], got {self.vertices}")
+        _require_simple(v)
         x, y = v[:, 0], v[:, 1]
         if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) <= 0:
             raise ValueError(f"polygon vertices must run counter-clockwise and enclose an area, got {self.vertices}")

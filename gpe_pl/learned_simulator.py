@@ -23,7 +23,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.nn.blocks import Standardize
-from gpe_pl.schema import MATERIALS, FeatureSpec
+from gpe_pl.schema import MATERIALS, FeatureSpec, node_code
 from gpe_pl.trajectory import Metadata, State, Trajectory
 
 CHECKPOINT_FORMAT = 1
@@ -125,10 +125,12 @@ class LearnedSimulator(nn.Module):
             SceneError: another frame interval, dimension or material than in training, or a value that is not finite; names the node.
         """
         own, scene = self.builder.metadata, trajectory.metadata
-        if abs(scene.frame_dt - own.frame_dt) > 1e-6 * own.frame_dt or scene.dim != own.dim or scene.param_names != own.param_names:
+        same_scales = abs(scene.frame_dt / own.frame_dt - 1) < 1e-6 and abs(scene.spacing / own.spacing - 1) < 0.01
+        if not same_scales or scene.dim != own.dim or scene.param_names != own.param_names:
             raise SceneError(
-                f"the model was trained with frame_dt={own.frame_dt:g} s in {own.dim}D on {', '.join(own.materials)}; "
-                f"the scene has frame_dt={scene.frame_dt:g} s in {scene.dim}D and {', '.join(scene.materials)}"
+                f"the model was trained with frame_dt={own.frame_dt:g} s and spacing={own.spacing:g} m in {own.dim}D on {', '.join(own.materials)}; "
+                f"the scene has frame_dt={scene.frame_dt:g} s and spacing={scene.spacing:g} m in {scene.dim}D and "
+                f"{', '.join(scene.materials)}; choose the data set with data=… size=…"
             )
         state = trajectory.state(frame, history=self.builder.config.history).to_torch(self.acceleration_std.device)
         for name, values in (("pos", state.pos), ("velocity", history_of(state))):
@@ -137,7 +139,7 @@ class LearnedSimulator(nn.Module):
                 raise SceneError(f"frame {frame}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
         for material, spec in MATERIALS.items():
             if material in self.builder.metadata.materials:
-                rows = torch.nonzero(state.node_type == list(MATERIALS).index(material)).flatten()
+                rows = torch.nonzero(state.node_type == node_code(material)).flatten()
                 column = state.material_params[rows, self.builder.metadata.param_names.index(spec.name)]
                 if not torch.isfinite(column).all():
                     node = int(rows[torch.nonzero(~torch.isfinite(column))[0]])

@@ -23,8 +23,9 @@ def data_statistics(root: Path | str) -> dict[str, float]:
     """Statistics of the train split, as written beside it by ``simulate``."""
     path = Path(root) / "statistics.json"
     try:
-        return json.loads(path.read_text())
-    except (OSError, json.JSONDecodeError) as error:
+        statistics = json.loads(path.read_text())
+        return {"acceleration_std": float(statistics["acceleration_std"])}
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise StoreError(f"{path}: cannot be read ({error}); run `python -m gpe_pl.simulate` again") from None
 
 

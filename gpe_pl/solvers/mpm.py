@@ -86,6 +86,8 @@ def _collider(shapes: tuple[Shape, ...], origin: tuple[float, ...], spacing: flo
     filled = np.zeros(counts, dtype=np.int64)
     planes, discs, vertices, first_vertex = [], [], [], [0]
     for shape, mask in zip(shapes, inside, strict=True):
+        if not isinstance(shape, Wall):
+            _require_resolved(shape, mask, spacing)
         at = np.nonzero(mask)
         normal = outward_normal(shape, nodes[at], 1e-3 * spacing)
         # deep inside a shape, where no direction leads out, the node sticks
@@ -110,6 +112,47 @@ def _collider(shapes: tuple[Shape, ...], origin: tuple[float, ...], spacing: flo
     )
 
 
+def _require_resolved(shape: Shape, mask: np.ndarray, spacing: float) -> None:
+    """Refuse an obstacle that particles could pass: a particle in the nearer half of a cell-thick obstacle is pushed back, not out at the far side."""
+    thickness = _thickness(shape)
+    if thickness < spacing * (1 - 1e-6):
+        raise SimulationError(
+            f"obstacle {shape} is {thickness:g} m thin; on a grid of spacing {spacing:g} m it must be at least {spacing:g} m thick", reason="input"
+        )
+    if not np.any(mask):
+        raise SimulationError(
+            f"obstacle {shape} contains no node of the grid of spacing {spacing:g} m; move it, or make it {math.sqrt(2) * spacing:g} m thick",
+            reason="input",
+        )
+
+
+def _thickness(shape: Shape) -> float:
+    """Smallest thickness in m: diameter, shortest side, or shortest way through a polygon from the middle of an edge along its inward normal."""
+    if isinstance(shape, Sphere):
+        return 2.0 * shape.radius
+    if isinstance(shape, Box):
+        return min(high - low for low, high in zip(shape.low, shape.high, strict=True))
+    vertices = np.array(_corners(shape), dtype=np.float64)
+    before, after = vertices - np.roll(vertices, 1, axis=0), np.roll(vertices, -1, axis=0) - vertices
+    turn = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    straight = np.abs(turn) <= 1e-9 * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    a = vertices[~straight]  # vertices along a straight edge do not divide it
+    edge = np.roll(a, -1, axis=0) - a
+    tangent = edge / np.linalg.norm(edge, axis=1)[:, None]
+    thickness = math.inf
+    for k, middle in enumerate(a + edge / 2):
+        inward = np.array([-tangent[k, 1], tangent[k, 0]])
+        # every other edge in this edge's frame: its ends' distances along the edge and into the polygon
+        along, depth = (a - middle) @ tangent[k], (a - middle) @ inward
+        for j in range(len(a)):
+            n = (j + 1) % len(a)
+            if j != k and along[j] != along[n] and min(along[j], along[n]) <= 0.0 <= max(along[j], along[n]):
+                hit = depth[j] + (depth[n] - depth[j]) * along[j] / (along[j] - along[n])
+                if hit > 0.0:
+                    thickness = min(thickness, float(hit))
+    return thickness
+
+
 def _corners(shape: Shape) -> list[tuple[float, float]]:
     if isinstance(shape, Polygon):
         return list(shape.vertices)
@@ -123,8 +166,8 @@ def _corners(shape: Shape) -> list[tuple[float, float]]:
 class MPM:
     """Material point solver; a ``Simulator``.
 
-    Each step advances one frame by substeps that satisfy ``h (c + |v|_max) <= cfl Δ``, with c the elastic wave speed. They are chosen from the current state
-    alone, so a restart repeats a run-through bit by bit.
+    Each step advances one frame by substeps that satisfy ``h (c + |v|_max) <= cfl Δ``, with c the elastic wave speed, and ``h² |g| <= cfl Δ / 4``. They are
+    chosen from the current state alone, so a restart repeats a run-through bit by bit. Obstacles must be at least one grid cell thick.
 
     Attributes:
         bounds: ``(low, high)`` per axis of the domain [m]; whole multiples of the grid spacing apart.
@@ -179,7 +222,7 @@ class MPM:
         """Advance one frame.
 
         Raises:
-            SimulationError: with reason ``input`` (arrays that do not fit the solver), ``nan``, ``escape`` (a particle left the domain through an open
+            SimulationError: with reason ``input`` (arrays or obstacles that do not fit the solver), ``nan``, ``escape`` (a particle left the domain through an open
                 side or started outside) or ``explosion`` (more than ``max_substeps``).
         """
         internal = state.internal if state.internal is not None else MPMInternal.at_rest(state.num_nodes, state.dim)
@@ -199,7 +242,7 @@ class MPM:
             self.frame_dt, self.cfl, self.max_substeps,
         )  # fmt: skip
         if status != OK:
-            raise self._error(status, node, pos, vel)
+            raise self._error(status, node, pos, vel, state.gravity)
         return replace(
             state,
             pos=pos,
@@ -264,13 +307,17 @@ class MPM:
             node = int(np.argmin(np.reshape(good, (len(good), -1)).all(axis=1)))
             raise SimulationError(f"{message} (node {node})", reason=reason, node=node)
 
-    def _error(self, status: int, node: int, pos: np.ndarray, vel: np.ndarray) -> SimulationError:
-        where = f"node {node} at {pos[node].tolist()} m with velocity {vel[node].tolist()} m/s"
+    def _error(self, status: int, node: int, pos: np.ndarray, vel: np.ndarray, gravity: np.ndarray) -> SimulationError:
+        if node < 0:
+            where = "a state without nodes"
+        else:
+            where = f"node {node} at {pos[node].tolist()} m with velocity {vel[node].tolist()} m/s"
         if status == NOT_FINITE:
             return SimulationError(f"{where} is not finite", reason="nan", node=node)
         if status == ESCAPE:
             return SimulationError(f"{where} is outside the domain {self.bounds}", reason="escape", node=node)
-        return SimulationError(f"{where} would need more than {self.max_substeps} substeps in one frame", reason="explosion", node=node)
+        message = f"{where} under gravity {np.asarray(gravity).tolist()} m/s² would need more than {self.max_substeps} substeps in one frame"
+        return SimulationError(message, reason="explosion", node=node)
 
 
 def compile_kernels() -> None:
@@ -293,14 +340,16 @@ def _advance_frame(
     inv = 1.0 / spacing
     grid = np.zeros((conditions.shape[0], conditions.shape[1], 3))
     remaining, substeps = frame_dt, 0
+    # a particle at rest may fall by no more than a quarter of cfl cells, so with its speed it moves at most 1.25 cfl cells
+    fall_rate = 2.0 * math.sqrt(math.hypot(gravity[0], gravity[1]) / (cfl * spacing))
     while True:
         status, node, speed, x_low, x_high, y_low, y_high = _survey(pos, vel, bounds, spacing)
         if status != OK or remaining <= 0.0:
             return status, node
-        needed = math.ceil(remaining * (wave_speed + speed) / (cfl * spacing) * (1.0 - 1e-12))
-        if substeps + needed > max_substeps:
+        needed = max(remaining * (wave_speed + speed) / (cfl * spacing), remaining * fall_rate) * (1.0 - 1e-12)
+        if needed > max_substeps - substeps:  # before it is rounded: an integer may not hold it
             return TOO_MANY_SUBSTEPS, node
-        count = max(1, int(needed))
+        count = max(1, int(math.ceil(needed)))
         h = remaining / count
         remaining = remaining - h if count > 1 else 0.0
         substeps += 1
@@ -320,7 +369,7 @@ def _survey(pos, vel, bounds, spacing):
     """Check that every particle can be indexed; status, node at fault (or the fastest), largest speed and extent of the particles."""
     x_low = y_low = math.inf
     x_high = y_high = -math.inf
-    fastest, speed_squared = 0, 0.0
+    fastest, speed_squared = (0 if pos.shape[0] > 0 else -1), 0.0
     # a particle may be up to a cell outside an open side before it counts as escaped
     left, right, bottom, top = bounds[0, 0] - spacing, bounds[0, 1] + spacing, bounds[1, 0] - spacing, bounds[1, 1] + spacing
     for p in range(pos.shape[0]):
@@ -433,7 +482,7 @@ def _grid_to_particles(pos, vel, affine, origin, spacing, h, grid, distance, pla
         scale = 4.0 * inv
         affine[p, 0, 0], affine[p, 0, 1], affine[p, 1, 0], affine[p, 1, 1] = scale * c00, scale * c01, scale * c10, scale * c11
         x_new, y_new = pos[p, 0] + h * u, pos[p, 1] + h * v
-        # node (i+1, j+1) is the nearest one, less than a cell away, and the particle moved less than a cell
+        # node (i+1, j+1) is the nearest one, at most 0.71 cells away, and by the choice of substeps the particle moved at most 1.25 cells
         if distance[i + 1, j + 1] < 2.0 * spacing:
             x_new, y_new, u, v = _push_out(x_new, y_new, u, v, planes, discs, vertices, first_vertex)
         pos[p, 0], pos[p, 1], vel[p, 0], vel[p, 1] = x_new, y_new, u, v

@@ -107,7 +107,8 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
         [
             f"Forward pass, {settings.num_nodes} nodes, {edges} undirected edges, {settings.num_message_passing_steps} × "
             f"{settings.hidden_channels}, {settings.num_threads} thread(s). Saved: median of paired ratios against `directed` of the same "
-            "implementation; the paper reports 37 % for `negated`.",
+            "implementation; the paper reports 37 % for `negated`. Plain: one product per edge on concatenated features (for `odd` on their sums and "
+            "differences); factored: products per node, gathered to edges.",
             "",
             "| interaction | implementation | median [ms] | saved |",
             "|---|---|---|---|",

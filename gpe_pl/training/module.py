@@ -90,12 +90,21 @@ class TrainingModule(L.LightningModule):
         model: Any = self.simulator.model
         plain = model.compute
         compiled = torch.compile(plain, dynamic=True)
+        compiler_works = True
 
         def compute(x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: dict[Any, tuple[Tensor, ...]]) -> Any:
             # only training steps, and no sizes of one, which the compiler would specialise on: else it recompiles until it gives up
             sizes = [t.shape[0] for t in x.values()] + [odd.shape[0] for _, odd, _ in edges.values()]
-            usable = torch.is_grad_enabled() and min(sizes, default=0) > 1
-            return (compiled if usable else plain)(x, params, mass, edges)
+            nonlocal compiler_works
+            if compiler_works and torch.is_grad_enabled() and min(sizes, default=0) > 1:
+                try:
+                    return compiled(x, params, mass, edges)
+                except Exception as error:  # whatever the machine's tool chain lacks
+                    if self.compile_mode == "on":
+                        raise
+                    log.warning("compile: auto does without torch.compile (%s)", type(error).__name__)
+                    compiler_works = False
+            return plain(x, params, mass, edges)
 
         model.compute = compute
 

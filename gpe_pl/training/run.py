@@ -48,6 +48,12 @@ class TrainingSettings:
     num_val_rollouts: Annotated[int, Field(ge=1)] = 4
     val_rollout_steps: Annotated[int, Field(ge=1)] = 100
 
+    def __post_init__(self) -> None:
+        if self.num_steps > self.val_interval and self.num_steps % self.val_interval:
+            raise ValueError(
+                f"val_interval={self.val_interval} must divide num_steps={self.num_steps}: the last steps would be neither validated nor saved"
+            )
+
 
 @dataclass(frozen=True)
 class TrainerSettings:
