@@ -117,7 +117,8 @@ def _require_resolved(shape: Shape, mask: np.ndarray, spacing: float) -> None:
     thickness = _thickness(shape)
     if thickness < spacing * (1 - 1e-6):
         raise SimulationError(
-            f"obstacle {shape} is {thickness:g} m thin; on a grid of spacing {spacing:g} m it must be at least {spacing:g} m thick", reason="input"
+            f"obstacle {shape} is {thickness:g} m thin; on a grid of spacing {spacing:g} m it must be at least {spacing:g} m thick",
+            reason="input",
         )
     if not np.any(mask):
         raise SimulationError(
@@ -316,7 +317,9 @@ class MPM:
             return SimulationError(f"{where} is not finite", reason="nan", node=node)
         if status == ESCAPE:
             return SimulationError(f"{where} is outside the domain {self.bounds}", reason="escape", node=node)
-        message = f"{where} under gravity {np.asarray(gravity).tolist()} m/s² would need more than {self.max_substeps} substeps in one frame"
+        message = (
+            f"{where} under gravity {np.asarray(gravity).tolist()} m/s² would need more than {self.max_substeps} substeps in one frame"
+        )
         return SimulationError(message, reason="explosion", node=node)
 
 

@@ -18,7 +18,7 @@ from gpe_pl.containment import Contained
 from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator, UnknownModelError, model_class
+from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator, SceneError, UnknownModelError, model_class
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout import Guard, rollout
 from gpe_pl.trajectory import State, Trajectory, iter_trajectories, write_shard
@@ -349,3 +349,15 @@ def test_gradients_reach_the_model_through_the_standardized_graph(simulator: Lea
     loss: Tensor = sum(v.square().sum() for v in simulator(graph).values())  # type: ignore[assignment]
     loss.backward()
     assert sum(float(p.grad.abs().sum()) for p in simulator.parameters() if p.grad is not None) > 0
+
+
+@pytest.mark.parametrize("change", [{"spacing": 0.06}, {"frame_dt": 0.01}, {"param_names": ("hardening_coefficient",)}])
+def test_a_scene_of_other_scales_or_materials_is_refused(change: dict[str, Any]) -> None:
+    build = scenes.builder()
+    simulator = learned(build)
+    pos = np.zeros((4, 3, 2), np.float32)
+    s = scenes.state(3, walls=False)
+    fitting = Trajectory(build.metadata, pos, pos, s.node_type, s.mass, s.material_params, s.boundary)
+    assert simulator.initial_state(fitting, 1).num_nodes == 3
+    with pytest.raises(SceneError, match="the model was trained with frame_dt=0.005 s and spacing=0.05 m in 2D on sand"):
+        simulator.initial_state(replace(fitting, metadata=replace(build.metadata, **change)), 1)

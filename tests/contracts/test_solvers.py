@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from gpe_pl.geometry import Box, Polygon, Sphere, domain_walls
 from gpe_pl.rollout import SimulationError, Simulator, rollout
 from gpe_pl.solvers.mpm import MPM, MPMInternal
 from gpe_pl.solvers.scenes import SceneConfig, describe, sample_scene
@@ -201,6 +202,82 @@ def test_random_particles_stay_in_the_domain(case, seed):
     state = replace(state, pos=rng.uniform(0, 1, state.pos.shape), vel=rng.uniform(-10, 10, state.vel.shape))
     after = run(solver, state, 20)
     assert np.all((after.pos >= 0) & (after.pos <= 1)) and np.all(np.isfinite(after.vel))
+
+
+@pytest.mark.parametrize("magnitude", [1e8, 1e30, 1e200])
+def test_absurd_gravity_is_an_explosion(case, magnitude):
+    """Whether or not there are particles to name."""
+    solver, state = case
+    gravity = np.array([0.0, -magnitude])
+    with pytest.raises(SimulationError, match="gravity") as caught:
+        solver.step(replace(isolated(state), gravity=gravity))
+    assert caught.value.reason == "explosion" and 0 <= caught.value.node < state.num_nodes
+    if magnitude > 1e8:
+        per_node = ("pos", "vel", "node_type", "mass", "material_params")
+        empty = replace(isolated(state), **{name: getattr(state, name)[:0] for name in per_node})
+        with pytest.raises(SimulationError) as caught:
+            solver.step(replace(empty, gravity=gravity))
+        assert (caught.value.reason, caught.value.node) == ("explosion", -1)
+
+
+def test_fall_from_rest_never_jumps_over_an_obstacle(case):
+    """Under any gravity that the solver accepts, particles stay above the slab below them."""
+    solver, state = case
+    slab = Box((-0.5, 0.3), (1.5, 0.3 + 2 * SCENE.grid_spacing), 0.3)
+    boundary = Boundary.sample((*domain_walls(SCENE.bounds, 0.3), slab), SCENE.spacing, 2)
+    top = slab.high[1]
+    pos = np.random.default_rng(0).uniform((0.1, top + 0.01), (0.9, top + 0.05), state.pos.shape)
+    start = replace(state, pos=pos, vel=np.zeros_like(pos), boundary=boundary)
+    for magnitude in (1e3, 1e4, 1e5, 1e6):
+        assert solver.step(replace(start, gravity=np.array([0.0, -magnitude]))).pos[:, 1].min() >= top - 1e-9
+
+
+def thin(name, thickness):
+    """An obstacle of one kind with a smallest thickness, around the middle of a grid cell."""
+    x, y, half = 0.5 + SCENE.grid_spacing / 2, 0.5 + SCENE.grid_spacing / 2, thickness / 2
+    return {
+        "flat box": lambda: Box((-0.5, y - half), (1.5, y + half), 0.3),
+        "narrow box": lambda: Box((x - half, 0.2), (x + half, 0.8), 0.3),
+        "sphere": lambda: Sphere((x, y), half, 0.3),
+        "turned slab": lambda: Polygon(((0.2, 0.2), (0.2 + 2**0.5 * thickness, 0.2), (0.8, 0.8 - 2**0.5 * thickness), (0.8, 0.8)), 0.3),
+        "triangle": lambda: Polygon(((0.2, y - thickness), (0.8, y - thickness), (0.8, y + thickness)), 0.3),
+        "thin arm": lambda: Polygon(((0.2, 0.2), (0.8, 0.2), (0.8, 0.2 + thickness), (0.4, 0.2 + thickness), (0.4, 0.8), (0.2, 0.8)), 0.3),
+    }[name]()
+
+
+def with_obstacle(state, obstacle):
+    return replace(state, boundary=Boundary.sample((*domain_walls(SCENE.bounds, 0.3), obstacle), SCENE.spacing, 2))
+
+
+@pytest.mark.parametrize("name", ["flat box", "narrow box", "sphere", "turned slab", "triangle", "thin arm"])
+def test_obstacle_thinner_than_a_cell_is_refused(case, name):
+    """By shape and by the thickness that would do."""
+    solver, state = case
+    for cells in (0.02, 0.5, 0.95):
+        with pytest.raises(SimulationError, match=rf"{type(thin(name, 1.0)).__name__}.*at least {SCENE.grid_spacing:g} m thick") as caught:
+            solver.step(with_obstacle(state, thin(name, cells * SCENE.grid_spacing)))
+        assert caught.value.reason == "input"
+    solver.step(with_obstacle(state, thin(name, 1.5 * SCENE.grid_spacing)))
+
+
+def test_obstacle_between_grid_nodes_is_refused(case):
+    solver, state = case
+    with pytest.raises(SimulationError, match=r"Sphere.*contains no node of the grid") as caught:
+        solver.step(with_obstacle(state, thin("sphere", 1.2 * SCENE.grid_spacing)))
+    assert caught.value.reason == "input"
+    solver.step(with_obstacle(state, thin("flat box", SCENE.grid_spacing)))  # exactly one cell is enough for a box
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.25, 0.5, 0.75])
+def test_thinnest_allowed_slab_holds_at_10_m_per_s(case, offset):
+    solver, state = case
+    low = 0.3 + offset * SCENE.grid_spacing
+    slab = Box((-0.5, low), (1.5, low + SCENE.grid_spacing), 0.3)
+    rng = np.random.default_rng(0)
+    pos = rng.uniform((0.02, 0.5), (0.98, 0.7), state.pos.shape)
+    state = with_obstacle(replace(state, pos=pos, vel=np.tile([0.0, -10.0], (state.num_nodes, 1))), slab)
+    after = run(solver, state, 40)
+    assert after.pos[:, 1].min() >= slab.high[1] - 1e-9 and after.pos[:, 1].min() < 0.45
 
 
 def test_rollout_names_the_frame_of_a_failure(case):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 import signal
 from collections.abc import Iterator
 from dataclasses import replace
@@ -282,6 +283,7 @@ def test_a_sweep_ends_with_table_and_plot(tiny_data: Path, tmp_path: Path) -> No
                 )
             )
     folder = tmp_path / "log"  # a folder's name must not matter
+    shutil.copytree(folder / "model.interaction=odd" / "seed=0", folder / "again")  # the same run once more is no further seed
     report_sweep(folder)
     with open(folder / "table.csv", newline="") as handle:
         reader = csv.DictReader(handle)
@@ -289,7 +291,7 @@ def test_a_sweep_ends_with_table_and_plot(tiny_data: Path, tmp_path: Path) -> No
         rows = list(reader)
     assert {(r["interaction"], r["seed"]) for r in rows} == {(i, s) for i in ("negated", "odd") for s in "01"}
     assert {r["split"] for r in rows} == {"val", "test", "test_unseen", "test_unseen/interpolated", "test_unseen/extrapolated"}
-    assert len({tuple(list(r.values())[:-1]) for r in rows}) == len(rows)
+    assert len({tuple(list(r.values())[:-1]) for r in rows}) == len(rows)  # the copy does not count
     chosen = {
         r["metric"]: float(r["value"])
         for r in rows

@@ -18,7 +18,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from pydantic import Field
 
-from gpe_pl.config import CONF, ConfigError, bind, construct, entry_point, explain, output_dir
+from gpe_pl.benchmark import benchmark
+from gpe_pl.config import CONF, ConfigError, Report, bind, construct, entry_point, explain, output_dir
 from gpe_pl.errors import GpeError
 from gpe_pl.fit import fit
 from gpe_pl.learned_simulator import UnknownModelError
@@ -179,6 +180,7 @@ def test_a_misspelling_beside_a_sweep_gets_the_valid_ones() -> None:
         ("+model.foo=1", "model.foo: unknown key; valid keys: interaction"),
         ("+training.foo=1", "training.foo: unknown key; valid keys: num_steps"),
         ("graph.history=0", "graph.history=0: input should be greater"),
+        ("training.val_interval=7", "training: val_interval=7 must divide num_steps="),
         ("evaluation.splits=[tset]", "evaluation.splits.0='tset': input should be 'train', 'val', 'test' or 'test_unseen'"),
         ("evaluation.splits=[]", r"evaluation.splits=\[\]: list should have at least 1 item"),
         ("seed=-1", "seed=-1: must be an integer of at least 0"),
@@ -236,6 +238,8 @@ def call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, task: Callable[[DictCo
         (lambda cfg: None, ["suit=speed"], "error: suit: unknown key 'suit'; valid keys: paths, suite"),
         (lambda cfg: None, ["suite=3"], "error: Config group override must be a string or a list. Got int"),
         (lambda cfg: None, ["paths.data=null"], "error: paths.data=None: input should be a valid string"),
+        (lambda cfg: None, ["+foo=1"], "error: foo: unknown or missing key; valid keys: paths, suite"),
+        (benchmark, ["suite.name=nope"], "error: suite.name='nope': must be one of "),
         (lambda cfg: None, ["suite.name=${nothing}"], "error: Interpolation key 'nothing' not found"),
         (lambda cfg: construct(Inner, {"size": cfg.suite.num_nodes}, "suite"), ["suite.num_nodes=0"], "error: suite.size=0: input should"),
     ],
@@ -250,6 +254,22 @@ def test_an_entry_point_fails_in_one_line(
     assert output.err.startswith(line)
     assert output.err.count("\n") == 1
     assert output.out == ""
+
+
+@pytest.mark.parametrize(("error", "code"), [(ConfigError("no table"), 2), (RuntimeError("a bug"), 1)])
+def test_a_report_that_fails_fails_the_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, error: Exception, code: int
+) -> None:
+    """Hydra alone would turn the exception into a warning and exit with 0."""
+
+    def broken(_: Path) -> None:
+        raise error
+
+    monkeypatch.setattr("gpe_pl.report.report", broken)
+    with pytest.raises(SystemExit) as caught:
+        Report().on_run_end(OmegaConf.create({"hydra": {"run": {"dir": str(tmp_path)}}}))
+    assert caught.value.code == code
+    assert str(error) in capsys.readouterr().err
 
 
 def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -151,6 +151,42 @@ def test_wrong_shapes_are_refused() -> None:
         Polygon(CONCAVE[:2], 0.0)
 
 
+@pytest.mark.parametrize(
+    ("vertices", "message"),
+    [
+        (((0, 0), (1, 0), (1, 0), (0, 1)), "vertices 1 and 2 coincide"),
+        (((0, 0), (1, 0), (1, 1), (0, 1), (0, 0)), "vertices 4 and 0 coincide"),
+        (((0, 0), (1, 0), (1, 1e-15), (0, 1)), "vertices 1 and 2 coincide"),
+        (((0, 0), (2, 0), (2, 1), (0.5, -0.5), (0, 1)), "edges 0 .* and 2 .* intersect"),  # crosses
+        (((0, 0), (1, 1), (1, 0), (0, 1)), "edges 0 .* and 2 .* intersect"),  # bow tie
+        (((0, 0), (2, 0), (2, 2), (1, 0), (0, 2)), "edges 0 .* and 2 .* intersect"),  # a vertex on an edge
+        (((0, 0), (1, 1), (2, 0), (2, 2), (1, 1), (0, 2)), "edges 0 .* and 3 .* intersect"),  # a vertex met twice
+        (((0, 0), (3, 0), (2, 0), (2, 1), (0, 1)), "edges 0 .* and 1 .* intersect"),  # doubles back
+        (
+            ((0, 0), (2, 0), (2, 1), (0, 1), (0, -1)),
+            "edges 3 .* and 4 .* intersect|edges 0 .* and 3 .* intersect",
+        ),  # over the closing vertex
+        (((0, 0), (1, 0), (2, 0)), "edges . .* and . .* intersect"),  # no area
+    ],
+)
+def test_degenerate_outlines_are_refused(vertices: Any, message: str) -> None:
+    for shift in range(len(vertices)):
+        with pytest.raises(ValueError, match=message if shift == 0 else "coincide|intersect"):
+            Polygon(vertices[shift:] + vertices[:shift], 0.3)
+
+
+def test_simple_outlines_are_accepted() -> None:
+    """Straight angles, reflex corners and many random star-shaped outlines; nothing is refused for being thin or large."""
+    Polygon(((0, 0), (1, 0), (2, 0), (2, 1), (0, 1)), 0.3)
+    rng = np.random.default_rng(0)
+    for scale in (1e-6, 1.0, 1e6):
+        for _ in range(50):
+            turn = np.sort(rng.uniform(0, 2 * np.pi, 9))
+            if np.max(np.diff(np.append(turn, turn[0] + 2 * np.pi))) < 3:
+                points = scale * rng.uniform(0.1, 1, 9)[:, None] * np.stack([np.cos(turn), np.sin(turn)], -1)
+                Polygon(tuple((float(x), float(y)) for x, y in points), 0.3)
+
+
 def test_wall_sampling_covers_the_face() -> None:
     wall = Wall((0.0, 0.0, 1.0), 0.0, (0.0, 0.0, 0.0), (1.0, 0.5, 1.0), 0.0)
     pos, _ = wall.sample(0.1)

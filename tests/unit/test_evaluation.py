@@ -1,0 +1,40 @@
+"""Numbers of ``metrics.csv`` that no failure may improve, and how they are written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpe_pl.evaluation import Row, _share_outside, read_rows, write_rows
+from gpe_pl.trajectory import Termination, Trajectory
+
+
+@pytest.fixture
+def inside(new_trajectory: Callable[..., Trajectory]) -> Trajectory:
+    """Eleven frames with all particles in free space."""
+    return new_trajectory(num_frames=11)
+
+
+def test_frames_that_a_stopped_rollout_lacks_count_as_outside(inside: Trajectory) -> None:
+    stopped = replace(inside.frames(0, 5), termination=Termination("nan", 5, 0, "frame 5"))
+    assert _share_outside(inside, 1, 10, 0.0) == 0.0
+    assert _share_outside(stopped, 1, 10, 0.0) == pytest.approx(6 / 10)
+    assert _share_outside(inside, 10, 10, 0.0) == 0.0
+    assert _share_outside(stopped, 10, 10, 0.0) == 1.0
+
+
+def test_a_particle_inside_a_wall_counts(inside: Trajectory) -> None:
+    pos = inside.pos.copy()
+    pos[3, 0] = -0.5
+    assert _share_outside(replace(inside, pos=pos), 1, 10, 0.0) == pytest.approx(1 / (10 * inside.num_nodes))
+
+
+def test_rows_survive_the_file(tmp_path: Path) -> None:
+    rows = [Row("learned", "test", 3, "seen", 30.0, "rollout_mse", "full", np.inf), Row("ballistic", "test", 0, "", 0.1, "x", "5", 1e-300)]
+    write_rows(tmp_path / "metrics.csv", rows)
+    assert list(read_rows(tmp_path / "metrics.csv")) == rows
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.csv"]
