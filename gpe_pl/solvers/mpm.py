@@ -223,8 +223,8 @@ class MPM:
         """Advance one frame.
 
         Raises:
-            SimulationError: with reason ``input`` (arrays or obstacles that do not fit the solver), ``nan``, ``escape`` (a particle left the domain through an open
-                side or started outside) or ``explosion`` (more than ``max_substeps``).
+            SimulationError: with reason ``input`` (arrays or obstacles that do not fit the solver), ``nan``, ``escape`` (a particle left the domain
+                through an open side or started outside) or ``explosion`` (more than ``max_substeps``).
         """
         internal = state.internal if state.internal is not None else MPMInternal.at_rest(state.num_nodes, state.dim)
         code, coefficient = self._check(state, internal)
@@ -352,7 +352,7 @@ def _advance_frame(
         needed = max(remaining * (wave_speed + speed) / (cfl * spacing), remaining * fall_rate) * (1.0 - 1e-12)
         if needed > max_substeps - substeps:  # before it is rounded: an integer may not hold it
             return TOO_MANY_SUBSTEPS, node
-        count = max(1, int(math.ceil(needed)))
+        count = max(1, math.ceil(needed))
         h = remaining / count
         remaining = remaining - h if count > 1 else 0.0
         substeps += 1

@@ -170,6 +170,7 @@ def test_wrong_shapes_are_refused() -> None:
     ],
 )
 def test_degenerate_outlines_are_refused(vertices: Any, message: str) -> None:
+    vertices = tuple((float(x), float(y)) for x, y in vertices)
     for shift in range(len(vertices)):
         with pytest.raises(ValueError, match=message if shift == 0 else "coincide|intersect"):
             Polygon(vertices[shift:] + vertices[:shift], 0.3)
@@ -177,7 +178,7 @@ def test_degenerate_outlines_are_refused(vertices: Any, message: str) -> None:
 
 def test_simple_outlines_are_accepted() -> None:
     """Straight angles, reflex corners and many random star-shaped outlines; nothing is refused for being thin or large."""
-    Polygon(((0, 0), (1, 0), (2, 0), (2, 1), (0, 1)), 0.3)
+    Polygon(((0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)), 0.3)
     rng = np.random.default_rng(0)
     for scale in (1e-6, 1.0, 1e6):
         for _ in range(50):
