@@ -186,7 +186,7 @@ def _pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predict
     from gpe_pl.viz.video import write_animation
 
     stem = run_dir / f"rollout_{split}_{number:02d}"
-    rollout_figure(truth, predictions).savefig(stem.with_suffix(".png"), dpi=150)
+    rollout_figure(truth, predictions).savefig(stem.with_suffix(".png"), dpi=150, bbox_inches="tight")
     stride = max(1, truth.num_frames // 60)
     write_animation(stem.with_suffix(".gif"), truth, predictions, fps=20, stride=stride)
 
