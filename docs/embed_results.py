@@ -16,7 +16,7 @@ README = DOCS.parent / "README.md"
 BLOCK = re.compile(r"(<!-- begin (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 FILES = (
     *("table.md", "table.csv", "metrics.csv", "config.json", "results.json"),
-    *("validation_loss.png", "error_curve_*.png", "rollout_test_*.png", "rollout_*_00.gif"),
+    *("validation_loss.png", "error_curve_*.png", "rollout_test_*.png", "rollout_test_00.gif"),
 )
 
 
