@@ -15,7 +15,7 @@ from array_api_compat import array_namespace
 
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import signed_distance
-from gpe_pl.trajectory import Boundary, Metadata, State, Termination, Trajectory
+from gpe_pl.trajectory import Boundary, Metadata, State, Stress, Termination, Trajectory
 
 
 @runtime_checkable
@@ -125,13 +125,14 @@ def rollout(
     Returns:
         Up to ``num_steps + 1`` frames; fewer if it stopped early, with the reason in ``termination``.
     """
-    pos, vel, termination = [_numpy(state.pos)], [_numpy(state.vel)], None
+    pos, vel, stress, termination = [_numpy(state.pos)], [_numpy(state.vel)], [state.stress], None
     for frame, item in enumerate(states(simulator, state, num_steps, guard), start=1):
         if isinstance(item, Termination):
             termination = item
             break
         pos.append(_numpy(item.pos))
         vel.append(_numpy(item.vel))
+        stress.append(item.stress)
         if on_frame is not None:
             on_frame(frame, item)
     b = state.boundary
@@ -145,8 +146,19 @@ def rollout(
         _numpy(state.mass),
         _numpy(state.material_params),
         boundary,
+        rest_pos=None if state.rest_pos is None else _numpy(state.rest_pos),
+        cells=None if state.cells is None else _numpy(state.cells),
+        stress=_stacked(stress),
         termination=termination,
     )
+
+
+def _stacked(frames: list[Stress | None]) -> Stress | None:
+    """The stresses of all frames; None unless every frame has them."""
+    known = [stress for stress in frames if stress is not None]
+    if len(known) < len(frames):
+        return None
+    return Stress(np.stack([_numpy(s.node) for s in known]), np.stack([_numpy(s.cell) for s in known]))
 
 
 def share_outside(trajectory: Trajectory, tolerance: float = 0.0) -> float:

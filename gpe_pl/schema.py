@@ -6,7 +6,7 @@ This module imports nothing but the standard library, so that solvers, store and
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Version of the HDF5 layout; a reader refuses any other."""
 
 STICKY = 1.0e6
@@ -84,6 +84,8 @@ class Field:
     required: bool = True
 
 
+STRESS_COMPONENTS = "xx, xy, yy, zz in plane strain; xx, xy, xz, yy, yz, zz in 3D"
+
 FIELDS: dict[str, Field] = {
     "pos": Field(("frame", "node", "dim"), "float32", "m", "positions of the dynamic nodes"),
     "vel": Field(("frame", "node", "dim"), "float32", "m/s", "velocities of the dynamic nodes as the solver has them at that frame"),
@@ -97,7 +99,10 @@ FIELDS: dict[str, Field] = {
     "boundary_restitution": Field(("boundary_node",), "float32", "1", "fraction of the normal velocity that a bounce returns"),
     "rest_pos": Field(("node", "dim"), "float32", "m", "undeformed positions of mesh nodes", required=False),
     "cells": Field(("cell", "corner"), "int32", "1", "node indices of each mesh cell", required=False),
-    "stress": Field(("frame", "node", "stress"), "float32", "Pa", "Cauchy stress, upper triangle by rows", required=False),
+    "node_stress": Field(("frame", "node", "stress"), "float32", "Pa", f"Cauchy stress at nodes: {STRESS_COMPONENTS}", required=False),
+    "cell_stress": Field(("frame", "cell", "stress"), "float32", "Pa", "Cauchy stress in cells, components as node_stress", required=False),
+    "node_von_mises": Field(("frame", "node"), "float32", "Pa", "von Mises stress at nodes", required=False),
+    "cell_von_mises": Field(("frame", "cell"), "float32", "Pa", "von Mises stress in cells", required=False),
 }
 
 

@@ -18,6 +18,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from array_api_compat import array_namespace
 from pydantic import TypeAdapter, ValidationError
 
 from gpe_pl import integrators
@@ -77,6 +78,39 @@ class Boundary:
 
 
 @dataclass(frozen=True)
+class Stress:
+    """Cauchy stress of a mesh in Pa; in a ``Trajectory`` with a leading axis of frames.
+
+    Attributes:
+        node: [node, component], averaged from the cells around each node; zero at nodes of no cell.
+        cell: [cell, component]. Components are xx, xy, yy, zz in plane strain and xx, xy, xz, yy, yz, zz in 3D.
+    """
+
+    node: Array
+    cell: Array
+
+    @property
+    def node_von_mises(self) -> Array:
+        return von_mises(self.node)
+
+    @property
+    def cell_von_mises(self) -> Array:
+        return von_mises(self.cell)
+
+
+def von_mises(stress: Array) -> Array:
+    """Von Mises stress √(3/2 s:s) [...] in Pa, with s the deviator of stresses [..., component] ordered as in ``Stress``."""
+    xp = array_namespace(stress)
+    zero = xp.zeros_like(stress[..., 0])
+    if stress.shape[-1] == 4:
+        (xx, xy, yy, zz), (xz, yz) = (stress[..., k] for k in range(4)), (zero, zero)
+    else:
+        xx, xy, xz, yy, yz, zz = (stress[..., k] for k in range(6))
+    normal = ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) / 2
+    return xp.sqrt(normal + 3 * (xy**2 + xz**2 + yz**2))
+
+
+@dataclass(frozen=True)
 class State:
     """Everything a ``Simulator`` needs to know at one instant; arrays of one backend.
 
@@ -90,6 +124,9 @@ class State:
         gravity: external acceleration [dim] in m/s².
         velocity_history: the last velocities [node, history, dim], oldest first, the last one equal to ``vel``; None for solvers.
         time: seconds since the start.
+        rest_pos: undeformed positions [node, dim] in m, where there is a mesh; nodes of no cell have their initial position.
+        cells: nodes of each mesh cell [cell, corner].
+        stress: of the mesh, where the solver computes it.
         internal: opaque part of a solver (deformation gradient, …), carried so that a restart equals a run-through.
     """
 
@@ -102,6 +139,9 @@ class State:
     gravity: Array
     velocity_history: Array | None = None
     time: float = 0.0
+    rest_pos: Array | None = None
+    cells: Array | None = None
+    stress: Stress | None = None
     internal: Any = None
 
     @property
@@ -113,7 +153,7 @@ class State:
         return self.pos.shape[1]
 
     def to_torch(self, device: Any = "cpu") -> State:
-        """The same state as float64 tensors on a device (``internal`` is dropped: it belongs to a solver)."""
+        """The same state as float64 tensors on a device (``internal`` and ``stress`` are dropped: they belong to a solver)."""
         import torch
 
         def tensor(x: Array) -> Any:
@@ -124,8 +164,10 @@ class State:
         b = self.boundary
         boundary = replace(b, **{name: tensor(getattr(b, name)) for name in ("pos", "vel", "normal", "friction", "restitution")})
         arrays = {name: tensor(getattr(self, name)) for name in ("pos", "vel", "node_type", "mass", "material_params", "gravity")}
-        history = None if self.velocity_history is None else tensor(self.velocity_history)
-        return replace(self, **arrays, boundary=boundary, velocity_history=history, internal=None)
+        for name in ("velocity_history", "rest_pos", "cells"):
+            value = getattr(self, name)
+            arrays[name] = None if value is None else tensor(value)
+        return replace(self, **arrays, boundary=boundary, stress=None, internal=None)
 
 
 @dataclass(frozen=True)
@@ -198,8 +240,8 @@ class Trajectory:
         node_type, mass: [node].
         material_params: [node, param].
         boundary: static boundary nodes.
-        rest_pos, cells: reference configuration of meshes.
-        stress: Cauchy stress [frame, node, components] in Pa.
+        rest_pos, cells: reference configuration of meshes, as in ``State``.
+        stress: of the mesh in every frame.
         termination: set when a rollout stopped before its last frame.
     """
 
@@ -212,7 +254,7 @@ class Trajectory:
     boundary: Boundary
     rest_pos: np.ndarray | None = None
     cells: np.ndarray | None = None
-    stress: np.ndarray | None = None
+    stress: Stress | None = None
     termination: Termination | None = field(default=None, compare=False)
 
     @property
@@ -240,13 +282,15 @@ class Trajectory:
             window = self.pos[frame - history : frame + 1].astype(np.float64)
             past = np.ascontiguousarray(integrators.velocities(window, self.metadata.frame_dt).swapaxes(0, 1))
             vel = past[:, -1]
+        rest_pos = None if self.rest_pos is None else self.rest_pos.astype(np.float64)
         return State(
-            pos, vel, self.node_type, self.mass, self.material_params, self.boundary, gravity, past, frame * self.metadata.frame_dt
-        )
+            pos, vel, self.node_type, self.mass, self.material_params, self.boundary, gravity, past, frame * self.metadata.frame_dt,
+            rest_pos, self.cells,
+        )  # fmt: skip
 
     def frames(self, start: int, stop: int | None = None) -> Trajectory:
         """The frames ``start:stop`` as a trajectory of their own."""
-        stress = None if self.stress is None else self.stress[start:stop]
+        stress = None if self.stress is None else Stress(self.stress.node[start:stop], self.stress.cell[start:stop])
         return replace(self, pos=self.pos[start:stop], vel=self.vel[start:stop], stress=stress)
 
 
@@ -268,8 +312,11 @@ def _fields_of(trajectory: Trajectory) -> dict[str, np.ndarray]:
         "boundary_restitution": b.restitution,
         "rest_pos": trajectory.rest_pos,
         "cells": trajectory.cells,
-        "stress": trajectory.stress,
     }
+    if trajectory.stress is not None:
+        for part in ("node", "cell"):
+            arrays[f"{part}_stress"] = getattr(trajectory.stress, part)
+            arrays[f"{part}_von_mises"] = getattr(trajectory.stress, f"{part}_von_mises")
     return {k: np.ascontiguousarray(v, dtype=FIELDS[k].dtype) for k, v in arrays.items() if v is not None}
 
 
@@ -495,6 +542,8 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
             attributes = {key: read_text(group, key) for key in ("metadata", "shapes", "node_types")}
             if digest(arrays, attributes) != read_text(group, "sha256"):
                 raise StoreError(f"{path}:{name}: SHA-256 digest does not match the content; delete the shard and run simulate again")
+        if ("node_stress" in arrays) != ("cell_stress" in arrays):
+            raise StoreError(f"{path}:{name}: has only one of the fields 'node_stress' and 'cell_stress'")
         for conflict in size_conflicts(arrays, metadata):
             raise StoreError(f"{path}:{name}: {conflict}")
         shapes, names = shapes_of(group), node_types_of(group)
@@ -519,7 +568,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         boundary,
         rest_pos=arrays.get("rest_pos"),
         cells=arrays.get("cells"),
-        stress=arrays.get("stress"),
+        stress=Stress(arrays["node_stress"], arrays["cell_stress"]) if "node_stress" in arrays else None,
     )
 
 

@@ -14,6 +14,12 @@ from gpe_pl.schema import node_code
 from gpe_pl.trajectory import Boundary, Metadata, Trajectory, write_shard
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--physics-page", metavar="FILE", help="write every measured value of tests/physics to FILE (Markdown) and beside it as CSV"
+    )
+
+
 def make_trajectory(seed: int = 0, num_frames: int = 6, num_nodes: int = 12, **metadata: object) -> Trajectory:
     """A sound trajectory of sand in a unit box with walls and an obstacle; the motion is random, not physical."""
     rng = np.random.default_rng(seed)

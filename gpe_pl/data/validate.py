@@ -287,7 +287,7 @@ def _check_motion(m: Metadata, arrays: dict[str, np.ndarray]) -> Iterator[Findin
     if pos.shape[0] < 2 or pos.shape[1] < 1:
         yield "pos", f"has {pos.shape[0]} frames and {pos.shape[1]} nodes; at least 2 frames and 1 node are needed"
         return
-    for key in ("pos", "vel", "rest_pos", "stress"):
+    for key in ("pos", "vel", "rest_pos", "node_stress", "cell_stress"):
         if key in arrays and (where := _offenders(key, ~np.isfinite(arrays[key]))):
             yield key, f"{where}: not finite"
     for axis, (low, high) in enumerate(m.bounds):

@@ -17,12 +17,14 @@ import pytest
 from gpe_pl.schema import NODE_TYPES, SCHEMA_VERSION
 from gpe_pl.trajectory import (
     StoreError,
+    Stress,
     Trajectory,
     iter_trajectories,
     read_metadata,
     read_trajectory,
     shards,
     trajectory_names,
+    von_mises,
     write_shard,
 )
 
@@ -32,12 +34,16 @@ New = Callable[..., Trajectory]
 def assert_same(a: Trajectory, b: Trajectory) -> None:
     assert a.metadata == b.metadata
     for f in fields(Trajectory):
-        if f.name not in ("metadata", "boundary", "termination"):
+        if f.name not in ("metadata", "boundary", "termination", "stress"):
             np.testing.assert_array_equal(getattr(a, f.name), getattr(b, f.name), err_msg=f.name)
     for f in fields(a.boundary):
         if f.name != "shapes":
             np.testing.assert_array_equal(getattr(a.boundary, f.name), getattr(b.boundary, f.name), err_msg=f.name)
     assert a.boundary.shapes == b.boundary.shapes
+    assert (a.stress is None) == (b.stress is None)
+    if a.stress is not None and b.stress is not None:
+        np.testing.assert_array_equal(a.stress.node, b.stress.node)
+        np.testing.assert_array_equal(a.stress.cell, b.stress.cell)
 
 
 @pytest.fixture
@@ -59,10 +65,27 @@ def test_round_trip_of_mesh_fields(tmp_path: Path, trajectory: Trajectory) -> No
         trajectory,
         rest_pos=rng.random((12, 2)).astype(np.float32),
         cells=rng.integers(0, 12, (7, 3), dtype=np.int32),
-        stress=rng.normal(size=(6, 12, 3)).astype(np.float32),
+        stress=Stress(rng.normal(size=(6, 12, 4)).astype(np.float32), rng.normal(size=(6, 7, 4)).astype(np.float32)),
     )
     write_shard(tmp_path / "mesh.h5", [mesh])
     assert_same(read_trajectory(tmp_path / "mesh.h5", "00000", verify=True), mesh)
+
+
+def test_half_a_stress_is_refused(tmp_path: Path, trajectory: Trajectory) -> None:
+    stressed = replace(trajectory, stress=Stress(np.zeros((6, 12, 4), np.float32), np.zeros((6, 7, 4), np.float32)))
+    write_shard(tmp_path / "mesh.h5", [stressed])
+    with h5py.File(tmp_path / "mesh.h5", "r+") as file:
+        del file["00000/cell_stress"]
+    with pytest.raises(StoreError, match="only one of the fields 'node_stress' and 'cell_stress'"):
+        read_trajectory(tmp_path / "mesh.h5", "00000")
+
+
+def test_von_mises_of_known_stresses() -> None:
+    """Uniaxial tension s: s; pure shear τ: √3 τ; hydrostatic: 0."""
+    uniaxial, shear, hydrostatic = [0.0, 0.0, 3.0, 0.0], [0.0, 2.0, 0.0, 0.0], [5.0, 0.0, 5.0, 5.0]
+    np.testing.assert_allclose(von_mises(np.array([uniaxial, shear, hydrostatic])), [3.0, 2 * 3**0.5, 0.0], atol=1e-12)
+    spatial = [[0.0, 0, 0, 0, 0, -3.0], [0.0, 1, 2, 0, 2, 0], [5.0, 0, 0, 5, 0, 5]]
+    np.testing.assert_allclose(von_mises(np.array(spatial)), [3.0, 3 * 3**0.5, 0.0], atol=1e-12)
 
 
 def test_round_trip_without_nodes_or_with_long_text(tmp_path: Path, trajectory: Trajectory, new_trajectory: New) -> None:
