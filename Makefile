@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install fit test test-all check lint types contracts format-page format bench notebooks clean
+.PHONY: help install fit test test-all physics check lint types contracts format-page format bench notebooks clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  %-12s %s\n", $$1, $$2}'
@@ -30,6 +30,9 @@ test: install ## fast tests (PYTEST_ARGS="-n 4" and the like)
 test-all: install ## all tests, analytic physics and notebooks included
 	$(BIN)/python -m pytest -m "" $(PYTEST_ARGS)
 
+physics: install ## solvers against formulas and experiments; writes docs/results/physics.md
+	$(BIN)/python -m pytest tests/physics -m "not notebook" --physics-page docs/results/physics.md $(PYTEST_ARGS)
+
 check: lint types contracts format-page ## everything that needs no run: style, types, import contracts, generated pages
 
 lint: install ## style and formatting
@@ -51,8 +54,9 @@ format: install ## rewrite the code in the project's style, and the generated pa
 	$(BIN)/ruff format .
 	$(BIN)/python -m gpe_pl.data.validate --format-page > data/README.md
 
-bench: install ## speed of the message-passing layers, simulators and data path
+bench: install ## speed of the message-passing layers and of the solvers
 	$(BIN)/python -m gpe_pl.benchmark suite=speed $(ARGS)
+	$(BIN)/python -m gpe_pl.benchmark suite=solvers $(ARGS)
 
 notebooks: install ## execute every notebook from start to end
 	$(BIN)/python -m pytest -m notebook $(PYTEST_ARGS)

@@ -8,6 +8,7 @@ import os
 import pkgutil
 import platform
 import subprocess
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,8 @@ from gpe_pl.config import ConfigError, construct, entry_point
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
+
+    from gpe_pl.generation import DatasetSpec
 
 
 def environment() -> dict[str, Any]:
@@ -35,6 +38,17 @@ def environment() -> dict[str, Any]:
     }
 
 
+def _dataset(overrides: list[str]) -> DatasetSpec:
+    import hydra
+    from omegaconf import OmegaConf
+
+    from gpe_pl.simulate import dataset_spec
+
+    cfg = hydra.compose("simulate", overrides)
+    OmegaConf.resolve(cfg)
+    return dataset_spec(cfg)
+
+
 def benchmark(cfg: DictConfig) -> None:
     """Run one suite and write ``results.json`` and ``table.md``."""
     suites = sorted(m.name for m in pkgutil.iter_modules(gpe_pl.suites.__path__))
@@ -42,10 +56,11 @@ def benchmark(cfg: DictConfig) -> None:
         raise ConfigError(f"suite.name={cfg.suite.name!r}: must be one of {', '.join(suites)}")
     suite = importlib.import_module(f"gpe_pl.suites.{cfg.suite.name}")
     settings = construct(suite.Settings, {k: v for k, v in cfg.suite.items() if k != "name"}, "suite")
-    records, table = suite.run(settings)
+    cases = getattr(settings, "cases", None)  # of a suite about data sets
+    records, table = suite.run(settings) if cases is None else suite.run(settings, {k: _dataset(c.overrides) for k, c in cases.items()})
     folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name
     folder.mkdir(parents=True, exist_ok=True)
-    results = {"environment": environment(), "settings": vars(settings), "records": records}
+    results = {"environment": environment(), "settings": asdict(settings), "records": records}
     for name, text in (("results.json", json.dumps(results, indent=1)), ("table.md", table + "\n")):
         temporary = folder / f".{name}.part"
         temporary.write_text(text)

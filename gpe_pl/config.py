@@ -6,6 +6,7 @@ type or out of range is refused by the signature of the class or function that t
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import os
 import re
@@ -27,6 +28,9 @@ from omegaconf.errors import OmegaConfBaseException
 from pydantic import ConfigDict, ValidationError, create_model
 
 from gpe_pl.errors import GpeError
+
+WITHOUT_KEY = {"experiment", "scene", "solver"}
+"""Config groups that fill other keys than one of their own."""
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 T = TypeVar("T")
@@ -57,6 +61,24 @@ def construct(target: Callable[..., T], settings: Mapping[str, Any], path: str, 
         ConfigError: unknown or missing key, wrong type or value out of range.
     """
     return bind(target, settings, path, *given)(**given)
+
+
+def construct_target(settings: Mapping[str, Any], path: str, package: str) -> Any:
+    """``construct`` of the class that ``_target_`` names; it must lie below ``package``.
+
+    Raises:
+        ConfigError: no such class there, or settings that do not fit it.
+    """
+    values = dict(settings)
+    target = str(values.pop("_target_", None))
+    module, _, name = target.rpartition(".")
+    try:
+        if not f"{module}.".startswith(package):
+            raise ImportError
+        cls = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError):
+        raise ConfigError(f"{path}._target_={target!r}: must be a class of {package.rstrip('.')}") from None
+    return construct(cls, values, path)
 
 
 def bind(target: Callable[..., T], settings: Mapping[str, Any], path: str, *later: str) -> Callable[..., T]:
@@ -96,7 +118,7 @@ def _one_line(error: ValidationError, path: str) -> str:
     parts = []
     for e in error.errors():
         key = ".".join([path, *(str(k) for k in e["loc"] if isinstance(k, (str, int)))])
-        value = f"={e['input']!r}" if e["loc"] and e["type"] != "missing" else ""
+        value = f"={e['input']!r}" if e["loc"] and e["type"] != "missing" and not isinstance(e["input"], dict) else ""
         message = e["msg"].removeprefix("Value error, ")
         message = message if message[:2].isupper() else message[0].lower() + message[1:]
         parts.append(f"{key}{value}: {message}")
@@ -177,7 +199,7 @@ def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
 
 def _check_top_level(cfg: DictConfig, config_name: str) -> None:
     known = {*_groups(config_name), *(str(k) for k in OmegaConf.load(CONF / f"{config_name}.yaml"))} - {"defaults", "hydra"}
-    wrong = {str(k) for k in cfg} ^ (known - {"experiment"})
+    wrong = {str(k) for k in cfg} ^ (known - WITHOUT_KEY)
     if wrong:
         raise ConfigError(f"{min(wrong)}: unknown or missing key; valid keys: {', '.join(sorted(known))}")
     if "name" in cfg and not (isinstance(cfg.name, str) and cfg.name.strip()):

@@ -5,7 +5,8 @@ leaves the same bytes as one that was not. Layout::
 
     {root}/{name}/{size}/dataset.json            the spec and its hash, written first
     {root}/{name}/{size}/{split}/shard-00000.h5
-    {root}/{name}/{size}/statistics.json         of the train split, written last
+    {root}/{name}/{size}/statistics.json         of the train split, written when all its shards are there
+    {root}/{name}/{size}/contact_sheet.png       one scene under several parameter values, to look at
 """
 
 from __future__ import annotations
@@ -18,28 +19,29 @@ import multiprocessing
 import os
 import shutil
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, InstanceOf
 from pydantic.dataclasses import dataclass
 
 from gpe_pl import integrators
 from gpe_pl.errors import GpeError
-from gpe_pl.rollout import Guard, rollout
+from gpe_pl.rollout import Guard, SimulationError, Simulator, rollout
 from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup
-from gpe_pl.solvers import mpm
-from gpe_pl.solvers.mpm import MPM
-from gpe_pl.solvers.scenes import SceneConfig, describe, sample_scene
-from gpe_pl.trajectory import Metadata, StoreError, Trajectory, read_trajectory, trajectory_names, write_shard
+from gpe_pl.solvers.scenes import Scene, describe
+from gpe_pl.trajectory import Metadata, State, StoreError, Trajectory, read_trajectory, trajectory_names, write_shard
 
 SPEC_FILE = "dataset.json"
 STATISTICS_FILE = "statistics.json"
+CONTACT_SHEET_FILE = "contact_sheet.png"
+SHEET_ROWS = 5
 
 Count = Annotated[int, Field(ge=0)]
 PathPart = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
@@ -58,15 +60,59 @@ class GenerationError(GpeError):
         return type(self), (str(self), self.split, self.index, self.seed)
 
 
+@runtime_checkable
+class Solver(Simulator, Protocol):
+    """A simulator whose results depend on nothing but its settings, name and version."""
+
+    name: ClassVar[str]
+    version: ClassVar[str]
+
+    @property
+    def frame_dt(self) -> float: ...
+
+    @property
+    def solver_dt(self) -> float: ...
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], ...]: ...
+
+    @property
+    def materials(self) -> tuple[str, ...]: ...
+
+    def compile_kernels(self) -> None: ...
+
+
 @dataclass(frozen=True, config={"extra": "forbid"})
+class ParameterValues:
+    """Values of a material's parameter.
+
+    Attributes:
+        seen: in ``train``, ``val`` and ``test``, dealt in turn.
+        interpolated, extrapolated: in even and in odd trajectories of ``test_unseen``: inside and outside the range of ``seen``.
+    """
+
+    seen: Annotated[tuple[float, ...], Field(min_length=1)]
+    interpolated: tuple[float, ...] = ()
+    extrapolated: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        unseen = {*self.interpolated, *self.extrapolated}
+        if unseen & set(self.seen):
+            raise ValueError(f"unseen values {sorted(unseen & set(self.seen))} are among the seen ones")
+        low, high = min(self.seen), max(self.seen)
+        if any(not low < v < high for v in self.interpolated) or any(low <= v <= high for v in self.extrapolated):
+            raise ValueError(
+                f"interpolated values must lie inside and extrapolated ones outside the range [{low}, {high}] of the seen ones"
+            )
+
+
+@dataclass(frozen=True, config={"extra": "forbid", "arbitrary_types_allowed": True})
 class DatasetSpec:
     """Everything that determines the bytes of a data set.
 
     Attributes:
         name, size: folder names.
-        material: of all particles.
-        seen_values: values of its material parameter in ``train``, ``val`` and ``test``, dealt in turn.
-        interpolated_values, extrapolated_values: values of even and of odd trajectories of ``test_unseen``.
+        parameters: values of each material's parameter.
         num_train, num_val, num_test, num_test_unseen: trajectories per split.
         num_frames: stored frames per trajectory, the initial one included.
         trajectories_per_shard: the unit of work and of resuming.
@@ -77,14 +123,11 @@ class DatasetSpec:
 
     name: PathPart
     size: PathPart
-    material: str
-    seen_values: Annotated[tuple[float, ...], Field(min_length=1)]
-    scene: SceneConfig
-    solver: MPM
+    parameters: dict[str, ParameterValues]
+    scene: InstanceOf[Scene]
+    solver: InstanceOf[Solver]
     num_train: Annotated[int, Field(ge=1)]
     num_frames: Annotated[int, Field(ge=3)]
-    interpolated_values: tuple[float, ...] = ()
-    extrapolated_values: tuple[float, ...] = ()
     num_val: Count = 0
     num_test: Count = 0
     num_test_unseen: Count = 0
@@ -92,29 +135,23 @@ class DatasetSpec:
     seed: Annotated[int, Field(ge=0)] = 0
 
     def __post_init__(self) -> None:
-        scene, solver = asdict(self.scene), asdict(self.solver)  # type: ignore[call-overload]
+        scene, solver = asdict(cast(Any, self.scene)), asdict(cast(Any, self.solver))
         for key in sorted(scene.keys() & solver.keys()):
             if scene[key] != solver[key]:
                 raise ValueError(f"scene.{key} = {scene[key]} and solver.{key} = {solver[key]} must be equal")
-        if tuple(self.solver.materials) != (self.material,):
-            raise ValueError(f"solver.materials = {self.solver.materials} must be ({self.material!r},)")
-        parameter = MATERIALS[self.material]
-        for key in ("seen_values", "interpolated_values", "extrapolated_values"):
-            for value in getattr(self, key):
-                if not parameter.low <= value <= parameter.high:
-                    raise ValueError(
-                        f"{key}: {parameter.name} = {value} is outside [{parameter.low:g}, {parameter.high:g}] {parameter.unit}"
-                    )
-        unseen = {*self.interpolated_values, *self.extrapolated_values}
-        if unseen & set(self.seen_values):
-            raise ValueError(f"unseen values {sorted(unseen & set(self.seen_values))} are among seen_values")
-        low, high = min(self.seen_values), max(self.seen_values)
-        if any(not low < v < high for v in self.interpolated_values) or any(low <= v <= high for v in self.extrapolated_values):
-            raise ValueError(
-                f"interpolated_values must lie inside and extrapolated_values outside the range [{low}, {high}] of seen_values"
-            )
-        if self.num_test_unseen and not (self.interpolated_values and self.extrapolated_values):
-            raise ValueError("num_test_unseen > 0 needs interpolated_values and extrapolated_values")
+        if set(self.parameters) != set(self.scene.materials):
+            raise ValueError(f"parameters are for {', '.join(self.parameters)}, the scene has {', '.join(self.scene.materials)}")
+        for material, values in self.parameters.items():
+            parameter = MATERIALS[material]
+            for key, group in asdict(cast(Any, values)).items():
+                for value in group:
+                    if not parameter.low <= value <= parameter.high:
+                        raise ValueError(
+                            f"parameters.{material}.{key}: {parameter.name} = {value} is outside "
+                            f"[{parameter.low:g}, {parameter.high:g}] {parameter.unit}"
+                        )
+            if self.num_test_unseen and not (values.interpolated and values.extrapolated):
+                raise ValueError(f"num_test_unseen > 0 needs parameters.{material}.interpolated and .extrapolated")
 
     @property
     def counts(self) -> dict[str, int]:
@@ -122,9 +159,11 @@ class DatasetSpec:
         return dict(zip(SPLITS, (self.num_train, self.num_val, self.num_test, self.num_test_unseen), strict=True))
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain JSON values; includes the solver's name and version, on which the bytes depend too."""
+        """Plain JSON values; includes what else the bytes depend on: the solver's name and version, and the content of the scene's files."""
         values = asdict(self)  # type: ignore[call-overload]
+        values["scene"] = {"kind": type(self.scene).__name__, **values["scene"]}
         values["solver"] |= {"name": self.solver.name, "version": self.solver.version}
+        values["input_files"] = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in self.scene.input_files}
         return json.loads(json.dumps(values))
 
 
@@ -137,13 +176,19 @@ def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:
     return int(words[0]) << 32 | int(words[1])
 
 
-def parameter_value(spec: DatasetSpec, split: str, index: int) -> tuple[float, ParameterGroup]:
-    """Value of the material parameter of one trajectory and the group that it belongs to."""
-    if split != "test_unseen":
-        return spec.seen_values[index % len(spec.seen_values)], "seen"
-    if index % 2 == 0:
-        return spec.interpolated_values[index // 2 % len(spec.interpolated_values)], "interpolated"
-    return spec.extrapolated_values[index // 2 % len(spec.extrapolated_values)], "extrapolated"
+def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[str, float], ParameterGroup]:
+    """Value of each material's parameter in one trajectory, and the group that they belong to.
+
+    Values are dealt in turn; each further material is one value ahead after every round, so that all combinations of seen values occur.
+    """
+    group: ParameterGroup = "seen"
+    if split == "test_unseen":
+        group, index = ("interpolated", "extrapolated")[index % 2], index // 2  # type: ignore[assignment]
+    values = {}
+    for k, (material, choices) in enumerate(spec.parameters.items()):
+        dealt = getattr(choices, group)
+        values[material] = dealt[(index + k * (index // len(dealt))) % len(dealt)]
+    return values, group
 
 
 def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
@@ -151,35 +196,43 @@ def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
     values = spec.as_dict()
     return describe(
         spec.scene,
-        spec.material,
         spec.solver.frame_dt,
         dataset=spec.name,
         solver_dt=spec.solver.solver_dt,
         seed=scene_seed(spec, split, index),
         split=split,
-        parameter_group=parameter_value(spec, split, index)[1],
+        parameter_group=parameter_values(spec, split, index)[1],
         solver=spec.solver.name,
         solver_version=spec.solver.version,
         config=json.dumps({"scene": values["scene"], "solver": values["solver"]}, sort_keys=True),
     )
 
 
-def generate_trajectory(spec: DatasetSpec, split: str, index: int) -> Trajectory:
-    """Simulate one trajectory; raises ``GenerationError`` if the scene is impossible or the solver gives up."""
+def initial_state(spec: DatasetSpec, split: str, index: int, values: Mapping[str, float] | None = None) -> State:
+    """The scene of one trajectory, on request with other parameter values."""
+    return spec.scene.sample(values or parameter_values(spec, split, index)[0], scene_seed(spec, split, index))
+
+
+def generate_trajectory(
+    spec: DatasetSpec, split: str, index: int, values: Mapping[str, float] | None = None, num_frames: int | None = None
+) -> Trajectory:
+    """Simulate one trajectory, on request with other parameter values or fewer frames.
+
+    Raises:
+        GenerationError: the scene is impossible or the solver gives up.
+    """
     metadata = trajectory_metadata(spec, split, index)
     label = f"split {split}, index {index}, seed {metadata.seed}"
     try:
-        state = sample_scene(spec.scene, spec.material, parameter_value(spec, split, index)[0], metadata.seed)
+        state = initial_state(spec, split, index, values)
     except ValueError as error:
         raise GenerationError(f"{label}: {error}", split, index, metadata.seed) from None
     guard = Guard(bounds=spec.scene.bounds, margin=1e-6)
-    trajectory = rollout(spec.solver, state, spec.num_frames - 1, metadata, guard)
+    trajectory = rollout(spec.solver, state, (num_frames or spec.num_frames) - 1, metadata, guard)
     if trajectory.termination is not None:
+        stop = trajectory.termination
         raise GenerationError(
-            f"{label}: {trajectory.termination.reason}: {trajectory.termination.message}; lower solver.cfl or scene.max_speed",
-            split,
-            index,
-            metadata.seed,
+            f"{label}: {stop.reason}: {stop.message}; lower the solver's cfl or the scene's max_speed", split, index, metadata.seed
         )
     return trajectory
 
@@ -217,21 +270,72 @@ def _write_shard(spec: DatasetSpec, folder: Path, split: str, shard: int) -> int
 
 
 def _bytes_per_trajectory(spec: DatasetSpec) -> int:
+    """Uncompressed; nodes and cells at most as many as the scene says, boundary nodes of the first scene."""
     dim = len(spec.scene.bounds)
-    node_frames = 2 * 4 * dim * spec.scene.num_particles * spec.num_frames
-    boundary = 64 * sum(math.ceil((high - low) / spec.scene.spacing) for low, high in spec.scene.bounds) * 2
-    return node_frames + boundary + 2**13
+    per_frame = 2 * dim * spec.scene.max_nodes
+    if getattr(spec.solver, "stores_stress", False):
+        per_frame += (5 if dim == 2 else 7) * (spec.scene.max_nodes + spec.scene.max_cells)
+    boundary = initial_state(spec, "train", 0).boundary
+    return 4 * per_frame * spec.num_frames + 16 * (dim + 1) * len(boundary.pos) + 2**13
 
 
 def dataset_bytes(spec: DatasetSpec) -> int:
-    """Estimate of what a complete data set takes on disk."""
+    """Estimate of what a complete data set takes on disk at most: compression saves a part of it."""
     return sum(spec.counts.values()) * _bytes_per_trajectory(spec)
 
 
 # --- the data set --------------------------------------------------------------------------------------------------------------------------
 
 
-def generate(root: Path | str, spec: DatasetSpec, num_workers: int = 1, on_progress: Progress | None = None) -> Path:
+@dataclass(frozen=True)
+class Plan:
+    """What is missing of a data set, and what it takes to generate it.
+
+    Attributes:
+        num_done, num_missing: trajectories that are there and that are not.
+        bytes_needed: on disk, at most.
+        bytes_free: on the disk.
+    """
+
+    num_done: int
+    num_missing: int
+    bytes_needed: int
+    bytes_free: int
+
+
+def plan(root: Path | str, spec: DatasetSpec) -> Plan:
+    """What ``generate`` would do."""
+    folder = Path(root) / spec.name / spec.size
+    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+    missing = sum(len(_shard_indices(spec, split, k)) for split, k in _shards(spec) if not _is_complete(spec, folder, split, k))
+    done = sum(spec.counts.values()) - missing
+    return Plan(done, missing, missing * _bytes_per_trajectory(spec), shutil.disk_usage(existing).free)
+
+
+def _compile(spec: DatasetSpec) -> None:
+    with contextlib.suppress(SimulationError):  # settings that cannot work are reported by the first trajectory, with its seed
+        spec.solver.compile_kernels()
+
+
+def seconds_per_trajectory(spec: DatasetSpec, budget: float = 10.0) -> float:
+    """Estimate [s] on one core: the whole scenes that fit into ``budget`` seconds, at least a tenth of one, at evenly spread parameter values.
+
+    Where less than a trajectory fits, its first frames stand for the rest, though scenes cost more when bodies collide.
+    """
+    _compile(spec)
+    started, frames = time.perf_counter(), 0
+    for index in range(spec.counts["train"]):
+        first = index * max(1, spec.counts["train"] // 7) % spec.counts["train"]
+        generate_trajectory(spec, "train", first, num_frames=max(3, spec.num_frames // 10))
+        frames += max(3, spec.num_frames // 10)
+        if time.perf_counter() - started > budget:
+            break
+    return (time.perf_counter() - started) / frames * spec.num_frames
+
+
+def generate(
+    root: Path | str, spec: DatasetSpec, num_workers: int = 1, on_progress: Progress | None = None, part: tuple[int, int] = (0, 1)
+) -> Path:
     """Generate what is missing of a data set.
 
     Args:
@@ -239,6 +343,8 @@ def generate(root: Path | str, spec: DatasetSpec, num_workers: int = 1, on_progr
         spec: the data set.
         num_workers: processes; 1 simulates in this process.
         on_progress: called with the trajectories done and their total, once at the start and after each shard.
+        part: ``(k, n)`` does every n-th shard from the k-th on, so that n machines with one disk share the work. Whoever finds all training shards
+            in place writes the statistics.
 
     Returns:
         The folder of the data set, ``root/name/size``.
@@ -248,41 +354,82 @@ def generate(root: Path | str, spec: DatasetSpec, num_workers: int = 1, on_progr
     """
     if num_workers < 1:
         raise ValueError(f"num_workers must be at least 1, got {num_workers}")
+    if not 0 <= part[0] < part[1]:
+        raise ValueError(f"part must be (k, n) with 0 <= k < n, got {part}")
     folder = Path(root) / spec.name / spec.size
     folder.mkdir(parents=True, exist_ok=True)
     _claim(folder, spec)
-    for leftover in folder.glob("*/.shard-*.part"):
-        leftover.unlink(missing_ok=True)
-    missing = [(split, k) for split, k in _shards(spec) if not _is_complete(spec, folder, split, k)]
-    total = sum(spec.counts.values())
+    own = _shards(spec)[part[0] :: part[1]]
+    for split, k in own:
+        for leftover in folder.glob(f"{split}/.{shard_path(folder, split, k).name}.*.part"):
+            leftover.unlink(missing_ok=True)
+    missing = [(split, k) for split, k in own if not _is_complete(spec, folder, split, k)]
+    total = sum(len(_shard_indices(spec, split, k)) for split, k in own)
     to_do = sum(len(_shard_indices(spec, split, k)) for split, k in missing)
     needed, free = to_do * _bytes_per_trajectory(spec), shutil.disk_usage(folder).free
     if needed > 0.95 * free:
         raise GenerationError(
-            f"{folder}: {to_do} trajectories need about {needed / 2**30:.3g} GiB, the disk has {free / 2**30:.3g} GiB free; "
+            f"{folder}: {to_do} trajectories need up to {needed / 2**30:.3g} GiB, the disk has {free / 2**30:.3g} GiB free; "
             "choose another folder with paths.data, or a smaller size"
         )
-    statistics = folder / STATISTICS_FILE
+    statistics, sheet = folder / STATISTICS_FILE, folder / CONTACT_SHEET_FILE
     if any(split == "train" for split, _ in missing):
         statistics.unlink(missing_ok=True)
-    if not missing and statistics.is_file():
-        if on_progress is not None:
-            on_progress(total, total)
-        return folder
     done = total - to_do
     if on_progress is not None:
         on_progress(done, total)
-    if missing and num_workers > 1:
-        mpm.compile_kernels()  # once, here: the workers load the compiled kernels from disk
+    draws_sheet = part[0] == 0 and not sheet.is_file()
+    if (missing or draws_sheet) and num_workers > 1:
+        _compile(spec)  # once, here: the workers load the compiled kernels from disk
     with _pool(num_workers) as pool:
         for count in _run(pool, _write_shard, [(spec, folder, split, k) for split, k in missing]):
             done += count
             if on_progress is not None:
                 on_progress(done, total)
-        train = [shard_path(folder, split, k) for split, k in _shards(spec) if split == "train"]
-        moments = {str(path): sums for path, sums in _run(pool, _moments, [(path,) for path in train])}
-    _write_json(statistics, _statistics(spec, [moments[str(path)] for path in train]))
+        train = [(split, k) for split, k in _shards(spec) if split == "train"]
+        if not statistics.is_file() and all(_is_complete(spec, folder, *shard) for shard in train):
+            paths = [shard_path(folder, *shard) for shard in train]
+            moments = {str(path): sums for path, sums in _run(pool, _moments, [(path,) for path in paths])}
+            _write_json(statistics, _statistics(spec, [moments[str(path)] for path in paths]))
+        if draws_sheet:
+            _draw_contact_sheet(spec, sheet, pool)
     return folder
+
+
+def _draw_contact_sheet(spec: DatasetSpec, path: Path, pool: Executor | None) -> None:
+    """A training scene with as many of the materials as possible, under parameter values from the smallest to the largest."""
+    from gpe_pl.viz.contact_sheet import contact_sheet
+
+    rows: dict[str, dict[str, float]] = {}
+    for share in np.linspace(0.0, 1.0, SHEET_ROWS):
+        values = {}
+        for material, choices in spec.parameters.items():
+            every = sorted({*choices.seen, *choices.interpolated, *choices.extrapolated})
+            values[material] = every[round(share * (len(every) - 1))]
+        rows[_row_label(values)] = values
+    index = max(range(min(spec.num_train, 8)), key=lambda i: len(np.unique(initial_state(spec, "train", i).node_type)))
+    arguments = [(spec, index, label, values) for label, values in rows.items()]
+    trajectories = dict(_run(pool, _labelled_trajectory, arguments))
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part.png")
+    try:
+        contact_sheet({label: trajectories[label] for label in rows}).savefig(temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _row_label(values: Mapping[str, float]) -> str:
+    lines = []
+    for material, value in values.items():
+        parameter = MATERIALS[material]
+        name = material if len(values) > 1 else f"{parameter.name.replace('_', ' ').replace('youngs', 'Young’s')}\n"
+        prefix, scale = next(((p, s) for p, s in (("M", 1e6), ("k", 1e3)) if parameter.unit == "Pa" and value >= s), ("", 1.0))
+        lines.append(f"{name} {value / scale:g} {prefix}{'' if parameter.unit == '1' else parameter.unit.replace('^2', '²')}".strip())
+    return "\n".join(lines)
+
+
+def _labelled_trajectory(spec: DatasetSpec, index: int, label: str, values: dict[str, float]) -> tuple[str, Trajectory]:
+    return label, generate_trajectory(spec, "train", index, values)
 
 
 @contextlib.contextmanager

@@ -6,9 +6,13 @@ into boundary nodes. All shapes take NumPy arrays or torch tensors [..., dim].
 
 from __future__ import annotations
 
+import base64
+import binascii
+import itertools
 import math
+import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -34,7 +38,7 @@ class Shape(Protocol):
     def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]: ...
 
 
-def _like(values: Sequence[float], points: Array) -> Array:
+def _like(values: Sequence[float] | np.ndarray, points: Array) -> Array:
     """``values`` with the backend, precision and device of ``points``."""
     return array_namespace(points).asarray(values, dtype=points.dtype, device=device(points))
 
@@ -54,6 +58,20 @@ def _grid(low: list[float], high: list[float], spacing: float) -> np.ndarray:
     """A regular grid over an axis-aligned face, corners included; shape [points, len(low)]."""
     axes = [np.linspace(a, b, max(2, math.ceil((b - a) / spacing - 1e-9) + 1)) for a, b in zip(low, high, strict=True)]
     return np.stack([m.ravel() for m in np.meshgrid(*axes, indexing="ij")], axis=-1)
+
+
+def _directions(dim: int, radius: float, spacing: float) -> np.ndarray:
+    """Unit vectors [points, dim] to points of a circle or sphere that are about ``spacing`` [m] apart at the distance ``radius``."""
+    if dim == 2:
+        count = max(6, math.ceil(2 * math.pi * radius / spacing))
+        angle: np.ndarray = 2 * math.pi * np.arange(count) / count
+        return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    # golden-angle spiral: near-uniform density on the sphere
+    count = max(12, math.ceil(4 * math.pi * radius**2 / spacing**2))
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.arange(count) * math.pi * (3 - math.sqrt(5))
+    rho = np.sqrt(1 - z * z)
+    return np.stack([rho * np.cos(angle), rho * np.sin(angle), z], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -102,17 +120,26 @@ class Sphere:
         return _norm(points - _like(self.center, points)) - self.radius
 
     def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-        if len(self.center) == 2:
-            count = max(6, math.ceil(2 * math.pi * self.radius / spacing))
-            angle: np.ndarray = 2 * math.pi * np.arange(count) / count
-            normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        else:  # golden-angle spiral: near-uniform density on the sphere
-            count = max(12, math.ceil(4 * math.pi * self.radius**2 / spacing**2))
-            z = 1 - (2 * np.arange(count) + 1) / count
-            angle = np.arange(count) * math.pi * (3 - math.sqrt(5))
-            rho = np.sqrt(1 - z * z)
-            normal = np.stack([rho * np.cos(angle), rho * np.sin(angle), z], axis=-1)
+        normal = _directions(len(self.center), self.radius, spacing)
         return np.asarray(self.center) + self.radius * normal, normal
+
+
+@dataclass(frozen=True)
+class Bowl:
+    """A closed spherical (2D: circular) container: solid is everything outside of it."""
+
+    center: tuple[float, ...]
+    radius: float
+    friction: float
+    restitution: float = 0.0
+    kind: ClassVar[str] = "bowl"
+
+    def signed_distance(self, points: Array) -> Array:
+        return self.radius - _norm(points - _like(self.center, points))
+
+    def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        outward = _directions(len(self.center), self.radius, spacing)
+        return np.asarray(self.center) + self.radius * outward, -outward
 
 
 @dataclass(frozen=True)
@@ -146,7 +173,11 @@ class Box:
                 normal[:, axis] = side
                 pos.append(points)
                 normals.append(normal)
-        return np.concatenate(pos), np.concatenate(normals)
+        # faces share the nodes of their edges and corners, whose normal is the mean of the faces' normals
+        points, which = np.unique(np.concatenate(pos), axis=0, return_inverse=True)
+        normal = np.zeros_like(points)
+        np.add.at(normal, which.ravel(), np.concatenate(normals))
+        return points, normal / _norm(normal)[:, None]
 
 
 def _require_simple(vertices: np.ndarray) -> None:
@@ -225,7 +256,166 @@ class Polygon:
         return np.concatenate(pos), np.concatenate(normals)
 
 
-SHAPES: dict[str, type] = {cls.kind: cls for cls in (Wall, Sphere, Box, Polygon)}
+MAX_GRID_NODES = 2**24
+"""Largest number of nodes of a ``DistanceGrid``; a file that asks for more is refused before anything is unpacked."""
+
+
+@dataclass(frozen=True)
+class DistanceGrid:
+    """Any solid, given by signed distances at the nodes of a regular grid: multilinear between them, continued linearly outside.
+
+    Attributes:
+        origin: position of the first node [m].
+        spacing: of the nodes along each axis [m].
+        counts: number of nodes along each axis, at least 2.
+        encoded: the distances [m] as little-endian float32 in C order, all first bytes before all second bytes and so on, compressed
+            with zlib, as base64; ``from_values`` makes it.
+
+    Raises:
+        ValueError: sizes do not fit together, or ``encoded`` is damaged.
+    """
+
+    origin: tuple[float, ...]
+    spacing: float
+    counts: tuple[int, ...]
+    encoded: str = field(repr=False)
+    friction: float
+    restitution: float = 0.0
+    kind: ClassVar[str] = "distance_grid"
+
+    def __post_init__(self) -> None:
+        if len(self.counts) not in (2, 3) or len(self.origin) != len(self.counts):
+            raise ValueError(f"a distance grid needs 2 or 3 axes, got origin {self.origin} and counts {self.counts}")
+        if not all(isinstance(n, int) and n >= 2 for n in self.counts) or math.prod(self.counts) > MAX_GRID_NODES:
+            raise ValueError(f"counts of a distance grid must be 2 or more and {MAX_GRID_NODES} together at most, got {self.counts}")
+        if not 0 < self.spacing < math.inf or not all(map(math.isfinite, self.origin)):
+            raise ValueError(
+                f"spacing and origin of a distance grid must be finite and spacing positive, got {self.spacing} and {self.origin}"
+            )
+        object.__setattr__(self, "_values", _decode(self.encoded, self.counts))  # no field: no part of equality, hash or dictionary
+
+    @classmethod
+    def from_values(
+        cls, origin: Sequence[float] | np.ndarray, spacing: float, values: np.ndarray, friction: float, restitution: float = 0.0
+    ) -> DistanceGrid:
+        """A grid of these signed distances [node along x, node along y(, node along z)] in m, rounded to about 1/4096 of ``spacing``.
+
+        Raises:
+            ValueError: fewer than 2 nodes along an axis, too many nodes, not finite, or not 2 or 3 axes.
+        """
+        values = np.asarray(values, np.float64)
+        if not np.isfinite(values).all():
+            raise ValueError("signed distances must be finite")
+        if values.size > MAX_GRID_NODES:
+            raise ValueError(f"a distance grid has at most {MAX_GRID_NODES} nodes, got {values.shape}; use a wider spacing")
+        quantum = 2.0 ** (math.floor(math.log2(spacing)) - 12)  # short mantissas compress well
+        rounded = (np.round(values / quantum) * quantum).astype("<f4")
+        planes = rounded.reshape(-1, 1).view(np.uint8).T
+        encoded = base64.b64encode(zlib.compress(planes.tobytes(), 9)).decode("ascii")
+        return cls(tuple(float(x) for x in origin), float(spacing), values.shape, encoded, float(friction), float(restitution))
+
+    @property
+    def values(self) -> np.ndarray:
+        """Signed distances at the nodes [m], read-only float32 of shape ``counts``."""
+        return self._values  # type: ignore[attr-defined, no-any-return]
+
+    def signed_distance(self, points: Array) -> Array:
+        return self._interpolate(points)[0]
+
+    def _interpolate(self, points: Array) -> tuple[Array, Array]:
+        """Distance [...] in m and its gradient [..., dim]."""
+        xp = array_namespace(points)
+        dim, values = len(self.counts), _like(self.values.ravel(), points)
+        place = (points - _like(self.origin, points)) / self.spacing
+        nearest = xp.minimum(xp.maximum(place, xp.zeros_like(place)), _like([n - 1.0 for n in self.counts], points))
+        cell = xp.minimum(xp.floor(nearest), _like([n - 2.0 for n in self.counts], points))
+        upper = nearest - cell
+        cell = xp.astype(xp.where(cell == cell, cell, xp.zeros_like(cell)), xp.int64)  # a NaN stays one in the weights
+        distance = xp.zeros_like(place[..., 0])
+        slope = [xp.zeros_like(distance) for _ in range(dim)]
+        for corner in itertools.product((0, 1), repeat=dim):
+            index = xp.zeros_like(cell[..., 0])
+            for axis in range(dim):
+                index = index * self.counts[axis] + cell[..., axis] + corner[axis]
+            value = values[index]
+            weight = [upper[..., axis] if corner[axis] else 1 - upper[..., axis] for axis in range(dim)]
+            distance = distance + value * math.prod(weight)
+            for axis in range(dim):
+                others = math.prod(weight[k] for k in range(dim) if k != axis)
+                slope[axis] = slope[axis] + (value if corner[axis] else -value) * others
+        gradient = xp.stack(slope, axis=-1)
+        return distance + xp.sum(gradient * (place - nearest), axis=-1), gradient / self.spacing
+
+    def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes on the surface inside the grid, such that every point of it has a node within ``spacing``."""
+        points = self._surface(spacing)
+        if len(points) == 0:
+            return points, points.copy()
+        gradient = self._interpolate(points)[1]
+        # on a curve, half of the spacing bounds the gaps; on a surface, 0.8 gives the density of a square lattice and a fifth more
+        keep = _thin(points, gradient / np.maximum(_norm(gradient), 1e-9)[:, None], (0.5 if len(self.counts) == 2 else 0.8) * spacing)
+        return points[keep], np.asarray(outward_normal(self, points[keep], 0.5 * min(spacing, self.spacing)))
+
+    def _surface(self, spacing: float) -> np.ndarray:
+        """Points [point, dim] on the surface, no further apart than about a third of ``spacing`` or a grid cell."""
+        dim = len(self.counts)
+        corners = [
+            self.values[tuple(slice(c, n - 1 + c) for c, n in zip(corner, self.counts, strict=True))]
+            for corner in itertools.product((0, 1), repeat=dim)
+        ]
+        # a multilinear function has a zero in a cell only where its corners differ in sign
+        cells = np.argwhere((np.minimum.reduce(corners) <= 0) & (np.maximum.reduce(corners) > 0))
+        if len(cells) == 0:
+            return np.empty((0, dim))
+        parts = max(1, math.ceil(3 * self.spacing / spacing))
+        inner = np.stack(np.meshgrid(*[(np.arange(parts) + 0.5) / parts] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+        low = np.asarray(self.origin)
+        high = low + self.spacing * (np.asarray(self.counts) - 1)
+        found = []
+        chunk = max(1, 2**20 // len(inner))
+        for start in range(0, len(cells), chunk):
+            points = low + self.spacing * (cells[start : start + chunk, None] + inner).reshape(-1, dim)
+            distance, gradient = self._interpolate(points)
+            steepness = np.maximum(_norm(gradient), 0.1)
+            points = points[np.abs(distance) <= 0.5 * math.sqrt(dim) * self.spacing / parts * steepness]
+            for _ in range(5):  # Newton's method along the gradient
+                distance, gradient = self._interpolate(points)
+                points = np.clip(points - gradient * (distance / np.maximum(_norm(gradient) ** 2, 0.01))[:, None], low, high)
+            found.append(points[np.abs(self.signed_distance(points)) < 0.01 * spacing])
+        return np.concatenate(found)
+
+
+def _decode(encoded: str, counts: tuple[int, ...]) -> np.ndarray:
+    """The values behind ``DistanceGrid.encoded``; never unpacks more than ``counts`` asks for."""
+    size = 4 * math.prod(counts)
+    unpack = zlib.decompressobj()
+    try:
+        data = unpack.decompress(base64.b64decode(encoded.encode("ascii"), validate=True), size + 1)
+    except (binascii.Error, UnicodeEncodeError, zlib.error) as error:
+        raise ValueError(f"the distances of a distance grid are damaged: {error}") from None
+    if len(data) != size or not unpack.eof or unpack.unused_data:
+        raise ValueError(f"the distances of a distance grid do not fit its counts {counts}")
+    values = np.ascontiguousarray(np.frombuffer(data, np.uint8).reshape(4, -1).T).view("<f4").reshape(counts).astype(np.float32, copy=False)
+    if not np.isfinite(values).all():
+        raise ValueError("the distances of a distance grid are not all finite")
+    values.setflags(write=False)
+    return values
+
+
+def _thin(points: np.ndarray, normals: np.ndarray, distance: float) -> np.ndarray:
+    """Indices of a maximal subset of points that are ``distance`` apart, taken in order; those on the other side of a thin sheet do not count."""
+    from scipy.spatial import cKDTree
+
+    tree, free, kept = cKDTree(points), np.ones(len(points), dtype=bool), []
+    for k, point in enumerate(points):
+        if free[k]:
+            kept.append(k)
+            near = np.asarray(tree.query_ball_point(point, distance))
+            free[near[normals[near] @ normals[k] > -0.5]] = False
+    return np.array(kept, dtype=np.int64)
+
+
+SHAPES: dict[str, type] = {cls.kind: cls for cls in (Wall, Sphere, Bowl, Box, Polygon, DistanceGrid)}
 
 
 def shape_to_dict(shape: Shape) -> dict[str, Any]:

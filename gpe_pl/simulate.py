@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpe_pl.config import ConfigError, construct, entry_point
+from gpe_pl.config import ConfigError, construct, construct_target, entry_point
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -22,15 +22,14 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     from omegaconf import OmegaConf
 
     from gpe_pl.generation import DatasetSpec
-    from gpe_pl.solvers.mpm import MPM
-    from gpe_pl.solvers.scenes import SceneConfig
 
-    values: dict[str, Any] = OmegaConf.to_container(cfg.data, resolve=True)  # type: ignore[assignment]
-    values.pop("sizes")
     if cfg.size.name not in cfg.data.sizes:
         raise ConfigError(f"size={cfg.size.name}: data={cfg.data.name} has the sizes {', '.join(cfg.data.sizes)}")
-    scene = construct(SceneConfig, values.pop("scene"), "data.scene")
-    solver = construct(MPM, values.pop("solver"), "data.solver")
+    values: dict[str, Any] = OmegaConf.to_container(cfg.data, resolve=True)  # type: ignore[assignment]
+    for table in ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds"):
+        values.pop(table, None)
+    scene = construct_target(values.pop("scene"), "data.scene", "gpe_pl.solvers.")
+    solver = construct_target(values.pop("solver"), "data.solver", "gpe_pl.solvers.")
     return construct(DatasetSpec, values, "data", scene=scene, solver=solver)
 
 
@@ -47,14 +46,27 @@ def ensure_data(cfg: DictConfig) -> Path:
 
 
 def simulate(cfg: DictConfig) -> None:
-    """Generate a data set, or what is missing of it."""
-    from gpe_pl.generation import generate, progress_bar
+    """Generate a data set, or what is missing of it, and say beforehand what a large one takes."""
+    from gpe_pl.generation import CONTACT_SHEET_FILE, generate, plan, progress_bar, seconds_per_trajectory
 
     if not (cfg.num_workers is None or (isinstance(cfg.num_workers, int) and cfg.num_workers >= 1)):
         raise ConfigError(f"num_workers={cfg.num_workers!r}: must be null (one per core) or an integer of at least 1")
-    spec = dataset_spec(cfg)
+    if not (isinstance(cfg.num_parts, int) and isinstance(cfg.part, int) and 0 <= cfg.part < cfg.num_parts):
+        raise ConfigError(f"part={cfg.part!r}, num_parts={cfg.num_parts!r}: must be integers with 0 <= part < num_parts")
+    spec, num_workers = dataset_spec(cfg), cfg.num_workers or os.cpu_count() or 1
+    missing = plan(cfg.paths.data, spec)
+    if missing.bytes_needed > AUTOMATIC_BYTES:
+        print(
+            f"{spec.name} {spec.size}: {missing.num_missing} trajectories to simulate, up to {missing.bytes_needed / 2**30:.1f} GiB "
+            f"({missing.bytes_free / 2**30:.1f} GiB free)",
+            flush=True,
+        )
+        if missing.bytes_needed <= 0.95 * missing.bytes_free:
+            hours = missing.num_missing * seconds_per_trajectory(spec) / (num_workers * cfg.num_parts) / 3600
+            print(f"{spec.name} {spec.size}: about {hours:.1f} h on {num_workers} cores", flush=True)
     with progress_bar(f"{spec.name} {spec.size}") as on_progress:
-        folder = generate(cfg.paths.data, spec, cfg.num_workers or os.cpu_count() or 1, on_progress)
+        folder = generate(cfg.paths.data, spec, num_workers, on_progress, (cfg.part, cfg.num_parts))
+    print(folder / CONTACT_SHEET_FILE)
     print(folder)
 
 

@@ -1,22 +1,23 @@
-"""Seeded random scenes: bodies of granular or soft material that fall and fly about in a box with obstacles.
+"""Seeded scenes of bodies that are thrown into a box with obstacles, and what every scene promises.
 
-``sample_scene`` is a pure function of configuration, material, parameter value and seed.
+``Scene.sample`` is a pure function of configuration, parameter values and seed.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gpe_pl.geometry import Box, Polygon, Shape, Sphere, domain_walls, signed_distance
-from gpe_pl.schema import STICKY, node_code, param_names
+from gpe_pl.schema import MATERIALS, STICKY, node_code, param_names
 from gpe_pl.trajectory import Boundary, Metadata, State
 
 PositiveFloat = Annotated[float, Field(gt=0)]
@@ -28,17 +29,72 @@ MAX_ATTEMPTS = 200
 JITTER = 0.25
 """Largest displacement from the seeding lattice per axis, in spacings; a plain lattice would crack along its rows when it spreads."""
 
+MESHED = ("elastomer",)
+"""Materials that keep their neighbours: their particles start on a plain lattice and carry its cells."""
+
+
+@runtime_checkable
+class Scene(Protocol):
+    """A distribution of initial states."""
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], ...]: ...
+
+    @property
+    def gravity(self) -> tuple[float, ...]: ...
+
+    @property
+    def materials(self) -> tuple[str, ...]: ...
+
+    @property
+    def spacing(self) -> float: ...
+
+    @property
+    def connectivity_radius(self) -> float: ...
+
+    @property
+    def max_nodes(self) -> int: ...
+
+    @property
+    def max_cells(self) -> int: ...
+
+    @property
+    def input_files(self) -> tuple[str, ...]:
+        """Files that scenes depend on."""
+        ...
+
+    def sample(self, values: Mapping[str, float], seed: int) -> State: ...
+
+
+def describe(scene: Scene, frame_dt: float, **provenance: Any) -> Metadata:
+    """Metadata of a scene's trajectories; ``provenance`` takes the other fields of ``Metadata``."""
+    return Metadata(
+        **{
+            "dataset": "-".join(scene.materials),
+            "materials": scene.materials,
+            "param_names": param_names(scene.materials),
+            "frame_dt": frame_dt,
+            "spacing": scene.spacing,
+            "connectivity_radius": scene.connectivity_radius,
+            "bounds": scene.bounds,
+            "gravity": scene.gravity,
+            "config": json.dumps({"scene": asdict(scene)}, sort_keys=True),  # type: ignore[call-overload]
+            **provenance,
+        }
+    )
+
 
 @dataclass(frozen=True, config={"extra": "forbid"})
-class SceneConfig:
-    """Distribution of scenes.
+class BodyScene:
+    """Bodies of random shape and material in a box with obstacles.
 
     Attributes:
-        bounds: ``(low, high)`` per axis of the domain [m].
+        bounds: ``(low, high)`` per axis of the domain [m]; 2 or 3 axes, gravity along the last.
+        materials: each body is of one of these.
         grid_spacing: of the solver [m].
         num_particles: in all bodies together.
         particles_per_cell: along each axis; the rest spacing is ``grid_spacing / particles_per_cell``.
-        density: at rest [kg/m³].
+        density: at rest [kg/m³], per material.
         gravity: [m/s²].
         max_bodies: the number of bodies is uniform in 1 … max_bodies.
         max_obstacles: the number of obstacles is uniform in 0 … max_obstacles.
@@ -52,10 +108,11 @@ class SceneConfig:
     """
 
     bounds: tuple[tuple[float, float], ...]
+    materials: Annotated[tuple[str, ...], Field(min_length=1)]
     grid_spacing: PositiveFloat
     num_particles: Annotated[int, Field(ge=1)]
-    particles_per_cell: Annotated[int, Field(ge=1)] = 2
-    density: PositiveFloat = 1600.0
+    density: dict[str, PositiveFloat]
+    particles_per_cell: Annotated[int, Field(ge=1)] = 1
     gravity: tuple[float, ...] = (0.0, -9.81)
     max_bodies: Annotated[int, Field(ge=1)] = 3
     max_obstacles: Annotated[int, Field(ge=0)] = 2
@@ -65,13 +122,19 @@ class SceneConfig:
     sticky_probability: Probability = 0.25
     slip_probability: Probability = 0.25
     coulomb_friction: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]] = (0.1, 0.8)
-    connectivity_cells: PositiveFloat = 1.5
+    connectivity_cells: PositiveFloat = 3.75
 
     def __post_init__(self) -> None:
-        if len(self.bounds) != 2 or len(self.gravity) != 2:
-            raise ValueError(f"only dimension=2 is supported, got bounds of {len(self.bounds)} axes and gravity of {len(self.gravity)}")
+        if len(self.bounds) not in (2, 3) or len(self.gravity) != len(self.bounds):
+            raise ValueError(f"bounds and gravity must both have 2 or 3 axes, got {len(self.bounds)} and {len(self.gravity)}")
         if any(not high > low for low, high in self.bounds):
             raise ValueError(f"bounds must be (low, high) with low < high, got {self.bounds}")
+        unknown = [m for m in self.materials if m not in MATERIALS]
+        if unknown or len(set(self.materials)) < len(self.materials):
+            raise ValueError(f"materials must be different ones of {', '.join(MATERIALS)}, got {self.materials}")
+        lacking = [m for m in self.materials if m not in self.density]
+        if lacking:
+            raise ValueError(f"density of {', '.join(lacking)} is missing")
         for name in ("obstacle_radius", "drop_height", "coulomb_friction"):
             low, high = getattr(self, name)
             if low > high:
@@ -80,71 +143,96 @@ class SceneConfig:
             raise ValueError("sticky_probability and slip_probability must not exceed 1 together")
 
     @property
+    def dim(self) -> int:
+        return len(self.bounds)
+
+    @property
     def spacing(self) -> float:
         """Rest spacing of particles in m."""
         return self.grid_spacing / self.particles_per_cell
 
+    @property
+    def connectivity_radius(self) -> float:
+        return self.connectivity_cells * self.grid_spacing
 
-def describe(scene: SceneConfig, material: str, frame_dt: float, **provenance: Any) -> Metadata:
-    """Metadata of scenes with this configuration; ``provenance`` takes the other fields of ``Metadata``."""
-    return Metadata(
-        **{
-            "dataset": material,
-            "materials": (material,),
-            "param_names": param_names((material,)),
-            "frame_dt": frame_dt,
-            "spacing": scene.spacing,
-            "connectivity_radius": scene.connectivity_cells * scene.grid_spacing,
-            "bounds": scene.bounds,
-            "gravity": scene.gravity,
-            "config": json.dumps({"scene": asdict(scene)}, sort_keys=True),
-            **provenance,
-        }
-    )
+    @property
+    def max_nodes(self) -> int:
+        return self.num_particles
 
+    @property
+    def max_cells(self) -> int:
+        """Upper bound of the number of mesh cells: two triangles per particle, or six tetrahedra."""
+        return (2 if self.dim == 2 else 6) * self.num_particles if set(self.materials) & set(MESHED) else 0
 
-def sample_scene(config: SceneConfig, material: str, value: float, seed: int) -> State:
-    """Draw a scene.
+    @property
+    def input_files(self) -> tuple[str, ...]:
+        return ()
 
-    Args:
-        config: distribution to draw from.
-        material: of all bodies.
-        value: of its material parameter, in the unit that ``schema`` gives.
-        seed: non-negative integer.
+    def sample(self, values: Mapping[str, float], seed: int) -> State:
+        """Draw a scene.
 
-    Returns:
-        State at time 0 with exactly ``config.num_particles`` particles in random order, float64.
+        Args:
+            values: of each material's parameter, in the unit that ``schema`` gives.
+            seed: non-negative integer.
 
-    Raises:
-        ValueError: the bodies do not fit into the domain.
-    """
-    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
-    for _ in range(MAX_ATTEMPTS):
-        shapes = (*_walls(config, rng), *_obstacles(config, rng))
-        pos = _bodies(config, shapes, rng)
-        if pos is not None:
-            break
-    else:
-        raise ValueError(
-            f"no room for {config.num_particles} particles of spacing {config.spacing:g} m and {config.max_obstacles} obstacles in {config.bounds}; "
-            "lower num_particles, max_bodies, max_obstacles or drop_height"
+        Returns:
+            State at time 0 with exactly ``num_particles`` particles in random order, float64.
+
+        Raises:
+            ValueError: the bodies do not fit into the domain.
+        """
+        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
+        for _ in range(MAX_ATTEMPTS):
+            shapes = (*_walls(self, rng), *_obstacles(self, rng))
+            bodies = _bodies(self, shapes, rng)
+            if bodies is not None:
+                break
+        else:
+            raise ValueError(
+                f"no room for {self.num_particles} particles of spacing {self.spacing:g} m and {self.max_obstacles} obstacles in {self.bounds}; "
+                "lower num_particles, max_bodies, max_obstacles or drop_height"
+            )
+        vel = np.concatenate([np.broadcast_to(_velocity(self, rng), body.pos.shape) for body in bodies])
+        pos = np.concatenate([body.pos for body in bodies])
+        material = np.concatenate([np.full(len(body.pos), node_code(body.material), np.uint8) for body in bodies])
+        # labels must not tell where a particle started
+        order = rng.permutation(self.num_particles)
+        pos, material = pos[order], material[order]
+        names = param_names(self.materials)
+        params, mass = np.full((self.num_particles, len(names)), np.nan), np.empty(self.num_particles)
+        for name in self.materials:
+            chosen = material == node_code(name)
+            params[chosen, names.index(MATERIALS[name].name)] = values[name]
+            mass[chosen] = self.density[name] * self.spacing**self.dim
+        return State(
+            pos=pos,
+            vel=vel[order],
+            node_type=material,
+            mass=mass,
+            material_params=params,
+            boundary=Boundary.sample(shapes, self.spacing, self.dim),
+            gravity=np.array(self.gravity),
+            rest_pos=pos.copy() if self.max_cells else None,
+            cells=_cells(bodies, order) if self.max_cells else None,
         )
-    vel = np.concatenate([np.broadcast_to(_velocity(config, rng), body.shape) for body in pos])
-    # labels must not tell where a particle started
-    order = rng.permutation(config.num_particles)
-    count, dim = config.num_particles, len(config.bounds)
-    return State(
-        pos=np.concatenate(pos)[order],
-        vel=vel[order],
-        node_type=np.full(count, node_code(material), dtype=np.uint8),
-        mass=np.full(count, config.density * config.spacing**dim),
-        material_params=np.full((count, 1), float(value)),
-        boundary=Boundary.sample(shapes, config.spacing, dim),
-        gravity=np.array(config.gravity),
-    )
 
 
-def _friction(config: SceneConfig, rng: np.random.Generator, may_slip: bool = True) -> float:
+class _Body(NamedTuple):
+    """Particles of one body: positions [point, dim] in m, material, and the nodes of its mesh cells [cell, corner]."""
+
+    pos: np.ndarray
+    material: str
+    cells: np.ndarray
+
+
+def _cells(bodies: list[_Body], order: np.ndarray) -> np.ndarray:
+    """Cells of all bodies in the numbers that their nodes have after the permutation ``order``."""
+    start = np.cumsum([0, *(len(body.pos) for body in bodies)])
+    new_number = np.argsort(order)
+    return new_number[np.concatenate([body.cells + first for body, first in zip(bodies, start, strict=False)])]
+
+
+def _friction(config: BodyScene, rng: np.random.Generator, may_slip: bool = True) -> float:
     kind, coulomb = rng.random(), rng.uniform(*config.coulomb_friction)
     if kind < config.sticky_probability:
         return STICKY
@@ -152,21 +240,21 @@ def _friction(config: SceneConfig, rng: np.random.Generator, may_slip: bool = Tr
     return 0.0 if slips else float(coulomb)
 
 
-def _walls(config: SceneConfig, rng: np.random.Generator) -> tuple[Shape, ...]:
-    names = [f"{axis}_{side}" for axis in "xyz"[: len(config.bounds)] for side in ("low", "high")]
-    floor = f"{'xyz'[len(config.bounds) - 1]}_low"  # on a frictionless floor sand slides for ever and no pile comes to rest
+def _walls(config: BodyScene, rng: np.random.Generator) -> tuple[Shape, ...]:
+    names = [f"{axis}_{side}" for axis in "xyz"[: config.dim] for side in ("low", "high")]
+    floor = f"{'xyz'[config.dim - 1]}_low"  # on a frictionless floor sand slides for ever and no pile comes to rest
     return domain_walls(config.bounds, {name: _friction(config, rng, may_slip=name != floor) for name in names})
 
 
-def _obstacles(config: SceneConfig, rng: np.random.Generator) -> tuple[Shape, ...]:
-    """Boxes, discs and convex polygons whose circumscribed circles stay clear of the walls and of each other."""
+def _obstacles(config: BodyScene, rng: np.random.Generator) -> tuple[Shape, ...]:
+    """Boxes, balls and, in 2D, convex polygons whose circumscribed balls stay clear of the walls and of each other."""
     obstacles: list[Shape] = []
     circles: list[tuple[np.ndarray, float]] = []
     low, high = np.array(config.bounds).T
     gap = 2.0 * config.grid_spacing  # narrower gaps are invisible to the grid
     for _ in range(rng.integers(config.max_obstacles + 1)):
         radius, angle, sides = rng.uniform(*config.obstacle_radius), rng.uniform(0, 2 * math.pi), int(rng.integers(3, 7))
-        kind, friction, share = rng.integers(3), _friction(config, rng), rng.uniform(0.3, 0.7)
+        kind, friction, share = rng.integers(3 if config.dim == 2 else 2), _friction(config, rng), rng.uniform(0.3, 0.7)
         room_low, room_high = low + radius + gap, high - radius - gap
         if np.any(room_low > room_high):
             continue
@@ -175,7 +263,7 @@ def _obstacles(config: SceneConfig, rng: np.random.Generator) -> tuple[Shape, ..
             continue
         circles.append((center, radius))
         if kind == 0:
-            half = radius * np.array([math.cos(share * math.pi / 2), math.sin(share * math.pi / 2)])
+            half = radius * np.array([math.cos(share * math.pi / 2), math.sin(share * math.pi / 2), 0.5][: config.dim])
             obstacles.append(Box(_floats(center - half), _floats(center + half), friction))
         elif kind == 1:
             obstacles.append(Sphere(_floats(center), float(radius), friction))
@@ -190,67 +278,119 @@ def _floats(values: np.ndarray) -> tuple[float, ...]:
     return tuple(float(v) for v in values)
 
 
-def _bodies(config: SceneConfig, shapes: tuple[Shape, ...], rng: np.random.Generator) -> list[np.ndarray] | None:
-    """Particle positions of each body, or None where this layout leaves no room."""
+def _bodies(config: BodyScene, shapes: tuple[Shape, ...], rng: np.random.Generator) -> list[_Body] | None:
+    """The bodies in their places, or None where this layout leaves no room."""
     low, high = np.array(config.bounds).T
     number = int(rng.integers(1, config.max_bodies + 1))
     share = rng.dirichlet(np.full(number, 4.0))
     counts = np.diff(np.round(np.concatenate([[0.0], np.cumsum(share)]) * config.num_particles)).astype(int)
+    up = np.eye(config.dim)[-1]
+    clearance = 0.5 * config.spacing
     boxes: list[tuple[np.ndarray, np.ndarray]] = []
     placed = []
     for count in counts[counts > 0]:
-        body = _body(int(count), config.spacing, rng)
-        extent_low, extent_high = body.min(axis=0), body.max(axis=0)
-        gap = max(0.5 * config.spacing, rng.uniform(*config.drop_height))
-        clearance = 0.5 * config.spacing
-        lowest = np.array([low[0] + clearance, low[1] + gap]) - extent_low
+        material = config.materials[int(rng.integers(len(config.materials))) if len(config.materials) > 1 else 0]
+        body = _body(int(count), config.spacing, material, config.dim, rng)
+        extent_low, extent_high = body.pos.min(axis=0), body.pos.max(axis=0)
+        gap = max(clearance, rng.uniform(*config.drop_height))
+        lowest = low + clearance + (gap - clearance) * up - extent_low
         highest = high - clearance - extent_high
         if np.any(lowest > highest):
             return None
-        body = body + np.array([rng.uniform(lowest[0], highest[0]), lowest[1]])
+        offset = lowest.copy()
+        offset[:-1] = [rng.uniform(a, b) for a, b in zip(lowest[:-1], highest[:-1], strict=True)]
+        pos = body.pos + offset
         # rise until nothing is in the way: bodies also start above obstacles and above each other
-        for _ in range(math.floor((highest[1] - lowest[1]) / config.grid_spacing) + 1):
-            box = (body.min(axis=0) - config.grid_spacing, body.max(axis=0) + config.grid_spacing)
+        for _ in range(math.floor((highest[-1] - lowest[-1]) / config.grid_spacing) + 1):
+            box = (pos.min(axis=0) - config.grid_spacing, pos.max(axis=0) + config.grid_spacing)
             overlaps = any(np.all(box[0] < other[1]) and np.all(other[0] < box[1]) for other in boxes)
-            if not overlaps and np.all(signed_distance(shapes, body) > 0.9 * clearance):
+            if not overlaps and np.all(signed_distance(shapes, pos) > 0.9 * clearance):
                 break
-            body = body + np.array([0.0, config.grid_spacing])
+            pos = pos + config.grid_spacing * up
         else:
             return None
         boxes.append(box)
-        placed.append(body)
+        placed.append(body._replace(pos=pos))
     return placed
 
 
-def _velocity(config: SceneConfig, rng: np.random.Generator) -> np.ndarray:
+def _velocity(config: BodyScene, rng: np.random.Generator) -> np.ndarray:
     """Velocity of a body [dim] in m/s: any horizontal direction, mostly downward."""
-    return config.max_speed * np.array([rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 0.25)])
+    return config.max_speed * np.array([*(rng.uniform(-1.0, 1.0) for _ in range(config.dim - 1)), rng.uniform(-1.0, 0.25)])
 
 
-def _body(count: int, spacing: float, rng: np.random.Generator) -> np.ndarray:
-    """``count`` points [count, dim] of a jittered lattice that fill a randomly turned rectangle, disc or convex polygon around the origin.
+def _body(count: int, spacing: float, material: str, dim: int, rng: np.random.Generator) -> _Body:
+    """A randomly turned body of ``count`` lattice points around the origin; jittered unless it is meshed.
 
     Every shape is a level set of a gauge, so the points of smallest gauge are the wanted number of points in the shape of the right size.
     """
-    gauge = _gauge(rng)
-    reach = math.ceil(2.0 * math.sqrt(count)) + 2
-    lattice = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-    points = lattice + rng.uniform(-JITTER, JITTER, lattice.shape) + rng.uniform(-0.5, 0.5, 2)
-    kept = points[np.argsort(gauge(points), kind="stable")[:count]]
-    turn = rng.uniform(0, 2 * math.pi)
-    rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    return spacing * kept @ rotation.T
+    gauge = _gauge(rng, dim)
+    reach = math.ceil(2.0 * count ** (1 / dim)) + 2
+    lattice = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    is_meshed = material in MESHED
+    jitter = 0.0 if is_meshed else rng.uniform(-JITTER, JITTER, lattice.shape)
+    points = lattice + jitter + rng.uniform(-0.5, 0.5, dim)
+    kept = np.argsort(gauge(points), kind="stable")[:count]
+    cells = _lattice_cells(lattice[kept]) if is_meshed else np.empty((0, dim + 1), dtype=np.int64)
+    return _Body(spacing * points[kept] @ _rotation(rng, dim).T, material, cells)
 
 
-def _gauge(rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
-    """A random convex shape as the factor [points] by which it must be scaled to reach each point [points, 2]."""
+def _rotation(rng: np.random.Generator, dim: int) -> np.ndarray:
+    """A uniformly distributed rotation [dim, dim]; in 3D from a random unit quaternion."""
+    if dim == 2:
+        turn = rng.uniform(0, 2 * math.pi)
+        return np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+    w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _lattice_cells(sites: np.ndarray) -> np.ndarray:
+    """Simplices [cell, dim + 1] of positive orientation that fill every lattice cell whose corners are all among the sites [point, dim] (integers).
+
+    Each cell is cut along paths from its lowest to its highest corner, one simplex per order of the axes (Kuhn 1960), so neighbours share faces.
+    """
+    dim = sites.shape[1]
+    number = {tuple(site): k for k, site in enumerate(sites.tolist())}
+    cells = []
+    for axes in itertools.permutations(range(dim)):
+        path = np.concatenate([np.zeros((1, dim), int), np.cumsum(np.eye(dim, dtype=int)[list(axes)], axis=0)])
+        if np.linalg.det(path[1:]) < 0:
+            path[[1, 2]] = path[[2, 1]]
+        cells.append(path)
+    corners = np.array(list(itertools.product((0, 1), repeat=dim)))
+    whole = [s for s in sites if all(tuple(c) in number for c in (s + corners).tolist())]
+    simplices = [[number[tuple(c)] for c in (s + path).tolist()] for s in whole for path in cells]
+    return np.array(simplices, dtype=np.int64).reshape(-1, dim + 1)
+
+
+def _gauge(rng: np.random.Generator, dim: int) -> Callable[[np.ndarray], np.ndarray]:
+    """A random convex shape as the factor [point] by which it must be scaled to reach each point [point, dim]."""
     kind = rng.integers(3)
     if kind == 0:
-        stretch = math.sqrt(rng.uniform(1.0, 2.5))
-        return lambda x: np.max(np.abs(x) / np.array([stretch, 1.0 / stretch]), axis=-1)
+        half = _half_lengths(rng, dim)
+        return lambda x: np.max(np.abs(x) / half, axis=-1)
     if kind == 1:
         return lambda x: np.linalg.norm(x, axis=-1)
     sides = int(rng.integers(3, 8))
-    angle = 2 * math.pi * (np.arange(sides) + rng.uniform(-0.2, 0.2, sides)) / sides
-    normals = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    if dim == 2:
+        angle = 2 * math.pi * (np.arange(sides) + rng.uniform(-0.2, 0.2, sides)) / sides
+        normals = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    else:  # a tetrahedron's normals close the shape, further ones cut it
+        normals = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1], *rng.normal(size=(sides, 3))])
+        normals /= np.linalg.norm(normals, axis=1)[:, None]
     return lambda x: np.max(x @ normals.T, axis=-1)
+
+
+def _half_lengths(rng: np.random.Generator, dim: int) -> np.ndarray:
+    """Half edge lengths [dim] of a box of volume 2^dim."""
+    if dim == 2:
+        stretch = math.sqrt(rng.uniform(1.0, 2.5))
+        return np.array([stretch, 1.0 / stretch])
+    lengths = np.sqrt(rng.uniform(1.0, 2.5, dim))
+    return lengths / np.prod(lengths) ** (1 / dim)

@@ -9,26 +9,17 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from gpe_pl.trajectory import Trajectory
-from gpe_pl.viz.panel import COLOR_MAPS, INK, PALETTE, ColorBy, Panel, color_scale, view
+from gpe_pl.viz.coloring import PALETTE, ColorBy, Coloring
+from gpe_pl.viz.film_strip import evenly_spaced_frames, film_strip, new_figure
 
 Numbers = Sequence[int | float] | np.ndarray
 
-TEXT_WIDTH = 7.0
-"""Width [inch] of a figure that spans both columns of a paper."""
-
 COLUMN_WIDTH = 3.4
-
-
-def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), dpi=150, facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
+"""Width [inch] of a figure in one column of a paper."""
 
 
 def rollout_figure(
@@ -41,48 +32,16 @@ def rollout_figure(
         predictions: rollouts from frame 0 of the ground truth, by the name of their row. One that stopped early says so in
             place of its missing frames.
         num_columns: number of times; fewer if there are fewer frames.
-        color: ``error`` colours predicted particles by their distance from the ground truth, ``height`` all particles by
-            where they started.
+        color: ``error`` is the distance of predicted particles from the ground truth; others as in ``Coloring``.
+
+    Raises:
+        ValueError: ``num_columns`` is not positive, or no trajectory has what ``color`` needs.
     """
-    if num_columns < 1:
-        raise ValueError(f"num_columns must be positive, got {num_columns}")
-    predictions = dict(predictions)
-    frames = np.unique(np.round(np.linspace(0, ground_truth.num_frames - 1, num_columns)).astype(int)).tolist()
     rows = {"ground truth": ground_truth, **predictions}
-    scale = color_scale(ground_truth, predictions, frames, color)
-    has_bar = color == "error" and bool(predictions)
-
-    low, high = view(ground_truth)
-    aspect = (high[1] - low[1]) / (high[0] - low[0]) if len(low) == 2 else 0.9
-    left, right, top, gap = 0.34, 0.62 if has_bar else 0.04, 0.22, 0.05  # inch
-    panel_width = (TEXT_WIDTH - left - right - gap * (len(frames) - 1)) / len(frames)
-    panel_height = panel_width * aspect
-    height = top + len(rows) * (panel_height + gap)
-    figure = _figure(TEXT_WIDTH, height)
-
-    def rectangle(row: int, column: int) -> tuple[float, float, float, float]:
-        x, y = left + column * (panel_width + gap), height - top - (row + 1) * panel_height - row * gap
-        return x / TEXT_WIDTH, y / height, panel_width / TEXT_WIDTH, panel_height / height
-
-    for i, (name, trajectory) in enumerate(rows.items()):
-        for j, frame in enumerate(frames):
-            box = rectangle(i, j)
-            panel = Panel(figure, box, ground_truth, color, scale)
-            panel.show_frame(trajectory, ground_truth, frame, color)
-            if i == 0:
-                time = frame * ground_truth.metadata.frame_dt
-                text = f"$t$ = {time:.2f} s" if j == 0 else f"{time:.2f} s"
-                figure.text(box[0] + box[2] / 2, box[1] + box[3] + 0.05 / height, text, ha="center", va="bottom", fontsize=8, color=INK)
-        label = name.replace(" ", "\n")  # a row may be lower than its name is long
-        figure.text(left / 2 / TEXT_WIDTH, box[1] + box[3] / 2, label, rotation=90, ha="center", va="center", fontsize=8, color=INK)
-    if has_bar:
-        bottom, first = rectangle(len(rows) - 1, 0)[1], rectangle(1, 0)
-        axes = figure.add_axes((1 - (right - 0.1) / TEXT_WIDTH, bottom, 0.08 / TEXT_WIDTH, first[1] + first[3] - bottom))
-        bar = figure.colorbar(ScalarMappable(scale, COLOR_MAPS[color]), cax=axes, extend="max")
-        bar.set_label("position error [m]", fontsize=7, color=INK)
-        bar.ax.tick_params(labelsize=6.5, width=0.5, length=2)
-        bar.outline.set_linewidth(0.5)
-    return figure
+    frames = evenly_spaced_frames(ground_truth.num_frames, num_columns)
+    coloring = Coloring(color, list(rows.values()), frames, ground_truth)
+    # A row may be lower than its name is long.
+    return film_strip([(name.replace(" ", "\n"), trajectory) for name, trajectory in rows.items()], frames, coloring)
 
 
 def error_curve_figure(
@@ -104,7 +63,7 @@ def error_curve_figure(
     Raises:
         ValueError: trajectories of one simulator differ in length.
     """
-    figure = _figure(COLUMN_WIDTH, 2.5)
+    figure = new_figure(COLUMN_WIDTH, 2.5)
     axes = _plain_axes(figure)
     bands = {}
     for name, errors in curves.items():
@@ -135,7 +94,7 @@ def validation_loss_figure(curves: Mapping[str, Sequence[tuple[Numbers, Numbers]
         curves: per label, one ``(steps, values)`` for each seed. Values that are not finite count as infinite.
         label: of the vertical axis.
     """
-    figure = _figure(COLUMN_WIDTH, 2.5)
+    figure = new_figure(COLUMN_WIDTH, 2.5)
     axes = _plain_axes(figure)
     runs = {name: [_clean(*seed) for seed in seeds] for name, seeds in curves.items()}
     ceiling = _set_log_limits(axes, np.concatenate([values for seeds in runs.values() for _, values in seeds]))

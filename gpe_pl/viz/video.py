@@ -12,7 +12,10 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from gpe_pl.trajectory import Trajectory
-from gpe_pl.viz.panel import COLOR_MAPS, INK, REFERENCE, ColorBy, Panel, color_scale, view
+from gpe_pl.viz.camera import Camera
+from gpe_pl.viz.coloring import COLOR_MAPS, REFERENCE, ColorBy, Coloring
+from gpe_pl.viz.panel import Panel
+from gpe_pl.viz.scenery import INK
 
 PANEL_PIXELS = 360
 DPI = 100
@@ -34,10 +37,12 @@ def write_animation(
         predictions: rollouts from frame 0 of the ground truth, by the name of their panel.
         fps: frames per second of the animation; a GIF rounds the time of a frame to 10 ms.
         stride: show every so many frames of the trajectory.
-        color: ``height`` colours particles by where they started, ``error`` predicted ones by their distance from the ground truth.
+        color: ``height`` colours particles by where they started, ``error`` predicted ones by their distance from the ground truth; others as in
+            ``Coloring``.
 
     Raises:
-        ValueError: another file type, a stride or frame rate that is not positive, or a GIF with more than 50 frames per second.
+        ValueError: another file type, a stride or frame rate that is not positive, or a GIF with more than 50 frames per
+            second, or no trajectory has what ``color`` needs.
         ModuleNotFoundError: MP4 without imageio-ffmpeg.
     """
     path = Path(path)
@@ -61,10 +66,9 @@ def write_animation(
 def _images(ground_truth: Trajectory, predictions: dict[str, Trajectory], stride: int, color: ColorBy) -> Iterator[np.ndarray]:
     """RGB images [height, width, 3], one per shown frame. Boundaries and titles are drawn once and restored below the particles."""
     frames = range(0, ground_truth.num_frames, stride)
-    scale = color_scale(ground_truth, predictions, frames, color)
     rows = {"ground truth": ground_truth, **predictions}
-    low, high = view(ground_truth)
-    aspect = (high[1] - low[1]) / (high[0] - low[0]) if len(low) == 2 else 0.9
+    coloring = Coloring(color, list(rows.values()), frames, ground_truth)
+    aspect = Camera(ground_truth).aspect
 
     title, gap = 28, 8
     width = len(rows) * PANEL_PIXELS + (len(rows) + 1) * gap
@@ -73,10 +77,10 @@ def _images(ground_truth: Trajectory, predictions: dict[str, Trajectory], stride
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
     canvas = FigureCanvasAgg(figure)
     panels = []
-    for k, name in enumerate(rows):
+    for k, (name, trajectory) in enumerate(rows.items()):
         left = gap + k * (PANEL_PIXELS + gap)
         box = (left / width, gap / height, PANEL_PIXELS / width, PANEL_PIXELS * aspect / height)
-        panels.append(Panel(figure, box, ground_truth, color, scale))
+        panels.append(Panel(figure, box, trajectory, coloring))
         figure.text((left + PANEL_PIXELS / 2) / width, 1 - title / 2 / height, name, ha="center", va="center", fontsize=10, color=INK)
     clock = figure.text(gap / width, 1 - title / 2 / height, "", ha="left", va="center", fontsize=9, color=INK)
 
@@ -87,8 +91,8 @@ def _images(ground_truth: Trajectory, predictions: dict[str, Trajectory], stride
     background = canvas.copy_from_bbox(figure.bbox)
     for frame in frames:
         canvas.restore_region(background)
-        for panel, trajectory in zip(panels, rows.values(), strict=True):
-            panel.show_frame(trajectory, ground_truth, frame, color)
+        for panel in panels:
+            panel.show_frame(frame)
         clock.set_text(f"{frame * ground_truth.metadata.frame_dt:.2f} s")
         for artist in moving:
             figure.draw_artist(artist)
@@ -96,14 +100,14 @@ def _images(ground_truth: Trajectory, predictions: dict[str, Trajectory], stride
 
 
 def _palette(color: ColorBy) -> Image.Image:
-    """The 256 colours of a GIF: greys, and the colours of particles, whole and mixed with white as at their edges.
+    """The 256 colours of a GIF: greys, and the colours of particles, whole, mixed with white as at their edges, and darkened as on edges of a mesh.
 
     Fixed beforehand, because a palette made from the first frame lacks what appears later, and one for every frame flickers.
     """
-    hues = np.concatenate([COLOR_MAPS[color](np.linspace(0, 1, 68))[:, :3], [to_rgb(REFERENCE)]])
-    mixed = [1 - part * (1 - hues) for part in (1.0, 0.65, 0.3)]
+    hues = np.concatenate([COLOR_MAPS[color](np.linspace(0, 1, 50))[:, :3], [to_rgb(REFERENCE)]])
+    mixed = [*(1 - part * (1 - hues) for part in (1.0, 0.65, 0.3)), 0.75 * hues]
     # Nearest colours are looked up approximately: nothing next to white, so that paper stays white.
-    greys = np.append(np.linspace(0, 0.9, 255 - 3 * len(hues)), 1.0)[:, None].repeat(3, axis=1)
+    greys = np.append(np.linspace(0, 0.9, 255 - 4 * len(hues)), 1.0)[:, None].repeat(3, axis=1)
     image = Image.new("P", (1, 1))
     image.putpalette(np.round(255 * np.concatenate([*mixed, greys])).astype(np.uint8).tobytes())
     return image

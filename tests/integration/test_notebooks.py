@@ -22,7 +22,7 @@ MAX_CELLS = 12
 # The whole ablation, as small as it goes: every split and both kinds of unseen parameters, few particles, frames and steps.
 MINIATURE = (
     *("data.sizes.tiny.num_train=2", "data.sizes.tiny.num_val=1", "data.sizes.tiny.num_test=2", "data.sizes.tiny.num_test_unseen=2"),
-    *("data.sizes.tiny.num_frames=30", "data.sizes.tiny.num_particles=40"),
+    *("data.sizes.tiny.num_frames=30", "data.sizes.tiny.d2.num_particles=40"),
     *("model.hidden_channels=8", "model.num_message_passing_steps=1"),
     *("training.num_steps=4", "training.val_interval=2", "training.warmup_steps=0", "training.compile=off"),
     *("training.num_val_rollouts=1", "training.val_rollout_steps=5"),

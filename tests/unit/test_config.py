@@ -206,9 +206,13 @@ def test_fit_takes_only_models(target: str, tmp_path: Path) -> None:
     ("override", "message"),
     [
         ("data.num_train=0", "data.num_train=0: input should be greater than or equal to 1"),
-        ("data.seen_values=[20,100]", r"data: seen_values: friction_angle = 100.0 is outside \[0, 60\] deg$"),
-        ("data.interpolated_values=[20.0]", r"data: unseen values \[20.0\] are among seen_values$"),
-        ("data.material=snad", "data.solver: MPM has no law for material snad; known: sand"),
+        (
+            "data.parameters.sand.extrapolated=[100]",
+            r"data: parameters.sand.extrapolated: friction_angle = 100.0 is outside \[0, 60\] deg$",
+        ),
+        ("data.parameters.sand.interpolated=[20.0]", r"data.parameters.sand: unseen values \[20.0\] are among the seen ones$"),
+        ("data.solver.materials=[snad]", "data.scene: materials must be different ones of sand, snow, fluid, elastomer, solid, got "),
+        ("data.scene._target_=os.system", "data.scene._target_='os.system': must be a class of gpe_pl.solvers$"),
         ("data.name=a/b", "data.name='a/b': string should match pattern"),
         ("data.solver.cfl=0", "data.solver.cfl=0: input should be greater than 0"),
         ("data.scene.gravity=[0,down]", "data.scene.gravity.1='down': input should be a valid number"),

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import json
+import pickle
+import zlib
 from typing import Any
 
 import numpy as np
@@ -9,13 +13,29 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from gpe_pl.geometry import Box, Polygon, Sphere, Wall, domain_walls, outward_normal, shape_from_dict, shape_to_dict, signed_distance
+from gpe_pl.geometry import (
+    SHAPES,
+    Bowl,
+    Box,
+    DistanceGrid,
+    Polygon,
+    Shape,
+    Sphere,
+    Wall,
+    domain_walls,
+    outward_normal,
+    shape_from_dict,
+    shape_to_dict,
+    signed_distance,
+)
 from gpe_pl.trajectory import Boundary
 
 CONCAVE = ((0.2, 0.2), (0.9, 0.1), (0.5, 0.5), (0.8, 0.9), (0.2, 0.8))
 SOLIDS: dict[str, Any] = {
     "disc": Sphere((0.4, 0.6), 0.25, 0.3),
     "ball": Sphere((0.4, 0.6, 0.5), 0.25, 0.3),
+    "bowl 2D": Bowl((0.4, 0.6), 0.45, 0.3),
+    "bowl 3D": Bowl((0.4, 0.6, 0.5), 0.45, 0.3),
     "box 2D": Box((0.3, 0.1), (0.7, 0.9), 0.3),
     "box 3D": Box((0.3, 0.1, 0.2), (0.7, 0.9, 0.5), 0.3),
     "concave polygon": Polygon(CONCAVE, 0.3),
@@ -34,6 +54,8 @@ def random_points(dim: int, count: int = 400) -> np.ndarray:
 
 def inside(solid: Any, points: np.ndarray) -> np.ndarray:
     """Membership, computed in another way than the signed distance does."""
+    if isinstance(solid, Bowl):
+        return np.asarray(((points - np.array(solid.center)) ** 2).sum(-1) > solid.radius**2)
     if isinstance(solid, Sphere):
         return np.asarray(((points - np.array(solid.center)) ** 2).sum(-1) < solid.radius**2)
     if isinstance(solid, Box):
@@ -94,6 +116,31 @@ def test_samples_are_no_further_apart_than_the_spacing(solid: Any, spacing: floa
     assert gaps[:, 1].max() <= spacing + 1e-12
 
 
+@each_solid
+@pytest.mark.parametrize("spacing", [0.05, 0.3])
+def test_samples_do_not_repeat(solid: Any, spacing: float) -> None:
+    """Faces share edges and corners."""
+    pos, _ = solid.sample(spacing)
+    assert cKDTree(pos).query(pos, k=2)[0][:, 1].min() > 0.2 * spacing
+
+
+def test_box_nodes_of_edges_and_corners() -> None:
+    pos, normal = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.0).sample(0.25)
+    assert len(pos) == 5**3 - 3**3
+    corner = normal[np.all(pos == (1.0, 0.0, 1.0), axis=-1)]
+    np.testing.assert_allclose(corner, np.array([[1.0, -1.0, 1.0]]) / np.sqrt(3))
+    edge = normal[np.all(pos == (1.0, 0.5, 1.0), axis=-1)]
+    np.testing.assert_allclose(edge, np.array([[1.0, 0.0, 1.0]]) / np.sqrt(2))
+
+
+def test_nodes_of_walls_around_a_bowl_vanish() -> None:
+    bounds = ((0.0, 1.0),) * 3
+    bowl = Bowl((0.5, 0.5, 0.5), 0.45, 0.2)
+    boundary = Boundary.sample((*domain_walls(bounds, 0.9), bowl), 0.05, 3)
+    assert set(np.unique(boundary.friction)) == {0.2}
+    assert len(boundary.pos) == len(bowl.sample(0.05)[0])
+
+
 def test_outward_normal_is_the_direction_to_the_surface() -> None:
     sphere = Sphere((0.5, 0.5), 0.2, 0.0)
     points = np.array([[0.9, 0.5], [0.5, 0.35], [0.8, 0.8]])
@@ -138,6 +185,10 @@ def test_boundary_leaves_out_nodes_inside_other_shapes() -> None:
 @pytest.mark.parametrize("shape", [*SOLIDS.values(), *domain_walls(((0.0, 1.0), (0.0, 2.0)), 0.1)], ids=lambda s: s.kind)
 def test_dictionary_round_trip(shape: Any) -> None:
     assert shape_from_dict(shape_to_dict(shape)) == shape
+    assert shape_from_dict(json.loads(json.dumps(shape_to_dict(shape)))) == shape
+    assert len({shape, shape_from_dict(shape_to_dict(shape))}) == 1
+    assert isinstance(shape, Shape)
+    assert SHAPES[shape.kind] is type(shape)
 
 
 def test_wrong_shapes_are_refused() -> None:
@@ -194,3 +245,163 @@ def test_wall_sampling_covers_the_face() -> None:
     np.testing.assert_allclose(pos.min(0), (0, 0, 0), atol=1e-12)
     np.testing.assert_allclose(pos.max(0), (1, 0.5, 0), atol=1e-12)
     assert len(pos) == 11 * 6
+
+
+# --- distance grids -----------------------------------------------------------------------------------------------------------------------
+
+
+def gridded(solid: Any, cells: int, low: float = -0.2, high: float = 1.2, friction: float = 0.3) -> DistanceGrid:
+    dim, axis = dimension(solid), np.linspace(low, high, cells + 1)
+    nodes = np.stack(np.meshgrid(*[axis] * dim, indexing="ij"), axis=-1)
+    return DistanceGrid.from_values((low,) * dim, (high - low) / cells, solid.signed_distance(nodes), friction)
+
+
+GRIDDED = {name: SOLIDS[name] for name in ("disc", "ball", "bowl 2D", "bowl 3D", "box 3D", "concave polygon")}
+each_gridded = pytest.mark.parametrize("solid", GRIDDED.values(), ids=GRIDDED.keys())
+
+
+@each_gridded
+def test_grid_keeps_the_distances_at_its_nodes(solid: Any) -> None:
+    grid = gridded(solid, 20)
+    nodes = np.stack(np.meshgrid(*[-0.2 + grid.spacing * np.arange(21)] * dimension(solid), indexing="ij"), axis=-1)
+    np.testing.assert_allclose(grid.signed_distance(nodes), solid.signed_distance(nodes), atol=grid.spacing / 4096)
+    np.testing.assert_allclose(grid.signed_distance(nodes), grid.values, atol=1e-6)
+    assert not grid.values.flags.writeable
+
+
+@each_gridded
+def test_grid_converges_to_the_solid(solid: Any) -> None:
+    points = random_points(dimension(solid))
+    error = [np.abs(gridded(solid, n).signed_distance(points) - solid.signed_distance(points)).max() for n in (14, 28, 56)]
+    assert error[2] < 0.5 * error[0]
+    assert error[2] < 0.5 * 1.4 / 56  # kinks are wrong by less than half a cell
+    smooth = np.abs(solid.signed_distance(points)) < 0.1 if isinstance(solid, (Sphere, Bowl)) else np.zeros(len(points), dtype=bool)
+    assert np.all(np.abs(gridded(solid, 56).signed_distance(points) - solid.signed_distance(points))[smooth] < 0.1 * 1.4 / 56)
+
+
+def test_grid_interpolates_linear_functions_exactly_and_continues_them() -> None:
+    rng = np.random.default_rng(0)
+    for dim in (2, 3):
+        slope = rng.normal(size=dim)
+        nodes = np.stack(np.meshgrid(*[0.25 * np.arange(n) for n in (3, 5, 4)[:dim]], indexing="ij"), axis=-1) + 1.0
+        grid = DistanceGrid.from_values((1.0,) * dim, 0.25, nodes @ slope - 1.0, 0.0)
+        points = rng.uniform(-3, 5, (200, dim))
+        np.testing.assert_allclose(grid.signed_distance(points), points @ slope - 1.0, atol=0.01)
+        np.testing.assert_allclose(
+            outward_normal(grid, points, 1e-2), np.broadcast_to(slope / np.linalg.norm(slope), points.shape), atol=0.01
+        )
+
+
+def test_grid_does_not_change_sign_beyond_its_edge() -> None:
+    """Above the ground stays free and below stays solid, however far away."""
+    x, z = np.meshgrid(np.arange(9) / 8, np.arange(9) / 8, indexing="ij")
+    ground = DistanceGrid.from_values((0.0, 0.0), 1 / 8, z - 0.45 - 0.1 * np.sin(9 * x), 0.5)
+    for height, sign in ((1.0, 1), (1.5, 1), (30.0, 1), (0.0, -1), (-1.0, -1), (-30.0, -1)):
+        points = np.stack([np.linspace(-0.5, 1.5, 50), np.full(50, height)], axis=-1)
+        assert np.all(np.sign(ground.signed_distance(points)) == sign)
+
+
+@each_gridded
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_grid_numpy_equals_torch(solid: Any, dtype: str) -> None:
+    grid = gridded(solid, 16)
+    points = np.concatenate([random_points(dimension(solid)), 4 * random_points(dimension(solid))]).astype(dtype)
+    points[0] = np.nan
+    tensor = torch.from_numpy(points)
+    result = grid.signed_distance(tensor)
+    assert result.dtype == tensor.dtype
+    assert np.isnan(result.numpy()[0])
+    np.testing.assert_allclose(result.numpy(), grid.signed_distance(points), atol=1e-5 if dtype == "float32" else 1e-13)
+    assert grid.signed_distance(torch.empty((5, dimension(solid)), device="meta")).device.type == "meta"
+    assert grid.signed_distance(points[3]).shape == ()
+
+
+@each_gridded
+@pytest.mark.parametrize("ratio", [0.5, 1.0, 2.5])
+def test_grid_samples_cover_the_surface(solid: Any, ratio: float) -> None:
+    grid = gridded(solid, 28)
+    spacing, dim = ratio * grid.spacing, dimension(solid)
+    pos, normal = grid.sample(spacing)
+    assert np.abs(grid.signed_distance(pos)).max() < 0.02 * spacing  # the validator asks for 0.1
+    np.testing.assert_allclose((normal**2).sum(-1), 1, atol=1e-12)
+    assert np.mean(grid.signed_distance(pos + 0.2 * grid.spacing * normal) > 0) > 0.99
+    surface, _ = solid.sample(spacing / 8)
+    reach = cKDTree(pos).query(surface)[0]
+    assert np.quantile(reach, 0.99) < spacing + 0.1 * grid.spacing
+    assert reach.max() < spacing + 0.6 * grid.spacing  # sharp corners lie between the nodes of the grid
+    ideal = len(surface) / 8 ** (dim - 1)
+    assert 0.8 * ideal < len(pos) < (1.9 if dim == 2 else 1.4) * ideal
+    np.testing.assert_array_equal(pos, grid.sample(spacing)[0])
+
+
+def test_grid_samples_both_sides_of_a_thin_plate() -> None:
+    z = np.arange(17) / 16
+    plate = np.broadcast_to(np.abs(z - 0.5) - 0.04, (17, 17, 17))
+    pos, normal = DistanceGrid.from_values((0.0, 0.0, 0.0), 1 / 16, plate, 0.0).sample(0.12)
+    upper, lower = pos[normal[:, 2] > 0.9], pos[normal[:, 2] < -0.9]
+    assert len(upper) + len(lower) == len(pos)
+    assert min(len(upper), len(lower)) > 0.9 * (1 / 0.12) ** 2
+    np.testing.assert_allclose(upper[:, 2].mean() - lower[:, 2].mean(), 0.08, atol=0.01)
+
+
+def test_grid_without_surface_has_no_nodes() -> None:
+    pos, normal = DistanceGrid.from_values((0.0, 0.0), 0.5, np.ones((3, 3)), 0.0).sample(0.1)
+    assert pos.shape == normal.shape == (0, 2)
+
+
+def test_grid_round_trip() -> None:
+    grid = gridded(SOLIDS["ball"], 16)
+    again = shape_from_dict(json.loads(json.dumps(shape_to_dict(grid))))
+    assert again == grid
+    assert hash(again) == hash(grid)
+    assert isinstance(again, DistanceGrid)
+    assert len(repr(grid)) < 300
+    np.testing.assert_array_equal(again.values, grid.values)
+    assert pickle.loads(pickle.dumps(grid)) == grid
+    assert isinstance(grid, Shape)
+    assert grid != gridded(SOLIDS["ball"], 16, friction=0.4)
+    assert len(grid.encoded) < 3 * grid.values.size  # less than the raw float32 takes
+    assert set(shape_to_dict(grid)) == {"kind", "origin", "spacing", "counts", "encoded", "friction", "restitution"}
+
+
+def packed(data: bytes) -> str:
+    return base64.b64encode(zlib.compress(data)).decode()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"encoded": "no base64!"}, "damaged"),
+        ({"encoded": "é"}, "damaged"),
+        ({"encoded": base64.b64encode(b"not zlib").decode()}, "damaged"),
+        ({"encoded": packed(bytes(4 * 9))[:-8]}, "damaged|do not fit"),
+        ({"encoded": packed(bytes(4 * 8))}, "do not fit"),
+        ({"encoded": packed(bytes(4 * 9 + 1))}, "do not fit"),
+        ({"encoded": packed(bytes(2**24))}, "do not fit"),  # unpacks to much more than it should
+        ({"encoded": packed(b"\xff" * 36)}, "not all finite"),
+        ({"counts": (3, 4)}, "do not fit"),
+        ({"counts": (1, 9)}, "counts"),
+        ({"counts": (3, -3)}, "counts"),
+        ({"counts": (3.0, 3.0)}, "counts"),
+        ({"counts": (2**20, 2**20)}, "counts"),
+        ({"counts": (9,)}, "2 or 3 axes"),
+        ({"origin": (0.0, 0.0, 0.0)}, "2 or 3 axes"),
+        ({"origin": (0.0, float("nan"))}, "finite"),
+        ({"spacing": 0.0}, "positive"),
+        ({"spacing": float("inf")}, "finite"),
+    ],
+)
+def test_damaged_grids_are_refused(change: dict[str, Any], message: str) -> None:
+    sound = shape_to_dict(DistanceGrid.from_values((0.0, 0.0), 0.5, np.zeros((3, 3)), 0.0))
+    shape_from_dict(sound)
+    with pytest.raises(ValueError, match=message):
+        shape_from_dict(sound | change)
+
+
+def test_unusable_grid_values_are_refused() -> None:
+    with pytest.raises(ValueError, match="finite"):
+        DistanceGrid.from_values((0.0, 0.0), 0.5, np.array([[0.0, np.nan], [0.0, 1.0]]), 0.0)
+    with pytest.raises(ValueError, match="2 or 3 axes"):
+        DistanceGrid.from_values((0.0,), 0.5, np.zeros(4), 0.0)
+    with pytest.raises(ValueError, match="wider spacing"):
+        DistanceGrid.from_values((0.0, 0.0), 0.5, np.broadcast_to(0.0, (2**13, 2**13)), 0.0)

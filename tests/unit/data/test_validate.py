@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import pytest
 
-from gpe_pl.data.validate import format_page, main, validate
+from gpe_pl.data.validate import disturbed_islands, format_page, main, validate
 from gpe_pl.geometry import Sphere
 from gpe_pl.schema import node_code
 from gpe_pl.trajectory import Trajectory, read_trajectory, write_shard
@@ -334,3 +334,43 @@ def test_format_page_names_everything() -> None:
 def test_usage_error() -> None:
     with pytest.raises(SystemExit, match="2"):
         main([])
+
+
+def falling(new_trajectory: Callable[..., Trajectory], extra: float, gap: float = 0.05, mesh: bool = False) -> Trajectory:
+    """A pair of nodes in mid-air that falls freely while its second node, ``gap`` [m] away, accelerates by ``extra`` [m/s²] more, and a node at rest on
+    the floor."""
+    t = new_trajectory(num_nodes=3, num_frames=6)
+    time = 0.01 * np.arange(6)[:, None]
+    acceleration = np.array([[0.0, -9.81], [extra, -9.81], [0.0, 0.0]])
+    start = np.array([[0.3, 0.6], [0.3 + gap, 0.6], [0.8, 0.02]])
+    pos = start + 0.5 * time[:, None] ** 2 * acceleration
+    cells = {"cells": np.array([[0, 1]], np.int32), "rest_pos": start.astype(np.float32)} if mesh else {}
+    return replace(t, pos=pos.astype(np.float32), vel=(time[:, None] * acceleration).astype(np.float32), **cells)
+
+
+@pytest.mark.parametrize(
+    ("extra", "gap", "mesh", "expected"),
+    [
+        (0.0, 0.05, False, (2, 1, 0)),  # one free island, which falls
+        (0.1, 0.05, False, (2, 1, 1)),  # pushed by something that the graph does not show
+        (0.1, 0.3, False, (3, 2, 1)),  # apart: only one of them is pushed
+        (0.1, 0.3, True, (2, 1, 1)),  # a cell ties them together
+        (0.005, 0.05, False, (2, 1, 0)),  # below the tolerance
+    ],
+)
+def test_islands_that_do_not_fall_freely(
+    new_trajectory: Callable[..., Trajectory], extra: float, gap: float, mesh: bool, expected: tuple[int, int, int]
+) -> None:
+    t = falling(new_trajectory, extra, gap, mesh)
+    arrays = {"pos": t.pos, "vel": t.vel, "mass": t.mass, "boundary_pos": t.boundary.pos[None]}
+    if t.cells is not None:
+        arrays["cells"] = t.cells
+    assert list(disturbed_islands(t.metadata, arrays)) == [expected] * 5
+
+
+def test_report_counts_disturbed_islands(
+    tmp_path: Path, new_trajectory: Callable[..., Trajectory], capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_shard(tmp_path / "shard-00000.h5", [falling(new_trajectory, 0.1)])
+    assert main([str(tmp_path)]) == 0
+    assert "boundary: 5 of 10 island-frames (50.000%), 5 of them free" in capsys.readouterr().out

@@ -1,39 +1,61 @@
 """Random scenes: pure, exact in number, free of overlap, and without order in the labels."""
 
+import itertools
+import math
+from collections import Counter
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from gpe_pl.geometry import signed_distance
-from gpe_pl.schema import STICKY
-from gpe_pl.solvers.scenes import SceneConfig, describe, sample_scene
+from gpe_pl.schema import NODE_TYPES, STICKY, node_code
+from gpe_pl.solvers.scenes import BodyScene, Scene, describe
 
-CONFIG = SceneConfig(bounds=((0, 1), (0, 1)), grid_spacing=1 / 32, num_particles=320)
+DENSITY = {"sand": 1600.0, "snow": 400.0, "elastomer": 1000.0}
+
+
+def make(**changes):
+    return BodyScene(
+        **{
+            "bounds": ((0, 1), (0, 1)),
+            "materials": ("sand",),
+            "grid_spacing": 1 / 32,
+            "particles_per_cell": 2,
+            "num_particles": 320,
+            "density": DENSITY,
+            **changes,
+        }
+    )
+
+
+CONFIG = make()
 SEEDS = range(30)
 
 
 @pytest.fixture(scope="module")
 def scenes():
-    return [sample_scene(CONFIG, "sand", 30.0, seed) for seed in SEEDS]
+    return [CONFIG.sample({"sand": 30.0}, seed) for seed in SEEDS]
 
 
 def test_is_a_pure_function(scenes):
     np.random.seed(1)  # noqa: NPY002 the global generator must not matter
-    again = sample_scene(CONFIG, "sand", 30.0, SEEDS[3])
+    again = CONFIG.sample({"sand": 30.0}, SEEDS[3])
     assert again.pos.tobytes() == scenes[3].pos.tobytes() and again.vel.tobytes() == scenes[3].vel.tobytes()
     assert again.boundary.shapes == scenes[3].boundary.shapes
     assert len({s.pos.tobytes() for s in scenes}) == len(scenes)
 
 
 def test_value_does_not_change_the_scene(scenes):
-    other = sample_scene(CONFIG, "sand", 45.0, SEEDS[0])
+    other = CONFIG.sample({"sand": 45.0}, SEEDS[0])
     assert other.pos.tobytes() == scenes[0].pos.tobytes()
     assert np.all(other.material_params == 45.0)
 
 
 @pytest.mark.parametrize("count", [1, 7, 150, 320])
 def test_number_of_particles_is_exact(count):
-    config = SceneConfig(bounds=((0, 1), (0, 1)), grid_spacing=1 / 32, num_particles=count)
-    assert all(sample_scene(config, "sand", 30.0, seed).num_nodes == count for seed in range(5))
+    config = make(num_particles=count)
+    assert all(config.sample({"sand": 30.0}, seed).num_nodes == count for seed in range(5))
 
 
 def test_no_overlap(scenes):
@@ -46,7 +68,7 @@ def test_no_overlap(scenes):
 
 def test_density_is_that_of_the_material(scenes):
     for state in scenes:
-        assert state.mass.sum() == pytest.approx(CONFIG.density * CONFIG.num_particles * CONFIG.spacing**2)
+        assert state.mass.sum() == pytest.approx(DENSITY["sand"] * CONFIG.num_particles * CONFIG.spacing**2)
         # as many neighbours within three spacings as an undisturbed lattice has, for an inner particle
         neighbours = np.sum(np.linalg.norm(state.pos[:, None] - state.pos, axis=-1) < 3 * CONFIG.spacing, axis=1) - 1
         assert np.percentile(neighbours, 90) == pytest.approx(np.pi * 9 - 1, abs=4)
@@ -73,9 +95,9 @@ def test_boundary_nodes_are_as_dense_as_particles(scenes):
 
 
 def test_impossible_scene_says_what_to_change():
-    config = SceneConfig(bounds=((0, 1), (0, 1)), grid_spacing=1 / 8, num_particles=256)
+    config = make(grid_spacing=1 / 8, num_particles=256)
     with pytest.raises(ValueError, match="lower num_particles"):
-        sample_scene(config, "sand", 30.0, 0)
+        config.sample({"sand": 30.0}, 0)
 
 
 @pytest.mark.parametrize(
@@ -92,10 +114,53 @@ def test_impossible_scene_says_what_to_change():
 )
 def test_invalid_config_is_refused(change):
     with pytest.raises(ValueError):
-        SceneConfig(**{"bounds": ((0, 1), (0, 1)), "grid_spacing": 1 / 32, "num_particles": 10, **change})
+        make(**{"num_particles": 10, **change})
 
 
 def test_metadata():
-    metadata = describe(CONFIG, "sand", 5e-3, seed=7)
+    metadata = describe(CONFIG, 5e-3, seed=7)
     assert metadata.param_names == ("friction_angle",) and metadata.seed == 7
-    assert metadata.connectivity_radius == pytest.approx(3 * metadata.spacing)
+    assert metadata.connectivity_radius == pytest.approx(3.75 / 32)
+
+
+SPATIAL = make(bounds=((0, 1),) * 3, gravity=(0, 0, -9.81), grid_spacing=1 / 16, particles_per_cell=1, num_particles=300)
+
+
+def test_scenes_in_3d():
+    states = [SPATIAL.sample({"sand": 30.0}, seed) for seed in range(12)]
+    for state in states:
+        assert state.pos.shape == (300, 3) and signed_distance(state.boundary.shapes, state.pos).min() > 0.4 * SPATIAL.spacing
+        assert state.mass.sum() == pytest.approx(1600 * 300 / 16**3)
+    assert {s.kind for state in states for s in state.boundary.shapes} == {"wall", "box", "sphere"}
+
+
+def test_bodies_of_several_materials():
+    config = make(materials=("sand", "snow", "elastomer"))
+    values = {"sand": 30.0, "snow": 8.0, "elastomer": 1e5}
+    states = [config.sample(values, seed) for seed in range(30)]
+    assert {NODE_TYPES[k] for state in states for k in state.node_type} == set(values)
+    for state in states:
+        for column, material in enumerate(("sand", "snow", "elastomer")):
+            chosen = state.node_type == node_code(material)
+            np.testing.assert_array_equal(state.material_params[chosen, column], values[material])
+            assert np.isnan(state.material_params[~chosen, column]).all()
+            np.testing.assert_allclose(state.mass[chosen], DENSITY[material] * config.spacing**2)
+        assert set(state.node_type[np.unique(state.cells)]) <= {node_code("elastomer")}
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_cells_fill_the_lattice_of_an_elastomer(dim):
+    """Every simplex has the volume of spacing^dim / dim!, together they fill whole lattice cells, and each face belongs to at most two."""
+    config = replace(make() if dim == 2 else SPATIAL, materials=("elastomer",), max_bodies=1)
+    state = config.sample({"elastomer": 1e5}, 4)
+    edges = state.pos[state.cells[:, 1:]] - state.pos[state.cells[:, :1]]
+    np.testing.assert_allclose(np.linalg.det(edges), config.spacing**dim, rtol=1e-9)
+    faces = Counter(frozenset(c) for cell in state.cells for c in itertools.combinations(cell.tolist(), dim))
+    assert max(faces.values()) == 2 and sum(n == 1 for n in faces.values()) < len(faces) / 2
+    assert len(state.cells) % math.factorial(dim) == 0 and 0.5 * config.max_cells < len(state.cells) <= config.max_cells
+    np.testing.assert_array_equal(state.rest_pos, state.pos)
+
+
+def test_only_meshed_materials_have_cells(scenes):
+    assert scenes[0].cells is None and scenes[0].rest_pos is None
+    assert isinstance(CONFIG, Scene)

@@ -1,0 +1,159 @@
+"""The staggered grid, and what rigid boundaries leave open of it.
+
+Cells are numbered in C order; one index addresses a cell, its lower face along each axis, its lower edge in each plane of axes and its lowest node, so
+every quantity is an array over cells and a neighbour is a stride away. Velocity components live on the faces, pressure and density at cell centres,
+shear stress at edges (nodes in 2D), signed distances of solids at nodes. Lengths are in cells.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from gpe_pl.geometry import Shape, signed_distance
+
+PADDING = 3
+"""Cells between the domain and the edge of the grid: room for the kernels of a particle that is up to one cell outside."""
+
+FAR = 1e3
+"""Largest signed distance in cells; stands for infinity where there is no solid."""
+
+SMALLEST_OPENING = 1e-3
+"""Faces that are open by less are closed."""
+
+HALF = 0.5
+"""The centre of a cell counts as solid where less of the kernel around it is open."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Where the cells are.
+
+    Attributes:
+        counts: cells along each axis, padding included.
+        strides: index difference of neighbours along each axis [dim].
+        corners: index difference of the 2^dim corners of a cell, bit b of the number for axis b.
+        origin: position of the lowest node [dim] in m.
+        spacing: Δ in m.
+    """
+
+    counts: np.ndarray
+    strides: np.ndarray
+    corners: np.ndarray
+    origin: np.ndarray
+    spacing: float
+
+    @property
+    def num_cells(self) -> int:
+        return int(np.prod(self.counts))
+
+    @property
+    def dim(self) -> int:
+        return len(self.counts)
+
+
+@dataclass(frozen=True)
+class Solids:
+    """What boundaries leave open, in arrays over all cells.
+
+    Attributes:
+        distance: signed distance of nodes [cell] in cells, positive in free space.
+        face_distance: the same at face centres [axis, cell]; not positive for closed faces.
+        area: open fraction of faces [axis, cell]; exactly 0 for closed faces.
+        is_open: whether a cell has an open face [cell].
+        cell_room: integral over free space of the kernel around each cell centre [cell]; 1 away from solids.
+        face_room: the same around face centres [axis, cell].
+    """
+
+    distance: np.ndarray
+    face_distance: np.ndarray
+    area: np.ndarray
+    is_open: np.ndarray
+    cell_room: np.ndarray
+    face_room: np.ndarray
+
+
+@lru_cache(maxsize=8)
+def make_grid(bounds: tuple[tuple[float, float], ...], spacing: float) -> Grid:
+    """The grid of a domain whose low corner is a node."""
+    counts = np.array([round((high - low) / spacing) + 2 * PADDING for low, high in bounds])
+    strides = np.array([int(np.prod(counts[axis + 1 :])) for axis in range(len(counts))])
+    corners = np.array([sum(int(s) for b, s in enumerate(strides) if k >> b & 1) for k in range(1 << len(counts))])
+    return Grid(counts, strides, corners, np.array([low - PADDING * spacing for low, _ in bounds]), spacing)
+
+
+@lru_cache(maxsize=4)
+def make_solids(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ...], spacing: float) -> Solids:
+    """Sample the boundary on the grid of a domain."""
+    grid = make_grid(bounds, spacing)
+    dim, counts = grid.dim, grid.counts
+    # one layer of nodes more than cells, so that every cell has all its corners
+    lines = [o + spacing * np.arange(n + 1) for o, n in zip(grid.origin, counts, strict=True)]
+    nodes = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
+    distance = np.clip(signed_distance(shapes, nodes) / spacing, -FAR, FAR)
+    distance[np.abs(distance) < 1e-9] = 0.0  # a node on a wall, whatever the rounding
+
+    def corner(bits: tuple[int, ...]) -> np.ndarray:
+        return distance[tuple(slice(bit, bit + n) for bit, n in zip(bits, counts, strict=True))]
+
+    def corners(free: list[int]) -> list[np.ndarray]:
+        """Values at the corners of the cell's lower facet along the free axes, the last axis fastest."""
+        return [
+            corner(tuple(dict(zip(free, bits, strict=True)).get(b, 0) for b in range(dim)))
+            for bits in itertools.product((0, 1), repeat=len(free))
+        ]
+
+    others = [[b for b in range(dim) if b != axis] for axis in range(dim)]
+    area = np.stack([_open_fraction(corners(axes)) for axes in others])
+    volume = _open_fraction(corners(list(range(dim))))
+    cell_room = volume
+    for axis in range(dim):
+        cell_room = _smooth(cell_room, axis)
+    face_room = np.stack([_halves(volume, axis) for axis in range(dim)])
+    for axis in range(dim):
+        for b in others[axis]:
+            face_room[axis] = _smooth(face_room[axis], b)
+    area[area < SMALLEST_OPENING] = 0.0
+    # a cell whose centre is solid gets its density from open neighbours whose centre is not; without one it is closed
+    free = cell_room >= HALF
+    reaches = [(area[k] > 0) & np.roll(free, 1, k) | (np.roll(area[k], -1, k) > 0) & np.roll(free, -1, k) for k in range(dim)]
+    closed = ~free & ~np.any(reaches, axis=0)
+    for axis in range(dim):
+        area[axis][closed | np.roll(closed, 1, axis)] = 0.0
+    is_open = np.any([(a > 0) | (np.roll(a, -1, axis) > 0) for axis, a in enumerate(area)], axis=0)
+    face_distance = np.stack([np.mean(corners(axes), axis=0) for axes in others])
+    face_distance[area == 0] = np.minimum(face_distance[area == 0], 0.0)
+    return Solids(
+        np.ascontiguousarray(distance[tuple(slice(0, n) for n in counts)]).ravel(),
+        face_distance.reshape(dim, -1),
+        area.reshape(dim, -1),
+        is_open.ravel(),
+        np.ascontiguousarray(cell_room).ravel(),
+        face_room.reshape(dim, -1),
+    )
+
+
+def _open_fraction(corners: list[np.ndarray], slices: int = 8) -> np.ndarray:
+    """Fraction of a segment, square or cube in free space, from the signed distances of its corners; exact along the last axis, else the midpoint rule."""
+    if len(corners) == 2:
+        high = np.maximum(*corners)
+        return np.where(high > 0, high / np.where(high > 0, high - np.minimum(np.minimum(*corners), 0.0), 1.0), 0.0)
+    half = len(corners) // 2
+    total = np.zeros_like(corners[0])
+    for k in range(slices):
+        t = (k + 0.5) / slices
+        total += _open_fraction([(1 - t) * a + t * b for a, b in zip(corners[:half], corners[half:], strict=True)], slices)
+    return total / slices
+
+
+def _smooth(x: np.ndarray, axis: int) -> np.ndarray:
+    """Integrate cell averages against a hat of half-width 1 around cell centres, along one axis."""
+    return 0.75 * x + 0.125 * (np.roll(x, 1, axis) + np.roll(x, -1, axis))
+
+
+def _halves(x: np.ndarray, axis: int) -> np.ndarray:
+    """The same around lower faces."""
+    return 0.5 * (x + np.roll(x, 1, axis))

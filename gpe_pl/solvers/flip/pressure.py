@@ -1,0 +1,179 @@
+"""Pressure: the projection onto velocities without divergence between curved solids and a free surface.
+
+Solids enter by the open fractions A of the faces (Batty, Bertails and Bridson 2007; the finite-volume form of Ng, Min and Gibou 2009), the free surface by
+the ghost fluid method (Enright et al. 2003): where it cuts the line between a liquid and an empty cell at a share θ, pressure is zero there. With
+the scaled pressure ``p = h P / (ρ Δ)`` in m/s, the equations of the liquid cells and the update of their faces are ::
+
+    Σ_faces ± A (u - Δp) = 0,    u ← u - Δp,    Δp = p_c - p_n   or   p_c / θ towards an empty cell
+
+The same matrix serves the correction of the particle density (Kugelstadt et al. 2019).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+SMALLEST_SHARE = 0.01
+"""Lower limit of θ."""
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def surface_distance(density):
+    """Signed distance to the free surface in cells, negative in the liquid, from the density at a cell centre; exact for a plane along the axes."""
+    if density >= 0.5:
+        return math.sqrt(2.0 * max(0.0, 1.0 - density)) - 1.0
+    return 1.0 - math.sqrt(2.0 * max(0.0, density))
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _drop(inside, outside):
+    """1/θ of the face between a liquid and an empty cell."""
+    return 1.0 / max(SMALLEST_SHARE, inside / (inside - outside))
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def extend_into_solids(active, strides, area, cell_room, half, density, viscous, touched):
+    """Give open cells whose centre is solid the mean density of the neighbours whose centre is not, weighted by the opening between them.
+
+    Their own density is measured in too little room, and liquid that seems empty would suck in its surroundings. Cells reached are marked as touched.
+    """
+    for n in active:
+        if not density[n] > 0.0 or cell_room[n] < half:
+            continue
+        for m in range(2 * strides.shape[0]):
+            c = n + strides[m // 2] if m % 2 == 0 else n - strides[m // 2]
+            if cell_room[c] >= half or not area[m // 2, max(n, c)] > 0.0:
+                continue
+            touched[c] = True
+            opening = total = total_viscous = 0.0
+            for k in range(2 * strides.shape[0]):
+                other = c + strides[k // 2] if k % 2 == 0 else c - strides[k // 2]
+                if cell_room[other] >= half:
+                    share = area[k // 2, max(c, other)]
+                    opening += share
+                    total += share * density[other]
+                    total_viscous += share * viscous[other]
+            density[c], viscous[c] = total / opening, total_viscous / opening
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def liquid_cells(active, is_open, density, unknown):
+    """Number the liquid cells from 1 in ``unknown`` [cell], which is 0 elsewhere; returns their list."""
+    found = np.empty(active.shape[0], dtype=np.int64)
+    n = 0
+    for c in active:
+        if density[c] >= 0.5 and is_open[c]:
+            found[n] = c
+            n += 1
+            unknown[c] = n
+    return found[:n].copy()
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def fill_open_faces(liquid, strides, area, weight, velocity, touch):
+    """Give open faces of liquid cells that no particle reaches the mean velocity of their neighbours, and the weight ``touch``."""
+    dim = strides.shape[0]
+    for c in liquid:
+        for m in range(2 * dim):
+            a = m // 2
+            face = c + (strides[a] if m % 2 == 1 else 0)
+            if area[a, face] > 0.0 and not weight[a, face] > 0.0:
+                total, count = 0.0, 0
+                for n in range(2 * dim):
+                    other = face + (strides[n // 2] if n % 2 == 0 else -strides[n // 2])
+                    if weight[a, other] > touch:
+                        total += velocity[a, other]
+                        count += 1
+                velocity[a, face] = total / count if count > 0 else 0.0
+                weight[a, face] = touch
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def pressure_matrix(liquid, unknown, strides, area, density):
+    """Matrix of the scaled pressure over the liquid cells: diagonal and lower triangle as in ``linear``."""
+    dim, n = strides.shape[0], liquid.shape[0]
+    diagonal, start = np.zeros(n), np.zeros(n + 1, dtype=np.int64)
+    column, value = np.empty(n * dim, dtype=np.int64), np.empty(n * dim)
+    entries = 0
+    for i in range(n):
+        c = liquid[i]
+        inside = surface_distance(density[c])
+        for a in range(dim):
+            s = strides[a]
+            low, high = area[a, c], area[a, c + s]
+            if low > 0.0:
+                j = unknown[c - s] - 1
+                if j >= 0:
+                    diagonal[i] += low
+                    column[entries], value[entries] = j, -low
+                    entries += 1
+                else:
+                    diagonal[i] += low * _drop(inside, surface_distance(density[c - s]))
+            if high > 0.0:
+                diagonal[i] += high * (1.0 if unknown[c + s] > 0 else _drop(inside, surface_distance(density[c + s])))
+        start[i + 1] = entries
+    return diagonal, start, column[:entries].copy(), value[:entries].copy()
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def inflow(liquid, strides, area, velocity):
+    """Sum of the velocities into each liquid cell [m/s]."""
+    total = np.zeros(liquid.shape[0])
+    for i in range(liquid.shape[0]):
+        c = liquid[i]
+        for a in range(strides.shape[0]):
+            total[i] += area[a, c] * velocity[a, c] - area[a, c + strides[a]] * velocity[a, c + strides[a]]
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def subtract_gradient(liquid, unknown, strides, area, density, pressure, velocity):
+    """Update the open faces of the liquid cells with the scaled pressure."""
+    for i in range(liquid.shape[0]):
+        c = liquid[i]
+        inside = surface_distance(density[c])
+        for a in range(strides.shape[0]):
+            s = strides[a]
+            if area[a, c] > 0.0:
+                j = unknown[c - s] - 1
+                if j >= 0:
+                    velocity[a, c] -= pressure[i] - pressure[j]
+                else:
+                    velocity[a, c] -= pressure[i] * _drop(inside, surface_distance(density[c - s]))
+            if area[a, c + s] > 0.0 and unknown[c + s] == 0:
+                velocity[a, c + s] += pressure[i] * _drop(inside, surface_distance(density[c + s]))
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def excess_density(liquid, unknown, strides, is_open, density, largest):
+    """Relative volume by which each liquid cell should expand, within ``±largest``; cells next to empty ones never contract."""
+    dim = strides.shape[0]
+    excess = np.empty(liquid.shape[0])
+    total = 1
+    for _ in range(dim):
+        total *= 3
+    for i in range(liquid.shape[0]):
+        value = min(largest, max(-largest, density[liquid[i]] - 1.0))
+        if value < 0.0:
+            for k in range(total):
+                c, rest = liquid[i], k
+                for b in range(dim):
+                    c += (rest % 3 - 1) * strides[b]
+                    rest //= 3
+                if unknown[c] == 0 and is_open[c]:
+                    value = 0.0
+        excess[i] = value
+    return excess

@@ -1,0 +1,415 @@
+"""``FLIP``: the solver that steps states of liquid particles."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, ClassVar
+
+import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass as validated_dataclass
+
+from gpe_pl.geometry import Wall, domain_walls, outward_normal, signed_distance
+from gpe_pl.rollout import SimulationError
+from gpe_pl.schema import MATERIALS, NODE_TYPES, node_code, param_names
+from gpe_pl.solvers.flip import islands, pressure, transfer, viscosity
+from gpe_pl.solvers.flip.grid import HALF, Grid, Solids, make_grid, make_solids
+from gpe_pl.solvers.flip.linear import conjugate_gradients, incomplete_cholesky
+from gpe_pl.trajectory import Boundary, State
+
+MATERIAL = "fluid"
+
+TOUCH = 1e-30
+"""Weight of faces whose velocity is known although no particle reaches them."""
+
+SHARE_TIME = 0.01
+"""Time in s to which the shares ``pic`` and ``evening`` refer, whatever the frames and substeps are."""
+
+MODIFIED = 0.97
+"""How far the preconditioner of the pressure keeps row sums; see ``incomplete_cholesky``."""
+
+DENSITY_TOLERANCE = 1e-2
+"""Largest residual of the density correction, as a share of a cell's volume."""
+
+NEAR = 3.0
+"""Particles whose cell is further from solids, in cells, are not inside any."""
+
+LARGEST_EXCESS = 0.5
+"""Relative change of a cell's volume that the density correction may ask for in one substep."""
+
+
+@dataclass(frozen=True)
+class Fields:
+    """The grid's arrays during a substep; unchanged outside the active cells.
+
+    Attributes:
+        velocity: on faces [axis, cell] in m/s.
+        old: the same before the forces.
+        shift: displacement that corrects the density, on faces [axis, cell] in m.
+        weight: density around faces, relative to that of the liquid [axis, cell].
+        density: the same around cell centres [cell].
+        viscous: density times kinematic viscosity [cell] in m²/s.
+        touched: whether a particle reaches the cell or its lower faces [cell].
+        liquid: number of each liquid cell from 1, else 0 [cell].
+        viscous_face: number of each face of the viscous system from 1, else 0 [axis, cell].
+        island: label of the connected body of each cell that holds mass [cell].
+    """
+
+    velocity: np.ndarray
+    old: np.ndarray
+    shift: np.ndarray
+    weight: np.ndarray
+    density: np.ndarray
+    viscous: np.ndarray
+    touched: np.ndarray
+    liquid: np.ndarray
+    viscous_face: np.ndarray
+    island: np.ndarray
+
+    @classmethod
+    def empty(cls, grid: Grid) -> Fields:
+        """Arrays without liquid."""
+        faces, cells = (grid.dim, grid.num_cells), grid.num_cells
+        return cls(
+            np.zeros(faces), np.zeros(faces), np.zeros(faces), np.zeros(faces), np.zeros(cells), np.zeros(cells), np.zeros(cells, np.bool_),
+            np.zeros(cells, np.int64), np.zeros(faces, np.int64), np.zeros(cells, np.int64),
+        )  # fmt: skip
+
+
+_idle: dict[tuple[tuple[tuple[float, float], ...], float], Fields] = {}
+"""Empty fields of the grid that was used last, by bounds and spacing: to fill new arrays with zeros would take longer than a substep. Who takes them out
+owns them, and puts them back only after success, so neither threads nor errors can meet fields that are not empty."""
+
+
+@dataclass(frozen=True)
+class Liquid:
+    """The liquid cells with the matrix of their pressure.
+
+    Attributes:
+        cells: [liquid] as numbered in ``Fields.liquid``.
+        is_free: whether a cell belongs to an island that touches no solid [liquid].
+        closed: label of the closed space that a cell is in, -1 where there is a free surface [liquid].
+        matrix: see ``linear``.
+        inverse: pivots of its preconditioner [liquid].
+    """
+
+    cells: np.ndarray
+    is_free: np.ndarray
+    closed: np.ndarray
+    matrix: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    inverse: np.ndarray
+
+
+@validated_dataclass(frozen=True, config={"extra": "forbid"})
+class FLIP:
+    """Incompressible liquid with a free surface by the fluid-implicit-particle method; a ``Simulator``.
+
+    A substep transfers the particles' velocities to a staggered grid (Zhu and Bridson 2005), adds gravity, solves for viscosity and then for pressure, and
+    moves the particles with the grid. Solids stop the liquid exactly at their surface: for pressure the liquid slips along them, for viscosity it does not
+    slip, whatever their friction; at a small viscosity the layer at rest is as thin as physics makes it. Bodies of liquid that touch no solid follow a
+    parabola exactly. Obstacles and gaps should be at least two cells wide.
+
+    Attributes:
+        bounds: ``(low, high)`` per axis of the domain [m], two or three axes; whole multiples of the grid spacing apart.
+        grid_spacing: Δ [m]; about two particles per cell and axis.
+        frame_dt: time between frames [s].
+        materials: every material of the data set, which fixes the columns of ``State.material_params``; only ``fluid`` can move.
+        density: [kg/m³]; with the particles' masses it says how much room each of them takes.
+        pic: share of the grid's velocity in a particle's velocity after 10 ms, which damps what the grid does not see.
+        evening: share of the error of the particles' density that is corrected in 10 ms, except in bodies that fly freely.
+        cfl: cells that a particle may cross in one substep.
+        max_substeps: per frame; more means that the state has exploded.
+        pressure_tolerance: largest relative change of a liquid cell's volume in a substep.
+        viscosity_tolerance: largest residual of the viscous system over the largest speed.
+        max_iterations: of each linear solver.
+    """
+
+    bounds: tuple[tuple[float, float], ...]
+    grid_spacing: Annotated[float, Field(gt=0)]
+    frame_dt: Annotated[float, Field(gt=0)] = 5e-3
+    materials: tuple[str, ...] = (MATERIAL,)
+    density: Annotated[float, Field(gt=0)] = 1000.0
+    pic: Annotated[float, Field(ge=0, le=1)] = 0.05
+    evening: Annotated[float, Field(ge=0, le=1)] = 0.4
+    cfl: Annotated[float, Field(gt=0, le=1)] = 1.0
+    max_substeps: Annotated[int, Field(ge=1)] = 200
+    pressure_tolerance: Annotated[float, Field(gt=0)] = 1e-6
+    viscosity_tolerance: Annotated[float, Field(gt=0)] = 1e-6
+    max_iterations: Annotated[int, Field(ge=1)] = 2000
+
+    name: ClassVar[str] = "flip"
+    version: ClassVar[str] = "1"
+
+    def __post_init__(self) -> None:
+        if len(self.bounds) not in (2, 3):
+            raise ValueError(f"bounds must have 2 or 3 axes, got {len(self.bounds)}")
+        for axis, (low, high) in enumerate(self.bounds):
+            cells = (high - low) / self.grid_spacing
+            if not (math.isfinite(cells) and cells > 0.5 and abs(cells - round(cells)) < 1e-6 * cells):
+                raise ValueError(
+                    f"bounds[{axis}] = ({low}, {high}) must span a whole number of grid cells of {self.grid_spacing} m, got {cells:g}"
+                )
+        if self.materials != (MATERIAL,):
+            raise ValueError(f"FLIP simulates materials ({MATERIAL!r},) only, got {self.materials}")
+
+    @property
+    def solver_dt(self) -> float:
+        """Largest substep in s."""
+        return self.frame_dt
+
+    def compile_kernels(self) -> None:
+        """Compile every kernel and fill Numba's cache on disk, so that worker processes started afterwards only load it; good for 2D and 3D."""
+        bounds = ((0.0, 1.0), (0.0, 1.0))
+        boundary = Boundary.sample(domain_walls(bounds, 0.0), 0.25, 2)
+        # a cell full of liquid in a corner, so that no step is left out
+        state = State(
+            np.full((4, 2), 0.1), np.zeros((4, 2)), np.full(4, node_code(MATERIAL), np.uint8), np.full(4, 15.0), np.full((4, 1), 0.1), boundary,
+            np.array([0.0, -9.81]),
+        )  # fmt: skip
+        FLIP(bounds=bounds, grid_spacing=0.25).step(state)
+
+    def step(self, state: State) -> State:
+        """Advance one frame.
+
+        Raises:
+            SimulationError: with reason ``input`` (arrays or boundaries that do not fit the solver), ``nan``, ``escape`` (a particle left the domain
+                through an open side or started outside) or ``explosion`` (more than ``max_substeps``, or a linear system that could not be solved).
+        """
+        viscosity_of_node = self._check(state)
+        solids = self.solids(state.boundary)
+        # np.array copies: the kernels work in place and the caller's arrays must not change
+        pos, vel = np.array(state.pos, dtype=np.float64, order="C"), np.array(state.vel, dtype=np.float64, order="C")
+        gravity, mass = np.array(state.gravity, dtype=np.float64), np.array(state.mass, dtype=np.float64)
+        grid = self.bounds, self.grid_spacing
+        fields = _idle.pop(grid, None) or Fields.empty(self.grid)
+        remaining, substeps = self.frame_dt, 0
+        while remaining > 0.0:
+            h = self._substep(pos, vel, gravity, remaining, substeps)
+            self._advance(pos, vel, mass, viscosity_of_node, gravity, h, solids, fields)
+            remaining = remaining - h if h < remaining else 0.0
+            substeps += 1
+        _idle.clear()
+        _idle[grid] = fields
+        self._survey(pos, vel)
+        self._leave_solids(state.boundary, solids, pos, vel)
+        return replace(
+            state, pos=pos, vel=vel, velocity_history=None, time=state.time + self.frame_dt, num_substeps=substeps, internal=None
+        )
+
+    def rasterize(
+        self, pos: np.ndarray, vel: np.ndarray, mass: np.ndarray, viscosity_of_node: np.ndarray, solids: Solids, fields: Fields
+    ) -> np.ndarray:
+        """Transfer the particles to empty ``fields``; returns the active cells in ascending order."""
+        grid = self.grid
+        volume = mass / (self.density * grid.spacing**grid.dim)
+        transfer.scatter(
+            pos, vel, volume, viscosity_of_node, grid.origin, 1.0 / grid.spacing, grid.strides, grid.counts, grid.corners,
+            fields.velocity, fields.weight, fields.density, fields.viscous, fields.touched,
+        )  # fmt: skip
+        active = np.flatnonzero(fields.touched)
+        transfer.normalize(
+            active, solids.cell_room, solids.face_room, HALF, fields.velocity, fields.old, fields.weight, fields.density, fields.viscous
+        )
+        pressure.extend_into_solids(
+            active, grid.strides, solids.area, solids.cell_room, HALF, fields.density, fields.viscous, fields.touched
+        )
+        return np.flatnonzero(fields.touched)
+
+    def diffuse(self, active: np.ndarray, solids: Solids, fields: Fields, h: float) -> None:
+        """Let viscosity act on the grid's velocities for a time h [s]."""
+        grid = self.grid
+        axes, cells = viscosity.viscous_faces(active, solids.face_distance, fields.weight, fields.viscous_face)
+        diagonal, start, column, value, right = viscosity.viscosity_system(
+            axes, cells, fields.viscous_face, grid.strides, solids.is_open, solids.face_distance, fields.weight, fields.viscous, fields.velocity,
+            h / grid.spacing**2,
+        )  # fmt: skip
+        u = fields.velocity[axes, cells]
+        tolerance = self.viscosity_tolerance * float(np.max(np.abs(u), initial=0.0))
+        inverse = incomplete_cholesky(diagonal, start, column, value, 0.0)
+        iterations, residual = conjugate_gradients(diagonal, start, column, value, right, inverse, u, tolerance, self.max_iterations)
+        self._require_converged("viscosity", iterations, residual, tolerance)
+        fields.velocity[axes, cells] = u
+        viscosity.drag_on_solids(
+            active, grid.strides, solids.area, solids.face_distance, fields.density, fields.viscous, fields.velocity, h / grid.spacing**2
+        )
+
+    def project(self, liquid: Liquid, solids: Solids, fields: Fields, h: float) -> np.ndarray:
+        """Make the grid's velocities free of divergence; returns the pressure [liquid] in Pa that this takes over a time h [s]."""
+        pressure.fill_open_faces(liquid.cells, self.grid.strides, solids.area, fields.weight, fields.velocity, TOUCH)
+        right = pressure.inflow(liquid.cells, self.grid.strides, solids.area, fields.velocity)
+        tolerance = self.pressure_tolerance * self.grid_spacing / h
+        return self.density * self.grid_spacing / h * self._correct("pressure", liquid, right, tolerance, solids, fields, fields.velocity)
+
+    def even_out(self, liquid: Liquid, solids: Solids, fields: Fields, h: float) -> None:
+        """Find the shift that expands cells with too many particles and contracts those with too few (Kugelstadt et al. 2019)."""
+        if np.all(liquid.is_free):
+            return
+        excess = pressure.excess_density(liquid.cells, fields.liquid, self.grid.strides, solids.is_open, fields.density, LARGEST_EXCESS)
+        share = _share(self.evening, h) * self.grid_spacing
+        right = np.where(liquid.is_free, 0.0, share * solids.cell_room[liquid.cells] * excess)
+        self._correct("density", liquid, right, DENSITY_TOLERANCE * share, solids, fields, fields.shift)
+
+    def _correct(
+        self, what: str, liquid: Liquid, right: np.ndarray, tolerance: float, solids: Solids, fields: Fields, target: np.ndarray
+    ) -> np.ndarray:
+        """Subtract from ``target`` on faces the gradient whose divergence is ``right``; returns its potential."""
+        for label in np.unique(liquid.closed[liquid.closed >= 0]):  # what a closed space cannot take is shared out
+            right[liquid.closed == label] -= np.mean(right[liquid.closed == label])
+        x = np.zeros(len(right))
+        iterations, residual = conjugate_gradients(*liquid.matrix, right, liquid.inverse, x, tolerance, self.max_iterations)
+        self._require_converged(what, iterations, residual, tolerance)
+        pressure.subtract_gradient(liquid.cells, fields.liquid, self.grid.strides, solids.area, fields.density, x, target)
+        return x
+
+    def liquid(self, active: np.ndarray, solids: Solids, fields: Fields) -> tuple[Liquid, np.ndarray]:
+        """Number the liquid cells; the second result says for each label of ``fields.island`` whether that island touches no solid."""
+        strides = self.grid.strides
+        cells = pressure.liquid_cells(active, solids.is_open, fields.density, fields.liquid)
+        is_free, is_closed = islands.find_islands(active, strides, solids.area, fields.density, fields.weight, fields.liquid, fields.island)
+        matrix = pressure.pressure_matrix(cells, fields.liquid, strides, solids.area, fields.density)
+        inverse = incomplete_cholesky(*matrix, MODIFIED)
+        island = fields.island[cells]
+        return Liquid(cells, is_free[island], np.where(is_closed[island], island, -1), matrix, inverse), is_free
+
+    @property
+    def grid(self) -> Grid:
+        """The solver's grid."""
+        return make_grid(self.bounds, self.grid_spacing)
+
+    def solids(self, boundary: Boundary) -> Solids:
+        """The boundary on the solver's grid."""
+        if np.any(np.asarray(boundary.vel) != 0) or np.any(np.asarray(boundary.restitution) != 0):
+            raise SimulationError("FLIP supports only boundaries at rest and without restitution", reason="input")
+        return make_solids(tuple(boundary.shapes), self.bounds, self.grid_spacing)
+
+    def _advance(
+        self, pos: np.ndarray, vel: np.ndarray, mass: np.ndarray, viscosity_of_node: np.ndarray, gravity: np.ndarray, h: float,
+        solids: Solids, fields: Fields,
+    ) -> None:  # fmt: skip
+        """Advance pos and vel in place by one substep; ``fields`` are empty before and after."""
+        grid = self.grid
+        active = self.rasterize(pos, vel, mass, viscosity_of_node, solids, fields)
+        transfer.add_impulse(active, h * gravity, fields.weight, fields.velocity)
+        liquid, is_free = self.liquid(active, solids, fields)
+        # viscosity must not see the part of gravity that pressure balances: it would drag a liquid at rest along the walls
+        self.project(liquid, solids, fields, h)
+        self.diffuse(active, solids, fields, h)
+        self.project(liquid, solids, fields, h)
+        self.even_out(liquid, solids, fields, h)
+        transfer.extend_into_solids(
+            active, grid.origin, grid.spacing, grid.strides, grid.counts, grid.corners, solids.distance, solids.face_distance, fields.weight,
+            fields.velocity,
+        )  # fmt: skip
+        flying = islands.Flying.select(fields.island[self._cell(pos)], is_free, pos, vel, mass)
+        transfer.gather(
+            pos, vel, grid.origin, grid.spacing, grid.strides, grid.counts, grid.corners, fields.old, fields.velocity, fields.shift,
+            fields.weight, _share(self.pic, h), h,
+        )  # fmt: skip
+        flying.balance(pos, vel, gravity, h)
+        transfer.push_out(pos, vel, grid.origin, grid.spacing, grid.strides, grid.counts, grid.corners, solids.distance)
+        transfer.clear(
+            active, grid.strides, fields.velocity, fields.old, fields.shift, fields.weight, fields.density, fields.viscous, fields.touched,
+            fields.liquid, fields.viscous_face,
+        )  # fmt: skip
+
+    def _leave_solids(self, boundary: Boundary, solids: Solids, pos: np.ndarray, vel: np.ndarray) -> None:
+        """Move particles out of the exact shapes, which the grid only interpolates; walls last, so that they always hold."""
+        near = np.flatnonzero(solids.distance[self._cell(pos)] < NEAR)
+        rows = near[signed_distance(boundary.shapes, pos[near]) < 0.0]
+        if len(rows) == 0:
+            return
+        moved, velocity = pos[rows], vel[rows]
+        for _ in range(4):  # corners need a pass per surface
+            for shape in sorted(boundary.shapes, key=lambda shape: isinstance(shape, Wall)):
+                depth = np.maximum(0.0, -shape.signed_distance(moved))[:, None]
+                normal = outward_normal(shape, moved, 1e-3 * self.grid_spacing)
+                moved += depth * normal
+                inward = np.minimum(0.0, np.sum(velocity * normal, axis=1))[:, None]
+                velocity -= np.where(depth > 0, inward, 0.0) * normal
+        pos[rows], vel[rows] = moved, velocity
+
+    def _cell(self, pos: np.ndarray) -> np.ndarray:
+        """The cell of each particle [node]."""
+        return ((pos - self.grid.origin) / self.grid_spacing).astype(np.int64) @ self.grid.strides
+
+    def _substep(self, pos: np.ndarray, vel: np.ndarray, gravity: np.ndarray, remaining: float, done: int) -> float:
+        """Duration of the next substep in s, of equal ones for the rest of the frame."""
+        fastest, speed = self._survey(pos, vel)
+        reach = self.cfl * self.grid_spacing
+        with np.errstate(over="ignore"):
+            fall = float(np.linalg.norm(gravity))
+        # neither a particle that keeps its speed nor one that falls from rest goes further than it may
+        needed = remaining * max(speed / reach, math.sqrt(fall / (2.0 * reach))) * (1.0 - 1e-12)
+        if needed > self.max_substeps - done:
+            message = f"{_describe(fastest, pos, vel)} under gravity {gravity.tolist()} m/s² would need more than {self.max_substeps} substeps in one frame"
+            raise SimulationError(message, reason="explosion", node=fastest)
+        return remaining / max(1, math.ceil(needed))
+
+    def _survey(self, pos: np.ndarray, vel: np.ndarray) -> tuple[int, float]:
+        """The fastest particle and its speed, or an error that names a particle that is not finite or outside the domain."""
+        if len(pos) == 0:
+            return -1, 0.0
+        with np.errstate(over="ignore", invalid="ignore"):
+            square = np.einsum("ij,ij->i", vel, vel)
+            finite = np.isfinite(square) & np.isfinite(pos.sum(axis=1))
+        low, high = np.array(self.bounds).T
+        outside = np.any((pos < low - self.grid_spacing) | (pos > high + self.grid_spacing), axis=1)
+        for bad, reason, complaint in ((~finite, "nan", "is not finite"), (outside, "escape", f"is outside the domain {self.bounds}")):
+            if np.any(bad):
+                node = int(np.argmax(bad))
+                raise SimulationError(f"{_describe(node, pos, vel)} {complaint}", reason=reason, node=node)
+        fastest = int(np.argmax(square))
+        return fastest, math.sqrt(square[fastest])
+
+    def _require_converged(self, what: str, iterations: int, residual: float, tolerance: float) -> None:
+        if not residual <= tolerance:
+            message = (
+                f"the {what} system has a residual of {residual:.3g} m/s after {iterations} iterations, above the tolerance of {tolerance:.3g} m/s; "
+                "use a shorter frame_dt or a coarser grid, or raise max_iterations or the tolerance"
+            )
+            raise SimulationError(message, reason="explosion")
+
+    def _check(self, state: State) -> np.ndarray:
+        """Kinematic viscosity per particle, or an error that names what does not fit."""
+        num_nodes, dim = state.num_nodes, len(self.bounds)
+        parameter = MATERIALS[MATERIAL]
+        shapes = {
+            "pos": (state.pos, (num_nodes, dim)),
+            "vel": (state.vel, (num_nodes, dim)),
+            "mass": (state.mass, (num_nodes,)),
+            "node_type": (state.node_type, (num_nodes,)),
+            "material_params": (state.material_params, (num_nodes, len(param_names(self.materials)))),
+            "gravity": (state.gravity, (dim,)),
+            "boundary.pos": (state.boundary.pos, (len(state.boundary.pos), dim)),
+        }
+        for name, (array, expected) in shapes.items():
+            if np.shape(array) != expected:
+                raise SimulationError(f"{name} has shape {np.shape(array)}, expected {expected}", reason="input")
+        if state.internal is not None:
+            raise SimulationError(f"internal state is of type {type(state.internal).__name__}, expected None", reason="input")
+        _require(np.isfinite(state.mass), "mass is not finite", reason="nan")
+        if not np.all(np.isfinite(state.gravity)):
+            raise SimulationError(f"gravity {state.gravity} is not finite", reason="nan")
+        _require(np.asarray(state.mass) > 0, "mass is not positive")
+        known = np.asarray(state.node_type) == node_code(MATERIAL)
+        _require(known, f"node_type is none of the solver's materials {MATERIAL} (codes of {', '.join(NODE_TYPES)})")
+        values = np.array(state.material_params, dtype=np.float64)[:, 0]
+        in_range = (values >= parameter.low) & (values <= parameter.high)
+        _require(in_range, f"{parameter.name} is outside [{parameter.low:g}, {parameter.high:g}] {parameter.unit}")
+        return np.ascontiguousarray(values)
+
+
+def _share(share: float, h: float) -> float:
+    """What a share per ``SHARE_TIME`` becomes in a time h [s]."""
+    return float(1.0 - (1.0 - share) ** (h / SHARE_TIME))
+
+
+def _require(good: np.ndarray, message: str, reason: str = "input") -> None:
+    if not np.all(good):
+        node = int(np.argmin(good))
+        raise SimulationError(f"{message} (node {node})", reason=reason, node=node)
+
+
+def _describe(node: int, pos: np.ndarray, vel: np.ndarray) -> str:
+    return "a state without nodes" if node < 0 else f"node {node} at {pos[node].tolist()} m with velocity {vel[node].tolist()} m/s"

@@ -1,0 +1,329 @@
+"""Seeded random scenes of liquid: a spherical bowl, a dam break, and a canyon with a waterfall. The last axis points up."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+from scipy.spatial import cKDTree
+
+from gpe_pl.geometry import Bowl, Box, DistanceGrid, Shape, domain_walls, signed_distance
+from gpe_pl.schema import STICKY, node_code
+from gpe_pl.solvers.scenes import JITTER, MAX_ATTEMPTS
+from gpe_pl.terrain import Bounds, Fit, Solid, Up, canyon, read_terrain
+from gpe_pl.trajectory import Boundary, State
+
+PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegativeFloat = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+CLEARANCE = 0.25
+"""Smallest distance of a particle from a solid at the start, in spacings; a jittered lattice beside a wall just keeps it."""
+
+
+@dataclass(frozen=True, config={"extra": "forbid"})
+class TerrainOptions:
+    """How ``read_terrain`` takes a terrain file; its documentation says what they mean."""
+
+    fit: Fit = "contain"
+    up: Up = "z"
+    solid: Solid = "auto"
+    relief: PositiveFloat | None = None
+
+
+@dataclass(frozen=True, config={"extra": "forbid"})
+class FluidScene:
+    """Distribution of scenes with liquid.
+
+    Attributes:
+        scene: ``bowl``, liquid that falls into a closed sphere (2D: circle) one cell narrower than the domain; ``dam_break``, a column that
+            collapses from one side of a box; ``canyon``, a reservoir that runs down a river bed and over a waterfall (3D).
+        bounds: ``(low, high)`` per axis of the domain [m].
+        grid_spacing: of the solver [m].
+        num_particles: exact number in every scene.
+        particles_per_cell: along each axis; the rest spacing is ``grid_spacing / particles_per_cell``.
+        density: [kg/m³].
+        gravity: [m/s²].
+        friction: of all solids; ``schema.STICKY`` is no-slip, 0 slips freely.
+        connectivity_cells: recommended connectivity radius in grid cells.
+        max_bodies: in the bowl; their number is uniform in 1 … max_bodies.
+        max_speed: of a body in the bowl along each axis [m/s]; upward at most a quarter of it.
+        column_aspect: range of height / width of the column of the dam break.
+        max_obstacles: boxes on the floor of the dam break; their number is uniform in 0 … max_obstacles.
+        terrain: mesh, point cloud or height map for the canyon instead of a random one, relative to the working directory.
+        terrain_options: how to take that file.
+        reservoir: region ``(low, high)`` per axis [m] where the water of the canyon starts: within the range of x from low x on, from its lowest free
+            place up. By default that of the random canyon; on terrain of a file, the third of the domain at low x.
+    """
+
+    scene: Literal["bowl", "dam_break", "canyon"]
+    bounds: tuple[tuple[float, float], ...]
+    grid_spacing: PositiveFloat
+    num_particles: Annotated[int, Field(ge=1)]
+    particles_per_cell: Annotated[int, Field(ge=1)] = 2
+    density: PositiveFloat = 1000.0
+    gravity: tuple[float, ...] = (0.0, 0.0, -9.81)
+    friction: NonNegativeFloat = STICKY
+    connectivity_cells: PositiveFloat = 1.5
+    max_bodies: Annotated[int, Field(ge=1)] = 2
+    max_speed: NonNegativeFloat = 1.0
+    column_aspect: tuple[PositiveFloat, PositiveFloat] = (0.5, 2.0)
+    max_obstacles: Annotated[int, Field(ge=0)] = 0
+    terrain: str | None = None
+    terrain_options: TerrainOptions = TerrainOptions()
+    reservoir: tuple[tuple[float, float], ...] | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.bounds) not in (2, 3) or len(self.gravity) != len(self.bounds):
+            raise ValueError(f"bounds need 2 or 3 axes and gravity as many components, got bounds {self.bounds} and gravity {self.gravity}")
+        if not np.isfinite(self.bounds).all() or any(not high > low for low, high in self.bounds):
+            raise ValueError(f"bounds must be (low, high) with low < high, got {self.bounds}")
+        if not np.isfinite(self.gravity).all():
+            raise ValueError(f"gravity must be finite, got {self.gravity}")
+        if self.scene == "canyon" and self.dim != 3:
+            raise ValueError(f"scene='canyon' needs bounds of 3 axes, got {self.bounds}")
+        if self.scene != "canyon" and (self.terrain is not None or self.reservoir is not None):
+            raise ValueError(f"terrain and reservoir belong to scene='canyon', not to scene={self.scene!r}")
+        if self.reservoir is not None and (len(self.reservoir) != self.dim or any(not high > low for low, high in self.reservoir)):
+            raise ValueError(f"reservoir must be (low, high) with low < high along {self.dim} axes, got {self.reservoir}")
+        if self.column_aspect[0] > self.column_aspect[1]:
+            raise ValueError(f"column_aspect must be (low, high) with low <= high, got {self.column_aspect}")
+        narrowest = min(high - low for low, high in self.bounds)
+        if narrowest < 4 * self.grid_spacing:
+            raise ValueError(f"bounds {self.bounds} must be at least 4 cells of grid_spacing = {self.grid_spacing} wide")
+
+    @property
+    def dim(self) -> int:
+        return len(self.bounds)
+
+    @property
+    def spacing(self) -> float:
+        """Rest spacing of particles in m."""
+        return self.grid_spacing / self.particles_per_cell
+
+    @property
+    def connectivity_radius(self) -> float:
+        """Recommended neighbour radius of a learned simulator in m."""
+        return self.connectivity_cells * self.grid_spacing
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        return ("fluid",)
+
+    @property
+    def max_nodes(self) -> int:
+        """Largest number of dynamic nodes of a scene."""
+        return self.num_particles
+
+    @property
+    def max_cells(self) -> int:
+        return 0
+
+    @property
+    def input_files(self) -> tuple[str, ...]:
+        return () if self.terrain is None else (self.terrain,)
+
+    def sample(self, values: Mapping[str, float], seed: int) -> State:
+        """Draw a scene: a pure function of configuration, values, seed and, where there is one, the content of the terrain file.
+
+        Args:
+            values: of ``fluid``, the kinematic viscosity [m²/s].
+            seed: non-negative integer.
+
+        Returns:
+            State at time 0 with exactly ``num_particles`` particles in random order, float64.
+
+        Raises:
+            ValueError: the liquid does not fit, or the terrain cannot be used.
+        """
+        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
+        shapes, pos, vel = {"bowl": _bowl, "dam_break": _dam_break, "canyon": _canyon}[self.scene](self, rng)
+        order = rng.permutation(self.num_particles)  # labels must not tell where a particle started
+        return State(
+            pos=np.ascontiguousarray(pos[order]),
+            vel=np.ascontiguousarray(vel[order]),
+            node_type=np.full(self.num_particles, node_code("fluid"), dtype=np.uint8),
+            mass=np.full(self.num_particles, self.density * self.spacing**self.dim),
+            material_params=np.full((self.num_particles, 1), float(values["fluid"])),
+            boundary=Boundary.sample(shapes, self.spacing, self.dim),
+            gravity=np.array(self.gravity, dtype=np.float64),
+        )
+
+
+Sampled = tuple[tuple[Shape, ...], np.ndarray, np.ndarray]
+"""Solids, positions [node, dim] and velocities [node, dim]."""
+
+
+def _bowl(config: FluidScene, rng: np.random.Generator) -> Sampled:
+    low, high = np.array(config.bounds).T
+    center, radius = (low + high) / 2, float(np.min(high - low)) / 2 - config.grid_spacing
+    bowl = Bowl(tuple(float(x) for x in center), radius, config.friction)
+    room = {2: math.pi, 3: 4 / 3 * math.pi}[config.dim] * max(0.0, radius - config.spacing) ** config.dim
+    for _ in range(MAX_ATTEMPTS if config.num_particles * config.spacing**config.dim < room else 0):
+        number = int(rng.integers(1, config.max_bodies + 1))
+        share = rng.dirichlet(np.full(number, 4.0))
+        counts = np.diff(np.round(np.concatenate([[0.0], np.cumsum(share)]) * config.num_particles)).astype(int)
+        bodies = [_body(int(count), config, rng) for count in counts[counts > 0]]
+        placed = _placed(bodies, bowl, config, rng)
+        if placed is not None:
+            vel = [np.broadcast_to(_velocity(config, rng), body.shape) for body in placed]
+            return (*domain_walls(config.bounds, config.friction), bowl), np.concatenate(placed), np.concatenate(vel)
+    raise ValueError(
+        f"no room for {config.num_particles} particles of spacing {config.spacing:g} m in up to {config.max_bodies} bodies in a bowl of radius {radius:g} m; "
+        "lower num_particles, grid_spacing or max_bodies"
+    )
+
+
+def _placed(bodies: list[np.ndarray], bowl: Bowl, config: FluidScene, rng: np.random.Generator) -> list[np.ndarray] | None:
+    """The bodies at random places in the bowl, a cell away from each other, or None where this fails."""
+    placed: list[np.ndarray] = []
+    center = np.array(bowl.center)
+    for body in bodies:
+        reach = bowl.radius - float(np.max(np.linalg.norm(body, axis=-1)))
+        if reach <= config.spacing:
+            return None
+        for _ in range(10):
+            body_pos = body + center + reach * rng.uniform(-1.0, 1.0, config.dim)
+            inside = np.all(bowl.signed_distance(body_pos) > config.spacing)
+            if inside and all(cKDTree(other).query(body_pos)[0].min() > config.grid_spacing for other in placed):
+                placed.append(body_pos)
+                break
+        else:
+            return None
+    return placed
+
+
+def _velocity(config: FluidScene, rng: np.random.Generator) -> np.ndarray:
+    """Velocity of a body [dim] in m/s: any horizontal direction, mostly downward."""
+    return config.max_speed * np.array([*rng.uniform(-1.0, 1.0, config.dim - 1), rng.uniform(-1.0, 0.25)])
+
+
+def _body(count: int, config: FluidScene, rng: np.random.Generator) -> np.ndarray:
+    """``count`` points [count, dim] of a jittered lattice that fill a ball or a randomly turned box around the origin."""
+    dim = config.dim
+    gauge: Callable[[np.ndarray], np.ndarray]
+    if rng.random() < 0.5:
+        longest = 1.0
+
+        def gauge(x: np.ndarray) -> np.ndarray:
+            return np.linalg.norm(x, axis=-1)
+    else:
+        stretch = np.exp(rng.uniform(-0.25, 0.25, dim))
+        stretch = stretch / np.prod(stretch) ** (1 / dim)
+        longest = float(stretch.max())
+
+        def gauge(x: np.ndarray) -> np.ndarray:
+            return np.max(np.abs(x) / stretch, axis=-1)
+
+    reach = math.ceil(0.75 * longest * count ** (1 / dim)) + 2
+    points = _lattice(np.full(dim, -reach), np.full(dim, reach), rng) + rng.uniform(-0.5, 0.5, dim)
+    kept = points[np.argsort(gauge(points), kind="stable")[:count]]
+    rotation, upper = np.linalg.qr(rng.normal(size=(dim, dim)))
+    return config.spacing * kept @ (rotation * np.sign(np.diag(upper))).T
+
+
+def _lattice(first: np.ndarray, last: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Jittered points [point, dim] around the integer points from ``first`` to ``last``."""
+    axes = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
+    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+    return lattice + rng.uniform(-JITTER, JITTER, lattice.shape)
+
+
+def _filling(config: FluidScene, region: Bounds, rng: np.random.Generator) -> np.ndarray:
+    """Jittered points of the rest spacing [point, dim] in a box, half a spacing away from its low sides."""
+    low, high = np.array(region, float).T
+    number = np.floor((high - low) / config.spacing + 1e-6)
+    if np.any(number < 1):
+        return np.empty((0, config.dim))
+    return low + config.spacing * (_lattice(np.zeros(config.dim), number - 1, rng) + 0.5)
+
+
+def _dam_break(config: FluidScene, rng: np.random.Generator) -> Sampled:
+    """The column stands at the low or high side along x and, in 3D, reaches across."""
+    low, high = np.array(config.bounds).T
+    room = high - low
+    face = config.num_particles * config.spacing**config.dim / float(np.prod(room[1:-1]))  # width times height
+    # a rim of one spacing, because the lattice seldom divides the domain
+    widest, tallest = 0.8 * room[0], room[-1] - config.spacing
+    least, most = max(config.column_aspect[0], face / widest**2), min(config.column_aspect[1], tallest**2 / face)
+    if least > most:
+        raise ValueError(
+            f"no room for a column of {config.num_particles} particles of spacing {config.spacing:g} m with "
+            f"column_aspect {config.column_aspect} in {config.bounds}; lower num_particles, or change column_aspect or bounds"
+        )
+    aspect, mirrored = math.exp(rng.uniform(math.log(least), math.log(most))), bool(rng.random() < 0.5)
+    width = math.sqrt(face / aspect)
+    points = _filling(config, config.bounds, rng)
+    gauge = np.maximum((points[:, 0] - low[0]) / width, (points[:, -1] - low[-1]) / (aspect * width))
+    if len(points) < config.num_particles:
+        raise ValueError(
+            f"{config.num_particles} particles of spacing {config.spacing:g} m do not fit into {config.bounds}, at most {len(points)}"
+        )
+    pos = points[np.argsort(gauge, kind="stable")[: config.num_particles]]
+    shapes: tuple[Shape, ...] = (*domain_walls(config.bounds, config.friction), *_obstacles(config, float(pos[:, 0].max()), rng))
+    if mirrored:
+        pos[:, 0] = low[0] + high[0] - pos[:, 0]
+        shapes = tuple(_mirrored(shape, float(low[0] + high[0])) if isinstance(shape, Box) else shape for shape in shapes)
+    return shapes, pos, np.zeros_like(pos)
+
+
+def _mirrored(box: Box, twice_middle: float) -> Box:
+    return Box((twice_middle - box.high[0], *box.low[1:]), (twice_middle - box.low[0], *box.high[1:]), box.friction, box.restitution)
+
+
+def _obstacles(config: FluidScene, start: float, rng: np.random.Generator) -> list[Box]:
+    """Boxes on the floor beyond x = ``start``, two cells away from the liquid, from each other and from the walls that they do not stand on."""
+    low, high = np.array(config.bounds).T
+    gap, boxes = 2.0 * config.grid_spacing, list[Box]()
+    for _ in range(rng.integers(config.max_obstacles + 1)):
+        size = np.maximum(gap, rng.uniform(0.1, 0.25, config.dim) * np.min(high - low))
+        corner = np.array([start + gap, *(low[1:] + gap)])
+        room = high - gap - size - corner
+        share = rng.random(config.dim)
+        if np.any(room < 0):
+            continue
+        corner = corner + share * room
+        corner[-1], size[-1] = low[-1] - gap, size[-1] + gap  # through the floor: no water gets under it
+        if any(np.all(corner < np.array(b.high) + gap) and np.all(corner + size > np.array(b.low) - gap) for b in boxes):
+            continue
+        boxes.append(Box(tuple(float(x) for x in corner), tuple(float(x) for x in corner + size), config.friction))
+    return boxes
+
+
+def _canyon(config: FluidScene, rng: np.random.Generator) -> Sampled:
+    """Water fills the region of the reservoir from its headwall and its lowest place on, in equal shares of its length and height."""
+    bounds = config.bounds
+    if config.terrain is None:
+        made = canyon(int(rng.integers(2**32)), bounds, config.grid_spacing, config.friction)
+        terrain, region = made.terrain, config.reservoir or made.reservoir
+    else:
+        path = Path(config.terrain)
+        stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else (0, 0)
+        terrain = _read(str(path.absolute()), stamp, bounds, config.grid_spacing, config.terrain_options, config.friction)
+        first, last = bounds[0]
+        region = config.reservoir or ((first, first + (last - first) / 3), *bounds[1:])
+    shapes: tuple[Shape, ...] = (*domain_walls(bounds, config.friction), terrain)
+    points = _filling(config, tuple((max(a, low), min(b, high)) for (a, b), (low, high) in zip(region, bounds, strict=True)), rng)
+    points = points[signed_distance(shapes, points) > CLEARANCE * config.spacing * (1 - 1e-6)]
+    if len(points) < config.num_particles:
+        raise ValueError(
+            f"{config.num_particles} particles of spacing {config.spacing:g} m do not fit into the reservoir {region}, at most {len(points)}; "
+            "lower num_particles or grid_spacing, or give a larger reservoir"
+        )
+    corner = np.array([region[0][0], points[:, -1].min()])
+    extent = np.array([region[0][1], region[-1][1]]) - corner
+    gauge = np.max((points[:, [0, -1]] - corner) / extent, axis=-1)
+    pos = points[np.argsort(gauge, kind="stable")[: config.num_particles]]
+    return shapes, pos, np.zeros_like(pos)
+
+
+@functools.lru_cache(maxsize=4)
+def _read(path: str, stamp: tuple[int, int], bounds: Bounds, spacing: float, options: TerrainOptions, friction: float) -> DistanceGrid:
+    """``read_terrain``, once per content of the file (``stamp``) and not once per scene."""
+    return read_terrain(path, bounds, spacing, friction=friction, **asdict(options))  # type: ignore[call-overload]

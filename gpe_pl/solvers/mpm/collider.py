@@ -1,0 +1,297 @@
+"""Walls and rigid obstacles of the material point method: conditions on the grid, and surfaces that no particle passes.
+
+Grid nodes inside a shape obey its boundary condition. A particle that still gets into a shape moves to its surface and loses the inward part of its
+velocity: planes, balls, boxes and polygons are exact; any other shape is sampled at the grid nodes and interpolated (multilinear), which is exact where it
+is flat and off by up to ``Δ² / 4R`` where its radius of curvature is R.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from numba import njit
+
+from gpe_pl.geometry import Box, Polygon, Shape, Sphere, Wall, outward_normal, signed_distance
+from gpe_pl.rollout import SimulationError
+from gpe_pl.schema import STICKY
+
+
+class Collider(NamedTuple):
+    """Boundary shapes in the form that the kernels take; a grid node is its index in C order.
+
+    Attributes:
+        row: row of ``conditions`` for each grid node, -1 in free space.
+        conditions: [row, k, dim + 1] normal and friction of the k-th shape that holds the node; friction < 0: none.
+        distance: signed distance of each grid node to the nearest shape [m].
+        planes: [wall, dim + 1] normal and offset.
+        balls: [ball, dim + 1] centre and radius.
+        boxes: [box, 2, dim] low and high corner.
+        vertices: [vertex, 2] of all polygons, counter-clockwise, one after the other.
+        first_vertex: [polygon + 1] where each polygon starts.
+        sampled: [shape, node, dim + 1] signed distance and outward normal of every other shape.
+    """
+
+    row: np.ndarray
+    conditions: np.ndarray
+    distance: np.ndarray
+    planes: np.ndarray
+    balls: np.ndarray
+    boxes: np.ndarray
+    vertices: np.ndarray
+    first_vertex: np.ndarray
+    sampled: np.ndarray
+
+
+@lru_cache(maxsize=8)
+def collider(shapes: tuple[Shape, ...], origin: tuple[float, ...], spacing: float, counts: tuple[int, ...]) -> Collider:
+    """Prepare shapes for a grid.
+
+    Args:
+        shapes: walls and obstacles.
+        origin: position of the first grid node [m].
+        spacing: of the grid [m].
+        counts: number of nodes along each axis.
+
+    Raises:
+        SimulationError: with reason ``input`` for a shape of another dimension, or one that the grid does not resolve.
+    """
+    dim = len(counts)
+    axes = [o + spacing * np.arange(n) for o, n in zip(origin, counts, strict=True)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dim)
+    tolerance = 1e-9 * spacing  # a node on a wall belongs to the wall whatever the rounding
+    inside = [_distance(shape, nodes) <= tolerance for shape in shapes]
+    depth = np.sum(inside, axis=0) if shapes else np.zeros(len(nodes), dtype=np.int64)
+    held = np.nonzero(depth)[0]
+    row = np.full(len(nodes), -1, dtype=np.int64)
+    row[held] = np.arange(len(held))
+    conditions = np.full((len(held), max(1, int(depth.max())), dim + 1), -1.0)
+    filled = np.zeros(len(held), dtype=np.int64)
+    planes, balls, boxes, sampled = [], [], [], []
+    vertices: list[tuple[float, float]] = []
+    first_vertex = [0]
+    for shape, mask in zip(shapes, inside, strict=True):
+        if not isinstance(shape, Wall):
+            _require_resolved(shape, mask, spacing, dim)
+        normal = outward_normal(shape, nodes[mask], 1e-3 * spacing)
+        # deep inside a shape, where no direction leads out, the node sticks
+        friction = np.where(np.sum(normal * normal, axis=-1) > 0, shape.friction, STICKY)
+        at = row[mask]
+        conditions[at, filled[at]] = np.concatenate([normal, friction[:, None]], axis=-1)
+        filled[at] += 1
+        if isinstance(shape, Wall):
+            planes.append([*shape.normal, shape.offset])
+        elif isinstance(shape, Sphere):
+            balls.append([*shape.center, shape.radius])
+        elif isinstance(shape, Box):
+            boxes.append([shape.low, shape.high])
+        elif isinstance(shape, Polygon):
+            vertices.extend(shape.vertices)
+            first_vertex.append(len(vertices))
+        else:
+            distance = np.asarray(shape.signed_distance(nodes))
+            sampled.append(np.concatenate([distance[:, None], outward_normal(shape, nodes, 1e-3 * spacing)], axis=-1))
+    return Collider(
+        row,
+        conditions,
+        signed_distance(shapes, nodes),
+        np.array(planes, dtype=np.float64).reshape(-1, dim + 1),
+        np.array(balls, dtype=np.float64).reshape(-1, dim + 1),
+        np.array(boxes, dtype=np.float64).reshape(-1, 2, dim),
+        np.array(vertices, dtype=np.float64).reshape(-1, 2),
+        np.array(first_vertex, dtype=np.int64),
+        np.array(sampled, dtype=np.float64).reshape(-1, len(nodes), dim + 1),
+    )
+
+
+def _distance(shape: Shape, nodes: np.ndarray) -> np.ndarray:
+    """Signed distance of the nodes [node, dim], or an error if the shape has another dimension."""
+    dim = nodes.shape[1]
+    own = {Wall: "normal", Sphere: "center", Box: "low"}.get(type(shape))
+    fits = dim == 2 if isinstance(shape, Polygon) else own is None or len(getattr(shape, own)) == dim
+    try:
+        distance = shape.signed_distance(nodes) if fits else None
+    except (ValueError, IndexError):  # any other shape, which does not say what its dimension is
+        distance = None
+    if distance is None:
+        raise SimulationError(f"a boundary of kind {shape.kind!r} does not have the {dim} axes of the domain", reason="input")
+    return np.asarray(distance)
+
+
+def _require_resolved(shape: Shape, mask: np.ndarray, spacing: float, dim: int) -> None:
+    """Refuse an obstacle that particles could pass: a particle in the nearer half of a cell-thick obstacle is pushed back, not out at the far side."""
+    thickness = _thickness(shape)
+    if thickness < spacing * (1 - 1e-6):
+        raise SimulationError(
+            f"obstacle {shape} is {thickness:g} m thin; on a grid of spacing {spacing:g} m it must be at least {spacing:g} m thick",
+            reason="input",
+        )
+    if not np.any(mask):
+        raise SimulationError(
+            f"obstacle {shape} contains no node of the grid of spacing {spacing:g} m; move it, or make it {math.sqrt(dim) * spacing:g} m thick",
+            reason="input",
+        )
+
+
+def _thickness(shape: Shape) -> float:
+    """Smallest thickness in m: diameter, shortest side, or shortest way through a polygon from the middle of an edge along its inward normal.
+
+    Infinite for a shape that does not tell.
+    """
+    if isinstance(shape, Sphere):
+        return 2.0 * shape.radius
+    if isinstance(shape, Box):
+        return min(high - low for low, high in zip(shape.low, shape.high, strict=True))
+    if not isinstance(shape, Polygon):
+        return math.inf
+    vertices = np.array(shape.vertices, dtype=np.float64)
+    before, after = vertices - np.roll(vertices, 1, axis=0), np.roll(vertices, -1, axis=0) - vertices
+    turn = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    straight = np.abs(turn) <= 1e-9 * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    a = vertices[~straight]  # vertices along a straight edge do not divide it
+    edge = np.roll(a, -1, axis=0) - a
+    tangent = edge / np.linalg.norm(edge, axis=1)[:, None]
+    thickness = math.inf
+    for k, middle in enumerate(a + edge / 2):
+        inward = np.array([-tangent[k, 1], tangent[k, 0]])
+        # every other edge in this edge's frame: its ends' distances along the edge and into the polygon
+        along, depth = (a - middle) @ tangent[k], (a - middle) @ inward
+        for j in range(len(a)):
+            n = (j + 1) % len(a)
+            if j != k and along[j] != along[n] and min(along[j], along[n]) <= 0.0 <= max(along[j], along[n]):
+                hit = depth[j] + (depth[n] - depth[j]) * along[j] / (along[j] - along[n])
+                if hit > 0.0:
+                    thickness = min(thickness, float(hit))
+    return thickness
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def keep_out(pos, vel, collider, counts, origin, inv):
+    """``push_out`` of all particles that may be inside a shape: whose nearest grid node is no further from one than from the particle."""
+    reach = 0.51 * math.sqrt(len(counts)) / inv
+    for p in range(pos.shape[0]):
+        node = 0
+        for axis in range(len(counts)):
+            place = (pos[p, axis] - origin[axis]) * inv + 0.5
+            node *= counts[axis]
+            if place > 0.0:  # any index will do for a particle that left the grid or is not a number
+                node += int(min(place, counts[axis] - 0.5))
+        if collider.distance[node] < reach:
+            push_out(pos, vel, p, collider, counts, origin, inv)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def push_out(pos, vel, p, collider, counts, origin, inv):
+    """Move particle ``p`` out of every shape that it is in, and remove the inward part of its velocity; walls last, so that they always hold."""
+    solid = len(counts) == 3
+    for k in range(collider.sampled.shape[0]):
+        depth, nx, ny, nz = _sampled_depth(pos, p, collider.sampled, k, counts, origin, inv)
+        if depth > 0.0:
+            _project(pos, vel, p, depth, nx, ny, nz, counts)
+    for k in range(collider.first_vertex.shape[0] - 1):
+        depth, nx, ny = _polygon_depth(pos[p, 0], pos[p, 1], collider.vertices, collider.first_vertex[k], collider.first_vertex[k + 1])
+        if depth > 0.0:
+            _project(pos, vel, p, depth, nx, ny, 0.0, counts)
+    for k in range(collider.boxes.shape[0]):
+        depth, axis, side = _box_depth(pos, p, collider.boxes, k, counts)
+        if depth > 0.0:
+            _project(pos, vel, p, depth, side if axis == 0 else 0.0, side if axis == 1 else 0.0, side if axis == 2 else 0.0, counts)
+    balls = collider.balls
+    for k in range(balls.shape[0]):
+        x, y, z = pos[p, 0] - balls[k, 0], pos[p, 1] - balls[k, 1], pos[p, 2] - balls[k, 2] if solid else 0.0
+        r, radius = math.sqrt(x * x + y * y + z * z), balls[k, len(counts)]
+        if r < radius:
+            nx, ny, nz = (x / r, y / r, z / r) if r > 0.0 else (0.0, 1.0, 0.0)
+            _project(pos, vel, p, radius - r, nx, ny, nz, counts)
+    planes = collider.planes
+    for k in range(planes.shape[0]):
+        nx, ny, nz = planes[k, 0], planes[k, 1], planes[k, 2] if solid else 0.0
+        depth = planes[k, len(counts)] - nx * pos[p, 0] - ny * pos[p, 1] - (nz * pos[p, 2] if solid else 0.0)
+        if depth > 0.0:
+            _project(pos, vel, p, depth, nx, ny, nz, counts)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _project(pos, vel, p, depth, nx, ny, nz, counts):
+    inward = vel[p, 0] * nx + vel[p, 1] * ny + (vel[p, 2] * nz if len(counts) == 3 else 0.0)
+    inward = min(0.0, inward)
+    pos[p, 0] += depth * nx
+    pos[p, 1] += depth * ny
+    vel[p, 0] -= inward * nx
+    vel[p, 1] -= inward * ny
+    if len(counts) == 3:
+        pos[p, 2] += depth * nz
+        vel[p, 2] -= inward * nz
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _sampled_depth(pos, p, sampled, shape, counts, origin, inv):
+    """Depth of a particle in a sampled shape and the shape's normal there; depth 0 outside, and outside of the grid."""
+    dim = len(counts)
+    first, fx, fy, fz = 0, 0.0, 0.0, 0.0
+    for axis in range(dim):
+        x = (pos[p, axis] - origin[axis]) * inv
+        if not (x >= 0.0 and x < counts[axis] - 1):
+            return 0.0, 0.0, 0.0, 0.0
+        first, fx, fy, fz = first * counts[axis] + int(x), fy, fz, x - int(x)
+    # the fractions are now in the last dim of fx, fy and fz
+    distance = nx = ny = nz = 0.0
+    for i in range(dim - 1):
+        for j in range(2):
+            for k in range(2):
+                node = first + j * counts[dim - 1] + k + (i * counts[1] * counts[2] if dim == 3 else 0)
+                w = (fy if j else 1.0 - fy) * (fz if k else 1.0 - fz) * ((fx if i else 1.0 - fx) if dim == 3 else 1.0)
+                distance += w * sampled[shape, node, 0]
+                nx += w * sampled[shape, node, 1]
+                ny += w * sampled[shape, node, 2]
+                nz += w * sampled[shape, node, dim] if dim == 3 else 0.0
+    length = math.sqrt(nx * nx + ny * ny + nz * nz)
+    if distance >= 0.0 or length == 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    return -distance, nx / length, ny / length, nz / length
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _box_depth(pos, p, boxes, box, counts):
+    """Depth of a particle in a box, and axis and direction of the nearest face; depth 0 outside."""
+    depth, nearest, side = math.inf, 0, 1.0
+    for axis in range(len(counts)):
+        above, below = pos[p, axis] - boxes[box, 0, axis], boxes[box, 1, axis] - pos[p, axis]
+        if above <= 0.0 or below <= 0.0:
+            return 0.0, 0, 1.0
+        if above < depth:
+            depth, nearest, side = above, axis, -1.0
+        if below < depth:
+            depth, nearest, side = below, axis, 1.0
+    return depth, nearest, side
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _polygon_depth(x, y, vertices, start, stop):
+    """Depth of a point inside a simple counter-clockwise polygon and the normal of the nearest edge; depth 0 outside."""
+    inside = False
+    nearest, nx, ny = math.inf, 0.0, 1.0
+    for k in range(start, stop):
+        after = k + 1 if k + 1 < stop else start
+        ax, ay = vertices[k, 0], vertices[k, 1]
+        ex, ey = vertices[after, 0] - ax, vertices[after, 1] - ay
+        px, py = x - ax, y - ay
+        if ((vertices[after, 1] > y) != (ay > y)) and px < ex * py / ey:
+            inside = not inside
+        length = math.sqrt(ex * ex + ey * ey)
+        t = min(1.0, max(0.0, (px * ex + py * ey) / (length * length)))
+        qx, qy = px - t * ex, py - t * ey
+        d = math.sqrt(qx * qx + qy * qy)
+        if d < nearest:
+            nearest = d
+            # from inside, the way out leads to the nearest point of the surface; on the surface, along the edge's normal
+            nx, ny = (-qx / d, -qy / d) if d > 1e-12 * length else (ey / length, -ex / length)
+    return (nearest if inside else 0.0), nx, ny

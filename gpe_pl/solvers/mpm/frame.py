@@ -1,0 +1,170 @@
+"""The time loop of one frame, on compiled kernels; the same in 2D and 3D.
+
+``counts``, the numbers of grid nodes along the axes, is a tuple, so that the dimension is known when a kernel is compiled.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from numba import njit
+
+from gpe_pl.schema import STICKY
+from gpe_pl.solvers.mpm import transfer_2d, transfer_3d
+from gpe_pl.solvers.mpm.collider import keep_out
+
+OK, NOT_FINITE, ESCAPE, TOO_MANY_SUBSTEPS = 0, 1, 2, 3
+
+
+class Particles(NamedTuple):
+    """Arrays of all particles, C-contiguous; the first five change in place.
+
+    Attributes:
+        pos, vel: [node, dim] in m and m/s.
+        deformation, affine, plastic: as in ``MPMInternal``.
+        mass: [node] in kg.
+        specific_volume: volume per mass at rest [node] in m³/kg.
+        law: code of the constitutive law [node].
+        constants: what the law reads [node, constant], see ``materials``.
+    """
+
+    pos: np.ndarray
+    vel: np.ndarray
+    deformation: np.ndarray
+    affine: np.ndarray
+    plastic: np.ndarray
+    mass: np.ndarray
+    specific_volume: np.ndarray
+    law: np.ndarray
+    constants: np.ndarray
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame_dt, cfl, max_substeps):
+    """Advance the particles in place by one frame; returns a status, the node that caused it and the number of substeps."""
+    inv, dim, gravity_squared = 1.0 / spacing, len(counts), 0.0
+    for axis in range(dim):
+        gravity_squared += gravity[axis] * gravity[axis]
+    # a particle at rest may fall by no more than a quarter of cfl cells, so with its speed it moves at most 1.25 cfl cells
+    fall_rate = 2.0 * math.sqrt(math.sqrt(gravity_squared) / (cfl * spacing))
+    grid, active = np.zeros((collider.distance.shape[0], dim + 1)), np.zeros((3, 2), dtype=np.int64)
+    flat, stress = grid.reshape(-1), np.empty((particles.pos.shape[0], 3 * dim - 3))
+    remaining, substeps = frame_dt, 0
+    squared = transfer_2d.squared_wave_speed(particles) if dim == 2 else transfer_3d.squared_wave_speed(particles)
+    while True:
+        status, node, speed = _survey(particles.pos, particles.vel, bounds, origin, counts, spacing, active)
+        if status != OK or remaining <= 0.0:
+            return status, node, substeps
+        needed = max(remaining * (math.sqrt(squared) + speed) / (cfl * spacing), remaining * fall_rate) * (1.0 - 1e-12)
+        if not needed <= max_substeps - substeps:  # before it is rounded: an integer may not hold it
+            return TOO_MANY_SUBSTEPS, node, substeps
+        count = max(1, math.ceil(needed))
+        h = remaining / count
+        remaining = remaining - h if count > 1 else 0.0
+        substeps += 1
+        _clear(grid, active, counts)
+        if dim == 2:
+            squared = transfer_2d.deform(particles, stress, h)
+            transfer_2d.particles_to_grid(particles, stress, flat, counts, origin, inv, h)
+        else:
+            squared = transfer_3d.deform(particles, stress, h)
+            transfer_3d.particles_to_grid(particles, stress, flat, counts, origin, inv, h)
+        _move_grid(grid, collider, gravity, h, active, counts)
+        if dim == 2:
+            transfer_2d.grid_to_particles(particles, flat, counts, origin, inv, h)
+        else:
+            transfer_3d.grid_to_particles(particles, flat, counts, origin, inv, h)
+        keep_out(particles.pos, particles.vel, collider, counts, origin, inv)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _survey(pos, vel, bounds, origin, counts, spacing, active):
+    """Check that every particle can be indexed; status, node at fault (or the fastest) and largest speed.
+
+    Writes to ``active`` the half-open ranges of grid nodes that the particles reach along x, y and z; in 2D the first row is left out, so that the last
+    two are x and y.
+    """
+    dim = len(counts)
+    fastest, speed_squared = (0 if pos.shape[0] > 0 else -1), 0.0
+    for p in range(pos.shape[0]):
+        squared = 0.0
+        for axis in range(dim):
+            squared += vel[p, axis] * vel[p, axis]
+        if not squared < math.inf:
+            return NOT_FINITE, p, 0.0
+        if squared > speed_squared:
+            fastest, speed_squared = p, squared
+    active[0, 0], active[0, 1] = 0, 1
+    for axis in range(dim):
+        low, high = math.inf, -math.inf
+        # a particle may be up to a cell outside an open side before it counts as escaped
+        lowest, highest = bounds[axis, 0] - spacing, bounds[axis, 1] + spacing
+        for p in range(pos.shape[0]):
+            x = pos[p, axis]
+            if not (x >= lowest and x <= highest):
+                return (ESCAPE if math.isfinite(x) else NOT_FINITE), p, 0.0
+            low, high = min(low, x), max(high, x)
+        if pos.shape[0] == 0:
+            low = high = bounds[axis, 0]
+        row, inv = axis + 3 - dim, 1.0 / spacing
+        active[row, 0], active[row, 1] = int((low - origin[axis]) * inv - 0.5), int((high - origin[axis]) * inv - 0.5) + 3
+    return OK, fastest, math.sqrt(speed_squared)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _clear(grid, active, counts):
+    dim = len(counts)
+    for i in range(active[0, 0], active[0, 1]):
+        for j in range(active[1, 0], active[1, 1]):
+            row = (i * counts[dim - 2] + j) * counts[dim - 1]
+            for node in range(row + active[2, 0], row + active[2, 1]):
+                for c in range(dim + 1):
+                    grid[node, c] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _move_grid(grid, collider, gravity, h, active, counts):
+    """Momenta to velocities, gravity, and the boundary conditions of the nodes inside walls and obstacles."""
+    dim = len(counts)
+    for i in range(active[0, 0], active[0, 1]):
+        for j in range(active[1, 0], active[1, 1]):
+            row = (i * counts[dim - 2] + j) * counts[dim - 1]
+            for node in range(row + active[2, 0], row + active[2, 1]):
+                if grid[node, dim] > 0.0:
+                    inverse = 1.0 / grid[node, dim]
+                    for axis in range(dim):
+                        grid[node, axis] = grid[node, axis] * inverse + h * gravity[axis]
+                    if collider.row[node] >= 0:
+                        _obey(grid, node, collider.conditions, collider.row[node], counts)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _obey(grid, node, conditions, row, counts):
+    """Remove the inward part of a node's velocity, and slow it by friction in proportion, for each shape that holds the node."""
+    dim = len(counts)
+    for k in range(conditions.shape[1]):
+        friction = conditions[row, k, dim]
+        if friction < 0.0:
+            break
+        inward = 0.0
+        for axis in range(dim):
+            inward += grid[node, axis] * conditions[row, k, axis]
+        if friction >= STICKY:
+            kept = 0.0
+        elif inward < 0.0:
+            sliding = 0.0
+            for axis in range(dim):
+                grid[node, axis] -= inward * conditions[row, k, axis]
+                sliding += grid[node, axis] * grid[node, axis]
+            kept = max(0.0, 1.0 + friction * inward / math.sqrt(sliding)) if sliding > 0.0 else 0.0
+        else:
+            continue
+        for axis in range(dim):
+            grid[node, axis] *= kept

@@ -1,0 +1,211 @@
+"""Constitutive laws in plane strain, compiled with Numba in float64.
+
+A law is a function from the trial deformation gradient F of one particle to its return-mapped F, its plastic state, its Kirchhoff stress τ and its stiffness:
+density at rest times the square of the fastest elastic wave's speed, from the second derivative of the energy along the principal axes,
+``∂²ψ/∂(log σᵢ)² - ∂ψ/∂(log σᵢ)``, or more. All laws are isotropic, so they act on the principal values of the left Cauchy-Green tensor ``b = F Fᵀ``; an
+isotropic function of a symmetric 2x2 tensor with principal values f₁ >= f₂ is ::
+
+    f(b) = (f₁ + f₂)/2 I + (f₁ - f₂)/2 [[c, s], [s, -c]],   (c, s) = (cos 2θ, sin 2θ)
+
+with θ the principal angle, so neither a singular value decomposition nor an angle is ever computed. Only b matters to them, so a law may drop the rotation
+of F, and does so for a particle that is flat (where the rotation is undefined).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import no_type_check
+
+from numba import njit
+
+from gpe_pl.solvers.materials import COEFFICIENT, ELASTOMER, LAMBDA, LARGEST, MAX_HARDENING, MU, SAND, SMALLEST, SNOW
+
+SMALLEST_STRETCH = 1e-4
+"""Principal stretches below this are treated as this: the logarithmic strain of a flattened particle stays finite."""
+
+SMALLEST_SQUARE = SMALLEST_STRETCH**2
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def left_cauchy_green(f00, f01, f10, f11):
+    """Principal values of ``F Fᵀ``, larger first, and the direction ``(cos 2θ, sin 2θ)`` of the larger one."""
+    b00, b01, b11 = f00 * f00 + f01 * f01, f00 * f10 + f01 * f11, f10 * f10 + f11 * f11
+    half_difference = 0.5 * (b00 - b11)
+    radius = math.sqrt(half_difference * half_difference + b01 * b01)
+    larger = 0.5 * (b00 + b11) + radius
+    determinant = f00 * f11 - f01 * f10
+    # det²/b₁ instead of mean - radius: no cancellation when the particle is flat
+    smaller = determinant * determinant / larger if larger > 0.0 else 0.0
+    if radius > 0.0:
+        inverse = 1.0 / radius
+        return larger, smaller, half_difference * inverse, b01 * inverse
+    return larger, smaller, 1.0, 0.0
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _isotropic(first, second, c, s):
+    """The entries 00, 01 and 11 of the symmetric tensor with these principal values."""
+    mean, half = 0.5 * (first + second), 0.5 * (first - second)
+    return mean + half * c, half * s, mean - half * c
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _stretched(f00, f01, f10, f11, ratio_1, ratio_2, c, s, flat, square_1, square_2):
+    """F with its principal stretches multiplied by ratios; of a flat particle, the left stretch tensor with stretches ``ratio √square``."""
+    if flat:
+        ratio_1, ratio_2 = ratio_1 * math.sqrt(square_1), ratio_2 * math.sqrt(square_2)
+        f00, f01, f10, f11 = 1.0, 0.0, 0.0, 1.0
+    m00, m01, m11 = _isotropic(ratio_1, ratio_2, c, s)
+    return m00 * f00 + m01 * f10, m00 * f01 + m01 * f11, m01 * f00 + m11 * f10, m01 * f01 + m11 * f11
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _hencky(f00, f01, f10, f11):
+    """Logarithmic strain ``log(b) / 2``: F (of a flat particle, its left stretch tensor), ``log |det F|`` and the entries 00 and 01 of the deviator."""
+    b00, b01, b11 = f00 * f00 + f01 * f01, f00 * f10 + f01 * f11, f10 * f10 + f11 * f11
+    half_difference, mean = 0.5 * (b00 - b11), 0.5 * (b00 + b11)
+    determinant = f00 * f11 - f01 * f10
+    inverse = 1.0 / mean
+    x = (half_difference * half_difference + b01 * b01) * (inverse * inverse)
+    if x < 1e-3 and determinant > 0.01:
+        # little distortion, as nearly always: (log b₁ - log b₂)/4 = atanh(√x)/2, and the series of atanh(√x)/√x to rounding
+        scale = 0.5 * inverse * (1.0 + x * (1.0 / 3.0 + x * (1.0 / 5.0 + x * (1.0 / 7.0 + x * (1.0 / 9.0)))))
+        return f00, f01, f10, f11, math.log(determinant), scale * half_difference, scale * b01
+    larger, smaller, c, s = left_cauchy_green(f00, f01, f10, f11)
+    if smaller < SMALLEST_SQUARE:
+        larger, smaller = max(larger, SMALLEST_SQUARE), SMALLEST_SQUARE
+        f00, f01, f10, f11 = _stretched(f00, f01, f10, f11, 1.0, 1.0, c, s, True, larger, smaller)
+    log_1, log_2 = 0.5 * math.log(larger), 0.5 * math.log(smaller)
+    deviator = 0.5 * (log_1 - log_2)
+    return f00, f01, f10, f11, log_1 + log_2, deviator * c, deviator * s
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def sand(f00, f01, f10, f11, volume_correction, lam, mu, slope):
+    """Hencky elasticity with a Drucker-Prager return mapping without dilation (Klar et al. 2016, sections 5 and 6.3).
+
+    ``ε = log σ + v/2`` are the principal logarithmic strains, where ``v`` is the volume that the particle gained while it was in tension and must
+    lose again before it can bear pressure. In expansion (``tr ε >= 0``) the particle is stress-free. Otherwise the deviatoric strain is
+    scaled back to the cone ``|dev ε| = -α (2λ + 2μ)/(2μ) tr ε`` at constant volume, and ``τ = 2μ ε + λ tr ε``.
+
+    Args:
+        f00, f01, f10, f11: trial elastic deformation gradient.
+        volume_correction: v of the particle.
+        lam, mu: Lamé parameters [Pa].
+        slope: of the cone, ``|dev ε| / -tr ε``.
+
+    Returns:
+        The four entries of the return-mapped F, the new v, τ₀₀, τ₀₁, τ₁₁ and the stiffness [Pa]. A trial F that is not finite gives a stress that is not
+        finite.
+    """
+    f00, f01, f10, f11, trace, e0, e1 = _hencky(f00, f01, f10, f11)
+    trace += volume_correction
+    if trace >= 0.0:
+        return 1.0, 0.0, 0.0, 1.0, trace, 0.0, 0.0, 0.0, lam + 2.0 * mu
+    deviator = math.sqrt(e0 * e0 + e1 * e1)  # |dev ε| / √2
+    largest = -slope * trace * math.sqrt(0.5)
+    if deviator > largest:
+        inverse = 1.0 / deviator
+        shrunk, kept = math.exp(largest - deviator), largest * inverse  # ratio of the larger stretch to the trial one
+        m00, m01, m11 = _isotropic(shrunk, 1.0 / shrunk, e0 * inverse, e1 * inverse)
+        f00, f01, f10, f11 = m00 * f00 + m01 * f10, m00 * f01 + m01 * f11, m01 * f00 + m11 * f10, m01 * f01 + m11 * f11
+        e0, e1, deviator = kept * e0, kept * e1, largest
+    if volume_correction != 0.0:
+        grown = math.exp(0.5 * volume_correction)
+        f00, f01, f10, f11 = grown * f00, grown * f01, grown * f10, grown * f11
+    pressure = (lam + mu) * trace
+    t00, t01, t11 = pressure + 2.0 * mu * e0, 2.0 * mu * e1, pressure - 2.0 * mu * e0
+    return f00, f01, f10, f11, 0.0, t00, t01, t11, lam + 2.0 * mu - (pressure - 2.0 * mu * deviator)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def hardening(compaction, xi, largest):
+    """Factor on snow's elastic moduli, ``exp(ξ (1 - J_P))``, at most ``largest`` (Stomakhin et al. 2013, equation 2)."""
+    return math.exp(min(-xi * compaction, math.log(largest)))
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def snow(f00, f01, f10, f11, compaction, lam, mu, xi, smallest, largest, max_hardening):
+    """Fixed-corotated elasticity with hardening; principal stretches are clamped (Stomakhin et al. 2013, sections 4 and 7).
+
+    ``τ = 2μ (F - R) Fᵀ + λ (J - 1) J`` with both moduli multiplied by ``hardening``, which is that of the plastic state before the return mapping: the
+    state that the substep's length was chosen for.
+
+    Args:
+        f00, f01, f10, f11: trial elastic deformation gradient.
+        compaction: ``J_P - 1``, with J_P the volume ratio of the plastic deformation.
+        lam, mu: Lamé parameters [Pa] before any compaction.
+        xi: hardening coefficient ξ.
+        smallest, largest: limits of the elastic principal stretches, ``1 - θ_c`` and ``1 + θ_s``.
+        max_hardening: largest factor on the moduli.
+
+    Returns:
+        The four entries of the return-mapped F, the new ``J_P - 1``, τ₀₀, τ₀₁, τ₁₁ and the stiffness [Pa].
+    """
+    larger, smaller, c, s = left_cauchy_green(f00, f01, f10, f11)
+    flat = smaller < SMALLEST_SQUARE
+    square_1, square_2 = max(larger, SMALLEST_SQUARE), max(smaller, SMALLEST_SQUARE)
+    factor = hardening(compaction, xi, max_hardening)
+    trial_1, trial_2 = math.sqrt(square_1), math.sqrt(square_2)
+    stretch_1, stretch_2 = min(max(trial_1, smallest), largest), min(max(trial_2, smallest), largest)
+    lam, mu, rest = factor * lam, factor * mu, lam + 2.0 * mu
+    volume = stretch_1 * stretch_2
+    if stretch_1 != trial_1 or stretch_2 != trial_2 or flat:
+        f00, f01, f10, f11 = _stretched(f00, f01, f10, f11, stretch_1 / trial_1, stretch_2 / trial_2, c, s, flat, square_1, square_2)
+        compaction = (1.0 + compaction) * (trial_1 * trial_2 / volume) - 1.0
+        factor = hardening(compaction, xi, max_hardening)
+    pressure = lam * (volume - 1.0) * volume
+    t00, t01, t11 = _isotropic(
+        2.0 * mu * (stretch_1 - 1.0) * stretch_1 + pressure, 2.0 * mu * (stretch_2 - 1.0) * stretch_2 + pressure, c, s
+    )
+    return f00, f01, f10, f11, compaction, t00, t01, t11, max(1.0, factor) * rest * max(1.0, stretch_1 * stretch_1, volume * volume)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def elastomer(f00, f01, f10, f11, lam, mu):
+    """Neo-Hookean elasticity, ``τ = μ (b - I) + λ log J`` (Bonet & Wood 2008, equation 6.28).
+
+    Args:
+        f00, f01, f10, f11: deformation gradient.
+        lam, mu: Lamé parameters [Pa].
+
+    Returns:
+        The four entries of F, 0 (no plastic state), τ₀₀, τ₀₁, τ₁₁ and the stiffness [Pa].
+    """
+    larger, smaller, c, s = left_cauchy_green(f00, f01, f10, f11)
+    if smaller < SMALLEST_SQUARE:
+        larger, smaller = max(larger, SMALLEST_SQUARE), SMALLEST_SQUARE
+        f00, f01, f10, f11 = _stretched(f00, f01, f10, f11, 1.0, 1.0, c, s, True, larger, smaller)
+    log_volume = 0.5 * math.log(larger * smaller)
+    pressure = lam * log_volume
+    t00, t01, t11 = _isotropic(mu * (larger - 1.0) + pressure, mu * (smaller - 1.0) + pressure, c, s)
+    return f00, f01, f10, f11, 0.0, t00, t01, t11, max(lam + 2.0 * mu, mu * (1.0 + larger) + lam * max(0.0, 1.0 - log_volume))
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def respond(law, f00, f01, f10, f11, plastic, constants, p):
+    """Apply the law with this code and row ``p`` of the constants; results as in ``sand``. An unknown code gives NaN."""
+    lam, mu = constants[p, LAMBDA], constants[p, MU]
+    if law == SAND:
+        return sand(f00, f01, f10, f11, plastic, lam, mu, constants[p, COEFFICIENT])
+    if law == SNOW:
+        xi, smallest, largest, hardest = (
+            constants[p, COEFFICIENT],
+            constants[p, SMALLEST],
+            constants[p, LARGEST],
+            constants[p, MAX_HARDENING],
+        )
+        return snow(f00, f01, f10, f11, plastic, lam, mu, xi, smallest, largest, hardest)
+    if law == ELASTOMER:
+        return elastomer(f00, f01, f10, f11, lam, mu)
+    nan = math.nan
+    return nan, nan, nan, nan, nan, nan, nan, nan, nan

@@ -1,0 +1,120 @@
+"""What the colours of particles and mesh cells mean."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal
+
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float
+from matplotlib.colors import Colormap, LinearSegmentedColormap, ListedColormap, Normalize
+
+from gpe_pl.metrics import displacement
+from gpe_pl.schema import MATERIALS
+from gpe_pl.trajectory import Trajectory, von_mises
+from gpe_pl.viz.camera import vertical_axis
+
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Colours that stay apart with colour-blind readers (Okabe and Ito, Color universal design, 2008)."""
+
+MATERIAL_COLORS = {"sand": "#E69F00", "snow": "#56B4E9", "fluid": "#0072B2", "elastomer": "#D55E00", "solid": "#009E73"}
+
+REFERENCE = "#7A8B99"
+"""What has no value of its own: particles of the ground truth where colour means error, particles outside of meshes where it means stress."""
+
+ColorBy = Literal["error", "height", "material", "von_mises"]
+
+
+def _shortened(name: str, low: float, high: float) -> Colormap:
+    """The part of a colour map that shows on white paper."""
+    return LinearSegmentedColormap.from_list(f"{name}_shortened", mpl.colormaps[name](np.linspace(low, high, 256)))
+
+
+COLOR_MAPS: dict[ColorBy, Colormap] = {
+    "error": _shortened("inferno", 0.08, 0.9),
+    "height": _shortened("viridis", 0.0, 0.95),
+    "material": ListedColormap([MATERIAL_COLORS[name] for name in MATERIALS], name="materials"),
+    "von_mises": _shortened("YlOrRd", 0.1, 1.0),
+}
+
+BAR_LABELS: dict[ColorBy, str] = {"error": "position error [m]", "von_mises": "von Mises stress"}
+"""Colours whose values a reader wants to look up."""
+
+
+def position_error(prediction: Trajectory, truth: Trajectory, frame: int) -> Float[np.ndarray, "node"]:
+    """Distance [m] of every particle from its place in the ground truth."""
+    return np.linalg.norm(displacement(prediction.pos[frame], truth.pos[frame], truth.metadata), axis=-1)
+
+
+class Coloring:
+    """Colours of all trajectories in one figure, on a common scale.
+
+    Args:
+        by: ``error`` is the distance from ``truth``; ``height`` that in the first frame, by which material can be followed; ``material`` and
+            ``von_mises`` (of a mesh) are what they say.
+        trajectories: all that the figure shows.
+        frames: those that it shows.
+        truth: ground truth, for ``error``.
+
+    Raises:
+        ValueError: ``von_mises`` where no trajectory knows a stress, or ``error`` without ground truth.
+    """
+
+    def __init__(self, by: ColorBy, trajectories: Sequence[Trajectory], frames: Iterable[int], truth: Trajectory | None = None) -> None:
+        if by == "error" and truth is None:
+            raise ValueError("colour by error needs the ground truth")
+        if by == "von_mises" and all(t.stress is None for t in trajectories):
+            raise ValueError("colour by von_mises needs a mesh with stress, which no trajectory has")
+        self.by, self._truth = by, truth
+        self.color_map: Colormap = COLOR_MAPS[by].with_extremes(bad=REFERENCE)
+        self.scale: Normalize = self._scale(trajectories, list(frames))
+
+    def _scale(self, trajectories: Sequence[Trajectory], frames: list[int]) -> Normalize:
+        if self.by == "material":
+            return Normalize(-0.5, len(MATERIALS) - 0.5)
+        if self.by == "height":
+            frames = [0]
+        part = 1 if self.by == "von_mises" else 0  # cells or nodes
+        shown = [self.values(t, f)[part] for t in trajectories for f in frames if f < t.num_frames]
+        values = np.concatenate([np.empty(0), *shown])
+        values = values[np.isfinite(values)]
+        if self.by == "height":
+            return Normalize(float(values.min()), float(values.max()))
+        # Ends at the 99th percentile, or a single lost particle would take all colour from the others.
+        top = float(np.quantile(np.append(values, 0.0), 0.99))
+        return Normalize(0.0, top if top > 0 else trajectories[0].metadata.spacing)
+
+    @property
+    def bar_label(self) -> str | None:
+        """Label of a colour bar, where one helps."""
+        return BAR_LABELS.get(self.by)
+
+    def values(self, trajectory: Trajectory, frame: int) -> tuple[Float[np.ndarray, "node"], Float[np.ndarray, "cell"]]:
+        """What nodes and mesh cells are coloured by; NaN where there is nothing to say."""
+        cells = np.empty((0, 1), int) if trajectory.cells is None else trajectory.cells
+        unknown = np.full(trajectory.num_nodes, np.nan)
+        if self.by == "von_mises":
+            if trajectory.stress is None:
+                return unknown, np.full(len(cells), np.nan)
+            in_mesh = np.isin(np.arange(trajectory.num_nodes), cells)
+            nodes = np.where(in_mesh, von_mises(trajectory.stress.node[frame]), np.nan)
+            return nodes, von_mises(trajectory.stress.cell[frame]).astype(float)
+        if self.by == "height":
+            nodes = trajectory.pos[0, :, vertical_axis(trajectory)].astype(float)
+        elif self.by == "material":
+            nodes = trajectory.node_type.astype(float)
+        else:
+            assert self._truth is not None
+            nodes = unknown if trajectory is self._truth else position_error(trajectory, self._truth, frame)
+        return nodes, nodes[cells].mean(axis=1)
+
+    def __call__(self, trajectory: Trajectory, frame: int) -> tuple[Float[np.ndarray, "node 4"], Float[np.ndarray, "cell 4"]]:
+        """Red, green, blue and opacity of every node and mesh cell."""
+        nodes, cells = (self.color_map(self.scale(values)) for values in self.values(trajectory, frame))
+        return nodes, cells
+
+    def legend(self, trajectories: Iterable[Trajectory]) -> dict[str, Any]:
+        """Colour of every material that occurs, where colour means material; empty otherwise."""
+        if self.by != "material":
+            return {}
+        codes = {int(code) for t in trajectories for code in np.unique(t.node_type)}
+        return {name: MATERIAL_COLORS[name] for code, name in enumerate(MATERIALS) if code in codes}

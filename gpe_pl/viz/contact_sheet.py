@@ -1,0 +1,36 @@
+"""A data set at a glance: one scene under several parameter values, so that a person sees at once whether the data is right."""
+
+from collections.abc import Mapping, Sequence
+
+from matplotlib.figure import Figure
+
+from gpe_pl.trajectory import Trajectory
+from gpe_pl.viz.coloring import ColorBy, Coloring
+from gpe_pl.viz.film_strip import evenly_spaced_frames, film_strip
+
+DPI = 220
+"""A sheet is looked at on a screen: single particles should be visible."""
+
+
+def telling_color(trajectories: Sequence[Trajectory]) -> ColorBy:
+    """Stress where a mesh has it, else the material where there are several, else the height at the start."""
+    if any(trajectory.stress is not None for trajectory in trajectories):
+        return "von_mises"
+    return "material" if len(trajectories[0].metadata.materials) > 1 else "height"
+
+
+def contact_sheet(trajectories: Mapping[str, Trajectory], num_columns: int = 6) -> Figure:
+    """A row for each trajectory, evenly spaced times to the right.
+
+    Args:
+        trajectories: by the label of their row, of scenes in the same domain; they may differ in the number of nodes.
+        num_columns: number of times; fewer if there are fewer frames.
+
+    Raises:
+        ValueError: no trajectories, or ``num_columns`` is not positive.
+    """
+    if not trajectories:
+        raise ValueError("a contact sheet needs at least one trajectory")
+    shown = list(trajectories.values())
+    frames = evenly_spaced_frames(max(trajectory.num_frames for trajectory in shown), num_columns)
+    return film_strip(list(trajectories.items()), frames, Coloring(telling_color(shown), shown, frames), DPI)

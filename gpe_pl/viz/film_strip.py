@@ -1,0 +1,119 @@
+"""The layout that figures of trajectories share: one row each, time runs to the right."""
+
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter
+
+from gpe_pl.trajectory import Trajectory
+from gpe_pl.viz.camera import Camera
+from gpe_pl.viz.coloring import Coloring
+from gpe_pl.viz.panel import Panel
+from gpe_pl.viz.scenery import INK
+
+TEXT_WIDTH = 7.0
+"""Width [inch] of a figure that spans both columns of a paper."""
+
+LINE, CHARACTER = 0.14, 0.062
+"""Height of a line and about the width of a character of a row's label [inch]."""
+
+
+def new_figure(width: float, height: float, dpi: int = 150) -> Figure:
+    """An empty figure [inch] with a canvas of its own, unknown to pyplot."""
+    figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def evenly_spaced_frames(num_frames: int, num_columns: int) -> list[int]:
+    """Up to ``num_columns`` different frames from the first to the last.
+
+    Raises:
+        ValueError: ``num_columns`` is not positive.
+    """
+    if num_columns < 1:
+        raise ValueError(f"num_columns must be positive, got {num_columns}")
+    return np.unique(np.round(np.linspace(0, num_frames - 1, num_columns)).astype(int)).tolist()
+
+
+def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], coloring: Coloring, dpi: int = 150) -> Figure:
+    """A panel per trajectory and frame, times above the columns, and a colour bar or legend where colours have to be explained.
+
+    Args:
+        rows: label and trajectory, from top to bottom, of scenes in the same domain.
+        frames: one per column; a trajectory that ended before says so.
+        coloring: of all rows.
+        dpi: dots per inch, unless ``savefig`` is given others.
+    """
+    trajectories = [trajectory for _, trajectory in rows]
+    # The ground truth has no error to look up: the bar stands beside the rows below it.
+    first_with_bar = 1 if coloring.by == "error" else 0
+    has_bar = coloring.bar_label is not None and len(rows) > first_with_bar
+    legend = coloring.legend(trajectories)
+    aspect = Camera(trajectories[0]).aspect
+    right = 0.04 if not has_bar else 0.62 if coloring.by == "error" else 0.9  # inch; a stress comes with its unit
+    top, bottom, gap = 0.22, (0.24 if legend else 0.0), 0.05
+
+    def panel_width(left: float) -> float:
+        return (TEXT_WIDTH - left - right - gap * (len(frames) - 1)) / len(frames)
+
+    wrap_at = max(1, int(panel_width(0.5) * aspect / CHARACTER))
+    labels = [
+        "\n".join(part for line in label.split("\n") for part in textwrap.wrap(line, wrap_at, break_long_words=False)) for label, _ in rows
+    ]
+    left = 0.06 + LINE * max(label.count("\n") + 1 for label in labels)
+    width = panel_width(left)
+    height = top + len(rows) * (width * aspect + gap) + bottom
+    figure = new_figure(TEXT_WIDTH, height, dpi)
+
+    def rectangle(row: int, column: int) -> tuple[float, float, float, float]:
+        x, y = left + column * (width + gap), height - top - (row + 1) * width * aspect - row * gap
+        return x / TEXT_WIDTH, y / height, width / TEXT_WIDTH, width * aspect / height
+
+    style: dict[str, Any] = {"fontsize": 8, "color": INK, "ha": "center"}
+    for i, (label, trajectory) in enumerate(zip(labels, trajectories, strict=True)):
+        for j, frame in enumerate(frames):
+            Panel(figure, rectangle(i, j), trajectory, coloring).show_frame(frame)
+        x, y, _, h = rectangle(i, 0)
+        figure.text(left / 2 / TEXT_WIDTH, y + h / 2, label, rotation=90, va="center", linespacing=1.1, **style)
+    for j, text in enumerate(_times(frames, trajectories[0].metadata.frame_dt)):
+        x, y, w, h = rectangle(0, j)
+        figure.text(x + w / 2, y + h + 0.05 / height, text, va="bottom", **style)
+    if has_bar:
+        low, high = rectangle(len(rows) - 1, 0)[1], rectangle(first_with_bar, 0)
+        _draw_bar(figure, coloring, (1 - (right - 0.1) / TEXT_WIDTH, low, 0.08 / TEXT_WIDTH, high[1] + high[3] - low))
+    if legend:
+        handles = [Line2D([], [], linestyle="", marker="o", markersize=5, color=color, label=name) for name, color in legend.items()]
+        figure.legend(
+            handles=handles,
+            loc="lower center",
+            ncols=len(handles),
+            frameon=False,
+            fontsize=8,
+            labelcolor=INK,
+            borderpad=0.2,
+            handletextpad=0.1,
+        )
+    return figure
+
+
+def _times(frames: Sequence[int], frame_dt: float) -> list[str]:
+    """Times with as many decimals as tell them apart."""
+    times = [frame * frame_dt for frame in frames]
+    decimals = next((d for d in range(2, 6) if len({f"{t:.{d}f}" for t in times}) == len(times)), 6)
+    return [("$t$ = " if k == 0 else "") + f"{time:.{decimals}f} s" for k, time in enumerate(times)]
+
+
+def _draw_bar(figure: Figure, coloring: Coloring, rectangle: tuple[float, float, float, float]) -> None:
+    formatter = EngFormatter(unit="Pa") if coloring.by == "von_mises" else None
+    axes = figure.add_axes(rectangle)
+    bar = figure.colorbar(ScalarMappable(coloring.scale, coloring.color_map), cax=axes, extend="max", format=formatter)
+    bar.set_label(coloring.bar_label, fontsize=7, color=INK)
+    bar.ax.tick_params(labelsize=6.5, width=0.5, length=2)
+    bar.outline.set_linewidth(0.5)

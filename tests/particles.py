@@ -1,0 +1,66 @@
+"""Blocks of particles that tests of particle solvers start from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from gpe_pl.rollout import Simulator
+from gpe_pl.schema import MATERIALS, NODE_TYPES, node_code, param_names
+from gpe_pl.solvers.materials import Elastomer, Sand, Snow
+from gpe_pl.trajectory import Boundary, State
+
+DENSITY = {"sand": Sand().density, "snow": Snow().density, "elastomer": Elastomer().density, "fluid": 1000.0}
+VALUE = {"sand": 30.0, "snow": 10.0, "elastomer": 1e5, "fluid": 0.05}
+
+
+def block(
+    low: Sequence[float],
+    size: Sequence[float],
+    spacing: float,
+    material: str = "sand",
+    *,
+    value: float | None = None,
+    velocity: npt.ArrayLike = 0.0,
+    boundary: Boundary | None = None,
+    gravity: npt.ArrayLike = 0.0,
+    jitter: float = 0.25,
+    seed: int = 0,
+) -> State:
+    """A box of particles at the nodes of a lattice, moved by up to ``jitter`` spacings; as many axes as ``low`` has."""
+    dim = len(low)
+    counts = [round(s / spacing) for s in size]
+    lattice = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1).reshape(-1, dim)
+    moved = lattice + 0.5 + np.random.default_rng(seed).uniform(-jitter, jitter, lattice.shape)
+    count = len(lattice)
+    return State(
+        np.asarray(low) + moved * spacing,
+        np.tile(np.broadcast_to(np.asarray(velocity, float), dim), (count, 1)),
+        np.full(count, node_code(material), np.uint8),
+        np.full(count, DENSITY[material] * spacing**dim),
+        np.full((count, 1), VALUE[material] if value is None else value),
+        boundary if boundary is not None else Boundary.empty(dim),
+        np.array(np.broadcast_to(np.asarray(gravity, float), dim)),
+    )
+
+
+def together(materials: tuple[str, ...], *states: State) -> State:
+    """Blocks in one scene with the boundary and gravity of the first; ``materials`` are those of the solver."""
+    names = param_names(materials)
+    params = []
+    for state in states:
+        columns = np.full((state.num_nodes, len(names)), np.nan)
+        columns[:, names.index(MATERIALS[NODE_TYPES[state.node_type[0]]].name)] = state.material_params[:, 0]
+        params.append(columns)
+    pos, vel, node_type, mass = (np.concatenate([getattr(s, name) for s in states]) for name in ("pos", "vel", "node_type", "mass"))
+    return replace(states[0], pos=pos, vel=vel, node_type=node_type, mass=mass, material_params=np.concatenate(params))
+
+
+def run(solver: Simulator, state: State, num_steps: int) -> State:
+    """The state after some frames."""
+    for _ in range(num_steps):
+        state = solver.step(state)
+    return state

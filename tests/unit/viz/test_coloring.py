@@ -1,0 +1,69 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgba
+
+from gpe_pl.schema import node_code
+from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, Coloring
+
+
+def test_materials_have_their_colours_and_a_legend(ground_truth):
+    types = np.array([node_code("sand")] * 20 + [node_code("solid")] * 5, np.uint8)
+    mixed = replace(ground_truth, node_type=types, cells=np.array([[20, 21, 22], [0, 1, 2]]))
+    coloring = Coloring("material", [mixed], [0])
+    nodes, cells = coloring(mixed, 0)
+    np.testing.assert_allclose(nodes[[0, 24]], [to_rgba(MATERIAL_COLORS[m]) for m in ("sand", "solid")])
+    np.testing.assert_allclose(cells, nodes[[24, 0]])
+    assert coloring.legend([mixed]) == {m: MATERIAL_COLORS[m] for m in ("sand", "solid")}
+    assert Coloring("height", [mixed], [0]).legend([mixed]) == {}
+    assert coloring.bar_label is None
+
+
+def test_every_material_has_a_colour_of_its_own():
+    from gpe_pl.schema import MATERIALS
+
+    assert set(MATERIAL_COLORS) == set(MATERIALS) and len(set(MATERIAL_COLORS.values())) == len(MATERIALS)
+
+
+def test_stress_has_one_scale_for_all_rows(mesh):
+    stiff = replace(mesh, stress=type(mesh.stress)(4 * mesh.stress.node, 4 * mesh.stress.cell))
+    coloring = Coloring("von_mises", [mesh, stiff], range(mesh.num_frames))
+    assert coloring.scale.vmin == 0 and 2.5 < coloring.scale.vmax / mesh.stress.cell_von_mises.max() <= 4
+    assert (coloring(mesh, -1)[1] != coloring(stiff, -1)[1]).any()
+    np.testing.assert_allclose(coloring.values(mesh, 3)[1], mesh.stress.cell_von_mises[3], rtol=1e-6)
+
+
+def test_what_has_no_stress_is_neutral(mesh):
+    loose = np.setdiff1d(np.arange(mesh.num_nodes), mesh.cells)
+    coloring = Coloring("von_mises", [mesh], [0, 1])
+    assert len(loose) > 0
+    np.testing.assert_allclose(coloring(mesh, 1)[0][loose], np.tile(to_rgba(REFERENCE), (len(loose), 1)))
+    for colors in coloring(replace(mesh, stress=None), 1):
+        np.testing.assert_allclose(colors, np.tile(to_rgba(REFERENCE), (len(colors), 1)))
+
+
+def test_cells_have_the_mean_of_their_corners(mesh):
+    moved = replace(mesh, pos=mesh.pos + 0.01 * np.arange(mesh.num_nodes)[:, None])
+    nodes, cells = Coloring("error", [mesh, moved], [0], mesh).values(moved, 0)
+    np.testing.assert_allclose(cells, nodes[mesh.cells].mean(axis=1))
+    assert nodes[1] == pytest.approx(0.01 * np.sqrt(mesh.metadata.dim), rel=1e-5)
+    assert np.isnan(Coloring("error", [mesh, moved], [0], mesh).values(mesh, 0)[0]).all()
+
+
+def test_frames_that_a_rollout_lacks_do_not_count(ground_truth, stopped):
+    coloring = Coloring("error", [ground_truth, stopped], range(ground_truth.num_frames), ground_truth)
+    assert 0 < coloring.scale.vmax < np.inf
+
+
+def test_equal_trajectories_still_have_a_scale(ground_truth, mesh):
+    assert Coloring("error", [ground_truth], [0], ground_truth).scale.vmax > 0
+    still = replace(mesh, stress=type(mesh.stress)(0 * mesh.stress.node, 0 * mesh.stress.cell))
+    assert Coloring("von_mises", [still], [0]).scale.vmax > 0
+
+
+def test_colours_without_data_are_refused(ground_truth):
+    with pytest.raises(ValueError, match="von_mises needs a mesh"):
+        Coloring("von_mises", [ground_truth], [0])
+    with pytest.raises(ValueError, match="ground truth"):
+        Coloring("error", [ground_truth], [0])

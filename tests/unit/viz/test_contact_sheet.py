@@ -1,0 +1,91 @@
+from dataclasses import replace
+
+import pytest
+
+from gpe_pl.schema import node_code
+from gpe_pl.trajectory import Termination
+from gpe_pl.viz.contact_sheet import contact_sheet
+
+
+def texts(figure) -> list[str]:
+    return [t.get_text() for t in figure.texts]
+
+
+def with_fewer_nodes(trajectory):
+    keep = slice(0, trajectory.num_nodes // 2)
+    parts = {name: getattr(trajectory, name)[keep] for name in ("node_type", "mass", "material_params")}
+    return replace(trajectory, pos=trajectory.pos[:, keep], vel=trajectory.vel[:, keep], **parts)
+
+
+def test_a_row_per_trajectory_and_a_column_per_time(ground_truth, dim):
+    rows = {f"friction angle\n{angle} deg": ground_truth for angle in (20, 30)} | {"half": with_fewer_nodes(ground_truth)}
+    figure = contact_sheet(rows, num_columns=4)
+    assert len(figure.axes) == 3 * 4
+    shown = [len(axes.collections[0].get_offsets()) for axes in figure.axes]
+    assert shown == [ground_truth.num_nodes] * 8 + [ground_truth.num_nodes // 2] * 4
+    assert "friction angle\n20 deg" in texts(figure) and "half" in texts(figure)
+    assert {"$t$ = 0.00 s", "0.22 s"} <= set(texts(figure))
+    assert len(contact_sheet({"a": ground_truth}).axes) == 6
+
+
+def test_rows_that_are_low_break_their_labels(ground_truth, dim):
+    if dim == 3:
+        pytest.skip("the same")
+    flat = replace(ground_truth, metadata=replace(ground_truth.metadata, bounds=((0.0, 1.0), (0.0, 0.4))))
+    figure = contact_sheet({"hardening coefficient\n10": flat})
+    assert "hardening\ncoefficient\n10" in texts(figure)
+    label = next(t for t in figure.texts if t.get_text().startswith("hardening"))
+    box, first = label.get_window_extent(), figure.axes[0].get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= first.x0
+
+
+def test_stress_has_a_colour_bar_in_engineering_units(mesh):
+    figure = contact_sheet({"0.5 MPa": mesh, "1 MPa": mesh}, num_columns=3)
+    assert len(figure.axes) == 2 * 3 + 1
+    bar = figure.axes[-1]
+    assert bar.get_ylabel() == "von Mises stress"
+    figure.canvas.draw()
+    labels = [t.get_text() for t in bar.get_yticklabels()]
+    assert labels[0] == "0 Pa" and any(label.endswith(" kPa") for label in labels)
+    panels = figure.axes[:6]
+    assert bar.get_position().x0 > max(axes.get_position().x1 for axes in panels)
+    assert bar.get_position().y0 == pytest.approx(panels[-1].get_position().y0)
+    for part in (bar.yaxis.label, *bar.get_yticklabels()):
+        assert part.get_window_extent().x1 <= figure.bbox.x1
+
+
+def test_several_materials_have_a_legend(ground_truth):
+    types = ground_truth.node_type.copy()
+    types[::2] = node_code("elastomer")
+    mixed = replace(ground_truth, node_type=types, metadata=replace(ground_truth.metadata, materials=("sand", "elastomer", "snow")))
+    figure = contact_sheet({"a": mixed}, num_columns=2)
+    (legend,) = figure.legends
+    assert [t.get_text() for t in legend.get_texts()] == ["sand", "elastomer"]  # snow does not occur
+    assert legend.get_window_extent().y1 <= figure.axes[-1].get_window_extent().y0
+    assert not contact_sheet({"a": ground_truth}, 2).legends
+
+
+def test_a_row_that_stopped_says_so(ground_truth):
+    short = replace(ground_truth.frames(0, 5), termination=Termination("nan", 5, 0, "frame 5: no number"))
+    figure = contact_sheet({"whole": ground_truth, "short": short, "cut": ground_truth.frames(0, 5)}, num_columns=2)
+    assert [axes.texts[0].get_text() for axes in figure.axes] == ["", "", "", "stopped at 0.10 s\n(nan)", "", "not simulated"]
+
+
+def test_short_times_are_told_apart(ground_truth):
+    quick = replace(ground_truth, metadata=replace(ground_truth.metadata, frame_dt=1e-3))
+    assert texts(contact_sheet({"a": quick}, num_columns=12))[1:4] == ["$t$ = 0.000 s", "0.001 s", "0.002 s"]
+
+
+def test_a_sheet_is_saved_at_its_own_resolution(tmp_path, ground_truth):
+    from PIL import Image
+
+    contact_sheet({"a": ground_truth}, 2).savefig(tmp_path / "sheet.png")
+    with Image.open(tmp_path / "sheet.png") as image:
+        assert image.width == 7 * 220
+
+
+def test_empty_sheets_are_refused(ground_truth):
+    with pytest.raises(ValueError, match="at least one"):
+        contact_sheet({})
+    with pytest.raises(ValueError, match="num_columns"):
+        contact_sheet({"a": ground_truth}, num_columns=0)
