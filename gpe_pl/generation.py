@@ -382,6 +382,8 @@ def generate(
     if (missing or draws_sheet) and num_workers > 1:
         _compile(spec)  # once, here: the workers load the compiled kernels from disk
     with _pool(num_workers) as pool:
+        if draws_sheet:  # first, so that hours of wrong data are seen within a minute
+            _draw_contact_sheet(spec, sheet, pool)
         for count in _run(pool, _write_shard, [(spec, folder, split, k) for split, k in missing]):
             done += count
             if on_progress is not None:
@@ -391,8 +393,6 @@ def generate(
             paths = [shard_path(folder, *shard) for shard in train]
             moments = {str(path): sums for path, sums in _run(pool, _moments, [(path,) for path in paths])}
             _write_json(statistics, _statistics(spec, [moments[str(path)] for path in paths]))
-        if draws_sheet:
-            _draw_contact_sheet(spec, sheet, pool)
     return folder
 
 

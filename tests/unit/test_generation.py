@@ -36,6 +36,7 @@ from tests.runs import compose
 
 DENSITY = {"sand": 1600.0, "snow": 400.0, "elastomer": 1000.0}
 SCENE = BodyScene(bounds=((0, 1), (0, 1)), materials=("sand",), grid_spacing=1 / 16, num_particles=40, density=DENSITY)
+SOLVER = MPM(bounds=SCENE.bounds, grid_spacing=SCENE.grid_spacing)
 SPEC = DatasetSpec(
     name="sand",
     size="smoke",
@@ -48,7 +49,7 @@ SPEC = DatasetSpec(
     trajectories_per_shard=2,
     seed=1,
     scene=SCENE,
-    solver=MPM(bounds=SCENE.bounds, grid_spacing=SCENE.grid_spacing),
+    solver=SOLVER,
 )
 
 
@@ -160,7 +161,7 @@ def test_complete_data_set_is_left_alone(folder):
 
 
 def test_other_spec_is_refused_by_key(folder):
-    other = replace(SPEC, seed=2, solver=replace(SPEC.solver, cfl=0.4))
+    other = replace(SPEC, seed=2, solver=replace(SOLVER, cfl=0.4))
     with pytest.raises(GenerationError, match=r"seed is 1, now 2; solver\.cfl is 0\.5, now 0\.4") as error:
         generate(folder.parents[1], other)
     assert "Delete the folder" in str(error.value)
@@ -200,7 +201,7 @@ def test_parameter_groups_are_marked(folder):
 def test_every_combination_of_seen_values_is_dealt():
     scene = replace(SCENE, materials=("sand", "snow"))
     parameters = {"sand": ParameterValues(seen=(20, 30, 40)), "snow": ParameterValues(seen=(5, 8, 11))}
-    solver = replace(SPEC.solver, materials=scene.materials)
+    solver = replace(SOLVER, materials=scene.materials)
     spec = replace(SPEC, scene=scene, solver=solver, parameters=parameters, num_test_unseen=0)
     dealt = [parameter_values(spec, "train", i)[0] for i in range(9)]
     assert {(v["sand"], v["snow"]) for v in dealt} == {(a, b) for a in (20, 30, 40) for b in (5, 8, 11)}
@@ -225,7 +226,7 @@ def test_statistics_are_of_the_train_split(folder):
 
 @pytest.mark.parametrize("num_workers", [1, 2])
 def test_failure_names_split_index_and_seed(tmp_path, num_workers):
-    spec = replace(SPEC, solver=replace(SPEC.solver, max_substeps=1))
+    spec = replace(SPEC, solver=replace(SOLVER, max_substeps=1))
     with pytest.raises(GenerationError, match=r"split train, index \d, seed \d+: explosion: frame 1") as error:
         generate(tmp_path, spec, num_workers)
     assert (error.value.split, error.value.seed) == ("train", scene_seed(spec, "train", error.value.index))

@@ -344,8 +344,9 @@ def falling(new_trajectory: Callable[..., Trajectory], extra: float, gap: float 
     acceleration = np.array([[0.0, -9.81], [extra, -9.81], [0.0, 0.0]])
     start = np.array([[0.3, 0.6], [0.3 + gap, 0.6], [0.8, 0.02]])
     pos = start + 0.5 * time[:, None] ** 2 * acceleration
-    cells = {"cells": np.array([[0, 1]], np.int32), "rest_pos": start.astype(np.float32)} if mesh else {}
-    return replace(t, pos=pos.astype(np.float32), vel=(time[:, None] * acceleration).astype(np.float32), **cells)
+    cells, rest_pos = (np.array([[0, 1]], np.int32), start.astype(np.float32)) if mesh else (None, None)
+    vel = (time[:, None] * acceleration).astype(np.float32)
+    return replace(t, pos=pos.astype(np.float32), vel=vel, cells=cells, rest_pos=rest_pos)
 
 
 @pytest.mark.parametrize(

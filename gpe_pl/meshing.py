@@ -1,0 +1,649 @@
+"""Random bodies and their meshes: triangles and quadrilaterals of outlines in the plane, tetrahedra of bodies given by a signed distance.
+
+Every mesh is a pair ``(points [node, dim], cells [cell, corner])`` in which each cell is positively oriented, no node is unused, and faces match. An explicit
+solver's time step follows from the flattest cell, so all meshes end with an optimisation of their cells' shapes.
+
+Triangles: evenly spaced nodes on the outline, a hexagonal lattice inside, Delaunay triangulation, and centroidal patch smoothing (Chen & Holst 2011).
+Quadrilaterals: triangles of a square lattice of twice the spacing, merged in pairs where that makes a good quadrilateral, then each merged pair split
+into four and each triangle left over into three quadrilaterals. Tetrahedra: those of a body-centred cubic lattice inside the body, their surface then
+moved onto that of the body.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial import Delaunay, QhullError
+
+from gpe_pl.errors import GpeError
+
+Loop = np.ndarray
+"""A closed polyline [point, 2]: the outer one counter-clockwise, holes clockwise."""
+
+Distance = Callable[[np.ndarray], np.ndarray]
+"""Signed distance [point] of points [point, 3], negative inside."""
+
+CORNER = math.radians(30.0)
+"""An outline that turns more than this at a point has a corner there, which the mesh keeps."""
+
+ATTEMPTS = 8
+"""Lattices to try before an outline counts as too fine for the spacing."""
+
+SMALLEST_QUALITY = 0.25
+"""Mean ratio of the worst cell of a good mesh."""
+
+TETRAHEDRA_PER_CUBE = 9.44
+"""Cells of a body-centred cubic lattice in a cube as wide as its mean edge."""
+
+
+class MeshingError(GpeError, ValueError):
+    """The body has details that are too fine for the spacing; the message says so."""
+
+
+# --- meshes in the plane --------------------------------------------------------------------------------------------------------------------
+
+
+def triangulate(loops: list[Loop], spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of edge length ``spacing`` [m] inside an outline with holes.
+
+    Raises:
+        MeshingError: details of the outline are finer than the spacing.
+    """
+    outline = [_resample(loop, spacing) for loop in loops]
+    for _ in range(ATTEMPTS):
+        found = _triangles(outline, _lattice(outline, spacing, rng, hexagonal=True), smooth=12)
+        if found is not None:
+            points, cells = found
+            points = optimise_shapes(points, cells, _is_on_outline(points, outline))
+            if shape_quality(points, cells).min() > SMALLEST_QUALITY:
+                return points, cells
+    raise MeshingError(f"no triangles of {spacing:g} m follow this outline; use a smaller spacing")
+
+
+def quadrangulate(loops: list[Loop], spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Quadrilaterals of edge length ``spacing`` [m] inside an outline with holes; errors as in ``triangulate``."""
+    fine = [_resample(loop, spacing, multiple=2) for loop in loops]
+    outline = [loop[::2] for loop in fine]
+    for _ in range(ATTEMPTS):
+        found = _triangles(outline, _lattice(outline, 2 * spacing, rng, hexagonal=False), smooth=1)
+        if found is None:
+            continue
+        points, cells = found
+        points, cells = _split(points, _without_ears(points, cells), outline, fine)
+        points = optimise_shapes(points, cells, _is_on_outline(points, fine), iterations=60)
+        if shape_quality(points, cells).min() > SMALLEST_QUALITY:
+            return points, cells
+    raise MeshingError(f"no quadrilaterals of {spacing:g} m follow this outline; use a smaller spacing")
+
+
+def _resample(loop: Loop, spacing: float, multiple: int = 1) -> Loop:
+    """Evenly spaced points on a loop that keep its corners; a whole ``multiple`` of them between corners."""
+    before, after = loop - np.roll(loop, 1, axis=0), np.roll(loop, -1, axis=0) - loop
+    turn = np.arctan2(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], np.sum(before * after, axis=1))
+    corners = np.nonzero(np.abs(turn) > CORNER)[0]
+    start = int(corners[0]) if len(corners) else 0
+    closed = np.concatenate([np.roll(loop, -start, axis=0), loop[start : start + 1]])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
+    stops = [*(corners - start), len(loop)] if len(corners) else [0, len(loop)]
+    pieces = []
+    for a, b in itertools.pairwise(stops):
+        smallest = 1 if len(stops) > 2 else 3
+        count = multiple * max(smallest, round((along[b] - along[a]) / (spacing * multiple)))
+        at = along[a] + (along[b] - along[a]) * np.arange(count) / count
+        pieces.append(np.stack([np.interp(at, along, closed[:, k]) for k in range(2)], axis=-1))
+    return np.concatenate(pieces)
+
+
+def _inside(points: np.ndarray, loops: list[Loop]) -> np.ndarray:
+    """Even-odd rule: which points [point, 2] are inside the outer loop and in no hole."""
+    crossings = np.zeros(len(points), dtype=int)
+    for loop in loops:
+        a, b = loop, np.roll(loop, -1, axis=0)
+        above = (a[:, 1] > points[:, 1:]) != (b[:, 1] > points[:, 1:])
+        rise = np.where(a[:, 1] == b[:, 1], 1.0, b[:, 1] - a[:, 1])
+        crossings += np.sum(above & (points[:, :1] < a[:, 0] + (b - a)[:, 0] * (points[:, 1:] - a[:, 1]) / rise), axis=1)
+    return crossings % 2 == 1
+
+
+def _distance(points: np.ndarray, loops: list[Loop]) -> np.ndarray:
+    """Distance of points to the nearest loop."""
+    nearest = np.full(len(points), math.inf)
+    for loop in loops:
+        edge = np.roll(loop, -1, axis=0) - loop
+        offset = points[:, None] - loop
+        t = np.clip(np.sum(offset * edge, axis=-1) / np.sum(edge * edge, axis=-1), 0.0, 1.0)
+        nearest = np.minimum(nearest, np.sqrt(np.min(np.sum((offset - t[..., None] * edge) ** 2, axis=-1), axis=1)))
+    return nearest
+
+
+def _lattice(loops: list[Loop], spacing: float, rng: np.random.Generator, hexagonal: bool) -> np.ndarray:
+    """Points of a randomly turned and shifted lattice inside an outline, not too close to it."""
+    low, high = loops[0].min(axis=0), loops[0].max(axis=0)
+    middle, reach = (low + high) / 2, math.ceil(0.5 * float(np.linalg.norm(high - low)) / spacing * 1.2) + 1
+    index = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1.0)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    if hexagonal:
+        index = np.stack([index[:, 0] + 0.5 * (index[:, 1] % 2), math.sqrt(0.75) * index[:, 1]], axis=-1)
+    angle = rng.uniform(0, math.pi / 2)
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    points = middle + spacing * (index + rng.uniform(-0.5, 0.5, 2) + rng.uniform(-1e-3, 1e-3, index.shape)) @ turn.T
+    points = points[np.all((points > low) & (points < high), axis=1)]
+    points = points[_inside(points, loops)]
+    return points[_distance(points, loops) > 0.62 * spacing]
+
+
+def _triangles(loops: list[Loop], inner: np.ndarray, smooth: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Delaunay triangles of the loops' points, which come first, and of inner points that move; None unless their surface is the loops."""
+    rim = np.concatenate(loops)
+    points = np.concatenate([rim, inner])
+    cells = np.empty((0, 3), dtype=np.int64)
+    for k in range(smooth + 1):
+        try:
+            cells = Delaunay(points).simplices.astype(np.int64)
+        except (QhullError, ValueError):
+            return None
+        cells = cells[_inside(points[cells].mean(axis=1), loops)]
+        area = _signed_volumes(points, cells)
+        cells[area < 0] = cells[area < 0][:, ::-1]
+        cells = cells[np.abs(area) > 1e-6 * np.mean(np.abs(area))]
+        if k < smooth:  # inner points to the weighted mean of the centroids around them
+            weight, pull = np.zeros(len(points)), np.zeros_like(points)
+            area = np.repeat(_signed_volumes(points, cells), 3)
+            np.add.at(weight, cells.ravel(), area)
+            np.add.at(pull, cells.ravel(), area[:, None] * np.repeat(points[cells].mean(axis=1), 3, axis=0))
+            free = np.arange(len(points)) >= len(rim)
+            free &= weight > 0
+            points[free] = pull[free] / weight[free][:, None]
+    first, expected = 0, set()
+    for loop in loops:
+        index = first + np.arange(len(loop))
+        expected |= {frozenset(edge) for edge in zip(index.tolist(), np.roll(index, -1).tolist(), strict=True)}
+        first += len(loop)
+    if {frozenset(face) for face in surface_faces(cells).tolist()} != expected or len(np.unique(cells)) != len(points):
+        return None
+    return points, cells
+
+
+def _is_on_outline(points: np.ndarray, loops: list[Loop]) -> np.ndarray:
+    """Mask of the nodes of the loops, by position."""
+    rim = {point.tobytes() for loop in loops for point in np.ascontiguousarray(loop)}
+    return np.array([point.tobytes() in rim for point in np.ascontiguousarray(points)])
+
+
+def _without_ears(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Triangles without cells that alone fill a wide angle of the outline: their inner edge is flipped to end in that angle."""
+    cells = cells.copy()
+    owners: dict[frozenset[int], list[int]] = {}
+    for number, cell in enumerate(cells.tolist()):
+        for k in range(3):
+            owners.setdefault(frozenset((cell[k], cell[k - 1])), []).append(number)
+    flipped: set[int] = set()
+    for number, cell in enumerate(cells.tolist()):
+        inner = [edge for edge in (frozenset((cell[k], cell[k - 1])) for k in range(3)) if len(owners[edge]) == 2]
+        if len(inner) != 1:
+            continue
+        tip = next(n for n in cell if n not in inner[0])
+        k = cell.index(tip)
+        right, left = cell[(k + 1) % 3], cell[(k + 2) % 3]
+        a, b = points[right] - points[tip], points[left] - points[tip]
+        other = next(c for c in owners[inner[0]] if c != number)
+        if np.dot(a, b) < -0.5 * np.linalg.norm(a) * np.linalg.norm(b) and not flipped & {number, other}:  # wider than 120 degrees
+            far = next(n for n in cells[other].tolist() if n not in inner[0])
+            cells[number], cells[other] = (tip, right, far), (tip, far, left)
+            flipped |= {number, other}
+    return cells
+
+
+def _split(points: np.ndarray, cells: np.ndarray, outline: list[Loop], fine: list[Loop]) -> tuple[np.ndarray, np.ndarray]:
+    """Merge triangles into quadrilaterals where they fit, and split everything into quadrilaterals around its middle."""
+    pairs: dict[tuple[int, int], list[int]] = {}
+    for number, cell in enumerate(cells.tolist()):
+        for k in range(3):
+            pairs.setdefault((min(cell[k], cell[k - 1]), max(cell[k], cell[k - 1])), []).append(number)
+    joined = [(a, b, edge) for edge, owners in pairs.items() if len(owners) == 2 for a, b in [owners]]
+    shapes = []
+    for a, b, edge in joined:
+        across = [next(n for n in cells[c].tolist() if n not in edge) for c in (a, b)]
+        turned = cells[a].tolist()
+        k = turned.index(across[0])
+        shapes.append([across[0], turned[(k + 1) % 3], across[1], turned[(k + 2) % 3]])
+    quality = shape_quality(points, np.array(shapes, dtype=np.int64).reshape(-1, 4))
+    merged, polygons = np.zeros(len(cells), dtype=bool), []
+    for k in np.argsort(-quality, kind="stable"):
+        a, b, _ = joined[k]
+        if quality[k] > 0.6 and not (merged[a] or merged[b]):
+            merged[[a, b]] = True
+            polygons.append(shapes[k])
+    polygons += cells[~merged].tolist()
+    # the middle of an edge of the outline is the outline's own point there
+    middles: dict[tuple[int, int], np.ndarray] = {}
+    first = 0
+    for coarse, loop in zip(outline, fine, strict=True):
+        for k in range(len(coarse)):
+            i, j = first + k, first + (k + 1) % len(coarse)
+            middles[min(i, j), max(i, j)] = loop[2 * k + 1]
+        first += len(coarse)
+    nodes, of_edge, quads = list(points), {}, []
+    for polygon in polygons:
+        center = len(nodes)
+        nodes.append(points[polygon].mean(axis=0))
+        edges = []
+        for i, j in zip(polygon, [*polygon[1:], polygon[0]], strict=True):
+            key = (min(i, j), max(i, j))
+            if key not in of_edge:
+                of_edge[key] = len(nodes)
+                nodes.append(middles.get(key, (points[i] + points[j]) / 2))
+            edges.append(of_edge[key])
+        quads += [[polygon[k], edges[k], center, edges[k - 1]] for k in range(len(polygon))]
+    return np.array(nodes), np.array(quads, dtype=np.int64)
+
+
+# --- tetrahedra -----------------------------------------------------------------------------------------------------------------------------
+
+
+def tetrahedralise(distance: Distance, reach: float, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Tetrahedra of mean edge length ``spacing`` [m] in a body; its edges and corners are rounded at that scale.
+
+    Args:
+        distance: signed distance of the body, at least near its surface.
+        reach: half the width [m] of a cube around the origin that holds the body.
+        spacing: mean edge length [m].
+        rng: turns and shifts the lattice.
+
+    Raises:
+        MeshingError: the body is thinner than about two spacings somewhere.
+    """
+    for _ in range(ATTEMPTS):
+        points, cells = _cubic_lattice(reach, spacing, rng)
+        depth = -distance(points[cells].mean(axis=1))
+        volume = np.sum(_signed_volumes(points, cells[depth > 0]))
+        # peeling takes as much away at the surface as this leaves too much
+        cells = _largest_part(_peeled(cells[depth > -0.15 * spacing]))
+        if len(cells) == 0:
+            continue
+        points, cells = _compact(points, cells)
+        surface = np.unique(surface_faces(cells))
+        points = _pull_to_surface(points, cells, surface, distance, spacing)
+        if shape_quality(points, cells).min() > SMALLEST_QUALITY and np.sum(_signed_volumes(points, cells)) > 0.7 * volume:
+            return points, cells
+    raise MeshingError(f"no tetrahedra of {spacing:g} m fill this body; use a smaller spacing")
+
+
+def _cubic_lattice(reach: float, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Delaunay tetrahedra of a body-centred cubic lattice, randomly turned and shifted, that covers a cube."""
+    width = spacing / ((8 * math.sqrt(0.75) + 6) / 14)
+    count = math.ceil(math.sqrt(3.0) * reach / width) + 1
+    index = np.stack(np.meshgrid(*[np.arange(-count, count + 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    index = np.concatenate([index, index + 0.5])
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    points = width * (index + rng.uniform(-0.5, 0.5, 3)) @ turn.T
+    points = points[np.all(np.abs(points) < reach + 1.5 * width, axis=1)]
+    # the lattice is its own Delaunay triangulation, but four ways to cut each octahedron are equally good: shake it to choose one
+    cells = Delaunay(points + 1e-4 * width * rng.uniform(-1, 1, points.shape)).simplices.astype(np.int64)
+    volume = _signed_volumes(points, cells)
+    cells[volume < 0] = cells[volume < 0][:, [1, 0, 2, 3]]
+    return points, cells[np.abs(volume) > 0.5 * width**3 / 12]
+
+
+def _peeled(cells: np.ndarray) -> np.ndarray:
+    """Without the cells of two or more surface faces: on a smooth surface they would become flat."""
+    while len(cells):
+        faces = np.sort(np.concatenate([np.delete(cells, k, axis=1) for k in range(4)]), axis=1)
+        _, which, times = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
+        open_faces = np.sum((times[which.ravel()] == 1).reshape(4, -1), axis=0)
+        if not np.any(open_faces > 1):
+            break
+        cells = cells[open_faces <= 1]
+    return cells
+
+
+def _largest_part(cells: np.ndarray) -> np.ndarray:
+    """The cells of the largest part that hangs together by faces."""
+    if len(cells) == 0:
+        return cells
+    faces = np.sort(np.concatenate([np.delete(cells, k, axis=1) for k in range(4)]), axis=1)
+    owner = np.tile(np.arange(len(cells)), 4)
+    order = np.lexsort(faces.T)
+    same = np.all(faces[order][1:] == faces[order][:-1], axis=1)
+    a, b = owner[order][:-1][same], owner[order][1:][same]
+    part = np.arange(len(cells))
+    while True:
+        lowest = part.copy()
+        np.minimum.at(lowest, a, part[b])
+        np.minimum.at(lowest, b, part[a])
+        if np.array_equal(lowest, part):
+            break
+        part = lowest
+    return cells[part == np.argmax(np.bincount(part))]
+
+
+def _compact(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    used, cells = np.unique(cells, return_inverse=True)
+    return points[used], cells.reshape(-1, 4)
+
+
+def _pull_to_surface(points: np.ndarray, cells: np.ndarray, surface: np.ndarray, distance: Distance, spacing: float) -> np.ndarray:
+    """Nodes for which the cells have a good shape and the surface nodes lie on the surface of the body."""
+
+    def misfit(at: np.ndarray) -> tuple[float, np.ndarray]:
+        gap, slope = distance(at[surface]) / spacing, np.zeros_like(at)
+        slope[surface] = 2 * gap[:, None] * _gradient(distance, at[surface], spacing) / spacing
+        return float(np.sum(gap**2)), slope
+
+    points = optimise_shapes(points, cells, np.zeros(len(points), dtype=bool), iterations=80, penalty=misfit)
+    for _ in range(3):
+        points[surface] -= distance(points[surface])[:, None] * _gradient(distance, points[surface], spacing)
+    fixed = np.zeros(len(points), dtype=bool)
+    fixed[surface] = True
+    return optimise_shapes(points, cells, fixed)
+
+
+def _gradient(distance: Distance, points: np.ndarray, spacing: float) -> np.ndarray:
+    """Direction away from the body [point, 3]."""
+    step = 1e-4 * spacing
+    slope = np.stack([distance(points + step * e) - distance(points - step * e) for e in np.eye(3)], axis=-1)
+    return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-300)
+
+
+# --- shapes of cells ------------------------------------------------------------------------------------------------------------------------
+
+
+def _signed_volumes(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Volume [cell] of simplices, negative where inverted."""
+    dim = points.shape[1]
+    corners = points[cells]
+    return np.linalg.det(corners[:, 1:] - corners[:, :1]) / math.factorial(dim)
+
+
+def surface_faces(cells: np.ndarray) -> np.ndarray:
+    """Faces [face, corner] that only one of the triangles or tetrahedra ``cells`` [cell, corner] has."""
+    faces = np.concatenate([np.delete(cells, k, axis=1) for k in range(cells.shape[1])])
+    _, first, times = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    return faces[first[times == 1]]
+
+
+def _simplices(cells: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
+    """Simplices whose shapes stand for those of the cells, and the inverse of the edge matrix of an ideal one: a quadrilateral has four right corners."""
+    if dim == 3:
+        ideal = np.array([[1.0, 0.0, 0.0], [0.5, math.sqrt(0.75), 0.0], [0.5, math.sqrt(1 / 12), math.sqrt(2 / 3)]])
+        return cells, np.linalg.inv(ideal)
+    if cells.shape[1] == 3:
+        return cells, np.linalg.inv(np.array([[1.0, 0.0], [0.5, math.sqrt(0.75)]]))
+    corners = np.stack([cells[:, [k, (k + 1) % 4, (k + 3) % 4]] for k in range(4)], axis=1)
+    return corners.reshape(-1, 3), np.eye(2)
+
+
+def shape_quality(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
+    """Mean ratio of each cell [cell]: 1 for a regular simplex or a square, 0 for a flat cell, negative for an inverted one (Knupp 2001).
+
+    ``d det(A)^(2/d) / |A|²`` with A the map from the ideal cell; for quadrilaterals, of the worst corner.
+    """
+    dim = points.shape[1]
+    simplices, inverse = _simplices(cells, dim)
+    edges = inverse @ (points[simplices][:, 1:] - points[simplices][:, :1])
+    determinant = np.linalg.det(edges)
+    ratio = dim * np.sign(determinant) * np.abs(determinant) ** (2 / dim) / np.sum(edges**2, axis=(1, 2))
+    return ratio.reshape(len(cells), -1).min(axis=1)
+
+
+def optimise_shapes(
+    points: np.ndarray,
+    cells: np.ndarray,
+    fixed: np.ndarray,
+    iterations: int = 30,
+    penalty: Callable[[np.ndarray], tuple[float, np.ndarray]] | None = None,
+) -> np.ndarray:
+    """Move the nodes that are not ``fixed`` [node] to minimise the sum of the squared inverse mean ratios, plus a ``penalty`` with its gradient.
+
+    The determinant is regularised, ``(det + √(det² + δ²))/2``, so that inverted cells are turned back (Escobar et al. 2003).
+    """
+    points = np.array(points)
+    if np.all(fixed) or len(cells) == 0:
+        return points
+    dim = points.shape[1]
+    simplices, inverse = _simplices(cells, dim)
+    scale = float(np.mean(np.abs(np.linalg.det(inverse @ (points[simplices][:, 1:] - points[simplices][:, :1]))))) ** (1 / dim)
+    origin, delta = points.mean(axis=0), 0.02
+
+    def cost(free: np.ndarray) -> tuple[float, np.ndarray]:
+        at = (points - origin) / scale
+        at[~fixed] = free.reshape(-1, dim)
+        corners = at[simplices]
+        edges = inverse @ (corners[:, 1:] - corners[:, :1])
+        cofactor = _cofactor(edges)
+        determinant = np.sum(edges[:, 0] * cofactor[:, 0], axis=1)
+        root = np.sqrt(determinant**2 + delta**2)
+        bounded = (determinant + root) / 2
+        square = np.sum(edges**2, axis=(1, 2)) / dim
+        distortion = square**dim / bounded**2
+        # d distortion / d edges
+        slope = 2 * distortion[:, None, None] * (edges / square[:, None, None] - cofactor / root[:, None, None])
+        pull = inverse.T @ slope
+        gradient = np.zeros_like(at)
+        for k in range(dim):
+            gradient += np.stack([np.bincount(simplices[:, k + 1], pull[:, k, axis], len(at)) for axis in range(dim)], axis=-1)
+        total = pull.sum(axis=1)
+        gradient -= np.stack([np.bincount(simplices[:, 0], total[:, axis], len(at)) for axis in range(dim)], axis=-1)
+        value = float(np.sum(distortion))
+        if penalty is not None:
+            extra, slope = penalty(origin + scale * at)
+            value, gradient = value + 20.0 * extra, gradient + 20.0 * scale * slope
+        return value, gradient[~fixed].ravel()
+
+    start = ((points - origin) / scale)[~fixed].ravel()
+    best = minimize(cost, start, jac=True, method="L-BFGS-B", options={"maxiter": iterations, "maxcor": 10})
+    points[~fixed] = origin + scale * best.x.reshape(-1, dim)
+    return points
+
+
+def _cofactor(matrices: np.ndarray) -> np.ndarray:
+    """Derivatives of the determinant by the entries."""
+    if matrices.shape[-1] == 2:
+        return np.stack([matrices[:, 1, ::-1] * [1, -1], matrices[:, 0, ::-1] * [-1, 1]], axis=1)
+    a, b, c = matrices[:, 0], matrices[:, 1], matrices[:, 2]
+    return np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+
+
+# --- random bodies: outlines of unit area and signed distances of unit volume around the origin ---------------------------------------------
+
+
+def _arc(count: int = 240) -> np.ndarray:
+    return 2 * math.pi * np.arange(count) / count
+
+
+def _polar(radius: np.ndarray) -> Loop:
+    angle = _arc(len(radius))
+    return radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _rounded(corners: np.ndarray, radius: float) -> Loop:
+    """A counter-clockwise polygon with its corners replaced by arcs of this radius, or as large as the edges allow."""
+    pieces = []
+    for before, at, after in zip(np.roll(corners, 1, axis=0), corners, np.roll(corners, -1, axis=0), strict=True):
+        a, b = before - at, after - at
+        la, lb = float(np.linalg.norm(a)), float(np.linalg.norm(b))
+        half = 0.5 * math.acos(max(-1.0, min(1.0, float(a @ b) / (la * lb))))
+        cut = min(radius / math.tan(half), 0.45 * la, 0.45 * lb)
+        start, end = at + cut * a / la, at + cut * b / lb
+        t = np.linspace(0, 1, 12)[:, None]
+        # a quadratic curve between the points of tangency
+        pieces.append((1 - t) ** 2 * start + 2 * t * (1 - t) * at + t**2 * end)
+    return np.concatenate(pieces)
+
+
+def _ellipse(rng: np.random.Generator) -> list[Loop]:
+    return [_polar(np.ones(240)) * [rng.uniform(1.0, 1.8), 1.0]]
+
+
+def _rectangle(rng: np.random.Generator) -> list[Loop]:
+    w = rng.uniform(1.0, 3.0)
+    return [np.array([(0.0, 0.0), (w, 0.0), (w, 1.0), (0.0, 1.0)])]
+
+
+def _polygon(rng: np.random.Generator) -> list[Loop]:
+    sides = int(rng.integers(3, 8))
+    angle = 2 * math.pi * (np.arange(sides) + rng.uniform(-0.2, 0.2, sides)) / sides
+    corners = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * rng.uniform(0.85, 1.15, (sides, 1))
+    return [_rounded(corners, rng.uniform(0.1, 0.3))]
+
+
+def _star(rng: np.random.Generator) -> list[Loop]:
+    arms = int(rng.integers(3, 7))
+    depth = rng.uniform(0.15, 0.35) * (1.0 if arms < 6 else 0.7)
+    return [_polar(1 + depth * np.cos(arms * _arc()))]
+
+
+def _blob(rng: np.random.Generator) -> list[Loop]:
+    angle, radius = _arc(), np.ones(240)
+    for k in range(2, 6):
+        radius += rng.uniform(-0.3, 0.3) / k * np.cos(k * angle + rng.uniform(0, 2 * math.pi))
+    return [_polar(radius)]
+
+
+def _ring(rng: np.random.Generator) -> list[Loop]:
+    hole, shift = rng.uniform(0.3, 0.5), rng.uniform(0.0, 0.12)
+    return [_polar(np.ones(240)), (hole * _polar(np.ones(240)) + [shift, 0.0])[::-1]]
+
+
+def _plate(rng: np.random.Generator) -> list[Loop]:
+    w, hole = rng.uniform(1.5, 2.2), rng.uniform(0.18, 0.26)
+    loops = [_rounded(np.array([(-w, -1.0), (w, -1.0), (w, 1.0), (-w, 1.0)]) / 2, 0.2)]
+    return [*loops, *((hole * _polar(np.ones(240)) + [x, 0.0])[::-1] for x in (-w / 4, w / 4))]
+
+
+def _gear(rng: np.random.Generator) -> list[Loop]:
+    teeth, depth = int(rng.integers(5, 9)), rng.uniform(0.25, 0.35)
+    angle = 2 * math.pi * (np.arange(teeth)[:, None] + np.array([-0.3, -0.17, 0.17, 0.3])) / teeth
+    radius = np.array([1.0, 1 + depth, 1 + depth, 1.0])
+    outer = (radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)).reshape(-1, 2)
+    return [outer, (rng.uniform(0.3, 0.45) * _polar(np.ones(240)))[::-1]] if rng.random() < 0.5 else [outer]
+
+
+def _letter(rng: np.random.Generator) -> list[Loop]:
+    """L, T, U or plus, with arms of a random width."""
+    t = rng.uniform(0.34, 0.45)
+    w, kind = rng.uniform(1.0, 1.4), int(rng.integers(4))
+    m, r = w / 2, t / 2
+    corners = {
+        0: [(0, 0), (w, 0), (w, t), (t, t), (t, 1), (0, 1)],
+        1: [(m - r, 0), (m + r, 0), (m + r, 1 - t), (w, 1 - t), (w, 1), (0, 1), (0, 1 - t), (m - r, 1 - t)],
+        2: [(0, 0), (w, 0), (w, 1), (w - t, 1), (w - t, t), (t, t), (t, 1), (0, 1)],
+        3: [
+            (m - r, 0), (m + r, 0), (m + r, 0.5 - r), (w, 0.5 - r), (w, 0.5 + r), (m + r, 0.5 + r),
+            (m + r, 1), (m - r, 1), (m - r, 0.5 + r), (0, 0.5 + r), (0, 0.5 - r), (m - r, 0.5 - r),
+        ],
+    }[kind]  # fmt: skip
+    return [np.array(corners, dtype=float)]
+
+
+OUTLINES: dict[str, Callable[[np.random.Generator], list[Loop]]] = {
+    "ellipse": _ellipse,
+    "rectangle": _rectangle,
+    "polygon": _polygon,
+    "star": _star,
+    "blob": _blob,
+    "ring": _ring,
+    "plate": _plate,
+    "gear": _gear,
+    "letter": _letter,
+}
+"""Families of plane bodies."""
+
+
+def random_outline(rng: np.random.Generator, family: str | None = None) -> list[Loop]:
+    """A body of unit area around the origin, of a given or random family."""
+    names = tuple(OUTLINES)
+    loops = OUTLINES[family or names[rng.integers(len(names))]](rng)
+    size = 1 / math.sqrt(sum(_area(loop) for loop in loops))
+    low, high = loops[0].min(axis=0), loops[0].max(axis=0)
+    return [size * (loop - (low + high) / 2) for loop in loops]
+
+
+def _area(loop: Loop) -> float:
+    after = np.roll(loop, -1, axis=0)
+    return float(np.sum(loop[:, 0] * after[:, 1] - loop[:, 1] * after[:, 0]) / 2)
+
+
+def _ellipsoid(rng: np.random.Generator) -> Distance:
+    axes = np.array([1.0, rng.uniform(0.7, 1.0), rng.uniform(0.6, 1.0)])
+
+    def distance(x: np.ndarray) -> np.ndarray:
+        scaled, slope = np.linalg.norm(x / axes, axis=-1), np.linalg.norm(x / axes**2, axis=-1)
+        return np.where(slope > 0, scaled * (scaled - 1) / np.maximum(slope, 1e-12), -axes.min())
+
+    return distance
+
+
+def _cuboid(rng: np.random.Generator) -> Distance:
+    half, radius = np.array([rng.uniform(0.7, 1.3), rng.uniform(0.6, 1.0), 0.6]), rng.uniform(0.3, 0.45)
+    return lambda x: _box_distance(x, half - radius) - radius
+
+
+def _box_distance(x: np.ndarray, half: np.ndarray) -> np.ndarray:
+    q = np.abs(x) - half
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0)
+
+
+def _cylinder(rng: np.random.Generator) -> Distance:
+    length, radius = rng.uniform(0.5, 1.2), 0.3
+
+    def distance(x: np.ndarray) -> np.ndarray:
+        q = np.stack([np.hypot(x[..., 0], x[..., 1]) - 0.7 + radius, np.abs(x[..., 2]) - length + radius], axis=-1)
+        return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(axis=-1), 0) - radius
+
+    return distance
+
+
+def _torus(rng: np.random.Generator) -> Distance:
+    thickness = rng.uniform(0.42, 0.5)
+    return lambda x: np.hypot(np.hypot(x[..., 0], x[..., 1]) - 1.0, x[..., 2]) - thickness
+
+
+def _bend(rng: np.random.Generator) -> Distance:
+    """Two arms at a right angle."""
+    arm = rng.uniform(1.0, 1.3)
+    a, b = np.array([arm, 0.5, 0.5]), np.array([0.5, arm, 0.5])
+
+    def distance(x: np.ndarray) -> np.ndarray:
+        one = _box_distance(x - [arm - 0.5, 0.0, 0.0], a - 0.35)
+        return np.minimum(one, _box_distance(x - [0.0, arm - 0.5, 0.0], b - 0.35)) - 0.35
+
+    return distance
+
+
+def _dumbbell(rng: np.random.Generator) -> Distance:
+    """Two balls on a rod, with smooth transitions."""
+    span, second = rng.uniform(0.7, 0.9), rng.uniform(0.5, 0.7)
+
+    def distance(x: np.ndarray) -> np.ndarray:
+        rod = np.linalg.norm(x - np.stack([np.clip(x[..., 0], -span, span), *[np.zeros(x.shape[:-1])] * 2], axis=-1), axis=-1) - 0.42
+        parts = [rod, *(np.linalg.norm(x - [s, 0.0, 0.0], axis=-1) - r for s, r in ((-span, 0.65), (span, second)))]
+        return -0.08 * np.log(np.sum(np.exp(-np.stack(parts) / 0.08), axis=0))
+
+    return distance
+
+
+SOLIDS: dict[str, Callable[[np.random.Generator], Distance]] = {
+    "ellipsoid": _ellipsoid,
+    "cuboid": _cuboid,
+    "cylinder": _cylinder,
+    "torus": _torus,
+    "bend": _bend,
+    "dumbbell": _dumbbell,
+}
+"""Families of bodies in space."""
+
+
+def random_solid(rng: np.random.Generator, family: str | None = None) -> tuple[Distance, float]:
+    """A body of unit volume, of a given or random family: its signed distance, and half the width of a cube around the origin that holds it."""
+    names = tuple(SOLIDS)
+    distance = SOLIDS[family or names[rng.integers(len(names))]](rng)
+    reach, count = 2.2, 40
+    axis = reach * (2 * np.arange(count) + 1 - count) / count
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = distance(grid) < 0
+    width = float(np.sum(inside)) ** (1 / 3) * 2 * reach / count
+    return (lambda x: distance(x * width) / width), (float(np.max(np.abs(grid[inside]))) + 2 * reach / count) / width

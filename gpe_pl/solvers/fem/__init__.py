@@ -1,0 +1,321 @@
+"""Explicit finite elements for a deformable solid that falls on rigid obstacles: symplectic Euler with lumped masses, in float64.
+
+One substep of length h, with internal forces f, damping included (``elements``) and contact (``contact``)::
+
+    v ← v + h f(x, v) / m + h g / 2,   v ← contact(x, v),   x ← x + h v,   v ← v + h g / 2
+
+Gravity comes in halves, so that a free body falls along the exact parabola whatever the substeps are. A body at rest on a floor keeps a velocity of h g / 2.
+h follows from the current state alone: it stays below the stability limit of the mesh as deformed now, and no node moves further
+than half the smallest height of a cell. There is no contact of the solid with itself: a scene holds one body.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Annotated, ClassVar, no_type_check
+
+import numpy as np
+from numba import njit
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from gpe_pl.rollout import SimulationError
+from gpe_pl.schema import MATERIALS, node_code
+from gpe_pl.solvers.fem.contact import Obstacles, collect, push_out_corners, push_out_nodes, resist_corners, resist_nodes
+from gpe_pl.solvers.fem.elements import (
+    Mesh,
+    add_quad_forces,
+    add_tetrahedron_forces,
+    add_triangle_forces,
+    build_mesh,
+    cauchy_stress,
+    elastic_energy,
+)
+from gpe_pl.solvers.materials import lame_parameters
+from gpe_pl.trajectory import Boundary, State
+
+OK, NOT_FINITE, ESCAPE, TOO_MANY_SUBSTEPS = 0, 1, 2, 3
+KINDS = {"triangle": 0, "quad": 1, "tetrahedron": 2}
+
+
+@dataclass(frozen=True, config={"extra": "forbid"})
+class FEM:
+    """Finite element solver for the node type ``solid``; a ``Simulator`` of states with ``rest_pos`` and ``cells``.
+
+    Young's modulus is the material parameter of each node; a cell takes the mean of its corners. Inertia comes from ``State.mass`` alone, lumped at the nodes.
+    Every step stores the elastic Cauchy stress.
+
+    Attributes:
+        bounds: ``(low, high)`` per axis of the domain [m], two or three of them.
+        frame_dt: time between frames [s].
+        materials: ``("solid",)``.
+        poisson_ratio: below 0.5; linear triangles and tetrahedra stiffen from about 0.45 on.
+        damping: fraction of critical damping that viscosity gives the fastest mode of the mesh; a mode n times slower gets 1/n of it.
+        cfl: fraction of the substep that is certainly stable.
+        max_substeps: per frame; more means that the state has exploded.
+    """
+
+    bounds: tuple[tuple[float, float], ...]
+    frame_dt: Annotated[float, Field(gt=0)] = 5e-3
+    materials: tuple[str, ...] = ("solid",)
+    poisson_ratio: Annotated[float, Field(ge=0, lt=0.5)] = 0.35
+    damping: Annotated[float, Field(ge=0, le=2)] = 0.2
+    cfl: Annotated[float, Field(gt=0, lt=1)] = 0.95
+    max_substeps: Annotated[int, Field(ge=1)] = 10000
+
+    name: ClassVar[str] = "fem"
+    version: ClassVar[str] = "1"
+    stores_stress: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if len(self.bounds) not in (2, 3):
+            raise ValueError(f"bounds must have two or three axes, got {len(self.bounds)}")
+        for axis, (low, high) in enumerate(self.bounds):
+            if not (math.isfinite(high - low) and low < high):
+                raise ValueError(f"bounds[{axis}] = ({low}, {high}) must be finite with low < high")
+        if self.materials != ("solid",):
+            raise ValueError(f"materials must be ('solid',), got {self.materials}")
+
+    @property
+    def solver_dt(self) -> float:
+        """Upper bound of the substep in s: ``frame_dt``. The substep itself depends on mesh, stiffness and deformation; see ``substep``."""
+        return self.frame_dt
+
+    def substep(self, state: State) -> float:
+        """Largest substep in s that the solver takes from this state at rest; raises what ``step`` raises for a state that does not fit."""
+        mesh, lam, mu, eta, _ = self._prepare(state)
+        pos = _three_dimensional(state.pos)
+        stiffest, most_viscous = _add_forces(
+            KINDS[mesh.kind],
+            pos,
+            np.zeros_like(pos),
+            mesh.cells,
+            mesh.gradient,
+            mesh.weight,
+            lam,
+            mu,
+            eta,
+            self.damping > 0,
+            np.zeros_like(pos),
+        )
+        return min(self.frame_dt, self.cfl / _critical_rate(mesh.scale * stiffest, mesh.scale * most_viscous))
+
+    def step(self, state: State) -> State:
+        """Advance one frame.
+
+        Raises:
+            SimulationError: with reason ``input`` (arrays, mesh or boundary that do not fit the solver), ``nan``, ``escape`` (a node left the domain
+                through an open side or started outside) or ``explosion`` (more than ``max_substeps``).
+        """
+        mesh, lam, mu, eta, obstacles = self._prepare(state)
+        pos, vel = _three_dimensional(state.pos), _three_dimensional(state.vel)
+        dim = state.dim
+        bounds = np.zeros((3, 2))
+        bounds[:dim] = self.bounds
+        # without cells, nothing may cross the domain in one substep
+        reach = mesh.reach if math.isfinite(mesh.reach) else float(np.max(bounds[:, 1] - bounds[:, 0]))
+        status, node, substeps = _advance_frame(
+            KINDS[mesh.kind], pos, vel, mesh.cells, mesh.gradient, mesh.weight, lam, mu, eta, mesh.scale, self.damping > 0,
+            np.array(state.mass, dtype=np.float64, order="C"), _three_dimensional(state.gravity), bounds, reach, mesh.edges,
+            obstacles, self.frame_dt, self.cfl, self.max_substeps,
+        )  # fmt: skip
+        if status != OK:
+            raise self._error(status, node, pos[:, :dim], vel[:, :dim], state.gravity)
+        pos, vel = np.array(pos[:, :dim], order="C"), np.array(vel[:, :dim], order="C")
+        return replace(
+            state,
+            pos=pos,
+            vel=vel,
+            velocity_history=None,
+            time=state.time + self.frame_dt,
+            stress=cauchy_stress(mesh, pos, lam, mu),
+            num_substeps=substeps,
+            internal=None,
+        )
+
+    def compile_kernels(self) -> None:
+        """Compile every kernel and fill Numba's cache on disk, so that worker processes started afterwards only load it."""
+        dim = len(self.bounds)
+        middle = np.array([(low + high) / 2 for low, high in self.bounds])
+        size = 0.25 * min(high - low for low, high in self.bounds)
+        pos = middle + size * np.concatenate([np.zeros((1, dim)), np.eye(dim)])
+        count = dim + 1
+        self.step(
+            State(
+                pos, np.zeros_like(pos), np.full(count, node_code("solid"), dtype=np.uint8), np.full(count, size**dim),
+                np.full((count, 1), MATERIALS["solid"].low), Boundary.empty(dim), np.zeros(dim), rest_pos=pos, cells=np.arange(count)[None],
+            )
+        )  # fmt: skip
+
+    def energy(self, state: State) -> float:
+        """Kinetic, gravitational and elastic energy in J (per metre of depth in 2D)."""
+        mesh, lam, mu, _, _ = self._prepare(state)
+        external = np.sum(state.mass * (np.sum(state.vel**2, axis=1) / 2 - state.pos @ state.gravity))
+        return float(external) + elastic_energy(mesh, np.asarray(state.pos), lam, mu)
+
+    def _prepare(self, state: State) -> tuple[Mesh, np.ndarray, np.ndarray, np.ndarray, Obstacles]:
+        """Mesh, Lamé parameters and viscosity of each cell, and obstacles, or an error that names what does not fit."""
+        num_nodes, dim = state.num_nodes, len(self.bounds)
+        if state.rest_pos is None or state.cells is None:
+            raise SimulationError("the state has no mesh: rest_pos and cells are required", reason="input")
+        if state.internal is not None:
+            raise SimulationError(f"internal state is of type {type(state.internal).__name__}, expected None", reason="input")
+        shapes = {
+            "pos": (state.pos, (num_nodes, dim)),
+            "vel": (state.vel, (num_nodes, dim)),
+            "mass": (state.mass, (num_nodes,)),
+            "rest_pos": (state.rest_pos, (num_nodes, dim)),
+            "node_type": (state.node_type, (num_nodes,)),
+            "material_params": (state.material_params, (num_nodes, 1)),
+            "gravity": (state.gravity, (dim,)),
+        }
+        for name, (array, expected) in shapes.items():
+            if np.shape(array) != expected:
+                raise SimulationError(f"{name} has shape {np.shape(array)}, expected {expected}", reason="input")
+            if name not in ("material_params", "gravity"):
+                _require(np.isfinite(array), f"{name} is not finite", reason="nan")
+        if not np.all(np.isfinite(state.gravity)):
+            raise SimulationError(f"gravity {state.gravity} is not finite", reason="nan")
+        _require(np.asarray(state.mass) > 0, "mass is not positive")
+        _require(np.asarray(state.node_type) == node_code("solid"), "node_type is not solid")
+        parameter = MATERIALS["solid"]
+        modulus = np.asarray(state.material_params, dtype=np.float64)[:, 0]
+        _require(
+            (modulus >= parameter.low) & (modulus <= parameter.high),
+            f"{parameter.name} is outside [{parameter.low:g}, {parameter.high:g}] {parameter.unit}",
+        )
+        if np.any(np.asarray(state.boundary.vel) != 0) or np.any(np.asarray(state.boundary.restitution) != 0):
+            raise SimulationError("FEM supports only boundaries at rest and without restitution", reason="input")
+        mesh = build_mesh(state.rest_pos, state.cells, state.mass)
+        lam_per_modulus, mu_per_modulus = lame_parameters(1.0, self.poisson_ratio)
+        of_cell = modulus[mesh.cells].mean(axis=1)
+        lam, mu = lam_per_modulus * of_cell, mu_per_modulus * of_cell
+        # Γ = 2 damping ω at rest, where ω² = scale (2μ + dim λ) and Γ = scale 2η
+        eta = self.damping * np.sqrt((2.0 * mu + dim * lam) / mesh.scale)
+        return mesh, lam, mu, eta, collect(tuple(state.boundary.shapes), self.bounds)
+
+    def _error(self, status: int, node: int, pos: np.ndarray, vel: np.ndarray, gravity: np.ndarray) -> SimulationError:
+        where = "a state without nodes" if node < 0 else f"node {node} at {pos[node].tolist()} m with velocity {vel[node].tolist()} m/s"
+        if status == NOT_FINITE:
+            return SimulationError(f"{where} is not finite", reason="nan", node=node)
+        if status == ESCAPE:
+            return SimulationError(f"{where} is outside the domain {self.bounds}", reason="escape", node=node)
+        message = (
+            f"{where} under gravity {np.asarray(gravity).tolist()} m/s² would need more than {self.max_substeps} substeps in one frame"
+        )
+        return SimulationError(message, reason="explosion", node=node)
+
+
+def _require(good: np.ndarray, message: str, reason: str = "input") -> None:
+    if not np.all(good):
+        node = int(np.argmin(np.reshape(good, (len(good), -1)).all(axis=1)))
+        raise SimulationError(f"{message} (node {node})", reason=reason, node=node)
+
+
+def _three_dimensional(values: np.ndarray) -> np.ndarray:
+    """A copy [..., 3]; the third component is zero in 2D."""
+    values = np.asarray(values, dtype=np.float64)
+    result = np.zeros((*values.shape[:-1], 3))
+    result[..., : values.shape[-1]] = values
+    return result
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _add_forces(kind, pos, vel, cells, gradient, weight, lam, mu, eta, damped, force):
+    if kind == 0:
+        return add_triangle_forces(pos, vel, cells, gradient, weight, lam, mu, eta, damped, force)
+    if kind == 1:
+        return add_quad_forces(pos, vel, cells, gradient, weight, lam, mu, eta, damped, force)
+    return add_tetrahedron_forces(pos, vel, cells, gradient, weight, lam, mu, eta, damped, force)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _critical_rate(frequency_squared, damping_rate):
+    """1/h of the largest stable substep: ``h² ω² + 2 h Γ = 4``."""
+    return 0.25 * (damping_rate + math.sqrt(damping_rate * damping_rate + 4.0 * frequency_squared))
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _advance_frame(
+    kind, pos, vel, cells, gradient, weight, lam, mu, eta, scale, damped, mass, gravity, bounds, reach, edges,
+    obstacles, frame_dt, cfl, max_substeps,
+):  # fmt: skip
+    """Advance pos and vel in place by one frame; returns a status, the node that caused it, and the number of substeps."""
+    force, box = np.zeros(pos.shape), np.empty(6)
+    touched, gaps = np.full(obstacles.corners.shape[0], -1), np.zeros(obstacles.corners.shape[0])
+    weighs = math.sqrt(gravity[0] * gravity[0] + gravity[1] * gravity[1] + gravity[2] * gravity[2])
+    remaining, substeps = frame_dt, 0
+    while True:
+        status, node, speed = _survey(pos, vel, bounds, reach, box)
+        if status != OK or remaining <= 0.0:
+            return status, node, substeps
+        stiffest, most_viscous = _add_forces(kind, pos, vel, cells, gradient, weight, lam, mu, eta, damped, force)
+        stable = _critical_rate(scale * stiffest, scale * most_viscous) / cfl
+        needed = remaining * max(stable, speed / reach, math.sqrt(weighs / reach)) * (1.0 - 1e-12)
+        if needed > max_substeps - substeps:  # before it is rounded: an integer may not hold it
+            return TOO_MANY_SUBSTEPS, node, substeps
+        count = max(1, math.ceil(needed))
+        h = remaining / count
+        remaining = remaining - h if count > 1 else 0.0
+        substeps += 1
+        _accelerate(vel, force, mass, gravity, h)
+        resist_corners(pos, vel, mass, edges, box, reach, h, obstacles.corners, touched, gaps)
+        resist_nodes(pos, vel, box, reach, h, obstacles)
+        _drift(pos, vel, gravity, h)
+        push_out_corners(pos, mass, edges, obstacles.corners, touched, gaps)
+        push_out_nodes(pos, box, reach, obstacles)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _accelerate(vel, force, mass, gravity, h):
+    """Apply the forces and half of gravity; clear the forces for the next substep."""
+    for p in range(vel.shape[0]):
+        s = h / mass[p]
+        vel[p, 0] += s * force[p, 0] + 0.5 * h * gravity[0]
+        vel[p, 1] += s * force[p, 1] + 0.5 * h * gravity[1]
+        vel[p, 2] += s * force[p, 2] + 0.5 * h * gravity[2]
+        force[p, 0] = force[p, 1] = force[p, 2] = 0.0
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _drift(pos, vel, gravity, h):
+    """Move the nodes, then apply the other half of gravity."""
+    for p in range(pos.shape[0]):
+        pos[p, 0] += h * vel[p, 0]
+        pos[p, 1] += h * vel[p, 1]
+        pos[p, 2] += h * vel[p, 2]
+        vel[p, 0] += 0.5 * h * gravity[0]
+        vel[p, 1] += 0.5 * h * gravity[1]
+        vel[p, 2] += 0.5 * h * gravity[2]
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _survey(pos, vel, bounds, reach, box):
+    """Check that every node is finite and in the domain; status, node at fault (or the fastest) and largest speed. Sets ``box`` to the nodes' extent."""
+    x_low = y_low = z_low = math.inf
+    x_high = y_high = z_high = -math.inf
+    fastest, speed_squared = (0 if pos.shape[0] > 0 else -1), 0.0
+    for p in range(pos.shape[0]):
+        x, y, z = pos[p, 0], pos[p, 1], pos[p, 2]
+        v2 = vel[p, 0] * vel[p, 0] + vel[p, 1] * vel[p, 1] + vel[p, 2] * vel[p, 2]
+        if not (v2 < math.inf and abs(x) + abs(y) + abs(z) < math.inf):
+            return NOT_FINITE, p, 0.0
+        if v2 > speed_squared:
+            fastest, speed_squared = p, v2
+        x_low, x_high, y_low, y_high = min(x_low, x), max(x_high, x), min(y_low, y), max(y_high, y)
+        z_low, z_high = min(z_low, z), max(z_high, z)
+    box[0], box[1], box[2], box[3], box[4], box[5] = x_low, y_low, z_low, x_high, y_high, z_high
+    for axis in range(3):
+        # a node may be a little outside an open side before it counts as escaped
+        if box[axis] < bounds[axis, 0] - reach or box[axis + 3] > bounds[axis, 1] + reach:
+            for p in range(pos.shape[0]):
+                if pos[p, axis] < bounds[axis, 0] - reach or pos[p, axis] > bounds[axis, 1] + reach:
+                    return ESCAPE, p, 0.0
+    return OK, fastest, math.sqrt(speed_squared)

@@ -1,0 +1,402 @@
+"""Frictional contact of mesh nodes with rigid obstacles at rest, by impulses.
+
+In each substep a node that would enter an obstacle loses just so much of its normal velocity that it arrives on the surface, and up to μ times that
+impulse of its tangential velocity (Coulomb); no-slip obstacles take all of it. Contact never adds kinetic energy, needs no stiffness, and limits no
+substep. In 2D, convex corners of polygons and boxes also act on the edges of the mesh between nodes; their impulse is shared by the edge's two nodes in
+inverse proportion to their masses. Obstacles sharper than an edge is long are not resolved otherwise: small discs, and edges and corners in 3D.
+
+Kernels treat two dimensions as three without depth, so there is one contact law for both.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple, no_type_check
+
+import numpy as np
+from numba import njit
+
+from gpe_pl.geometry import Box, Polygon, Shape, Sphere, Wall
+from gpe_pl.schema import STICKY
+
+FIELD_CELLS = 64
+"""Cells along the longest axis of the grid on which an obstacle of another kind is sampled."""
+
+
+class Obstacles(NamedTuple):
+    """Boundary shapes in the form that the kernels take; every array of floats ends with the friction coefficient.
+
+    Attributes:
+        planes: [wall, 5] normal, offset, friction.
+        spheres: [sphere, 5] centre, radius, friction.
+        boxes: [box, 7] low, high, friction; only in 3D.
+        polygons: [polygon, 5] low x, low y, high x, high y, friction; boxes in 2D are polygons.
+        edges: [edge, 5] of all polygons, counter-clockwise, one after the other: start, vector to the end, 1 / length².
+        first_edge: [polygon + 1] where each polygon starts.
+        corners: [corner, 3] convex polygon vertices: x, y, friction.
+        fields: signed distances [field, x, y, z] on a grid over the domain, of shapes of any other kind.
+        field_friction: [field].
+        grid: [4] low corner and spacing of that grid.
+    """
+
+    planes: np.ndarray
+    spheres: np.ndarray
+    boxes: np.ndarray
+    polygons: np.ndarray
+    edges: np.ndarray
+    first_edge: np.ndarray
+    corners: np.ndarray
+    fields: np.ndarray
+    field_friction: np.ndarray
+    grid: np.ndarray
+
+
+@lru_cache(maxsize=8)
+def collect(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ...]) -> Obstacles:
+    """Prepare shapes for the kernels; ``bounds`` are ``(low, high)`` per axis of the domain [m]."""
+    dim = len(bounds)
+    depth = (0.0,) * (3 - dim)
+    low, high = np.array(bounds, dtype=np.float64).T
+    spacing = float(np.max(high - low)) / FIELD_CELLS
+    planes: list = []
+    spheres: list = []
+    boxes: list = []
+    polygons: list = []
+    edges: list = []
+    first_edge = [0]
+    corners: list = []
+    fields: list = []
+    field_friction: list = []
+    for shape in shapes:
+        mu = shape.friction
+        if isinstance(shape, Wall):
+            planes.append([*shape.normal, *depth, shape.offset, mu])
+        elif isinstance(shape, Sphere):
+            spheres.append([*shape.center, *depth, shape.radius, mu])
+        elif isinstance(shape, Box) and dim == 3:
+            boxes.append([*shape.low, *shape.high, mu])
+        elif isinstance(shape, (Box, Polygon)):
+            outline = _outline(shape)
+            polygons.append([*outline.min(axis=0), *outline.max(axis=0), mu])
+            before, after = outline - np.roll(outline, 1, axis=0), np.roll(outline, -1, axis=0) - outline
+            convex = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] > 0
+            corners.extend([*corner, mu] for corner in outline[convex])
+            edges.extend(np.concatenate([outline, after, 1.0 / np.sum(after**2, axis=1, keepdims=True)], axis=1))
+            first_edge.append(len(edges))
+        else:
+            fields.append(_sampled(shape, low, high, spacing))
+            field_friction.append(mu)
+    return Obstacles(
+        _table(planes, 5),
+        _table(spheres, 5),
+        _table(boxes, 7),
+        _table(polygons, 5),
+        _table(edges, 5),
+        np.array(first_edge, dtype=np.int64),
+        _table(corners, 3),
+        np.array(fields, dtype=np.float64) if fields else np.empty((0, 2, 2, 2)),
+        np.array(field_friction, dtype=np.float64),
+        np.array([*low, *depth, spacing], dtype=np.float64),
+    )
+
+
+def _table(rows: list, width: int) -> np.ndarray:
+    return np.array(rows, dtype=np.float64).reshape(-1, width)
+
+
+def _outline(shape: Box | Polygon) -> np.ndarray:
+    if isinstance(shape, Polygon):
+        return np.array(shape.vertices, dtype=np.float64)
+    (x0, y0), (x1, y1) = shape.low, shape.high
+    return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)], dtype=np.float64)
+
+
+def _sampled(shape: Shape, low: np.ndarray, high: np.ndarray, spacing: float) -> np.ndarray:
+    """Signed distance [x, y, z] on grid points that cover the domain; without depth in 2D."""
+    axes = [a + spacing * np.arange(math.ceil((b - a) / spacing - 1e-9) + 1) for a, b in zip(low, high, strict=True)]
+    distance = shape.signed_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
+    return distance if len(axes) == 3 else np.stack([distance, distance], axis=-1)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _resist(u, v, w, gap, nx, ny, nz, friction, h):
+    """Velocity after contact with a surface at distance ``gap`` along the normal n, in a substep h."""
+    approach, slowest = u * nx + v * ny + w * nz, -max(gap, 0.0) / h
+    if approach >= slowest:
+        return u, v, w
+    u, v, w = u - approach * nx, v - approach * ny, w - approach * nz
+    largest, sliding = friction * (slowest - approach), math.sqrt(u * u + v * v + w * w)
+    kept = 0.0 if friction >= STICKY or sliding <= largest else 1.0 - largest / sliding
+    return kept * u + slowest * nx, kept * v + slowest * ny, kept * w + slowest * nz
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _slow(vel, p, gap, nx, ny, nz, friction, h):
+    vel[p, 0], vel[p, 1], vel[p, 2] = _resist(vel[p, 0], vel[p, 1], vel[p, 2], gap, nx, ny, nz, friction, h)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _push(pos, p, gap, nx, ny, nz):
+    if gap < 0.0:
+        pos[p, 0] -= gap * nx
+        pos[p, 1] -= gap * ny
+        pos[p, 2] -= gap * nz
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _sphere_gap(x, y, z, sphere):
+    dx, dy, dz = x - sphere[0], y - sphere[1], z - sphere[2]
+    r = math.sqrt(dx * dx + dy * dy + dz * dz)
+    if r > 0.0:
+        return r - sphere[3], dx / r, dy / r, dz / r
+    return -sphere[3], 0.0, 1.0, 0.0
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _box_gap(x, y, z, box):
+    cx, cy, cz = x - 0.5 * (box[0] + box[3]), y - 0.5 * (box[1] + box[4]), z - 0.5 * (box[2] + box[5])
+    qx, qy, qz = abs(cx) - 0.5 * (box[3] - box[0]), abs(cy) - 0.5 * (box[4] - box[1]), abs(cz) - 0.5 * (box[5] - box[2])
+    sx, sy, sz = math.copysign(1.0, cx), math.copysign(1.0, cy), math.copysign(1.0, cz)
+    ax, ay, az = max(qx, 0.0), max(qy, 0.0), max(qz, 0.0)
+    r = math.sqrt(ax * ax + ay * ay + az * az)
+    if r > 0.0:
+        return r, sx * ax / r, sy * ay / r, sz * az / r
+    if qx >= qy and qx >= qz:
+        return qx, sx, 0.0, 0.0
+    if qy >= qz:
+        return qy, 0.0, sy, 0.0
+    return qz, 0.0, 0.0, sz
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _polygon_gap(x, y, edges, start, stop):
+    inside = False
+    nearest, nearest_square, qx, qy = start, math.inf, 0.0, 0.0
+    for k in range(start, stop):
+        px, py, ex, ey = x - edges[k, 0], y - edges[k, 1], edges[k, 2], edges[k, 3]
+        if ((py < 0.0) != (py < ey)) and px < ex * py / ey:
+            inside = not inside
+        t = min(1.0, max(0.0, (px * ex + py * ey) * edges[k, 4]))
+        dx, dy = px - t * ex, py - t * ey
+        square = dx * dx + dy * dy
+        if square < nearest_square:
+            nearest, nearest_square, qx, qy = k, square, dx, dy
+    gap = -math.sqrt(nearest_square) if inside else math.sqrt(nearest_square)
+    if nearest_square * edges[nearest, 4] > 1e-18:
+        return gap, qx / gap, qy / gap
+    # within rounding of an edge, the direction to its nearest point means nothing
+    inv = math.sqrt(edges[nearest, 4])
+    return gap, edges[nearest, 3] * inv, -edges[nearest, 2] * inv
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _field_gap(x, y, z, field, grid):
+    """Trilinear interpolation of a sampled distance and the direction of its gradient."""
+    inv = 1.0 / grid[3]
+    fx, fy, fz = (x - grid[0]) * inv, (y - grid[1]) * inv, (z - grid[2]) * inv
+    i = min(max(int(fx), 0), field.shape[0] - 2)
+    j = min(max(int(fy), 0), field.shape[1] - 2)
+    k = min(max(int(fz), 0), field.shape[2] - 2)
+    fx, fy, fz = fx - i, fy - j, fz - k
+    gap = gx = gy = gz = 0.0
+    for a in range(2):
+        wx, sx = (fx, 1.0) if a == 1 else (1.0 - fx, -1.0)
+        for b in range(2):
+            wy, sy = (fy, 1.0) if b == 1 else (1.0 - fy, -1.0)
+            for c in range(2):
+                wz, sz = (fz, 1.0) if c == 1 else (1.0 - fz, -1.0)
+                d = field[i + a, j + b, k + c]
+                gap += wx * wy * wz * d
+                gx += sx * wy * wz * d
+                gy += wx * sy * wz * d
+                gz += wx * wy * sz * d
+    length = math.sqrt(gx * gx + gy * gy + gz * gz)
+    if length > 0.0:
+        return gap, gx / length, gy / length, gz / length
+    return gap, 0.0, 1.0, 0.0
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _apart(box, margin, x_low, y_low, z_low, x_high, y_high, z_high):
+    """Whether two extents are further apart than a margin."""
+    if x_low > box[3] + margin or y_low > box[4] + margin or z_low > box[5] + margin:
+        return True
+    return x_high < box[0] - margin or y_high < box[1] - margin or z_high < box[2] - margin
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _beyond(box, margin, plane):
+    """Whether an extent is further in front of a plane than a margin."""
+    nearest = -plane[3] - margin
+    for axis in range(3):
+        nearest += plane[axis] * (box[axis] if plane[axis] > 0.0 else box[axis + 3])
+    return nearest > 0.0
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def resist_nodes(pos, vel, box, reach, h, obstacles):
+    """Slow down the nodes that would enter an obstacle. ``box`` [6] is the extent of the nodes, ``reach`` the furthest that one may move."""
+    for k in range(obstacles.polygons.shape[0]):
+        xl, yl, xh, yh, friction = obstacles.polygons[k]
+        if _apart(box, reach, xl, yl, 0.0, xh, yh, 0.0):
+            continue
+        for p in range(pos.shape[0]):
+            x, y = pos[p, 0], pos[p, 1]
+            if x > xl - reach and x < xh + reach and y > yl - reach and y < yh + reach:
+                gap, nx, ny = _polygon_gap(x, y, obstacles.edges, obstacles.first_edge[k], obstacles.first_edge[k + 1])
+                _slow(vel, p, gap, nx, ny, 0.0, friction, h)
+    for k in range(obstacles.spheres.shape[0]):
+        x, y, z, r, friction = obstacles.spheres[k]
+        if _apart(box, reach, x - r, y - r, z - r, x + r, y + r, z + r):
+            continue
+        for p in range(pos.shape[0]):
+            gap, nx, ny, nz = _sphere_gap(pos[p, 0], pos[p, 1], pos[p, 2], obstacles.spheres[k])
+            if gap < reach:
+                _slow(vel, p, gap, nx, ny, nz, friction, h)
+    for k in range(obstacles.boxes.shape[0]):
+        xl, yl, zl, xh, yh, zh, friction = obstacles.boxes[k]
+        if _apart(box, reach, xl, yl, zl, xh, yh, zh):
+            continue
+        for p in range(pos.shape[0]):
+            gap, nx, ny, nz = _box_gap(pos[p, 0], pos[p, 1], pos[p, 2], obstacles.boxes[k])
+            if gap < reach:
+                _slow(vel, p, gap, nx, ny, nz, friction, h)
+    for k in range(obstacles.fields.shape[0]):
+        for p in range(pos.shape[0]):
+            gap, nx, ny, nz = _field_gap(pos[p, 0], pos[p, 1], pos[p, 2], obstacles.fields[k], obstacles.grid)
+            if gap < reach:
+                _slow(vel, p, gap, nx, ny, nz, obstacles.field_friction[k], h)
+    for k in range(obstacles.planes.shape[0]):
+        nx, ny, nz, offset, friction = obstacles.planes[k]
+        if _beyond(box, reach, obstacles.planes[k]):
+            continue
+        for p in range(pos.shape[0]):
+            gap = nx * pos[p, 0] + ny * pos[p, 1] + nz * pos[p, 2] - offset
+            if gap < reach:
+                _slow(vel, p, gap, nx, ny, nz, friction, h)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def push_out_nodes(pos, box, reach, obstacles):
+    """Move nodes that are inside an obstacle, by rounding or around a curved surface, to its surface; walls last, so that they always hold.
+
+    ``box`` and ``reach`` are those before the nodes moved.
+    """
+    margin = 2.0 * reach
+    for k in range(obstacles.polygons.shape[0]):
+        xl, yl, xh, yh, _ = obstacles.polygons[k]
+        if _apart(box, margin, xl, yl, 0.0, xh, yh, 0.0):
+            continue
+        for p in range(pos.shape[0]):
+            x, y = pos[p, 0], pos[p, 1]
+            if x > xl and x < xh and y > yl and y < yh:
+                gap, nx, ny = _polygon_gap(x, y, obstacles.edges, obstacles.first_edge[k], obstacles.first_edge[k + 1])
+                _push(pos, p, gap, nx, ny, 0.0)
+    for k in range(obstacles.spheres.shape[0]):
+        x, y, z, r, _ = obstacles.spheres[k]
+        if _apart(box, margin, x - r, y - r, z - r, x + r, y + r, z + r):
+            continue
+        for p in range(pos.shape[0]):
+            gap, nx, ny, nz = _sphere_gap(pos[p, 0], pos[p, 1], pos[p, 2], obstacles.spheres[k])
+            _push(pos, p, gap, nx, ny, nz)
+    for k in range(obstacles.boxes.shape[0]):
+        xl, yl, zl, xh, yh, zh, _ = obstacles.boxes[k]
+        if _apart(box, margin, xl, yl, zl, xh, yh, zh):
+            continue
+        for p in range(pos.shape[0]):
+            gap, nx, ny, nz = _box_gap(pos[p, 0], pos[p, 1], pos[p, 2], obstacles.boxes[k])
+            _push(pos, p, gap, nx, ny, nz)
+    for k in range(obstacles.fields.shape[0]):
+        for p in range(pos.shape[0]):
+            gap, nx, ny, nz = _field_gap(pos[p, 0], pos[p, 1], pos[p, 2], obstacles.fields[k], obstacles.grid)
+            _push(pos, p, gap, nx, ny, nz)
+    for k in range(obstacles.planes.shape[0]):
+        nx, ny, nz, offset, _ = obstacles.planes[k]
+        if _beyond(box, margin, obstacles.planes[k]):
+            continue
+        for p in range(pos.shape[0]):
+            _push(pos, p, nx * pos[p, 0] + ny * pos[p, 1] + nz * pos[p, 2] - offset, nx, ny, nz)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _facing_edge(x, y, pos, edges, reach):
+    """The surface edge nearest to a point in front of it or less than half its length behind: edge (-1: none), gap, position along it, normal."""
+    best, gap, along, nx, ny = -1, math.inf, 0.0, 0.0, 0.0
+    for e in range(edges.shape[0]):
+        a, b = edges[e, 0], edges[e, 1]
+        px, py = x - pos[a, 0], y - pos[a, 1]
+        ex, ey = pos[b, 0] - pos[a, 0], pos[b, 1] - pos[a, 1]
+        square = ex * ex + ey * ey
+        t = px * ex + py * ey
+        if t <= 0.0 or t >= square:
+            continue
+        length = math.sqrt(square)
+        d = (px * ey - py * ex) / length
+        if d < reach and d > -0.5 * length and abs(d) < abs(gap):
+            best, gap, along, nx, ny = e, d, t / square, ey / length, -ex / length
+    return best, gap, along, nx, ny
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def resist_corners(pos, vel, mass, edges, box, reach, h, corners, touched, gaps):
+    """Slow down the mesh edges that obstacle corners would cross; ``touched`` and ``gaps`` [corner] become the edge in reach (-1: none) and its gap."""
+    for k in range(corners.shape[0]):
+        touched[k] = -1
+        x, y = corners[k, 0], corners[k, 1]
+        if x < box[0] - reach or x > box[3] + reach or y < box[1] - reach or y > box[4] + reach:
+            continue
+        e, gap, t, nx, ny = _facing_edge(x, y, pos, edges, reach)
+        if e < 0:
+            continue
+        touched[k], gaps[k] = e, gap
+        a, b = edges[e, 0], edges[e, 1]
+        u, v = (1.0 - t) * vel[a, 0] + t * vel[b, 0], (1.0 - t) * vel[a, 1] + t * vel[b, 1]
+        # the edge moves against its outward normal to retreat
+        u_new, v_new, _ = _resist(u, v, 0.0, gap, -nx, -ny, 0.0, corners[k, 2], h)
+        share_a, share_b = (1.0 - t) / mass[a], t / mass[b]
+        whole = (1.0 - t) * share_a + t * share_b
+        vel[a, 0] += share_a / whole * (u_new - u)
+        vel[a, 1] += share_a / whole * (v_new - v)
+        vel[b, 0] += share_b / whole * (u_new - u)
+        vel[b, 1] += share_b / whole * (v_new - v)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def push_out_corners(pos, mass, edges, corners, touched, gaps):
+    """Move the edges that a corner has crossed by turning or stretching back onto it; a corner that was inside before only gets no deeper.
+
+    To push that out would store energy in the cells around it.
+    """
+    for k in range(corners.shape[0]):
+        e = touched[k]
+        if e < 0:
+            continue
+        a, b = edges[e, 0], edges[e, 1]
+        ex, ey = pos[b, 0] - pos[a, 0], pos[b, 1] - pos[a, 1]
+        px, py = corners[k, 0] - pos[a, 0], corners[k, 1] - pos[a, 1]
+        square = ex * ex + ey * ey
+        t, length = (px * ex + py * ey) / square, math.sqrt(square)
+        gap = (px * ey - py * ex) / length - min(gaps[k], 0.0)
+        if t <= 0.0 or t >= 1.0 or gap >= 0.0:
+            continue
+        share_a, share_b = (1.0 - t) / mass[a], t / mass[b]
+        step = gap / ((1.0 - t) * share_a + t * share_b) / length
+        pos[a, 0] += share_a * step * ey
+        pos[a, 1] -= share_a * step * ex
+        pos[b, 0] += share_b * step * ey
+        pos[b, 1] -= share_b * step * ex
