@@ -51,11 +51,14 @@ def _dataset(overrides: list[str]) -> DatasetSpec:
 
 def benchmark(cfg: DictConfig) -> None:
     """Run one suite and write ``results.json`` and ``table.md``."""
+    from omegaconf import OmegaConf
+
     suites = sorted(m.name for m in pkgutil.iter_modules(gpe_pl.suites.__path__))
     if cfg.suite.name not in suites:
         raise ConfigError(f"suite.name={cfg.suite.name!r}: must be one of {', '.join(suites)}")
     suite = importlib.import_module(f"gpe_pl.suites.{cfg.suite.name}")
-    settings = construct(suite.Settings, {k: v for k, v in cfg.suite.items() if k != "name"}, "suite")
+    values: Any = OmegaConf.to_container(cfg.suite, resolve=True)
+    settings = construct(suite.Settings, {k: v for k, v in values.items() if k != "name"}, "suite")
     cases = getattr(settings, "cases", None)  # of a suite about data sets
     records, table = suite.run(settings) if cases is None else suite.run(settings, {k: _dataset(c.overrides) for k, c in cases.items()})
     folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name

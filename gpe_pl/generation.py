@@ -407,7 +407,7 @@ def _draw_contact_sheet(spec: DatasetSpec, path: Path, pool: Executor | None) ->
             every = sorted({*choices.seen, *choices.interpolated, *choices.extrapolated})
             values[material] = every[round(share * (len(every) - 1))]
         rows[_row_label(values)] = values
-    index = max(range(min(spec.num_train, 8)), key=lambda i: len(np.unique(initial_state(spec, "train", i).node_type)))
+    index = max(range(min(spec.num_train, 32)), key=lambda i: len(np.unique(initial_state(spec, "train", i).node_type)))
     arguments = [(spec, index, label, values) for label, values in rows.items()]
     trajectories = dict(_run(pool, _labelled_trajectory, arguments))
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part.png")

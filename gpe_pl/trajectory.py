@@ -322,6 +322,11 @@ def _fields_of(trajectory: Trajectory) -> dict[str, np.ndarray]:
     return {k: np.ascontiguousarray(v, dtype=FIELDS[k].dtype) for k, v in arrays.items() if v is not None}
 
 
+def array_bytes(trajectory: Trajectory) -> int:
+    """Bytes of what is stored of a trajectory, uncompressed."""
+    return sum(array.nbytes for array in _fields_of(trajectory).values())
+
+
 def _attributes_of(trajectory: Trajectory) -> dict[str, str]:
     m = trajectory.metadata
     meta = json.dumps(asdict(m), sort_keys=True)
