@@ -1,5 +1,7 @@
 """The benchmark of the solvers runs, counts what it simulates, and names data sets that exist."""
 
+from typing import Any
+
 import pytest
 from omegaconf import OmegaConf
 
@@ -12,7 +14,8 @@ TINY = ["size=tiny", "data.sizes.tiny.num_train=3", "data.sizes.tiny.num_frames=
 
 
 def test_every_configured_case_is_a_data_set():
-    cases = OmegaConf.to_container(OmegaConf.load(CONF / "suite" / "solvers.yaml"))["cases"]  # type: ignore[call-overload,index]
+    suite: Any = OmegaConf.to_container(OmegaConf.load(CONF / "suite" / "solvers.yaml"))
+    cases = suite["cases"]
     assert {"sand", "snow", "elastomer", "fluid", "fem"} <= set(cases)
     specs = {label: dataset_spec(compose("simulate", *Case(**case).overrides)) for label, case in cases.items()}
     assert all(spec.size == "paper" and sum(spec.counts.values()) == 2700 for spec in specs.values())
