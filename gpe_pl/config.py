@@ -24,7 +24,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 from pydantic import ConfigDict, ValidationError, create_model
 
 from gpe_pl.errors import GpeError
@@ -138,10 +138,17 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             nonlocal is_composed
             is_composed = True
             try:
+                if "dimension" in list(cfg) and cfg.dimension not in (2, 3):
+                    raise ConfigError(f"dimension={cfg.dimension}: must be 2 or 3")
                 OmegaConf.resolve(cfg)
                 construct(Paths, cfg.paths, "paths")
                 _check_top_level(cfg, config_name)
                 return task(cfg)
+            except InterpolationKeyError as error:
+                if verbose:
+                    raise
+                hint = "; data, scene and dimension do not fit together" if "'data." in str(error) else ""
+                _fail(ConfigError(f"{' '.join(str(error).split())}{hint}"))
             except (GpeError, OmegaConfBaseException) as error:
                 if verbose:
                     raise

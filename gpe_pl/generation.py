@@ -179,7 +179,8 @@ def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:
 def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[str, float], ParameterGroup]:
     """Value of each material's parameter in one trajectory, and the group that they belong to.
 
-    Values are dealt in turn; each further material is one value ahead after every round, so that all combinations of seen values occur.
+    A first material's values are dealt in turn. Every other one's are too, but each round of them in an order of its own, so that no material's
+    parameter tells another's.
     """
     group: ParameterGroup = "seen"
     if split == "test_unseen":
@@ -187,7 +188,9 @@ def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[st
     values = {}
     for k, (material, choices) in enumerate(spec.parameters.items()):
         dealt = getattr(choices, group)
-        values[material] = dealt[(index + k * (index // len(dealt))) % len(dealt)]
+        number, place = divmod(index, len(dealt))
+        shuffled = np.random.default_rng((spec.seed, SPLITS.index(split), k, number)).permutation(len(dealt))
+        values[material] = dealt[place if k == 0 else int(shuffled[place])]
     return values, group
 
 
@@ -209,8 +212,12 @@ def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
 
 
 def initial_state(spec: DatasetSpec, split: str, index: int, values: Mapping[str, float] | None = None) -> State:
-    """The scene of one trajectory, on request with other parameter values."""
-    return spec.scene.sample(values or parameter_values(spec, split, index)[0], scene_seed(spec, split, index))
+    """The scene of one trajectory, on request with other parameter values; raises ``GenerationError`` if it is impossible."""
+    seed = scene_seed(spec, split, index)
+    try:
+        return spec.scene.sample(values or parameter_values(spec, split, index)[0], seed)
+    except ValueError as error:
+        raise GenerationError(f"split {split}, index {index}, seed {seed}: {error}", split, index, seed) from None
 
 
 def generate_trajectory(
@@ -223,17 +230,13 @@ def generate_trajectory(
     """
     metadata = trajectory_metadata(spec, split, index)
     label = f"split {split}, index {index}, seed {metadata.seed}"
-    try:
-        state = initial_state(spec, split, index, values)
-    except ValueError as error:
-        raise GenerationError(f"{label}: {error}", split, index, metadata.seed) from None
+    state = initial_state(spec, split, index, values)
     guard = Guard(bounds=spec.scene.bounds, margin=1e-6)
     trajectory = rollout(spec.solver, state, (num_frames or spec.num_frames) - 1, metadata, guard)
     if trajectory.termination is not None:
         stop = trajectory.termination
-        raise GenerationError(
-            f"{label}: {stop.reason}: {stop.message}; lower the solver's cfl or the scene's max_speed", split, index, metadata.seed
-        )
+        advice = "raise the solver's max_substeps or lower" if stop.reason == "explosion" else "lower the solver's cfl or"
+        raise GenerationError(f"{label}: {stop.reason}: {stop.message}; {advice} the scene's max_speed", split, index, metadata.seed)
     return trajectory
 
 
@@ -318,19 +321,14 @@ def _compile(spec: DatasetSpec) -> None:
 
 
 def seconds_per_trajectory(spec: DatasetSpec, budget: float = 10.0) -> float:
-    """Estimate [s] on one core: the whole scenes that fit into ``budget`` seconds, at least a tenth of one, at evenly spread parameter values.
-
-    Where less than a trajectory fits, its first frames stand for the rest, though scenes cost more when bodies collide.
-    """
+    """Estimate [s] on one core: the mean over random training trajectories, as many as take ``budget`` seconds and at least one."""
     _compile(spec)
-    started, frames = time.perf_counter(), 0
-    for index in range(spec.counts["train"]):
-        first = index * max(1, spec.counts["train"] // 7) % spec.counts["train"]
-        generate_trajectory(spec, "train", first, num_frames=max(3, spec.num_frames // 10))
-        frames += max(3, spec.num_frames // 10)
-        if time.perf_counter() - started > budget:
-            break
-    return (time.perf_counter() - started) / frames * spec.num_frames
+    order = np.random.default_rng(0).permutation(spec.num_train).tolist()
+    started, count = time.perf_counter(), 0
+    while count == 0 or (count < len(order) and time.perf_counter() - started < budget):
+        generate_trajectory(spec, "train", order[count])
+        count += 1
+    return (time.perf_counter() - started) / count
 
 
 def generate(
@@ -357,7 +355,10 @@ def generate(
     if not 0 <= part[0] < part[1]:
         raise ValueError(f"part must be (k, n) with 0 <= k < n, got {part}")
     folder = Path(root) / spec.name / spec.size
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise GenerationError(f"{folder}: cannot be made ({error}); choose another folder with paths.data") from None
     _claim(folder, spec)
     own = _shards(spec)[part[0] :: part[1]]
     for split, k in own:

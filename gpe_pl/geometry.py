@@ -448,6 +448,38 @@ def signed_distance(shapes: tuple[Shape, ...], points: Array) -> Array:
     return distance
 
 
+def thickness(shape: Shape) -> float:
+    """Smallest thickness in m: diameter, shortest side, or shortest way through a polygon from the middle of an edge along its inward normal.
+
+    Infinite for a shape that does not tell.
+    """
+    if isinstance(shape, Sphere):
+        return 2.0 * shape.radius
+    if isinstance(shape, Box):
+        return min(high - low for low, high in zip(shape.low, shape.high, strict=True))
+    if not isinstance(shape, Polygon):
+        return math.inf
+    vertices = np.array(shape.vertices, dtype=np.float64)
+    before, after = vertices - np.roll(vertices, 1, axis=0), np.roll(vertices, -1, axis=0) - vertices
+    turn = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+    straight = np.abs(turn) <= 1e-9 * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+    a = vertices[~straight]  # vertices along a straight edge do not divide it
+    edge = np.roll(a, -1, axis=0) - a
+    tangent = edge / np.linalg.norm(edge, axis=1)[:, None]
+    thinnest = math.inf
+    for k, middle in enumerate(a + edge / 2):
+        inward = np.array([-tangent[k, 1], tangent[k, 0]])
+        # every other edge in this edge's frame: its ends' distances along the edge and into the polygon
+        along, depth = (a - middle) @ tangent[k], (a - middle) @ inward
+        for j in range(len(a)):
+            n = (j + 1) % len(a)
+            if j != k and along[j] != along[n] and min(along[j], along[n]) <= 0.0 <= max(along[j], along[n]):
+                hit = depth[j] + (depth[n] - depth[j]) * along[j] / (along[j] - along[n])
+                if hit > 0.0:
+                    thinnest = min(thinnest, float(hit))
+    return thinnest
+
+
 def outward_normal(shape: Shape, points: Array, step: float) -> Array:
     """Direction into free space: the signed distance's gradient by central differences of ``step`` [m], unit length where defined."""
     xp = array_namespace(points)

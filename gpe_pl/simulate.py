@@ -66,8 +66,9 @@ def simulate(cfg: DictConfig) -> None:
             print(f"{spec.name} {spec.size}: about {hours:.1f} h on {num_workers} cores", flush=True)
     with progress_bar(f"{spec.name} {spec.size}") as on_progress:
         folder = generate(cfg.paths.data, spec, num_workers, on_progress, (cfg.part, cfg.num_parts))
-    print(folder / CONTACT_SHEET_FILE)
-    print(folder)
+    for path in (folder / CONTACT_SHEET_FILE, folder):
+        if path.exists():  # only the first part draws the sheet
+            print(path)
 
 
 main = entry_point("simulate")(simulate)

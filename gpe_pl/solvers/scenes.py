@@ -90,13 +90,13 @@ class BodyScene:
 
     Attributes:
         bounds: ``(low, high)`` per axis of the domain [m]; 2 or 3 axes, gravity along the last.
-        materials: each body is of one of these.
+        materials: of the bodies, in random order; where there are several, a scene has two of them or more.
         grid_spacing: of the solver [m].
         num_particles: in all bodies together.
         particles_per_cell: along each axis; the rest spacing is ``grid_spacing / particles_per_cell``.
         density: at rest [kg/m³], per material.
         gravity: [m/s²].
-        max_bodies: the number of bodies is uniform in 1 … max_bodies.
+        max_bodies: the number of bodies is uniform in 1 … max_bodies, with several materials in 2 … max_bodies.
         max_obstacles: the number of obstacles is uniform in 0 … max_obstacles.
         obstacle_radius: range of their circumscribed radii [m].
         drop_height: range of the gap between a body and the floor [m].
@@ -281,15 +281,17 @@ def _floats(values: np.ndarray) -> tuple[float, ...]:
 def _bodies(config: BodyScene, shapes: tuple[Shape, ...], rng: np.random.Generator) -> list[_Body] | None:
     """The bodies in their places, or None where this layout leaves no room."""
     low, high = np.array(config.bounds).T
-    number = int(rng.integers(1, config.max_bodies + 1))
+    several = len(config.materials) > 1  # then they meet: bodies of at least two
+    number = int(rng.integers(min(2, config.max_bodies) if several else 1, config.max_bodies + 1))
+    order = rng.permutation(len(config.materials)) if several else np.zeros(1, dtype=int)
     share = rng.dirichlet(np.full(number, 4.0))
     counts = np.diff(np.round(np.concatenate([[0.0], np.cumsum(share)]) * config.num_particles)).astype(int)
     up = np.eye(config.dim)[-1]
     clearance = 0.5 * config.spacing
     boxes: list[tuple[np.ndarray, np.ndarray]] = []
     placed = []
-    for count in counts[counts > 0]:
-        material = config.materials[int(rng.integers(len(config.materials))) if len(config.materials) > 1 else 0]
+    for k, count in enumerate(counts[counts > 0]):
+        material = config.materials[order[k % len(order)]]
         body = _body(int(count), config.spacing, material, config.dim, rng)
         extent_low, extent_high = body.pos.min(axis=0), body.pos.max(axis=0)
         gap = max(clearance, rng.uniform(*config.drop_height))

@@ -198,13 +198,16 @@ def test_parameter_groups_are_marked(folder):
     assert [parameter_values(SPEC, "train", i)[0]["sand"] for i in range(4)] == [20, 30, 40, 20]
 
 
-def test_every_combination_of_seen_values_is_dealt():
+def test_parameters_of_several_materials_are_dealt_independently():
     scene = replace(SCENE, materials=("sand", "snow"))
     parameters = {"sand": ParameterValues(seen=(20, 30, 40)), "snow": ParameterValues(seen=(5, 8, 11))}
     solver = replace(SOLVER, materials=scene.materials)
     spec = replace(SPEC, scene=scene, solver=solver, parameters=parameters, num_test_unseen=0)
-    dealt = [parameter_values(spec, "train", i)[0] for i in range(9)]
+    dealt = [parameter_values(spec, "train", i)[0] for i in range(300)]
     assert {(v["sand"], v["snow"]) for v in dealt} == {(a, b) for a in (20, 30, 40) for b in (5, 8, 11)}
+    assert abs(np.corrcoef([v["sand"] for v in dealt], [v["snow"] for v in dealt])[0, 1]) < 0.15
+    for material in ("sand", "snow"):  # every round has every value once
+        assert all(len({v[material] for v in dealt[k : k + 3]}) == 3 for k in range(0, 300, 3))
 
 
 def test_statistics_are_of_the_train_split(folder):

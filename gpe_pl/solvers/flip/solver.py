@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as validated_dataclass
 
-from gpe_pl.geometry import Wall, domain_walls, outward_normal, signed_distance
+from gpe_pl.geometry import Wall, domain_walls, outward_normal, signed_distance, thickness
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, NODE_TYPES, node_code, param_names
 from gpe_pl.solvers.flip import islands, pressure, transfer, viscosity
@@ -281,6 +281,12 @@ class FLIP:
         """The boundary on the solver's grid."""
         if np.any(np.asarray(boundary.vel) != 0) or np.any(np.asarray(boundary.restitution) != 0):
             raise SimulationError("FLIP supports only boundaries at rest and without restitution", reason="input")
+        for shape in boundary.shapes:
+            if thickness(shape) < self.grid_spacing * (1 - 1e-6):
+                raise SimulationError(
+                    f"obstacle {shape} is {thickness(shape):g} m thin; on a grid of spacing {self.grid_spacing:g} m it must be at least that thick",
+                    reason="input",
+                )
         return make_solids(tuple(boundary.shapes), self.bounds, self.grid_spacing)
 
     def _advance(

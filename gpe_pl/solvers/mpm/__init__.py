@@ -4,7 +4,7 @@ Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC). One substep of length h, wit
 
     F_p ← (1 + h C_p) F_p, return-mapped;  τ_p = Kirchhoff stress
     m_i v_i = Σ_p w_ip [m_p v_p + (m_p C_p - h V_p τ_p / D) (x_i - x_p)],   m_i = Σ_p w_ip m_p
-    v_i ← boundary conditions (v_i + h g)
+    v_i ← boundary conditions (v_i + h g),   with gravity over the mean of this h and the one before
     v_p = Σ_i w_ip v_i,   C_p = Σ_i w_ip v_i (x_i - x_p)ᵀ / D,   x_p ← x_p + h v_p
 
 Particles of all materials share the grid; each has its own constitutive law. ``solver`` is the ``Simulator``, ``frame`` the time loop, ``transfer_*`` the

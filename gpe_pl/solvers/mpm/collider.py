@@ -14,7 +14,7 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from numba import njit
 
-from gpe_pl.geometry import Box, Polygon, Shape, Sphere, Wall, outward_normal, signed_distance
+from gpe_pl.geometry import Box, Polygon, Shape, Sphere, Wall, outward_normal, signed_distance, thickness
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import STICKY
 
@@ -122,10 +122,10 @@ def _distance(shape: Shape, nodes: np.ndarray) -> np.ndarray:
 
 def _require_resolved(shape: Shape, mask: np.ndarray, spacing: float, dim: int) -> None:
     """Refuse an obstacle that particles could pass: a particle in the nearer half of a cell-thick obstacle is pushed back, not out at the far side."""
-    thickness = _thickness(shape)
-    if thickness < spacing * (1 - 1e-6):
+    thin = thickness(shape)
+    if thin < spacing * (1 - 1e-6):
         raise SimulationError(
-            f"obstacle {shape} is {thickness:g} m thin; on a grid of spacing {spacing:g} m it must be at least {spacing:g} m thick",
+            f"obstacle {shape} is {thin:g} m thin; on a grid of spacing {spacing:g} m it must be at least {spacing:g} m thick",
             reason="input",
         )
     if not np.any(mask):
@@ -133,38 +133,6 @@ def _require_resolved(shape: Shape, mask: np.ndarray, spacing: float, dim: int) 
             f"obstacle {shape} contains no node of the grid of spacing {spacing:g} m; move it, or make it {math.sqrt(dim) * spacing:g} m thick",
             reason="input",
         )
-
-
-def _thickness(shape: Shape) -> float:
-    """Smallest thickness in m: diameter, shortest side, or shortest way through a polygon from the middle of an edge along its inward normal.
-
-    Infinite for a shape that does not tell.
-    """
-    if isinstance(shape, Sphere):
-        return 2.0 * shape.radius
-    if isinstance(shape, Box):
-        return min(high - low for low, high in zip(shape.low, shape.high, strict=True))
-    if not isinstance(shape, Polygon):
-        return math.inf
-    vertices = np.array(shape.vertices, dtype=np.float64)
-    before, after = vertices - np.roll(vertices, 1, axis=0), np.roll(vertices, -1, axis=0) - vertices
-    turn = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
-    straight = np.abs(turn) <= 1e-9 * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
-    a = vertices[~straight]  # vertices along a straight edge do not divide it
-    edge = np.roll(a, -1, axis=0) - a
-    tangent = edge / np.linalg.norm(edge, axis=1)[:, None]
-    thickness = math.inf
-    for k, middle in enumerate(a + edge / 2):
-        inward = np.array([-tangent[k, 1], tangent[k, 0]])
-        # every other edge in this edge's frame: its ends' distances along the edge and into the polygon
-        along, depth = (a - middle) @ tangent[k], (a - middle) @ inward
-        for j in range(len(a)):
-            n = (j + 1) % len(a)
-            if j != k and along[j] != along[n] and min(along[j], along[n]) <= 0.0 <= max(along[j], along[n]):
-                hit = depth[j] + (depth[n] - depth[j]) * along[j] / (along[j] - along[n])
-                if hit > 0.0:
-                    thickness = min(thickness, float(hit))
-    return thickness
 
 
 @njit(cache=True, error_model="numpy")

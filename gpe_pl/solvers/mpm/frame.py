@@ -43,8 +43,12 @@ class Particles(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame_dt, cfl, max_substeps):
-    """Advance the particles in place by one frame; returns a status, the node that caused it and the number of substeps."""
+def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame_dt, cfl, max_substeps, last_substep):
+    """Advance the particles in place by one frame; returns a status, the node that caused it, the number of substeps and the last one's length.
+
+    Positions follow velocities half a substep later, so gravity acts over the mean of a substep and the one before: then a body in free flight stays on its
+    parabola although substeps change.
+    """
     inv, dim, gravity_squared = 1.0 / spacing, len(counts), 0.0
     for axis in range(dim):
         gravity_squared += gravity[axis] * gravity[axis]
@@ -57,10 +61,10 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
     while True:
         status, node, speed = _survey(particles.pos, particles.vel, bounds, origin, counts, spacing, active)
         if status != OK or remaining <= 0.0:
-            return status, node, substeps
+            return status, node, substeps, last_substep
         needed = max(remaining * (math.sqrt(squared) + speed) / (cfl * spacing), remaining * fall_rate) * (1.0 - 1e-12)
         if not needed <= max_substeps - substeps:  # before it is rounded: an integer may not hold it
-            return TOO_MANY_SUBSTEPS, node, substeps
+            return TOO_MANY_SUBSTEPS, node, substeps, last_substep
         count = max(1, math.ceil(needed))
         h = remaining / count
         remaining = remaining - h if count > 1 else 0.0
@@ -72,7 +76,8 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
         else:
             squared = transfer_3d.deform(particles, stress, h)
             transfer_3d.particles_to_grid(particles, stress, flat, counts, origin, inv, h)
-        _move_grid(grid, collider, gravity, h, active, counts)
+        _move_grid(grid, collider, gravity, 0.5 * (h + last_substep) if last_substep > 0.0 else h, active, counts)
+        last_substep = h
         if dim == 2:
             transfer_2d.grid_to_particles(particles, flat, counts, origin, inv, h)
         else:

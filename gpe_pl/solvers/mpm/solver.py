@@ -32,11 +32,13 @@ class MPMInternal:
         deformation: elastic deformation gradient F [node, dim, dim].
         affine: APIC velocity gradient C [node, dim, dim] in 1/s.
         plastic: plastic state [node]: the volume correction of sand, ``J_P - 1`` of snow.
+        last_substep: length of the substep before [s]; 0 where there is none.
     """
 
     deformation: np.ndarray
     affine: np.ndarray
     plastic: np.ndarray
+    last_substep: np.ndarray = field(default_factory=lambda: np.zeros(()))
 
     @classmethod
     def at_rest(cls, num_nodes: int, dim: int) -> MPMInternal:
@@ -73,7 +75,7 @@ class MPM:
     max_substeps: Annotated[int, Field(ge=1)] = 1000
 
     name: ClassVar[str] = "mpm"
-    version: ClassVar[str] = "2"
+    version: ClassVar[str] = "3"
 
     def __post_init__(self) -> None:
         if len(self.bounds) not in (2, 3):
@@ -113,7 +115,7 @@ class MPM:
         particles = self._particles(state, internal)
         origin = tuple(low - PADDING * self.grid_spacing for low, _ in self.bounds)
         counts = tuple(round((high - low) / self.grid_spacing) + 1 + 2 * PADDING for low, high in self.bounds)
-        status, node, num_substeps = advance(
+        status, node, num_substeps, last_substep = advance(
             particles,
             self._collider(state.boundary, origin, counts),
             np.asarray(state.gravity, dtype=np.float64),
@@ -124,6 +126,7 @@ class MPM:
             self.frame_dt,
             self.cfl,
             self.max_substeps,
+            float(internal.last_substep),
         )
         if status != OK:
             raise self._error(status, node, particles.pos, particles.vel, state.gravity)
@@ -134,7 +137,7 @@ class MPM:
             velocity_history=None,
             time=state.time + self.frame_dt,
             num_substeps=num_substeps,
-            internal=MPMInternal(particles.deformation, particles.affine, particles.plastic),
+            internal=MPMInternal(particles.deformation, particles.affine, particles.plastic, np.array(last_substep)),
         )
 
     def _collider(self, boundary: Boundary, origin: tuple[float, ...], counts: tuple[int, ...]) -> Collider:

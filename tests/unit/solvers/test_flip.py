@@ -310,3 +310,13 @@ assert len(outer) >= 15 and set(counts) <= {0, 1} and counts == [len(f.signature
 """
     child = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=Path(__file__).parents[3], check=False)
     assert child.returncode == 0, child.stderr
+
+
+@pytest.mark.parametrize("height", [0.3, 0.99])
+def test_an_obstacle_thinner_than_a_cell_is_refused(height):
+    """Liquid at 10 m/s went through a plate of 0.3 cells on a grid line."""
+    cell = 1 / 16
+    solver = FLIP(bounds=((0, 1), (0, 1)), grid_spacing=cell)
+    plate = Box((0.1, 0.5), (0.9, 0.5 + height * cell), 0.0)
+    with pytest.raises(SimulationError, match="m thin; on a grid of spacing 0.0625 m"):
+        solver.solids(Boundary.sample((plate,), cell / 2, 2))
