@@ -1,7 +1,7 @@
 # Everything runs in .venv, which the first target that needs it creates.
 PYTHON ?= python3
 VENV ?= .venv
-PYTEST_ARGS ?=
+PYTEST_ARGS ?= -n auto
 ARGS ?=
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
@@ -24,14 +24,14 @@ $(INSTALLED): pyproject.toml constraints.txt
 fit: install ## momentum ablation of the paper: generates data, trains, evaluates, reports (ARGS="size=tiny" and the like)
 	$(BIN)/python -m gpe_pl.fit experiment=ablation_momentum $(ARGS)
 
-test: install ## fast tests (PYTEST_ARGS="-n 4" and the like)
+test: install ## fast tests on all cores (PYTEST_ARGS="-x" and the like for one)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 test-all: install ## all tests, analytic physics and notebooks included
 	$(BIN)/python -m pytest -m "" $(PYTEST_ARGS)
 
 physics: install ## solvers against formulas and experiments; writes docs/results/physics.md
-	$(BIN)/python -m pytest tests/physics -m "not notebook" --physics-page docs/results/physics.md $(PYTEST_ARGS)
+	$(BIN)/python -m pytest tests/physics -m "not notebook" --physics-page docs/results/physics.md $(PYTEST_ARGS) -n 0
 
 check: lint types contracts format-page ## everything that needs no run: style, types, import contracts, generated pages
 
