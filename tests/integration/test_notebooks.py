@@ -63,7 +63,7 @@ def _execute(path: Path, folder: Path, runs: Path, data: Path) -> Any:
     with pytest.MonkeyPatch.context() as monkeypatch:
         for key, value in {**_environment(), **own}.items():
             monkeypatch.setenv(key, str(value))
-        client = NotebookClient(notebook, timeout=120, kernel_name="python3", resources={"metadata": {"path": str(folder)}})
+        client = NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(folder)}})
         try:
             client.execute()
         finally:
