@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from array_api_compat import array_namespace
 
 from gpe_pl.geometry import outward_normal, signed_distance
-from gpe_pl.rollout import Simulator
+from gpe_pl.rollout import SimulationError, Simulator, step_all
 from gpe_pl.trajectory import Array, State
 
 TOLERANCE = 1e-6
@@ -51,27 +51,24 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
     return replace(state, pos=new_pos, vel=vel, velocity_history=history), inside
 
 
-@dataclass
+@dataclass(frozen=True)
 class Contained:
-    """A simulator with containment after every step, which counts what it corrected.
+    """A simulator with containment after every step; new states know how many nodes it corrected (``State.num_corrected``).
 
     Attributes:
         simulator: the simulator inside.
         dt: frame interval [s].
-        num_corrected, num_steps: corrected particle-steps out of all particle-steps so far.
     """
 
     simulator: Simulator
     dt: float
-    num_corrected: int = field(default=0, init=False)
-    num_steps: int = field(default=0, init=False)
 
     def step(self, state: State) -> State:
-        state, corrected = contain(self.simulator.step(state), self.dt)
-        self.num_corrected += int(corrected.sum())
-        self.num_steps += state.num_nodes
-        return state
+        return self._contain(self.simulator.step(state))
 
-    @property
-    def share_corrected(self) -> float:
-        return self.num_corrected / self.num_steps if self.num_steps else 0.0
+    def step_all(self, states: list[State]) -> list[State | SimulationError]:
+        return [self._contain(item) if isinstance(item, State) else item for item in step_all(self.simulator, states)]
+
+    def _contain(self, state: State) -> State:
+        contained, corrected = contain(state, self.dt)
+        return replace(contained, num_corrected=int(corrected.sum()))

@@ -7,6 +7,7 @@ import logging
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Annotated
 
@@ -19,9 +20,9 @@ from gpe_pl.containment import TOLERANCE, Contained
 from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
-from gpe_pl.rollout import Guard, Simulator, rollout, share_outside
+from gpe_pl.rollout import Guard, Start, rollout, rollouts, share_outside
 from gpe_pl.schema import Split
-from gpe_pl.trajectory import Trajectory, iter_trajectories
+from gpe_pl.trajectory import State, Trajectory, iter_trajectories
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +30,8 @@ LEARNED = "learned"
 MAX_SPEED_FACTOR = 20.0
 """A learned rollout faster than this many times the fastest particle of the ground truth has exploded."""
 ONE_STEP_WINDOWS = 256
+ROLLOUTS_AT_ONCE = 16
+"""Scenes that one pass of the model advances together."""
 
 
 @dataclass(frozen=True)
@@ -75,64 +78,70 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     for split in settings.splits:
         curves: dict[str, list[np.ndarray]] = {label: [], "ballistic": [], "constant_velocity": []}
         rows += [Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split))]
-        for number, trajectory in enumerate(iter_trajectories(root, split)):
-            if settings.num_trajectories is not None and number >= settings.num_trajectories:
-                break
-            predictions, extra = _predict(simulator, trajectory, settings, label)
-            truth = trajectory.frames(simulator.builder.config.history)
-            values = np.asarray(trajectory.material_params, dtype=np.float64)
-            parameter = float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
-            stop = predictions[label].termination
-            if stop is not None:
-                log.warning("%s %d stopped: %s, %s", split, number, stop.reason, stop.message)
-            for model, prediction in predictions.items():
-                curves[model].append(per_frame_mse(prediction, truth))
-                for record in rollout_metrics(prediction, truth, [*settings.horizons, "full"]):
-                    rows.append(
-                        Row(
-                            model,
-                            split,
-                            number,
-                            truth.metadata.parameter_group,
-                            parameter,
-                            record.metric,
-                            str(record.horizon),
-                            record.value,
-                        )
-                    )
-            rows += [Row(label, split, number, truth.metadata.parameter_group, parameter, k, "full", v) for k, v in extra.items()]
-            if number < settings.num_pictures:
-                _pictures(run_dir, split, number, truth, {label: predictions[label]})
-        _error_curve(run_dir / f"error_curve_{split}.png", curves, truth.metadata.frame_dt)
+        trajectories = islice(iter_trajectories(root, split), settings.num_trajectories)
+        number, truth = 0, None
+        while batch := list(islice(trajectories, ROLLOUTS_AT_ONCE)):
+            for trajectory, (predictions, extra) in zip(batch, _predict(simulator, batch, settings.containment, label), strict=True):
+                truth = trajectory.frames(simulator.builder.config.history)
+                values = np.asarray(trajectory.material_params, dtype=np.float64)
+                parameter = float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
+                stop = predictions[label].termination
+                if stop is not None:
+                    log.warning("%s %d stopped: %s, %s", split, number, stop.reason, stop.message)
+                about = (split, number, truth.metadata.parameter_group, parameter)
+                for model, prediction in predictions.items():
+                    curves[model].append(per_frame_mse(prediction, truth))
+                    for record in rollout_metrics(prediction, truth, [*settings.horizons, "full"]):
+                        rows.append(Row(model, *about, record.metric, str(record.horizon), record.value))
+                rows += [Row(label, *about, metric, "full", value) for metric, value in extra.items()]
+                if number < settings.num_pictures:
+                    _pictures(run_dir, split, number, truth, {label: predictions[label]})
+                number += 1
+        if truth is not None:
+            _error_curve(run_dir / f"error_curve_{split}.png", curves, truth.metadata.frame_dt)
     write_rows(run_dir / "metrics.csv", rows)
     return rows
 
 
 def _predict(
-    simulator: LearnedSimulator, trajectory: Trajectory, settings: EvaluationSettings, label: str
-) -> tuple[dict[str, Trajectory], dict[str, float]]:
+    simulator: LearnedSimulator, trajectories: list[Trajectory], containment: bool, label: str
+) -> Iterator[tuple[dict[str, Trajectory], dict[str, float]]]:
+    """Predictions of all models, and further numbers of the learned one, for each trajectory."""
     history = simulator.builder.config.history
-    truth = trajectory.frames(history)
-    steps, dt = truth.num_frames - 1, truth.metadata.frame_dt
-    start = simulator.initial_state(trajectory, history)
-    speed = float(np.linalg.norm(trajectory.vel, axis=-1).max(initial=0.0))
+    truths = [trajectory.frames(history) for trajectory in trajectories]
+    starts = [_start(simulator, *pair) for pair in zip(trajectories, truths, strict=True)]
+    num_corrected = [0] * len(starts)
+
+    def count(scene: int, _: int, state: State) -> None:
+        num_corrected[scene] += state.num_corrected
+
+    free = rollouts(simulator, starts)
+    contained = rollouts(Contained(simulator, truths[0].metadata.frame_dt), starts, count) if containment else free
+    for scene, (trajectory, truth) in enumerate(zip(trajectories, truths, strict=True)):
+        dt, steps, spacing = truth.metadata.frame_dt, truth.num_frames - 1, truth.metadata.spacing
+        prediction = contained[scene]
+        predictions = {label: prediction}
+        for name, baseline in (("ballistic", Ballistic(dt)), ("constant_velocity", ConstantVelocity(dt))):
+            predictions[name] = rollout(baseline, trajectory.state(history, history), steps, truth.metadata)
+        num_steps = truth.num_nodes * max(1, prediction.num_frames - 1)
+        yield (
+            predictions,
+            {
+                "share_outside_uncontained": _share_outside(free[scene], 1, steps, tolerance=1e-3 * spacing),
+                "share_outside_at_end": _share_outside(prediction, steps, steps, tolerance=TOLERANCE),
+                "num_good_frames": float(prediction.num_frames - 1),
+                "share_corrected": num_corrected[scene] / num_steps,
+            },
+        )
+
+
+def _start(simulator: LearnedSimulator, trajectory: Trajectory, truth: Trajectory) -> Start:
+    """The first frame with enough history, and limits far beyond what the ground truth does."""
     bounds = truth.metadata.bounds
-    size = max(b - a for a, b in bounds)
+    size = max(high - low for low, high in bounds)
+    speed = float(np.linalg.norm(trajectory.vel, axis=-1).max(initial=0.0))
     guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, size), bounds=bounds, margin=size)
-    contained = Contained(simulator, dt)
-    inner: Simulator = contained if settings.containment else simulator
-    free = rollout(simulator, start, steps, truth.metadata, guard)
-    prediction = rollout(inner, start, steps, truth.metadata, guard) if settings.containment else free
-    predictions = {label: prediction}
-    for name, baseline in (("ballistic", Ballistic(dt)), ("constant_velocity", ConstantVelocity(dt))):
-        predictions[name] = rollout(baseline, trajectory.state(history, history), steps, truth.metadata)
-    extra = {
-        "share_outside_uncontained": _share_outside(free, 1, steps, tolerance=1e-3 * truth.metadata.spacing),
-        "share_outside_at_end": _share_outside(prediction, steps, steps, tolerance=TOLERANCE),
-        "num_good_frames": float(prediction.num_frames - 1),
-        "share_corrected": contained.share_corrected,
-    }
-    return predictions, extra
+    return Start(simulator.initial_state(trajectory, simulator.builder.config.history), truth.num_frames - 1, truth.metadata, guard)
 
 
 def _share_outside(prediction: Trajectory, first: int, last: int, tolerance: float) -> float:
@@ -149,7 +158,7 @@ def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windo
     with torch.inference_mode():
         for window in windows:
             data = dataset[int(window)]
-            for material, value in simulator(data).items():
+            for material, value in simulator(data).acceleration.items():
                 metric.update(value, data[material].target / simulator.acceleration_std.float())
     return float(metric.compute())
 

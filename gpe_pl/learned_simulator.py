@@ -16,13 +16,15 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
-from torch_geometric.data import HeteroData
+from torch_geometric.data import Batch, HeteroData
 
 from gpe_pl import integrators
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig, history_of
+from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import Standardize
+from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, FeatureSpec, node_code
 from gpe_pl.trajectory import Metadata, State, Trajectory
 
@@ -47,8 +49,8 @@ class GraphStandardizer(nn.Module):
         self.spec = spec
         self.node = nn.ModuleDict({t: Standardize(c) for t, c in spec.node_channels.items()})
         self.params = nn.ModuleDict({m: Standardize(c) for m, c in spec.param_channels.items()})
-        self.odd = nn.ModuleDict({"__".join(r): Standardize(spec.odd_channels, centered=False) for r in spec.relations})
-        self.even = nn.ModuleDict({"__".join(r): Standardize(spec.even_channels) for r in spec.relations})
+        self.odd = nn.ModuleDict({"__".join(r): Standardize(spec.odd_channels[r], centered=False) for r in spec.relations})
+        self.even = nn.ModuleDict({"__".join(r): Standardize(spec.even_channels[r]) for r in spec.relations})
         self.register_buffer("mass", torch.ones(()))
 
     @staticmethod
@@ -113,7 +115,7 @@ class LearnedSimulator(nn.Module):
             raise ValueError(f"the training data's accelerations without gravity have rms {float(rms)}; nothing to learn from")
         self.acceleration_std.copy_(rms)
 
-    def forward(self, data: HeteroData) -> dict[str, Tensor]:
+    def forward(self, data: HeteroData) -> Prediction:
         """Accelerations without gravity per material, in units of ``acceleration_std``."""
         return self.model(self.standardizer(data))
 
@@ -148,12 +150,23 @@ class LearnedSimulator(nn.Module):
 
     @torch.inference_mode()
     def step(self, state: State) -> State:
-        data = self.builder(state)
-        predicted = self(data)
-        acc = state.gravity.expand_as(state.pos).clone()
+        return self._advance_all([state])[0]
+
+    @torch.inference_mode()
+    def step_all(self, states: list[State]) -> list[State | SimulationError]:
+        """``step`` of several scenes in one pass of the model."""
+        return [*self._advance_all(states)]
+
+    def _advance_all(self, states: list[State]) -> list[State]:
+        graphs = [self.builder(state) for state in states]
+        data = graphs[0] if len(graphs) == 1 else Batch.from_data_list(graphs)
+        predicted = self(data).acceleration
+        acc = [state.gravity.expand_as(state.pos).clone() for state in states]
         for material, normalized in predicted.items():
-            acc[data[material].node_id] += normalized.double() * self.acceleration_std
-        return self.advance(state, acc)
+            rows = [graph[material].node_id for graph in graphs]
+            for scene, part in enumerate(normalized.split([len(r) for r in rows])):
+                acc[scene][rows[scene]] += part.double() * self.acceleration_std
+        return [self.advance(state, a) for state, a in zip(states, acc, strict=True)]
 
     def advance(self, state: State, acc: Tensor) -> State:
         """The next state under a given acceleration [m/s²], gravity included."""

@@ -6,9 +6,9 @@ A guard looks at every new state. When it finds a state that cannot be trusted, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from array_api_compat import array_namespace
@@ -23,6 +23,13 @@ class Simulator(Protocol):
     """Anything that advances a state by one frame of ``Metadata.frame_dt``."""
 
     def step(self, state: State) -> State: ...
+
+
+@runtime_checkable
+class BatchSimulator(Simulator, Protocol):
+    """A simulator that advances several scenes at once for less than the sum of their costs."""
+
+    def step_all(self, states: list[State]) -> list[State | SimulationError]: ...
 
 
 class SimulationError(GpeError, RuntimeError):
@@ -88,20 +95,117 @@ class Guard:
         return None
 
 
-def states(simulator: Simulator, state: State, num_steps: int, guard: Guard | None = None) -> Iterator[State | Termination]:
-    """Yield ``num_steps`` successive states, or fewer and then a ``Termination``. Holds one state at a time."""
-    for frame in range(1, num_steps + 1):
-        try:
-            state = simulator.step(state)
-        except SimulationError as error:
-            yield Termination(error.reason, frame, error.node, f"frame {frame}: {error}")
+def step_all(simulator: Simulator, states: list[State]) -> list[State | SimulationError]:
+    """One step of every state, together if the simulator can; errors of single scenes are returned, so that the others go on."""
+    if isinstance(simulator, BatchSimulator):
+        return simulator.step_all(states)
+    return [_step(simulator, state) for state in states]
+
+
+def _step(simulator: Simulator, state: State) -> State | SimulationError:
+    try:
+        return simulator.step(state)
+    except SimulationError as error:
+        return error
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a rollout begins and ends.
+
+    Attributes:
+        state: becomes frame 0.
+        num_steps: frames to add.
+        metadata: of the scene; describes the result.
+        guard: stops the rollout at the first state that cannot be trusted.
+    """
+
+    state: State
+    num_steps: int
+    metadata: Metadata
+    guard: Guard | None = None
+
+
+def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int, int, State | Termination]]:
+    """Step all scenes side by side and yield (scene, frame, new state), or a ``Termination`` as a scene's last item. Holds one state per scene."""
+    live = {scene: start.state for scene, start in enumerate(starts)}
+    frame = 0
+    while True:
+        frame += 1
+        live = {scene: state for scene, state in live.items() if frame <= starts[scene].num_steps}
+        if not live:
             return
-        if guard is not None:
-            stop = guard.check(state, frame)
-            if stop is not None:
-                yield stop
-                return
-        yield state
+        for scene, item in zip(list(live), step_all(simulator, list(live.values())), strict=True):
+            stop = _termination(item, frame, starts[scene].guard)
+            if stop is None:
+                live[scene] = cast(State, item)
+            else:
+                del live[scene]
+            yield scene, frame, stop or cast(State, item)
+
+
+def _termination(item: State | SimulationError, frame: int, guard: Guard | None) -> Termination | None:
+    if isinstance(item, SimulationError):
+        return Termination(item.reason, frame, item.node, f"frame {frame}: {item}")
+    return None if guard is None else guard.check(item, frame)
+
+
+def rollouts(simulator: Simulator, starts: Sequence[Start], on_frame: Callable[[int, int, State], Any] | None = None) -> list[Trajectory]:
+    """``rollout`` of several scenes side by side; a learned simulator advances them in one pass of its model.
+
+    Args:
+        simulator: solver, learned model, baseline or ``Replay``.
+        starts: one per scene.
+        on_frame: called with scene, frame number and state.
+
+    Returns:
+        One trajectory per start.
+    """
+    recordings = [_Recording(start) for start in starts]
+    for scene, frame, item in frames(simulator, starts):
+        recordings[scene].add(item)
+        if on_frame is not None and isinstance(item, State):
+            on_frame(scene, frame, item)
+    return [recording.trajectory() for recording in recordings]
+
+
+class _Recording:
+    """The frames of one scene so far, as arrays of its own."""
+
+    def __init__(self, start: Start) -> None:
+        self.start = start
+        self.pos: list[np.ndarray] = []
+        self.vel: list[np.ndarray] = []
+        self.stress: list[Stress | None] = []
+        self.termination: Termination | None = None
+        self.add(start.state)
+
+    def add(self, item: State | Termination) -> None:
+        if isinstance(item, Termination):
+            self.termination = item
+            return
+        self.pos.append(_numpy(item.pos))
+        self.vel.append(_numpy(item.vel))
+        self.stress.append(None if item.stress is None else Stress(_numpy(item.stress.node), _numpy(item.stress.cell)))
+
+    def trajectory(self) -> Trajectory:
+        state, b = self.start.state, self.start.state.boundary
+        boundary = Boundary(_numpy(b.pos), _numpy(b.vel), _numpy(b.normal), _numpy(b.friction), _numpy(b.restitution), b.shapes)
+        known = [stress for stress in self.stress if stress is not None]
+        has_stress = len(known) == len(self.stress)
+        return Trajectory(
+            self.start.metadata,
+            np.stack(self.pos),
+            np.stack(self.vel),
+            _numpy(state.node_type),
+            _numpy(state.mass),
+            _numpy(state.material_params),
+            boundary,
+            rest_pos=None if state.rest_pos is None else _numpy(state.rest_pos),
+            cells=None if state.cells is None else _numpy(state.cells),
+            stress=Stress(np.stack([s.node for s in known]), np.stack([s.cell for s in known])) if has_stress else None,
+            termination=self.termination,
+        )
 
 
 def rollout(
@@ -125,40 +229,8 @@ def rollout(
     Returns:
         Up to ``num_steps + 1`` frames; fewer if it stopped early, with the reason in ``termination``.
     """
-    pos, vel, stress, termination = [_numpy(state.pos)], [_numpy(state.vel)], [state.stress], None
-    for frame, item in enumerate(states(simulator, state, num_steps, guard), start=1):
-        if isinstance(item, Termination):
-            termination = item
-            break
-        pos.append(_numpy(item.pos))
-        vel.append(_numpy(item.vel))
-        stress.append(item.stress)
-        if on_frame is not None:
-            on_frame(frame, item)
-    b = state.boundary
-    pos_b, vel_b, normal, friction, restitution = (_numpy(x) for x in (b.pos, b.vel, b.normal, b.friction, b.restitution))
-    boundary = Boundary(pos_b, vel_b, normal, friction, restitution, b.shapes)
-    return Trajectory(
-        metadata,
-        np.stack(pos),
-        np.stack(vel),
-        _numpy(state.node_type),
-        _numpy(state.mass),
-        _numpy(state.material_params),
-        boundary,
-        rest_pos=None if state.rest_pos is None else _numpy(state.rest_pos),
-        cells=None if state.cells is None else _numpy(state.cells),
-        stress=_stacked(stress),
-        termination=termination,
-    )
-
-
-def _stacked(frames: list[Stress | None]) -> Stress | None:
-    """The stresses of all frames; None unless every frame has them."""
-    known = [stress for stress in frames if stress is not None]
-    if len(known) < len(frames):
-        return None
-    return Stress(np.stack([_numpy(s.node) for s in known]), np.stack([_numpy(s.cell) for s in known]))
+    see = None if on_frame is None else lambda _, frame, item: on_frame(frame, item)
+    return rollouts(simulator, [Start(state, num_steps, metadata, guard)], see)[0]
 
 
 def share_outside(trajectory: Trajectory, tolerance: float = 0.0) -> float:

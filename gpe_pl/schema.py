@@ -3,7 +3,7 @@
 This module imports nothing but the standard library, so that solvers, store and models can agree on names without depending on each other.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 SCHEMA_VERSION = 2
@@ -43,7 +43,8 @@ MATERIALS: dict[str, MaterialParameter] = {
 
 BOUNDARY = "boundary"
 NODE_TYPES: tuple[str, ...] = (*MATERIALS, BOUNDARY)
-RADIUS = "radius"
+RADIUS, CELL, SAME, DOWN = "radius", "cell", "same", "down"
+"""Relations: within a radius; in one mesh cell; neighbours of one level of virtual nodes; from a virtual node to its children (``up`` is its reverse)."""
 
 EdgeType = tuple[str, str, str]
 """``(source node type, relation, target node type)``."""
@@ -51,6 +52,11 @@ EdgeType = tuple[str, str, str]
 Split = Literal["train", "val", "test", "test_unseen"]
 SPLITS: tuple[str, ...] = get_args(Split)
 ParameterGroup = Literal["seen", "interpolated", "extrapolated"]
+
+
+def grid(level: int) -> str:
+    """Node type of the virtual nodes of a level; level 1 lies above the mesh nodes."""
+    return f"grid_{level}"
 
 
 def node_code(name: str) -> int:
@@ -116,8 +122,10 @@ class FeatureSpec:
         node_channels: channels of ``x`` per node type, ``boundary`` included.
         param_channels: material parameters per material.
         relations: edge types that can occur.
-        odd_channels: edge channels that change sign when source and target swap; the first ``dim`` are the relative displacement.
-        even_channels: edge channels that do not.
+        odd_channels: per relation, edge channels that change sign when source and target swap; the first ``dim`` are the relative displacement.
+        even_channels: per relation, edge channels that do not.
+        stress_channels: components of the Cauchy stress per material that has one, in the order of ``STRESS_COMPONENTS``.
+        num_levels: of virtual nodes above meshes.
     """
 
     dim: int
@@ -125,9 +133,11 @@ class FeatureSpec:
     node_channels: dict[str, int]
     param_channels: dict[str, int]
     relations: tuple[EdgeType, ...]
-    odd_channels: int
-    even_channels: int
+    odd_channels: dict[EdgeType, int]
+    even_channels: dict[EdgeType, int]
+    stress_channels: dict[str, int] = field(default_factory=dict)
+    num_levels: int = 0
 
     @property
     def node_types(self) -> tuple[str, ...]:
-        return (*self.materials, BOUNDARY)
+        return (*self.materials, BOUNDARY, *(grid(level) for level in range(1, self.num_levels + 1)))

@@ -128,6 +128,7 @@ class State:
         cells: nodes of each mesh cell [cell, corner].
         stress: of the mesh, where the solver computes it.
         num_substeps: that a solver took to come here from the frame before.
+        num_corrected: nodes that containment put back in coming here from the frame before.
         internal: opaque part of a solver (deformation gradient, …), carried so that a restart equals a run-through.
     """
 
@@ -144,6 +145,7 @@ class State:
     cells: Array | None = None
     stress: Stress | None = None
     num_substeps: int = 0
+    num_corrected: int = 0
     internal: Any = None
 
     @property

@@ -69,14 +69,15 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
     """Channel counts of the graphs that ``config`` makes of a data set."""
     dim = metadata.dim
     materials = tuple(m for m in metadata.materials)
+    relations = radius_relations(materials)
     return FeatureSpec(
         dim=dim,
         materials=materials,
         node_channels={**dict.fromkeys(materials, (config.history + 1) * dim), BOUNDARY: 2 * dim + 2},
         param_channels={m: len(param_names((m,))) for m in materials},
-        relations=radius_relations(materials),
-        odd_channels=dim if config.features == "paper" else 3 * dim,
-        even_channels=0 if config.features == "paper" else 4,
+        relations=relations,
+        odd_channels=dict.fromkeys(relations, dim if config.features == "paper" else 3 * dim),
+        even_channels=dict.fromkeys(relations, 0 if config.features == "paper" else 4),
     )
 
 

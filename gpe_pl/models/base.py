@@ -1,5 +1,6 @@
 """The contract of every model: a graph in, one prediction per dynamic node type out."""
 
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from torch import Tensor
@@ -8,14 +9,27 @@ from torch_geometric.data import HeteroData
 from gpe_pl.schema import FeatureSpec
 
 
+@dataclass(frozen=True)
+class Prediction:
+    """What a model says about a graph; materials without nodes are absent.
+
+    Attributes:
+        acceleration: without gravity, per material [node, dim], in units of the data set's acceleration scale.
+        stress: Cauchy stress after the step, per material with a stress decoder [node, component], in units of the data set's stress scale.
+    """
+
+    acceleration: dict[str, Tensor]
+    stress: dict[str, Tensor] = field(default_factory=dict)
+
+
 class Model(Protocol):
     """A network whose constructor takes a ``FeatureSpec`` first and keyword settings after it.
 
-    ``forward`` gets a graph with standardised features and returns, per material with nodes in it, the acceleration without gravity [node, dim] in units
-    of the data set's acceleration scale. ``settings`` holds the constructor's keyword arguments as plain values, so a checkpoint can rebuild the model.
+    ``forward`` gets a graph with standardised features. ``settings`` holds the constructor's keyword arguments as plain values, so a checkpoint can rebuild
+    the model.
     """
 
     spec: FeatureSpec
     settings: dict[str, Any]
 
-    def forward(self, data: HeteroData) -> dict[str, Tensor]: ...
+    def forward(self, data: HeteroData) -> Prediction: ...

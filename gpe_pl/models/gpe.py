@@ -16,6 +16,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
+from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import MLP
 from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction, MomentumConv, orient
 from gpe_pl.schema import BOUNDARY, EdgeType, FeatureSpec
@@ -60,15 +61,15 @@ class PairForce(nn.Module):
     F_ij = C (φ(z_ij) − φ(z_ji)) with z_ij = A h_i + B h_j + W o_ij + S s_ij + b.
     """
 
-    def __init__(self, spec: FeatureSpec, hidden_channels: int, bipartite: bool) -> None:
+    def __init__(self, spec: FeatureSpec, relation: EdgeType, hidden_channels: int) -> None:
         super().__init__()
-        self.bipartite = bipartite
+        self.bipartite = relation[0] != relation[2]
         self.lin_target = nn.Linear(hidden_channels, hidden_channels, bias=False)
         self.lin_source = nn.Linear(hidden_channels, hidden_channels, bias=False)
-        self.lin_odd = nn.Linear(spec.odd_channels, hidden_channels, bias=False)
-        self.lin_even = nn.Linear(spec.even_channels, hidden_channels)
+        self.lin_odd = nn.Linear(spec.odd_channels[relation], hidden_channels, bias=False)
+        self.lin_even = nn.Linear(spec.even_channels[relation], hidden_channels)
         self.act = nn.PReLU()
-        self.lin_out = nn.Linear(hidden_channels, spec.dim, bias=bipartite)
+        self.lin_out = nn.Linear(hidden_channels, spec.dim, bias=self.bipartite)
 
     def forward(self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, odd: Tensor, even: Tensor) -> Float[Tensor, "edge dim"]:
         """Force on the target of every edge; the source feels the opposite."""
@@ -128,41 +129,40 @@ class GPE(nn.Module):
         self.node_encoder = nn.ModuleDict(
             {t: MLP(spec.node_channels[t] + (hidden if t in params else 0), hidden, hidden) for t in spec.node_types}
         )
-        raw = spec.odd_channels + spec.even_channels
         self.edge_encoder = nn.ModuleDict()
         if edge_state == "latent":
             for relation in spec.relations:
-                odd = self._interaction(relation) in ("odd", "odd_even")
-                self.edge_encoder[_key(relation)] = (
-                    OddEncoder(spec.odd_channels, spec.even_channels, hidden) if odd else MLP(raw, hidden, hidden)
-                )
+                odd, even = spec.odd_channels[relation], spec.even_channels[relation]
+                is_odd = self._interaction(relation) in ("odd", "odd_even")
+                self.edge_encoder[_key(relation)] = OddEncoder(odd, even, hidden) if is_odd else MLP(odd + even, hidden, hidden)
         self.convs, self.updates = nn.ModuleList(), nn.ModuleList()
         for step in range(num_message_passing_steps):
             convs = nn.ModuleDict()
             for relation in spec.relations:
                 kind = self._interaction(relation)
-                raw_edge = spec.odd_channels if kind in ("odd", "odd_even") else raw
+                odd, even = spec.odd_channels[relation], spec.even_channels[relation]
+                raw_edge = odd if kind in ("odd", "odd_even") else odd + even
                 edge_channels = hidden if edge_state == "latent" else raw_edge
-                convs[_key(relation)] = MomentumConv(hidden, edge_channels, spec.even_channels, kind, implementation)
+                convs[_key(relation)] = MomentumConv(hidden, edge_channels, even, kind, implementation)
             self.convs.append(convs)
             last = step == num_message_passing_steps - 1  # nobody reads the boundary's state after the last step
             self.updates.append(nn.ModuleDict({t: MLP(hidden, hidden, hidden) for t in (spec.materials if last else spec.node_types)}))
         if decoder == "node":
             self.node_decoder = nn.ModuleDict({m: MLP(hidden, hidden, spec.dim) for m in spec.materials})
         else:
-            self.pair_decoder = nn.ModuleDict({_key(r): PairForce(spec, hidden, r[0] != r[2]) for r in spec.relations})
+            self.pair_decoder = nn.ModuleDict({_key(r): PairForce(spec, r, hidden) for r in spec.relations})
 
     def _interaction(self, relation: EdgeType) -> Interaction:
         same = relation[0] == relation[2]
         return self.interaction if same or self.interaction == "directed" else "negated"
 
-    def forward(self, data: HeteroData) -> dict[str, Tensor]:
+    def forward(self, data: HeteroData) -> Prediction:
         """Accelerations without gravity per material, in units of the data set's acceleration scale; types and relations without members are skipped."""
         x = {t: data[t].x for t in self.spec.node_types if data[t].x.shape[0]}
         params = {m: data[m].material_params for m in self.material_embedding if m in x}
         mass = {m: data[m].mass for m in self.spec.materials if m in x}
         edges = {r: (data[r].edge_index, data[r].odd, data[r].even) for r in self.spec.relations if data[r].edge_index.shape[1]}
-        return self.compute(x, params, mass, edges)
+        return Prediction(self.compute(x, params, mass, edges))
 
     def compute(
         self,

@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import lightning as L
+import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, WeightAveraging
 
 from gpe_pl.containment import Contained
+from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import per_frame_mse
-from gpe_pl.rollout import Guard, rollout
+from gpe_pl.rollout import Guard, Start, rollouts
 from gpe_pl.trajectory import Trajectory
 
 
@@ -50,18 +52,20 @@ class RolloutValidation(Callback):
             return
         was_training = simulator.training
         simulator.eval()
-        values = [self._mse(simulator, t) for t in self.trajectories]
+        value = self._mse(simulator)
         simulator.train(was_training)
-        pl_module.log("val/rollout_mse", float(torch.tensor(values).mean()))
+        pl_module.log("val/rollout_mse", value)
 
-    def _mse(self, simulator: Any, trajectory: Trajectory) -> float:
+    def _mse(self, simulator: LearnedSimulator) -> float:
         history = simulator.builder.config.history
-        truth = trajectory.frames(history, history + self.num_steps + 1)
-        contained = Contained(simulator, truth.metadata.frame_dt)
-        bounds = truth.metadata.bounds
-        guard = Guard(bounds=bounds, margin=max(b - a for a, b in bounds), max_speed=1e3)
-        prediction = rollout(contained, simulator.initial_state(trajectory, history), truth.num_frames - 1, truth.metadata, guard)
-        error = per_frame_mse(prediction, truth)
-        worst = max(b - a for a, b in bounds) ** 2  # a rollout that stopped early counts as lost from there on
-        good = error[: prediction.num_frames]
-        return float((good[1:].sum() + worst * (truth.num_frames - prediction.num_frames)) / (truth.num_frames - 1))
+        truths = [t.frames(history, history + self.num_steps + 1) for t in self.trajectories]
+        starts, worst = [], []
+        for trajectory, truth in zip(self.trajectories, truths, strict=True):
+            bounds = truth.metadata.bounds
+            size = max(high - low for low, high in bounds)
+            guard = Guard(bounds=bounds, margin=size, max_speed=1e3)
+            starts.append(Start(simulator.initial_state(trajectory, history), truth.num_frames - 1, truth.metadata, guard))
+            worst.append(size**2)  # a rollout that stopped early counts as lost from there on
+        predictions = rollouts(Contained(simulator, truths[0].metadata.frame_dt), starts)
+        errors = [per_frame_mse(p, t)[1:] for p, t in zip(predictions, truths, strict=True)]
+        return float(np.mean([np.where(np.isfinite(e), e, w).mean() for e, w in zip(errors, worst, strict=True)]))

@@ -113,7 +113,7 @@ class TrainingModule(L.LightningModule):
 
     def loss(self, batch: HeteroData) -> Tensor:
         """Mean squared error of the normalised accelerations."""
-        predicted = self.simulator(batch)
+        predicted = self.simulator(batch).acceleration
         errors = [(predicted[m] - self._normalized(batch[m].target)).square() for m in predicted]
         return torch.cat(errors).mean()
 
@@ -139,7 +139,7 @@ class TrainingModule(L.LightningModule):
             )
 
     def validation_step(self, batch: HeteroData, batch_idx: int) -> None:
-        predicted = self.simulator(batch)
+        predicted = self.simulator(batch).acceleration
         for material, value in predicted.items():
             self.val_nmse.update(value, self._normalized(batch[material].target))
 

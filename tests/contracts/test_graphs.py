@@ -108,8 +108,8 @@ def test_every_store_is_there_and_empty_where_the_frame_has_none(count: int, wal
         store = data[relation]
         assert store.edge_index.shape == (2, store.odd.shape[0])
         assert store.edge_index.dtype == torch.int64
-        assert store.odd.shape[1] == build.spec.odd_channels
-        assert store.even.shape == (store.odd.shape[0], build.spec.even_channels)
+        assert store.odd.shape[1] == build.spec.odd_channels[relation]
+        assert store.even.shape == (store.odd.shape[0], build.spec.even_channels[relation])
 
 
 def test_boundary_nodes_have_no_edges_among_themselves() -> None:

@@ -206,9 +206,21 @@ def test_a_contained_rollout_ends_inside_and_a_guarded_one_with_a_reason(traject
     assert free.termination is not None
     assert free.termination.reason == "escape"
     contained = Contained(simulator, trajectory.metadata.frame_dt)
-    inside = rollout(contained, start, 50, trajectory.metadata, Guard(bounds=trajectory.metadata.bounds, margin=1e-5))
+    counts: list[int] = []
+    guard = Guard(bounds=trajectory.metadata.bounds, margin=1e-5)
+    inside = rollout(contained, start, 50, trajectory.metadata, guard, lambda _, state: counts.append(state.num_corrected))
     assert inside.termination is None
-    assert contained.share_corrected > 0
+    assert sum(counts) > 0
+
+
+def test_scenes_stepped_together_equal_scenes_alone(trajectory: Trajectory) -> None:
+    simulator = learned(builder_of(trajectory)).double()
+    starts = [simulator.initial_state(trajectory, frame) for frame in (2, 4, 3)]
+    together = simulator.step_all(starts)
+    for start, result in zip(starts, together, strict=True):
+        assert isinstance(result, State)
+        assert torch.allclose(result.pos, simulator.step(start).pos, rtol=0, atol=1e-9)
+        assert not torch.equal(result.pos, start.pos)
 
 
 # --- checkpoints ---------------------------------------------------------------------------------------------------------------------------
@@ -346,7 +358,7 @@ def test_only_models_of_the_package_are_looked_up() -> None:
 
 def test_gradients_reach_the_model_through_the_standardized_graph(simulator: LearnedSimulator) -> None:
     graph = simulator.builder(scenes.state(40, ("sand", "snow"), history=2).to_torch())
-    loss: Tensor = sum(v.square().sum() for v in simulator(graph).values())  # type: ignore[assignment]
+    loss: Tensor = sum(v.square().sum() for v in simulator(graph).acceleration.values())  # type: ignore[assignment]
     loss.backward()
     assert sum(float(p.grad.abs().sum()) for p in simulator.parameters() if p.grad is not None) > 0
 

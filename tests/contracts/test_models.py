@@ -45,7 +45,7 @@ def make(request: pytest.FixtureRequest) -> Factory:
 def predict(model: Any, data: HeteroData, num_nodes: int) -> torch.Tensor:
     """Predictions in the order of the state's nodes."""
     out = torch.full((num_nodes, model.spec.dim), float("nan"), dtype=torch.float64)
-    for material, value in model(data).items():
+    for material, value in model(data).acceleration.items():
         out[data[material].node_id] = value
     return out
 
@@ -108,7 +108,7 @@ def test_batch_equals_singles_whatever_types_are_present(make: Factory) -> None:
     singles = [predict(model, g, s.num_nodes) for g, s in zip(graphs, states, strict=True)]
     for order in ((0, 1, 2, 3, 4), (1, 0, 2, 4, 3), (2, 1, 0, 3, 4), (3, 4, 0, 1, 2), (4, 3, 2, 1, 0)):
         batch = Batch.from_data_list([graphs[k] for k in order])
-        out = model(batch)
+        out = model(batch).acceleration
         for material, value in out.items():
             owner = batch[material].batch
             for position, k in enumerate(order):
@@ -154,7 +154,7 @@ def test_degenerate_geometry_is_finite_with_finite_gradients(make: Factory, case
     s = replace(s, pos=pos, vel=past[:, -1], velocity_history=past)
     data = scenes.to_dtype(build(s.to_torch()), torch.float64)
     model = make(build.spec)
-    out = model(data)
+    out = model(data).acceleration
     if case == "none":
         assert not out
         return
@@ -175,7 +175,7 @@ def test_gradients_are_correct(make: Factory) -> None:
     def f(x: torch.Tensor, odd: torch.Tensor) -> torch.Tensor:
         d = data.clone()
         d["sand"].x, d["sand", "radius", "sand"].odd = x, odd
-        return model(d)["sand"]
+        return model(d).acceleration["sand"]
 
     x = data["sand"].x.clone().requires_grad_()
     odd = data["sand", "radius", "sand"].odd.clone().requires_grad_()
@@ -187,7 +187,7 @@ def test_every_parameter_is_used(make: Factory) -> None:
     build = scenes.builder(TWO)
     data = scenes.to_dtype(build(scenes.state(60, TWO).to_torch()), torch.float64)
     model = make(build.spec)
-    sum(v.square().sum() for v in model(data).values()).backward()
+    sum(v.square().sum() for v in model(data).acceleration.values()).backward()
     unused = [n for n, p in model.named_parameters() if p.grad is None]
     allowed = ("updates", "lin_even", "pair_decoder", "boundary")
     assert all(any(a in n for a in allowed) for n in unused), unused
@@ -219,6 +219,6 @@ def test_all_features_work(make: Factory, features: str, history: int) -> None:
     data = scenes.to_dtype(build(scenes.state(history=history).to_torch()), torch.float64)
     standardizer = GraphStandardizer(build.spec).double()
     standardizer.fit([data])
-    out = make(build.spec)(standardizer(data))["sand"]
+    out = make(build.spec)(standardizer(data)).acceleration["sand"]
     assert out.shape == (40, 2)
     assert torch.isfinite(out).all()

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gpe_pl import integrators
-from gpe_pl.rollout import Guard, Replay, SimulationError, Simulator, rollout, share_outside, states
+from gpe_pl.rollout import Guard, Replay, SimulationError, Simulator, Start, frames, rollout, rollouts, share_outside
 from gpe_pl.trajectory import State, Termination, Trajectory
 
 New = Callable[..., Trajectory]
@@ -136,12 +136,37 @@ def test_on_frame_sees_every_new_state(trajectory: Trajectory) -> None:
     assert seen == [1, 2, 3, 4, 5]
 
 
-def test_states_holds_one_state_at_a_time(trajectory: Trajectory) -> None:
-    stream = states(FreeFall(0.01), trajectory.state(0), 10**12)
-    first, second = next(stream), next(stream)
+def test_frames_holds_one_state_at_a_time(trajectory: Trajectory) -> None:
+    stream = frames(FreeFall(0.01), [Start(trajectory.state(0), 10**12, trajectory.metadata)])
+    (_, _, first), (_, _, second) = next(stream), next(stream)
     assert isinstance(first, State)
     assert isinstance(second, State)
     assert second.time == pytest.approx(0.02)
+
+
+def test_scenes_side_by_side_equal_scenes_alone(trajectory: Trajectory) -> None:
+    """Different lengths, a guard that stops one of them, a refusal in another."""
+    guard = Guard(bounds=((0.0, 1.0), (-0.3, 1.0)))
+
+    def refuse(state: State) -> State:
+        if state.pos[0, 0] > 0.5:
+            raise SimulationError("too far right", reason="input", node=0)
+        return state
+
+    simulator = FreeFall(0.01, 4, refuse)
+    left = replace(trajectory.state(0), pos=trajectory.pos[0] * 0.3)
+    right = replace(left, pos=left.pos + np.array([0.6, 0.5]))
+    starts = [Start(left, 30, trajectory.metadata, guard), Start(right, 10, trajectory.metadata), Start(left, 3, trajectory.metadata)]
+    seen: list[tuple[int, int]] = []
+    together = rollouts(simulator, starts, lambda scene, frame, _: seen.append((scene, frame)))
+    for start, result in zip(starts, together, strict=True):
+        alone = rollout(simulator, start.state, start.num_steps, start.metadata, start.guard)
+        np.testing.assert_array_equal(result.pos, alone.pos)
+        assert result.termination == alone.termination
+    assert [t.num_frames for t in together][1:] == [4, 4]
+    assert together[1].termination is not None and together[1].termination.reason == "input"
+    assert together[0].termination is not None and together[0].termination.reason == "escape"
+    assert seen[:4] == [(0, 1), (1, 1), (2, 1), (0, 2)]
 
 
 def test_frames_do_not_share_memory_with_the_simulator(trajectory: Trajectory) -> None:

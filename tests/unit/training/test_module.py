@@ -84,7 +84,7 @@ def test_the_optimizer_follows_the_schedule() -> None:
 
 def test_the_loss_is_the_mean_over_all_nodes_and_axes_of_both_materials() -> None:
     m, data = module(), batch()
-    predicted = m.simulator(data)
+    predicted = m.simulator(data).acceleration
     errors = [
         float((predicted[t][i, d].detach() - data[t].target[i, d] / 5.0) ** 2)
         for t in MATERIALS
