@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
 import os
 import re
 import sys
@@ -27,7 +28,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 from pydantic import ConfigDict, ValidationError, create_model
 
+from gpe_pl import launcher
 from gpe_pl.errors import GpeError
+from gpe_pl.launcher import RESULT, SweepError
 
 WITHOUT_KEY = {"experiment", "scene", "solver"}
 """Config groups that fill other keys than one of their own."""
@@ -143,7 +146,10 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
                 OmegaConf.resolve(cfg)
                 construct(Paths, cfg.paths, "paths")
                 _check_top_level(cfg, config_name)
-                return task(cfg)
+                value = task(cfg)
+                if RESULT in os.environ:
+                    Path(os.environ[RESULT]).write_text(json.dumps(value))
+                return value
             except InterpolationKeyError as error:
                 if verbose:
                     raise
@@ -158,8 +164,11 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             if not CONF.is_dir():
                 _fail(ConfigError(f"{CONF} not found: install gpe_pl from a clone with `pip install -e .`"))
             os.environ["HYDRA_FULL_ERROR"] = "1"  # let exceptions reach us instead of Hydra's own report
+            launcher.register()
             try:
                 return hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
+            except SweepError as error:
+                _fail(error)
             except (HydraException, OmegaConfBaseException, ValueError) as error:
                 if verbose or (is_composed and isinstance(error, ValueError)):
                     raise
@@ -222,7 +231,7 @@ def _first_choice(override: str) -> str:
 def _groups(config_name: str) -> set[str]:
     """The config groups that a command takes."""
     defaults = OmegaConf.load(CONF / f"{config_name}.yaml").defaults
-    return {str(group) for entry in defaults if isinstance(entry, DictConfig) for group in entry}
+    return {str(group) for entry in defaults if isinstance(entry, DictConfig) for group in entry if "/" not in str(group)}
 
 
 def output_dir(cfg: DictConfig) -> Path:
@@ -242,9 +251,15 @@ class Report(Callback):
     def _report(self, folder: Path, is_sweep: bool) -> None:
         """Ends the process on failure: Hydra turns an exception of a callback into a warning, and the command would seem to have succeeded."""
         try:
+            from gpe_pl.domain_table import compares_models, report_domains
             from gpe_pl.report import report, report_sweep
 
-            (report_sweep if is_sweep else report)(folder)
+            if not is_sweep:
+                report(folder)
+            elif compares_models(folder):
+                report_domains(folder)
+            else:
+                report_sweep(folder)
         except GpeError as error:
             _fail(error)
         except Exception:

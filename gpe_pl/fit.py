@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpe_pl.config import ConfigError, bind, construct, entry_point, output_dir
@@ -12,7 +13,10 @@ if TYPE_CHECKING:
 
 def fit(cfg: DictConfig) -> float:
     """Generate what data is missing, train or resume, evaluate; returns the mean full-length rollout MSE [m²] on the first split evaluated."""
+    from dataclasses import asdict
+
     import lightning as L
+    from filelock import FileLock
     from omegaconf import OmegaConf
 
     from gpe_pl.data.datamodule import TrajectoryDataModule
@@ -21,6 +25,7 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
     from gpe_pl.simulate import ensure_data
+    from gpe_pl.training.budget import digest, step_time, within_budget
     from gpe_pl.training.module import TrainingModule
     from gpe_pl.training.run import LoggerSettings, TrainerSettings, TrainingSettings, claim, set_threads, train
 
@@ -35,19 +40,32 @@ def fit(cfg: DictConfig) -> float:
     noise = Noise(training.noise, training.noise_std)
 
     run_dir = output_dir(cfg)
-    root = ensure_data(cfg)
-    settings: Any = OmegaConf.to_container(cfg, resolve=True)
-    claim(run_dir, {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training", "evaluation")})
-    if not (run_dir / "metrics.csv").exists():
-        set_threads(trainer)
+    Path(cfg.paths.data).mkdir(parents=True, exist_ok=True)
+    with FileLock(Path(cfg.paths.data) / f".{cfg.data.name}.lock"):  # runs of a sweep start at the same time
+        root = ensure_data(cfg)
+    device = "cuda" if trainer.accelerator == "gpu" else "cpu"
+    datamodule = TrajectoryDataModule(
+        root, graph, noise, training.batch_size, cfg.seed, trainer.num_workers, stress=bool(cfg.model.get("stress", False))
+    )
+    set_threads(trainer)
+
+    def new_module(training: TrainingSettings) -> TrainingModule:
         L.seed_everything(cfg.seed, verbose=False)
-        datamodule = TrajectoryDataModule(root, graph, noise, training.batch_size, cfg.seed, trainer.num_workers)
         simulator = LearnedSimulator(new_model(spec=datamodule.builder.spec), datamodule.builder)
         simulator.fit_statistics(datamodule.statistics_sample())
-        names = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "compile")
-        module = TrainingModule(simulator, **{n: getattr(training, n) for n in names})
-        best = train(module, datamodule, training, trainer, logger.loggers(run_dir), run_dir)
-        device = "cuda" if trainer.accelerator == "gpu" else "cpu"
+        names = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "stress_weight", "compile")
+        return TrainingModule(simulator, **{n: getattr(training, n) for n in names})
+
+    settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    if training.budget_minutes is not None:
+        parts = {k: settings[k] for k in ("data", "graph", "model")} | {"batch_size": training.batch_size, "device": device}
+        key = f"{cfg.data.name} {cfg.size.name} {cfg.model._target_.rpartition('.')[2]} {digest(parts)}"
+        measure = lambda: step_time(new_module(training).to(device), datamodule.train_set, training)
+        training = within_budget(training, Path(cfg.paths.runs) / cfg.name / "step_times.json", key, measure)
+    settings["training"] = asdict(training)
+    claim(run_dir, {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training", "evaluation")})
+    if not (run_dir / "metrics.csv").exists():
+        best = train(new_module(training), datamodule, training, trainer, logger.loggers(run_dir), run_dir)
         evaluate(LearnedSimulator.from_checkpoint(best, device), root, evaluation, run_dir)
 
     values = [

@@ -1,7 +1,7 @@
 """Parallel, resumable generation of data sets.
 
 Every trajectory is a pure function of ``(spec, split, index)`` and every shard appears atomically, so a run that was killed resumes where it stopped and
-leaves the same bytes as one that was not. Layout::
+leaves the same bytes as one that was not. A shard that can be opened counts as complete; ``discard_damaged`` looks at every byte. Layout::
 
     {root}/{name}/{size}/dataset.json            the spec and its hash, written first
     {root}/{name}/{size}/{split}/shard-00000.h5
@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import logging
 import math
 import multiprocessing
 import os
@@ -37,6 +38,8 @@ from gpe_pl.rollout import Guard, SimulationError, Simulator, rollout
 from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.trajectory import Metadata, State, StoreError, Trajectory, read_trajectory, trajectory_names, write_shard
+
+log = logging.getLogger(__name__)
 
 SPEC_FILE = "dataset.json"
 STATISTICS_FILE = "statistics.json"
@@ -66,6 +69,7 @@ class Solver(Simulator, Protocol):
 
     name: ClassVar[str]
     version: ClassVar[str]
+    stores_stress: ClassVar[bool]
 
     @property
     def frame_dt(self) -> float: ...
@@ -152,19 +156,30 @@ class DatasetSpec:
                         )
             if self.num_test_unseen and not (values.interpolated and values.extrapolated):
                 raise ValueError(f"num_test_unseen > 0 needs parameters.{material}.interpolated and .extrapolated")
+        for key, path in self.scene.input_files.items():
+            try:
+                Path(path).open("rb").close()
+            except OSError as error:
+                raise ValueError(f"scene.{key} = {path}: {error.strerror} (searched from {Path.cwd()})") from None
 
     @property
     def counts(self) -> dict[str, int]:
         """Trajectories per split."""
         return dict(zip(SPLITS, (self.num_train, self.num_val, self.num_test, self.num_test_unseen), strict=True))
 
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Settings of scene and solver, with the solver's name and version."""
+        scene, solver = asdict(cast(Any, self.scene)), asdict(cast(Any, self.solver))
+        return {
+            "scene": {"kind": type(self.scene).__name__, **scene},
+            "solver": {**solver, "name": self.solver.name, "version": self.solver.version},
+        }
+
     def as_dict(self) -> dict[str, Any]:
         """Plain JSON values; includes what else the bytes depend on: the solver's name and version, and the content of the scene's files."""
-        values = asdict(self)  # type: ignore[call-overload]
-        values["scene"] = {"kind": type(self.scene).__name__, **values["scene"]}
-        values["solver"] |= {"name": self.solver.name, "version": self.solver.version}
-        values["input_files"] = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in self.scene.input_files}
-        return json.loads(json.dumps(values))
+        files = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in self.scene.input_files.values()}
+        return json.loads(json.dumps({**asdict(self), **self.provenance, "input_files": files}))  # type: ignore[call-overload]
 
 
 # --- one trajectory ------------------------------------------------------------------------------------------------------------------------
@@ -196,7 +211,6 @@ def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[st
 
 def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
     """Metadata of one trajectory."""
-    values = spec.as_dict()
     return describe(
         spec.scene,
         spec.solver.frame_dt,
@@ -207,7 +221,7 @@ def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
         parameter_group=parameter_values(spec, split, index)[1],
         solver=spec.solver.name,
         solver_version=spec.solver.version,
-        config=json.dumps({"scene": values["scene"], "solver": values["solver"]}, sort_keys=True),
+        config=json.dumps(spec.provenance, sort_keys=True),
     )
 
 
@@ -253,8 +267,12 @@ def _shard_indices(spec: DatasetSpec, split: str, shard: int) -> range:
     return range(start, min(start + spec.trajectories_per_shard, spec.counts[split]))
 
 
-def _shards(spec: DatasetSpec) -> list[tuple[str, int]]:
-    return [(split, k) for split, count in spec.counts.items() for k in range(math.ceil(count / spec.trajectories_per_shard))]
+def _shards(spec: DatasetSpec, part: tuple[int, int] = (0, 1)) -> list[tuple[str, int]]:
+    """Split and number of each shard, or of every n-th from the k-th on."""
+    if not 0 <= part[0] < part[1]:
+        raise ValueError(f"part must be (k, n) with 0 <= k < n, got {part}")
+    every = [(split, k) for split, count in spec.counts.items() for k in range(math.ceil(count / spec.trajectories_per_shard))]
+    return every[part[0] :: part[1]]
 
 
 def _is_complete(spec: DatasetSpec, folder: Path, split: str, shard: int) -> bool:
@@ -263,6 +281,16 @@ def _is_complete(spec: DatasetSpec, folder: Path, split: str, shard: int) -> boo
         return trajectory_names(shard_path(folder, split, shard)) == [f"{i:05d}" for i in _shard_indices(spec, split, shard)]
     except StoreError:
         return False
+
+
+def _fault(path: Path) -> tuple[Path, str]:
+    """Why a shard cannot be used, or nothing where all that it holds agrees with its checksums."""
+    try:
+        for name in trajectory_names(path):
+            read_trajectory(path, name, verify=True)
+    except StoreError as error:
+        return path, str(error).partition("; ")[0]  # without the advice, which is about to be followed
+    return path, ""
 
 
 def _write_shard(spec: DatasetSpec, folder: Path, split: str, shard: int) -> int:
@@ -276,7 +304,7 @@ def _bytes_per_trajectory(spec: DatasetSpec) -> int:
     """Uncompressed; nodes and cells at most as many as the scene says, boundary nodes of the first scene."""
     dim = len(spec.scene.bounds)
     per_frame = 2 * dim * spec.scene.max_nodes
-    if getattr(spec.solver, "stores_stress", False):
+    if spec.solver.stores_stress:
         per_frame += (5 if dim == 2 else 7) * (spec.scene.max_nodes + spec.scene.max_cells)
     boundary = initial_state(spec, "train", 0).boundary
     return 4 * per_frame * spec.num_frames + 16 * (dim + 1) * len(boundary.pos) + 2**13
@@ -295,24 +323,49 @@ class Plan:
     """What is missing of a data set, and what it takes to generate it.
 
     Attributes:
+        missing: split and number of each shard that is not there.
         num_done, num_missing: trajectories that are there and that are not.
         bytes_needed: on disk, at most.
         bytes_free: on the disk.
     """
 
+    missing: tuple[tuple[str, int], ...]
     num_done: int
     num_missing: int
     bytes_needed: int
     bytes_free: int
 
+    @property
+    def fits(self) -> bool:
+        """Whether the disk has enough room."""
+        return self.bytes_needed <= 0.95 * self.bytes_free
 
-def plan(root: Path | str, spec: DatasetSpec) -> Plan:
-    """What ``generate`` would do."""
+
+def plan(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1)) -> Plan:
+    """What ``generate`` does with the same arguments."""
     folder = Path(root) / spec.name / spec.size
     existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
-    missing = sum(len(_shard_indices(spec, split, k)) for split, k in _shards(spec) if not _is_complete(spec, folder, split, k))
-    done = sum(spec.counts.values()) - missing
-    return Plan(done, missing, missing * _bytes_per_trajectory(spec), shutil.disk_usage(existing).free)
+    own = _shards(spec, part)
+    missing = tuple((split, k) for split, k in own if not _is_complete(spec, folder, split, k))
+    total, num_missing = (sum(len(_shard_indices(spec, split, k)) for split, k in shards) for shards in (own, missing))
+    return Plan(missing, total - num_missing, num_missing, num_missing * _bytes_per_trajectory(spec), shutil.disk_usage(existing).free)
+
+
+def discard_damaged(root: Path | str, spec: DatasetSpec, num_workers: int = 1, part: tuple[int, int] = (0, 1)) -> None:
+    """Read all shards that are there and delete those whose content disagrees with their checksums, so that ``generate`` makes them again.
+
+    Each of them is logged. This takes about a twentieth of the time to generate them. Arguments and errors are those of ``generate``.
+    """
+    folder = Path(root) / spec.name / spec.size
+    paths = [path for shard in _shards(spec, part) if (path := shard_path(folder, *shard)).is_file()]
+    if not paths:
+        return
+    _claim(folder, spec)
+    with _pool(num_workers) as pool:
+        for path, fault in _run(pool, _fault, [(path,) for path in paths]):
+            if fault:
+                log.warning("generating a shard again: %s", fault)
+                path.unlink(missing_ok=True)
 
 
 def _compile(spec: DatasetSpec) -> None:
@@ -352,40 +405,35 @@ def generate(
     """
     if num_workers < 1:
         raise ValueError(f"num_workers must be at least 1, got {num_workers}")
-    if not 0 <= part[0] < part[1]:
-        raise ValueError(f"part must be (k, n) with 0 <= k < n, got {part}")
+    own = _shards(spec, part)
     folder = Path(root) / spec.name / spec.size
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise GenerationError(f"{folder}: cannot be made ({error}); choose another folder with paths.data") from None
     _claim(folder, spec)
-    own = _shards(spec)[part[0] :: part[1]]
     for split, k in own:
         for leftover in folder.glob(f"{split}/.{shard_path(folder, split, k).name}.*.part"):
             leftover.unlink(missing_ok=True)
-    missing = [(split, k) for split, k in own if not _is_complete(spec, folder, split, k)]
-    total = sum(len(_shard_indices(spec, split, k)) for split, k in own)
-    to_do = sum(len(_shard_indices(spec, split, k)) for split, k in missing)
-    needed, free = to_do * _bytes_per_trajectory(spec), shutil.disk_usage(folder).free
-    if needed > 0.95 * free:
+    to_do = plan(root, spec, part)
+    if not to_do.fits:
         raise GenerationError(
-            f"{folder}: {to_do} trajectories need up to {needed / 2**30:.3g} GiB, the disk has {free / 2**30:.3g} GiB free; "
-            "choose another folder with paths.data, or a smaller size"
+            f"{folder}: {to_do.num_missing} trajectories need up to {to_do.bytes_needed / 2**30:.3g} GiB, the disk has "
+            f"{to_do.bytes_free / 2**30:.3g} GiB free; choose another folder with paths.data, or a smaller size"
         )
     statistics, sheet = folder / STATISTICS_FILE, folder / CONTACT_SHEET_FILE
-    if any(split == "train" for split, _ in missing):
+    if any(split == "train" for split, _ in to_do.missing):
         statistics.unlink(missing_ok=True)
-    done = total - to_do
+    done, total = to_do.num_done, to_do.num_done + to_do.num_missing
     if on_progress is not None:
         on_progress(done, total)
     draws_sheet = part[0] == 0 and not sheet.is_file()
-    if (missing or draws_sheet) and num_workers > 1:
+    if (to_do.missing or draws_sheet) and num_workers > 1:
         _compile(spec)  # once, here: the workers load the compiled kernels from disk
     with _pool(num_workers) as pool:
         if draws_sheet:  # first, so that hours of wrong data are seen within a minute
             _draw_contact_sheet(spec, sheet, pool)
-        for count in _run(pool, _write_shard, [(spec, folder, split, k) for split, k in missing]):
+        for count in _run(pool, _write_shard, [(spec, folder, split, k) for split, k in to_do.missing]):
             done += count
             if on_progress is not None:
                 on_progress(done, total)
@@ -408,7 +456,7 @@ def _draw_contact_sheet(spec: DatasetSpec, path: Path, pool: Executor | None) ->
             every = sorted({*choices.seen, *choices.interpolated, *choices.extrapolated})
             values[material] = every[round(share * (len(every) - 1))]
         rows[_row_label(values)] = values
-    index = max(range(min(spec.num_train, 32)), key=lambda i: len(np.unique(initial_state(spec, "train", i).node_type)))
+    index = _most_varied_scene(spec)
     arguments = [(spec, index, label, values) for label, values in rows.items()]
     trajectories = dict(_run(pool, _labelled_trajectory, arguments))
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part.png")
@@ -417,6 +465,18 @@ def _draw_contact_sheet(spec: DatasetSpec, path: Path, pool: Executor | None) ->
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _most_varied_scene(spec: DatasetSpec) -> int:
+    """Index of the training scene with the most materials, among the first ones."""
+    best, most = 0, 1
+    for index in range(min(spec.num_train, 32)):
+        if most == len(spec.scene.materials):  # also where there is but one
+            break
+        number = len(np.unique(initial_state(spec, "train", index).node_type))
+        if number > most:
+            best, most = index, number
+    return best
 
 
 def _row_label(values: Mapping[str, float]) -> str:

@@ -492,6 +492,24 @@ def outward_normal(shape: Shape, points: Array, step: float) -> Array:
     return gradient / xp.where(length > 0, length, xp.ones_like(length))[..., None]
 
 
+def check_bounds(bounds: tuple[tuple[float, float], ...]) -> None:
+    """Raise ``ValueError`` unless bounds are finite ``(low, high)`` with low < high along 2 or 3 axes."""
+    if len(bounds) not in (2, 3):
+        raise ValueError(f"bounds must have 2 or 3 axes, got {bounds}")
+    for axis, (low, high) in enumerate(bounds):
+        if not (math.isfinite(high - low) and low < high):
+            raise ValueError(f"bounds[{axis}] = ({low}, {high}) must be finite with low < high")
+
+
+def check_whole_cells(bounds: tuple[tuple[float, float], ...], spacing: float) -> None:
+    """Raise ``ValueError`` unless bounds are sound and span a whole number of grid cells of ``spacing`` [m] along each axis."""
+    check_bounds(bounds)
+    for axis, (low, high) in enumerate(bounds):
+        cells = (high - low) / spacing
+        if not (math.isfinite(cells) and cells > 0.5 and abs(cells - round(cells)) < 1e-6 * cells):
+            raise ValueError(f"bounds[{axis}] = ({low}, {high}) must span a whole number of grid cells of {spacing} m, got {cells:g}")
+
+
 def domain_walls(bounds: tuple[tuple[float, float], ...], friction: dict[str, float] | float) -> tuple[Wall, ...]:
     """The walls of a box-shaped domain.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import importlib
 import inspect
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
@@ -25,10 +25,13 @@ from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import Standardize
 from gpe_pl.rollout import SimulationError
-from gpe_pl.schema import MATERIALS, FeatureSpec, node_code
-from gpe_pl.trajectory import Metadata, State, Trajectory
+from gpe_pl.schema import MATERIALS, EdgeType, FeatureSpec, node_code, role
+from gpe_pl.trajectory import Metadata, State, Stress, Trajectory
 
-CHECKPOINT_FORMAT = 1
+CHECKPOINT_FORMAT = 2
+
+RANGE_TOLERANCE = 1e-5
+"""Material parameters are stored in single precision; differences below this share of the value are none."""
 
 
 class CheckpointError(GpeError, ValueError):
@@ -40,18 +43,26 @@ class SceneError(GpeError, ValueError):
 
 
 class GraphStandardizer(nn.Module):
-    """Standardises every feature of a graph with training statistics; odd edge channels are only scaled, so they stay odd."""
+    """Standardises every feature of a graph with training statistics; odd edge channels are only scaled, so they stay odd.
+
+    All levels of virtual nodes share their statistics, so that a graph may have more of them than those in training.
+    """
 
     mass: Tensor
 
     def __init__(self, spec: FeatureSpec) -> None:
         super().__init__()
         self.spec = spec
-        self.node = nn.ModuleDict({t: Standardize(c) for t, c in spec.node_channels.items()})
+        self.node = nn.ModuleDict({role(t): Standardize(c) for t, c in spec.node_channels.items()})
         self.params = nn.ModuleDict({m: Standardize(c) for m, c in spec.param_channels.items()})
-        self.odd = nn.ModuleDict({"__".join(r): Standardize(spec.odd_channels[r], centered=False) for r in spec.relations})
-        self.even = nn.ModuleDict({"__".join(r): Standardize(spec.even_channels[r]) for r in spec.relations})
+        self.odd = nn.ModuleDict({self._key(r): Standardize(spec.odd_channels[r], centered=False) for r in spec.relations})
+        self.even = nn.ModuleDict({self._key(r): Standardize(spec.even_channels[r]) for r in spec.relations})
         self.register_buffer("mass", torch.ones(()))
+
+    @staticmethod
+    def _key(relation: EdgeType) -> str:
+        source, name, target = relation
+        return f"{role(source)}__{name}__{role(target)}"
 
     @staticmethod
     def _material_scale(material: str, params: Tensor) -> Tensor:
@@ -63,13 +74,14 @@ class GraphStandardizer(nn.Module):
         def fit(module: nn.Module, values: Iterable[Tensor]) -> None:
             cast(Standardize, module).fit(values)
 
-        for t, module in self.node.items():
-            fit(module, (g[t].x for g in graphs))
+        for name, module in self.node.items():
+            fit(module, (g[t].x for g in graphs for t in self.spec.node_types if role(t) == name))
         for m, module in self.params.items():
             fit(module, (self._material_scale(m, g[m].material_params) for g in graphs))
-        for relation in self.spec.relations:
-            fit(self.odd["__".join(relation)], (g[relation].odd for g in graphs))
-            fit(self.even["__".join(relation)], (g[relation].even for g in graphs))
+        for key, module in self.odd.items():
+            relations = [r for r in self.spec.relations if self._key(r) == key]
+            fit(module, (g[r].odd for g in graphs for r in relations))
+            fit(self.even[key], (g[r].even for g in graphs for r in relations))
         mass = [g[m].mass for g in graphs for m in self.spec.materials]
         if sum(len(x) for x in mass):
             self.mass.copy_(torch.cat(mass).double().mean())
@@ -78,13 +90,13 @@ class GraphStandardizer(nn.Module):
         """A graph with standardised features; the input is left as it is."""
         out = copy.copy(data)
         for t in self.spec.node_types:
-            out[t].x = self.node[t](data[t].x)
+            out[t].x = self.node[role(t)](data[t].x)
         for m in self.spec.materials:
             out[m].material_params = self.params[m](self._material_scale(m, data[m].material_params))
             out[m].mass = data[m].mass / self.mass
         for relation in self.spec.relations:
-            out[relation].odd = self.odd["__".join(relation)](data[relation].odd)
-            out[relation].even = self.even["__".join(relation)](data[relation].even)
+            out[relation].odd = self.odd[self._key(relation)](data[relation].odd)
+            out[relation].even = self.even[self._key(relation)](data[relation].even)
         return out
 
 
@@ -97,16 +109,25 @@ class LearnedSimulator(nn.Module):
     """
 
     acceleration_std: Tensor
+    stress_std: Tensor
 
     def __init__(self, model: nn.Module, builder: GraphBuilder) -> None:
         super().__init__()
         self.model, self.builder = model, builder
         self.standardizer = GraphStandardizer(builder.spec)
         self.register_buffer("acceleration_std", torch.ones((), dtype=torch.float64))
+        self.register_buffer("stress_std", torch.ones((), dtype=torch.float64))
+        for material, count in builder.spec.param_channels.items():
+            self.register_buffer(
+                f"trained_{material}", torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).expand(2, count).clone()
+            )
 
     @torch.no_grad()
     def fit_statistics(self, graphs: Iterable[HeteroData]) -> None:
-        """Set feature statistics and the acceleration scale (one scalar for all axes and materials, mean zero) from training graphs with ``target``."""
+        """Set feature statistics, the range of material parameters, and the scales of acceleration and stress from training graphs with ``target``.
+
+        Each scale is one scalar for all axes or components and all materials, with mean zero.
+        """
         graphs = list(graphs)
         self.standardizer.fit(graphs)
         target = torch.cat([g[m].target for g in graphs for m in self.builder.spec.materials]).double()
@@ -114,6 +135,32 @@ class LearnedSimulator(nn.Module):
         if not torch.isfinite(rms) or rms == 0:
             raise ValueError(f"the training data's accelerations without gravity have rms {float(rms)}; nothing to learn from")
         self.acceleration_std.copy_(rms)
+        stress = [g[m].stress_target for g in graphs for m in self.builder.spec.stress_channels if "stress_target" in g[m]]
+        if stress:
+            self.stress_std.copy_(torch.cat(stress).double().square().mean().sqrt().clamp(min=1.0))
+        for material, trained in self._trained_ranges():
+            params = torch.cat([g[material].material_params for g in graphs]).double()
+            if len(params):
+                trained.copy_(torch.stack([params.amin(dim=0), params.amax(dim=0)]))
+
+    def _trained_ranges(self) -> Iterator[tuple[str, Tensor]]:
+        """Lowest and highest value [2, param] of each material's parameters in training."""
+        for material in self.builder.spec.param_channels:
+            yield material, self.get_buffer(f"trained_{material}")
+
+    def untrained_parameters(self, state: State) -> list[str]:
+        """What in a scene lies outside the range of the training data: one line per material parameter, empty if nothing does."""
+        found = []
+        for material, trained in self._trained_ranges():
+            column = self.builder.metadata.param_names.index(MATERIALS[material].name)
+            values = state.material_params[state.node_type == node_code(material), column]
+            margin = RANGE_TOLERANCE * trained.abs()
+            outside = (values < trained[0] - margin[0]) | (values > trained[1] + margin[1])
+            if bool(outside.any()):
+                spec = MATERIALS[material]
+                low, high = trained[0].item(), trained[1].item()
+                found.append(f"{spec.name} of {material} is {values[outside][0].item():g} {spec.unit}, trained were {low:g} to {high:g}")
+        return found
 
     def forward(self, data: HeteroData) -> Prediction:
         """Accelerations without gravity per material, in units of ``acceleration_std``."""
@@ -160,20 +207,29 @@ class LearnedSimulator(nn.Module):
     def _advance_all(self, states: list[State]) -> list[State]:
         graphs = [self.builder(state) for state in states]
         data = graphs[0] if len(graphs) == 1 else Batch.from_data_list(graphs)
-        predicted = self(data).acceleration
+        predicted = self(data)
         acc = [state.gravity.expand_as(state.pos).clone() for state in states]
-        for material, normalized in predicted.items():
-            rows = [graph[material].node_id for graph in graphs]
-            for scene, part in enumerate(normalized.split([len(r) for r in rows])):
-                acc[scene][rows[scene]] += part.double() * self.acceleration_std
-        return [self.advance(state, a) for state, a in zip(states, acc, strict=True)]
+        for scene, rows, part in _per_scene(predicted.acceleration, graphs):
+            acc[scene][rows] += part.double() * self.acceleration_std
+        new = [self.advance(state, a) for state, a in zip(states, acc, strict=True)]
+        return self._with_stress(new, predicted.stress, graphs) if predicted.stress else new
+
+    def _with_stress(self, states: list[State], predicted: dict[str, Tensor], graphs: list[HeteroData]) -> list[State]:
+        components = next(iter(self.builder.spec.stress_channels.values()))
+        node = [state.pos.new_zeros(state.num_nodes, components) for state in states]
+        for scene, rows, part in _per_scene(predicted, graphs):
+            node[scene][rows] = part.double() * self.stress_std
+        return [
+            state if state.cells is None else replace(state, stress=Stress(n, n[state.cells].mean(dim=1)))
+            for state, n in zip(states, node, strict=True)
+        ]
 
     def advance(self, state: State, acc: Tensor) -> State:
         """The next state under a given acceleration [m/s²], gravity included."""
         dt = self.builder.metadata.frame_dt
         pos, vel = integrators.advance(state.pos, state.vel, acc, dt)
         history = torch.cat([history_of(state)[:, 1:], vel[:, None]], dim=1)
-        return replace(state, pos=pos, vel=vel, velocity_history=history, time=state.time + dt)
+        return replace(state, pos=pos, vel=vel, velocity_history=history, time=state.time + dt, stress=None)
 
     # --- checkpoints ----------------------------------------------------------------------------------------------------------------------
 
@@ -216,6 +272,14 @@ class LearnedSimulator(nn.Module):
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model ({_reason(error)})") from None
         return simulator.to(device).eval()
+
+
+def _per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """What was predicted for a batch, as (number of the scene, rows of its state, values)."""
+    for material, values in predicted.items():
+        rows = [graph[material].node_id for graph in graphs]
+        for scene, part in enumerate(values.split([len(r) for r in rows])):
+            yield scene, rows[scene], part
 
 
 def _reason(error: Exception) -> str:

@@ -32,6 +32,9 @@ HORIZONS: tuple[Horizon, ...] = (5, 20, 50, 100, "full")
 
 UNITS: dict[str, str] = {
     "rollout_mse": "m^2",
+    "displacement_error": "1",
+    "velocity_error": "1",
+    "von_mises_error": "1",
     "energy_distance": "m",
     "momentum_error": "m/s",
     "angular_momentum_error": "m^2/s",
@@ -170,6 +173,26 @@ def _cloud_distance(prediction: Trajectory, ground_truth: Trajectory, frame: int
     return total / float(mass.sum())
 
 
+def _relative_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps: int) -> dict[str, float]:
+    """L2 errors over frames 1 to ``num_steps`` and all nodes, relative to the ground truth's own norm; infinite where that is zero and the error is not."""
+    own, true = prediction.pos[: num_steps + 1], ground_truth.pos[: num_steps + 1]
+    metadata = ground_truth.metadata
+    steps, true_steps = displacement(own[1:], own[:-1], metadata), displacement(true[1:], true[:-1], metadata)
+    errors = {
+        "displacement_error": _relative(displacement(own[1:], true[1:], metadata), np.cumsum(true_steps, axis=0)),
+        "velocity_error": _relative(steps - true_steps, true_steps),
+    }
+    if prediction.stress is not None and ground_truth.stress is not None:
+        stress, true_stress = (t.stress.node_von_mises[1 : num_steps + 1].astype(np.float64) for t in (prediction, ground_truth))  # type: ignore[union-attr]
+        errors["von_mises_error"] = _relative(stress - true_stress, true_stress)
+    return errors
+
+
+def _relative(error: np.ndarray, reference: np.ndarray) -> float:
+    size, scale = float(np.linalg.norm(error)), float(np.linalg.norm(reference))
+    return size / scale if scale > 0 else (0.0 if size == 0 else math.inf)
+
+
 # --- conservation -------------------------------------------------------------------------------------------------------------------------
 
 
@@ -219,6 +242,9 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
 
     ====================== ====== ====================================================================================================
     rollout_mse            m²     squared position error, mean over frames 1 … h, nodes and dimensions (the paper's average MSE)
+    displacement_error     1      ‖x − x̂‖ / ‖x̂ − x̂(0)‖ with x̂ the ground truth, norms over frames, nodes and dimensions
+    velocity_error         1      ‖v − v̂‖ / ‖v̂‖ likewise
+    von_mises_error        1      the same of the von Mises stress at mesh nodes; only where both trajectories have a stress
     energy_distance        m      between the clouds of frame h, per material, averaged by mass
     momentum_error         m/s    length of the difference in momentum per mass, mean over frames. Gravity and walls act on the
                                   ground truth too, so only what the prediction adds or loses remains
@@ -240,7 +266,10 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     """
     error = per_frame_mse(prediction, ground_truth)
     periodic = any(ground_truth.metadata.periodic)
-    names = [name for name in UNITS if not (periodic and name in ("energy_distance", "angular_momentum_error"))]
+    undefined = {"energy_distance", "angular_momentum_error"} if periodic else set()
+    if prediction.stress is None or ground_truth.stress is None:
+        undefined.add("von_mises_error")
+    names = [name for name in UNITS if name not in undefined]
     records = []
     for horizon, steps in _reached(horizons, error, ground_truth):
         values = dict.fromkeys(names, math.inf)
@@ -248,6 +277,7 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
             motion = _motion_errors(prediction, ground_truth, steps)
             values |= {name: motion[name] for name in motion.keys() & values.keys()}
             values["rollout_mse"] = float(error[1 : steps + 1].mean())
+            values |= _relative_errors(prediction, ground_truth, steps)
             values["share_outside"] = share_outside(prediction.frames(1, steps + 1), tolerance=1e-3 * ground_truth.metadata.spacing)
             if not periodic:
                 values["energy_distance"] = _cloud_distance(prediction, ground_truth, steps)
@@ -339,7 +369,7 @@ def bootstrap_interval(
 
     Args:
         values: one row per training seed, one column per test trajectory; ``inf`` marks a failure.
-        statistic: maps values to a number, such as ``np.median``, ``np.mean`` or ``scipy.stats.gmean``.
+        statistic: maps a table [seed, trajectory] to a number, such as ``np.median`` or ``np.mean``.
         confidence: probability that the interval should cover.
         num_resamples: bootstrap resamples.
         seed: of the resampling.
@@ -359,10 +389,10 @@ def bootstrap_interval(
     rng = np.random.default_rng(seed)
     num_seeds, num_trajectories = table.shape
     resampled = [
-        statistic(table[np.ix_(rng.integers(num_seeds, size=num_seeds), rng.integers(num_trajectories, size=num_trajectories))].ravel())
+        statistic(table[np.ix_(rng.integers(num_seeds, size=num_seeds), rng.integers(num_trajectories, size=num_trajectories))])
         for _ in range(num_resamples)
     ]
     # Order statistics, because interpolation between infinities is not a number.
     tail = (1 - confidence) / 2
     low, high = np.quantile(resampled, [tail, 1 - tail], method="inverted_cdf")
-    return Interval(float(statistic(table.ravel())), float(low), float(high))
+    return Interval(float(statistic(table)), float(low), float(high))

@@ -85,7 +85,7 @@ def _report(folder: Path, runs: list[Run]) -> None:
         variants[tuple(str(run.config.get(a)) for a in axes)].append(run)
     _write_csv(folder / "table.csv", axes, runs)
     ratios = forward_time_ratios(variants)
-    _replace(folder / "table.md", _markdown(axes, variants, ratios))
+    replace_text(folder / "table.md", _markdown(axes, variants, ratios))
     curves = {", ".join(v) or LEARNED: [validation_curve(r.folder) for r in members] for v, members in variants.items()}
     curves = {k: [c for c in v if len(c[0])] for k, v in curves.items()}
     if all(curves.values()):
@@ -98,7 +98,7 @@ def summary(rows: list[Row]) -> str:
     """Mean over trajectories of every metric, as plain text: one line per model, split, metric and horizon."""
     groups: dict[tuple[str, str, str, str], list[float]] = defaultdict(list)
     for row in rows:
-        for split in _groups(row):
+        for split in groups_of(row):
             groups[row.model, split, row.metric, row.horizon].append(row.value)
     lines = [f"{model:18} {split:25} {metric:28} {horizon:>5} {np.mean(v):12.5g}" for (model, split, metric, horizon), v in groups.items()]
     return "\n".join([f"{'model':18} {'split':25} {'metric':28} {'frame':>5} {'mean':>12}", *lines])
@@ -108,7 +108,7 @@ def _column(axis: str) -> str:
     return axis.rpartition(".")[2]
 
 
-def _groups(row: Row) -> list[str]:
+def groups_of(row: Row) -> list[str]:
     """Splits that a row counts for; unseen parameters also apart by where they lie."""
     return [row.split, f"{row.split}/{row.parameter_group}"] if row.parameter_group in ("interpolated", "extrapolated") else [row.split]
 
@@ -121,7 +121,7 @@ def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
         groups: dict[tuple[str, str, str], list[float]] = defaultdict(list)
         for row in run.rows:
             if row.model == LEARNED:
-                for split in _groups(row):
+                for split in groups_of(row):
                     groups[split, row.metric, row.horizon].append(row.value)
         steps, losses = validation_curve(run.folder)
         if len(steps):
@@ -135,7 +135,8 @@ def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
     os.replace(temporary, path)
 
 
-def _replace(path: Path, text: str) -> None:
+def replace_text(path: Path, text: str) -> None:
+    """Write a file, atomically."""
     temporary = path.with_suffix(".part")
     temporary.write_text(text)
     os.replace(temporary, path)
@@ -157,7 +158,7 @@ def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon
     """One list of per-trajectory values per run."""
     table = []
     for run in runs:
-        rows = [r for r in run.rows if r.model == model and r.metric == metric and r.horizon == horizon and split in _groups(r)]
+        rows = [r for r in run.rows if r.model == model and r.metric == metric and r.horizon == horizon and split in groups_of(r)]
         table.append([r.value for r in sorted(rows, key=lambda r: r.trajectory)])
     return [t for t in table if t]
 
@@ -213,12 +214,12 @@ def _training_table(names: list[str], variants: dict[tuple[str, ...], list[Run]]
         "outside without containment",
         "corrected",
     ]
-    lines = _row(header), "|" + "---|" * len(header)
+    lines = table_row(header), "|" + "---|" * len(header)
     rows = []
     for key, runs in variants.items():
         losses = [loss[-1] for _, loss in (validation_curve(r.folder) for r in runs) if len(loss)]
         rows.append(
-            _row(
+            table_row(
                 [
                     *(key or (LEARNED,)),
                     str(len(runs)),
@@ -238,13 +239,13 @@ def _training_table(names: list[str], variants: dict[tuple[str, ...], list[Run]]
 
 
 def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]], first: Run) -> list[str]:
-    splits = sorted({s for r in first.rows for s in _groups(r)})
+    splits = sorted({s for r in first.rows for s in groups_of(r)})
     horizons = sorted({r.horizon for r in first.rows if r.metric == "rollout_mse"}, key=lambda h: (h == "full", h.zfill(6)))[
         -TABLE_HORIZONS:
     ]
     baselines = sorted({r.model for r in first.rows} - {LEARNED})
     header = [*names, "split", *(f"@{h}" for h in horizons)]
-    lines = [_row(header), "|" + "---|" * len(header)]
+    lines = [table_row(header), "|" + "---|" * len(header)]
     for split in splits:
         trivial = {
             h: min((_mean(values_by_seed([first], b, split, "rollout_mse", h)) for b in baselines), default=float("nan")) for h in horizons
@@ -254,10 +255,10 @@ def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]],
             for h in horizons:
                 values = values_by_seed(runs, LEARNED, split, "rollout_mse", h)
                 cells.append(f"{_interval(values, 1e3)} **{trivial[h] / _mean(values):.1f}×**" if values else "–")
-            lines.append(_row([*(key or (LEARNED,)), split, *cells]))
+            lines.append(table_row([*(key or (LEARNED,)), split, *cells]))
         for baseline in baselines:
             cells = [_interval(values_by_seed([first], baseline, split, "rollout_mse", h), 1e3) for h in horizons]
-            lines.append(_row([baseline, *[""] * (len(names) - 1), split, *cells]))
+            lines.append(table_row([baseline, *[""] * (len(names) - 1), split, *cells]))
     note = (
         "Rollout MSE ×1e-3 [m²] over frames 1 … h, nodes and axes: mean over trajectories and seeds, 95 % bootstrap interval over both (too narrow where "
         "seeds or trajectories are few), and how many times lower than the best trivial baseline. `test_unseen` holds friction angles that training did "
@@ -266,7 +267,8 @@ def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]],
     return [*lines, "", note]
 
 
-def _row(cells: list[str]) -> str:
+def table_row(cells: list[str]) -> str:
+    """A row of a Markdown table."""
     return "| " + " | ".join(cells) + " |"
 
 

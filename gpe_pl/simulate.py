@@ -1,4 +1,7 @@
-"""Generate ground truth: ``python -m gpe_pl.simulate data=sand size=tiny``."""
+"""Generate ground truth: ``python -m gpe_pl.simulate data=sand size=tiny``.
+
+The same command resumes a run that was killed. Of what is there it reads every byte, and generates shards again whose checksums disagree.
+"""
 
 from __future__ import annotations
 
@@ -46,26 +49,31 @@ def ensure_data(cfg: DictConfig) -> Path:
 
 
 def simulate(cfg: DictConfig) -> None:
-    """Generate a data set, or what is missing of it, and say beforehand what a large one takes."""
-    from gpe_pl.generation import CONTACT_SHEET_FILE, generate, plan, progress_bar, seconds_per_trajectory
+    """Generate a data set, or what is missing of it or damaged, and say beforehand what a large one takes."""
+    from gpe_pl.generation import CONTACT_SHEET_FILE, discard_damaged, generate, plan, progress_bar, seconds_per_trajectory
 
     if not (cfg.num_workers is None or (isinstance(cfg.num_workers, int) and cfg.num_workers >= 1)):
         raise ConfigError(f"num_workers={cfg.num_workers!r}: must be null (one per core) or an integer of at least 1")
     if not (isinstance(cfg.num_parts, int) and isinstance(cfg.part, int) and 0 <= cfg.part < cfg.num_parts):
         raise ConfigError(f"part={cfg.part!r}, num_parts={cfg.num_parts!r}: must be integers with 0 <= part < num_parts")
     spec, num_workers = dataset_spec(cfg), cfg.num_workers or os.cpu_count() or 1
-    missing = plan(cfg.paths.data, spec)
+    part = (cfg.part, cfg.num_parts)
+    there = sum(path.stat().st_size for path in (Path(cfg.paths.data) / spec.name / spec.size).glob("*/shard-*.h5"))
+    if there > AUTOMATIC_BYTES:
+        print(f"{spec.name} {spec.size}: checking {there / 2**30:.1f} GiB that are there", flush=True)
+    discard_damaged(cfg.paths.data, spec, num_workers, part)
+    missing = plan(cfg.paths.data, spec, part)
     if missing.bytes_needed > AUTOMATIC_BYTES:
         print(
             f"{spec.name} {spec.size}: {missing.num_missing} trajectories to simulate, up to {missing.bytes_needed / 2**30:.1f} GiB "
             f"({missing.bytes_free / 2**30:.1f} GiB free)",
             flush=True,
         )
-        if missing.bytes_needed <= 0.95 * missing.bytes_free:
-            hours = missing.num_missing * seconds_per_trajectory(spec) / (num_workers * cfg.num_parts) / 3600
+        if missing.fits:
+            hours = missing.num_missing * seconds_per_trajectory(spec) / num_workers / 3600
             print(f"{spec.name} {spec.size}: about {hours:.1f} h on {num_workers} cores", flush=True)
     with progress_bar(f"{spec.name} {spec.size}") as on_progress:
-        folder = generate(cfg.paths.data, spec, num_workers, on_progress, (cfg.part, cfg.num_parts))
+        folder = generate(cfg.paths.data, spec, num_workers, on_progress, part)
     for path in (folder / CONTACT_SHEET_FILE, folder):
         if path.exists():  # only the first part draws the sheet
             print(path)

@@ -99,9 +99,9 @@ def read_terrain(
         friction: Coulomb coefficient of the surface.
 
     Raises:
-        TerrainError: the file cannot be read, holds nothing usable, is too large, or does not fit the options.
+        TerrainError: the file cannot be read, holds nothing usable, is too large, or does not fit the options; or it is an OBJ, STL or PLY and the package
+            trimesh is not installed.
         ValueError: options or bounds that no file could fit.
-        ModuleNotFoundError: OBJ, STL and PLY need the package trimesh.
     """
     path = Path(path)
     low, counts = _lattice(bounds, spacing)
@@ -163,8 +163,10 @@ def _read(path: Path) -> _Mesh | _Cloud | _Heights:
         raise TerrainError(f"{path}: {path.stat().st_size} bytes are too many, at most {MAX_FILE_BYTES}; simplify it first")
     try:
         source = _READERS[extension](path)
-    except (TerrainError, ModuleNotFoundError):
+    except TerrainError:
         raise
+    except ModuleNotFoundError as error:
+        raise TerrainError(f"{path}: needs the package {error.name}; install it with `pip install 'gpe_pl[terrain]'`") from None
     except Exception as error:  # the readers raise anything on damaged files
         raise TerrainError(f"{path}: cannot be read as {extension[1:].upper()}: {type(error).__name__}: {error}") from error
     return source

@@ -157,7 +157,7 @@ class State:
         return self.pos.shape[1]
 
     def to_torch(self, device: Any = "cpu") -> State:
-        """The same state as float64 tensors on a device (``internal`` and ``stress`` are dropped: they belong to a solver)."""
+        """The same state as float64 tensors on a device (``internal`` is dropped: it belongs to a solver)."""
         import torch
 
         def tensor(x: Array) -> Any:
@@ -171,7 +171,8 @@ class State:
         for name in ("velocity_history", "rest_pos", "cells"):
             value = getattr(self, name)
             arrays[name] = None if value is None else tensor(value)
-        return replace(self, **arrays, boundary=boundary, stress=None, internal=None)
+        stress = None if self.stress is None else Stress(tensor(self.stress.node), tensor(self.stress.cell))
+        return replace(self, **arrays, boundary=boundary, stress=stress, internal=None)
 
 
 @dataclass(frozen=True)
@@ -287,9 +288,10 @@ class Trajectory:
             past = np.ascontiguousarray(integrators.velocities(window, self.metadata.frame_dt).swapaxes(0, 1))
             vel = past[:, -1]
         rest_pos = None if self.rest_pos is None else self.rest_pos.astype(np.float64)
+        stress = None if self.stress is None else Stress(self.stress.node[frame], self.stress.cell[frame])
         return State(
             pos, vel, self.node_type, self.mass, self.material_params, self.boundary, gravity, past, frame * self.metadata.frame_dt,
-            rest_pos, self.cells,
+            rest_pos, self.cells, stress,
         )  # fmt: skip
 
     def frames(self, start: int, stop: int | None = None) -> Trajectory:

@@ -40,6 +40,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         seed: of order and noise.
         num_workers: processes that build graphs; 0 builds them in the training process.
         num_val_windows: windows of the one-step validation loss, evenly spread over the ``val`` split.
+        stress: samples also hold the stress; see ``WindowDataset``.
     """
 
     def __init__(
@@ -51,6 +52,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         seed: int = 0,
         num_workers: int = 0,
         num_val_windows: int = 256,
+        stress: bool = False,
     ) -> None:
         super().__init__()
         self.root, self.noise, self.batch_size, self.seed = Path(root), noise, batch_size, seed
@@ -60,8 +62,8 @@ class TrajectoryDataModule(L.LightningDataModule):
         self.metadata = train[0].window(0, 1).metadata
         self.builder = GraphBuilder(graph, self.metadata)
         unit = data_statistics(root)["acceleration_std"] * self.metadata.frame_dt
-        self.train_set = WindowDataset(train, self.builder, noise, unit, seed)
-        self.val_set = WindowDataset(val, self.builder)
+        self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress)
+        self.val_set = WindowDataset(val, self.builder, stress=stress)
 
     def statistics_sample(self, num_windows: int = 256) -> Iterator[HeteroData]:
         """Training graphs, noise included, evenly spread over the split; for the standardisation of features."""

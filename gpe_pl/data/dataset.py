@@ -73,6 +73,7 @@ class WindowDataset(Dataset[HeteroData]):
         noise: applied to inputs; None for evaluation.
         velocity_unit: acceleration std × frame interval [m/s], the unit of velocity noise.
         seed: of the noise.
+        stress: also give the Cauchy stress at t+1, ``stress_target`` [node, component] in Pa, of materials that have one.
 
     Raises:
         StoreError: no trajectory is long enough, or a window holds a position that is not finite.
@@ -85,8 +86,9 @@ class WindowDataset(Dataset[HeteroData]):
         noise: Noise | None = None,
         velocity_unit: float = 0.0,
         seed: int = 0,
+        stress: bool = False,
     ) -> None:
-        self.trajectories, self.builder, self.noise = trajectories, builder, noise
+        self.trajectories, self.builder, self.noise, self.stress = trajectories, builder, noise, stress
         self.velocity_unit, self.seed = velocity_unit, seed
         history = builder.config.history
         counts = [max(0, t.num_frames - history - 1) for t in trajectories]
@@ -133,11 +135,17 @@ class WindowDataset(Dataset[HeteroData]):
             gravity,
             past,
             frame * dt,
+            trajectory.rest_pos,
+            trajectory.cells,
         )
         data = self.builder(state.to_torch())
         target_tensor = torch.from_numpy(target).float()
         for material in self.builder.spec.materials:
             data[material].target = target_tensor[data[material].node_id]
+        if self.stress and trajectory.stress is not None:
+            stress = torch.from_numpy(np.array(trajectory.stress.node[-1], dtype=np.float32))
+            for material in self.builder.spec.stress_channels:
+                data[material].stress_target = stress[data[material].node_id]
         data.trajectory, data.frame = number, frame
         return data
 

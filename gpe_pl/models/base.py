@@ -26,10 +26,12 @@ class Model(Protocol):
     """A network whose constructor takes a ``FeatureSpec`` first and keyword settings after it.
 
     ``forward`` gets a graph with standardised features. ``settings`` holds the constructor's keyword arguments as plain values, so a checkpoint can rebuild
-    the model.
+    the model. ``compute`` does the work of ``forward`` on tensors, in dictionaries and tuples: the part that ``torch.compile`` sees.
     """
 
     spec: FeatureSpec
     settings: dict[str, Any]
 
     def forward(self, data: HeteroData) -> Prediction: ...
+
+    def compute(self, *args: Any) -> Any: ...

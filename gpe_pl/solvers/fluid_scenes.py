@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from gpe_pl.geometry import Bowl, Box, DistanceGrid, Shape, domain_walls, signed_distance
 from gpe_pl.schema import STICKY, node_code
-from gpe_pl.solvers.scenes import JITTER, MAX_ATTEMPTS
+from gpe_pl.solvers.scenes import JITTER, MAX_ATTEMPTS, check_domain, check_ranges, draw_velocity, floats, integer_lattice
 from gpe_pl.terrain import Bounds, Fit, Solid, Up, canyon, read_terrain
 from gpe_pl.trajectory import Boundary, State
 
@@ -80,20 +80,14 @@ class FluidScene:
     reservoir: tuple[tuple[float, float], ...] | None = None
 
     def __post_init__(self) -> None:
-        if len(self.bounds) not in (2, 3) or len(self.gravity) != len(self.bounds):
-            raise ValueError(f"bounds need 2 or 3 axes and gravity as many components, got bounds {self.bounds} and gravity {self.gravity}")
-        if not np.isfinite(self.bounds).all() or any(not high > low for low, high in self.bounds):
-            raise ValueError(f"bounds must be (low, high) with low < high, got {self.bounds}")
-        if not np.isfinite(self.gravity).all():
-            raise ValueError(f"gravity must be finite, got {self.gravity}")
+        check_domain(self.bounds, self.gravity)
         if self.scene == "canyon" and self.dim != 3:
             raise ValueError(f"scene='canyon' needs bounds of 3 axes, got {self.bounds}")
         if self.scene != "canyon" and (self.terrain is not None or self.reservoir is not None):
             raise ValueError(f"terrain and reservoir belong to scene='canyon', not to scene={self.scene!r}")
         if self.reservoir is not None and (len(self.reservoir) != self.dim or any(not high > low for low, high in self.reservoir)):
             raise ValueError(f"reservoir must be (low, high) with low < high along {self.dim} axes, got {self.reservoir}")
-        if self.column_aspect[0] > self.column_aspect[1]:
-            raise ValueError(f"column_aspect must be (low, high) with low <= high, got {self.column_aspect}")
+        check_ranges(self, "column_aspect")
         narrowest = min(high - low for low, high in self.bounds)
         if narrowest < 4 * self.grid_spacing:
             raise ValueError(f"bounds {self.bounds} must be at least 4 cells of grid_spacing = {self.grid_spacing} wide")
@@ -126,8 +120,8 @@ class FluidScene:
         return 0
 
     @property
-    def input_files(self) -> tuple[str, ...]:
-        return () if self.terrain is None else (self.terrain,)
+    def input_files(self) -> dict[str, str]:
+        return {} if self.terrain is None else {"terrain": self.terrain}
 
     def sample(self, values: Mapping[str, float], seed: int) -> State:
         """Draw a scene: a pure function of configuration, values, seed and, where there is one, the content of the terrain file.
@@ -163,7 +157,7 @@ Sampled = tuple[tuple[Shape, ...], np.ndarray, np.ndarray]
 def _bowl(config: FluidScene, rng: np.random.Generator) -> Sampled:
     low, high = np.array(config.bounds).T
     center, radius = (low + high) / 2, float(np.min(high - low)) / 2 - config.grid_spacing
-    bowl = Bowl(tuple(float(x) for x in center), radius, config.friction)
+    bowl = Bowl(floats(center), radius, config.friction)
     room = {2: math.pi, 3: 4 / 3 * math.pi}[config.dim] * max(0.0, radius - config.spacing) ** config.dim
     for _ in range(MAX_ATTEMPTS if config.num_particles * config.spacing**config.dim < room else 0):
         number = int(rng.integers(1, config.max_bodies + 1))
@@ -172,7 +166,7 @@ def _bowl(config: FluidScene, rng: np.random.Generator) -> Sampled:
         bodies = [_body(int(count), config, rng) for count in counts[counts > 0]]
         placed = _placed(bodies, bowl, config, rng)
         if placed is not None:
-            vel = [np.broadcast_to(_velocity(config, rng), body.shape) for body in placed]
+            vel = [np.broadcast_to(draw_velocity(config.max_speed, config.dim, rng), body.shape) for body in placed]
             return (*domain_walls(config.bounds, config.friction), bowl), np.concatenate(placed), np.concatenate(vel)
     raise ValueError(
         f"no room for {config.num_particles} particles of spacing {config.spacing:g} m in up to {config.max_bodies} bodies in a bowl of radius {radius:g} m; "
@@ -197,11 +191,6 @@ def _placed(bodies: list[np.ndarray], bowl: Bowl, config: FluidScene, rng: np.ra
         else:
             return None
     return placed
-
-
-def _velocity(config: FluidScene, rng: np.random.Generator) -> np.ndarray:
-    """Velocity of a body [dim] in m/s: any horizontal direction, mostly downward."""
-    return config.max_speed * np.array([*rng.uniform(-1.0, 1.0, config.dim - 1), rng.uniform(-1.0, 0.25)])
 
 
 def _body(count: int, config: FluidScene, rng: np.random.Generator) -> np.ndarray:
@@ -230,8 +219,7 @@ def _body(count: int, config: FluidScene, rng: np.random.Generator) -> np.ndarra
 
 def _lattice(first: np.ndarray, last: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Jittered points [point, dim] around the integer points from ``first`` to ``last``."""
-    axes = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
-    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+    lattice = integer_lattice(first, last)
     return lattice + rng.uniform(-JITTER, JITTER, lattice.shape)
 
 
@@ -292,7 +280,7 @@ def _obstacles(config: FluidScene, start: float, rng: np.random.Generator) -> li
         corner[-1], size[-1] = low[-1] - gap, size[-1] + gap  # through the floor: no water gets under it
         if any(np.all(corner < np.array(b.high) + gap) and np.all(corner + size > np.array(b.low) - gap) for b in boxes):
             continue
-        boxes.append(Box(tuple(float(x) for x in corner), tuple(float(x) for x in corner + size), config.friction))
+        boxes.append(Box(floats(corner), floats(corner + size), config.friction))
     return boxes
 
 

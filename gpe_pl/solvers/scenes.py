@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from gpe_pl.geometry import Box, Polygon, Shape, Sphere, domain_walls, signed_distance
+from gpe_pl.geometry import Box, Polygon, Shape, Sphere, check_bounds, domain_walls, signed_distance
 from gpe_pl.schema import MATERIALS, STICKY, node_code, param_names
 from gpe_pl.trajectory import Boundary, Metadata, State
 
@@ -59,8 +59,8 @@ class Scene(Protocol):
     def max_cells(self) -> int: ...
 
     @property
-    def input_files(self) -> tuple[str, ...]:
-        """Files that scenes depend on."""
+    def input_files(self) -> dict[str, str]:
+        """Files that scenes depend on, by the setting that names them."""
         ...
 
     def sample(self, values: Mapping[str, float], seed: int) -> State: ...
@@ -82,6 +82,86 @@ def describe(scene: Scene, frame_dt: float, **provenance: Any) -> Metadata:
             **provenance,
         }
     )
+
+
+# --- what several kinds of scenes draw and check --------------------------------------------------------------------------------------------
+
+
+@runtime_checkable
+class Surroundings(Protocol):
+    """Settings of a scene that decide the friction of its walls and obstacles."""
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], ...]: ...
+
+    @property
+    def sticky_probability(self) -> float: ...
+
+    @property
+    def slip_probability(self) -> float: ...
+
+    @property
+    def coulomb_friction(self) -> tuple[float, float]: ...
+
+
+def check_domain(bounds: tuple[tuple[float, float], ...], gravity: tuple[float, ...]) -> None:
+    """Raise ``ValueError`` unless bounds are sound and gravity is finite and has as many components."""
+    check_bounds(bounds)
+    if len(gravity) != len(bounds):
+        raise ValueError(f"gravity must have as many components as bounds have axes, got gravity {gravity} and bounds {bounds}")
+    if not np.isfinite(gravity).all():
+        raise ValueError(f"gravity must be finite, got {gravity}")
+
+
+def check_ranges(scene: object, *names: str) -> None:
+    """Raise ``ValueError`` unless these settings of a scene are ``(low, high)`` with low <= high."""
+    for name in names:
+        low, high = getattr(scene, name)
+        if low > high:
+            raise ValueError(f"{name} must be (low, high) with low <= high, got {(low, high)}")
+
+
+def check_surroundings(scene: Surroundings) -> None:
+    """Raise ``ValueError`` unless friction can be drawn from these settings."""
+    check_ranges(scene, "coulomb_friction")
+    if scene.sticky_probability + scene.slip_probability > 1:
+        raise ValueError("sticky_probability and slip_probability must not exceed 1 together")
+
+
+def draw_friction(scene: Surroundings, rng: np.random.Generator, may_slip: bool = True) -> float:
+    """Coulomb coefficient of a wall or obstacle: no-slip, frictionless or in between."""
+    kind, coulomb = rng.random(), rng.uniform(*scene.coulomb_friction)
+    if kind < scene.sticky_probability:
+        return STICKY
+    slips = may_slip and kind < scene.sticky_probability + scene.slip_probability
+    return 0.0 if slips else float(coulomb)
+
+
+def draw_walls(scene: Surroundings, rng: np.random.Generator) -> tuple[Shape, ...]:
+    """The walls of the domain, each with a friction of its own."""
+    axes = "xyz"[: len(scene.bounds)]
+    floor = f"{axes[-1]}_low"  # on a frictionless floor things slide for ever: no pile and no body comes to rest
+    names = [f"{axis}_{side}" for axis in axes for side in ("low", "high")]
+    return domain_walls(scene.bounds, {name: draw_friction(scene, rng, may_slip=name != floor) for name in names})
+
+
+def draw_velocity(max_speed: float, dim: int, rng: np.random.Generator) -> np.ndarray:
+    """Velocity of a body [dim] in m/s: any horizontal direction, mostly downward."""
+    return max_speed * np.array([*rng.uniform(-1.0, 1.0, dim - 1), rng.uniform(-1.0, 0.25)])
+
+
+def integer_lattice(first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """Points [point, dim] of whole coordinates from ``first`` to ``last`` [dim]."""
+    axes = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+
+
+def floats(values: np.ndarray) -> tuple[float, ...]:
+    """Coordinates as shapes take them."""
+    return tuple(float(v) for v in values)
+
+
+# --- bodies of particles --------------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
@@ -125,22 +205,15 @@ class BodyScene:
     connectivity_cells: PositiveFloat = 3.75
 
     def __post_init__(self) -> None:
-        if len(self.bounds) not in (2, 3) or len(self.gravity) != len(self.bounds):
-            raise ValueError(f"bounds and gravity must both have 2 or 3 axes, got {len(self.bounds)} and {len(self.gravity)}")
-        if any(not high > low for low, high in self.bounds):
-            raise ValueError(f"bounds must be (low, high) with low < high, got {self.bounds}")
+        check_domain(self.bounds, self.gravity)
         unknown = [m for m in self.materials if m not in MATERIALS]
         if unknown or len(set(self.materials)) < len(self.materials):
             raise ValueError(f"materials must be different ones of {', '.join(MATERIALS)}, got {self.materials}")
         lacking = [m for m in self.materials if m not in self.density]
         if lacking:
             raise ValueError(f"density of {', '.join(lacking)} is missing")
-        for name in ("obstacle_radius", "drop_height", "coulomb_friction"):
-            low, high = getattr(self, name)
-            if low > high:
-                raise ValueError(f"{name} must be (low, high) with low <= high, got {(low, high)}")
-        if self.sticky_probability + self.slip_probability > 1:
-            raise ValueError("sticky_probability and slip_probability must not exceed 1 together")
+        check_ranges(self, "obstacle_radius", "drop_height")
+        check_surroundings(self)
 
     @property
     def dim(self) -> int:
@@ -165,8 +238,8 @@ class BodyScene:
         return (2 if self.dim == 2 else 6) * self.num_particles if set(self.materials) & set(MESHED) else 0
 
     @property
-    def input_files(self) -> tuple[str, ...]:
-        return ()
+    def input_files(self) -> dict[str, str]:
+        return {}
 
     def sample(self, values: Mapping[str, float], seed: int) -> State:
         """Draw a scene.
@@ -183,7 +256,7 @@ class BodyScene:
         """
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
         for _ in range(MAX_ATTEMPTS):
-            shapes = (*_walls(self, rng), *_obstacles(self, rng))
+            shapes = (*draw_walls(self, rng), *_obstacles(self, rng))
             bodies = _bodies(self, shapes, rng)
             if bodies is not None:
                 break
@@ -192,7 +265,7 @@ class BodyScene:
                 f"no room for {self.num_particles} particles of spacing {self.spacing:g} m and {self.max_obstacles} obstacles in {self.bounds}; "
                 "lower num_particles, max_bodies, max_obstacles or drop_height"
             )
-        vel = np.concatenate([np.broadcast_to(_velocity(self, rng), body.pos.shape) for body in bodies])
+        vel = np.concatenate([np.broadcast_to(draw_velocity(self.max_speed, self.dim, rng), body.pos.shape) for body in bodies])
         pos = np.concatenate([body.pos for body in bodies])
         material = np.concatenate([np.full(len(body.pos), node_code(body.material), np.uint8) for body in bodies])
         # labels must not tell where a particle started
@@ -232,20 +305,6 @@ def _cells(bodies: list[_Body], order: np.ndarray) -> np.ndarray:
     return new_number[np.concatenate([body.cells + first for body, first in zip(bodies, start, strict=False)])]
 
 
-def _friction(config: BodyScene, rng: np.random.Generator, may_slip: bool = True) -> float:
-    kind, coulomb = rng.random(), rng.uniform(*config.coulomb_friction)
-    if kind < config.sticky_probability:
-        return STICKY
-    slips = may_slip and kind < config.sticky_probability + config.slip_probability
-    return 0.0 if slips else float(coulomb)
-
-
-def _walls(config: BodyScene, rng: np.random.Generator) -> tuple[Shape, ...]:
-    names = [f"{axis}_{side}" for axis in "xyz"[: config.dim] for side in ("low", "high")]
-    floor = f"{'xyz'[config.dim - 1]}_low"  # on a frictionless floor sand slides for ever and no pile comes to rest
-    return domain_walls(config.bounds, {name: _friction(config, rng, may_slip=name != floor) for name in names})
-
-
 def _obstacles(config: BodyScene, rng: np.random.Generator) -> tuple[Shape, ...]:
     """Boxes, balls and, in 2D, convex polygons whose circumscribed balls stay clear of the walls and of each other."""
     obstacles: list[Shape] = []
@@ -254,7 +313,7 @@ def _obstacles(config: BodyScene, rng: np.random.Generator) -> tuple[Shape, ...]
     gap = 2.0 * config.grid_spacing  # narrower gaps are invisible to the grid
     for _ in range(rng.integers(config.max_obstacles + 1)):
         radius, angle, sides = rng.uniform(*config.obstacle_radius), rng.uniform(0, 2 * math.pi), int(rng.integers(3, 7))
-        kind, friction, share = rng.integers(3 if config.dim == 2 else 2), _friction(config, rng), rng.uniform(0.3, 0.7)
+        kind, friction, share = rng.integers(3 if config.dim == 2 else 2), draw_friction(config, rng), rng.uniform(0.3, 0.7)
         room_low, room_high = low + radius + gap, high - radius - gap
         if np.any(room_low > room_high):
             continue
@@ -264,18 +323,14 @@ def _obstacles(config: BodyScene, rng: np.random.Generator) -> tuple[Shape, ...]
         circles.append((center, radius))
         if kind == 0:
             half = radius * np.array([math.cos(share * math.pi / 2), math.sin(share * math.pi / 2), 0.5][: config.dim])
-            obstacles.append(Box(_floats(center - half), _floats(center + half), friction))
+            obstacles.append(Box(floats(center - half), floats(center + half), friction))
         elif kind == 1:
-            obstacles.append(Sphere(_floats(center), float(radius), friction))
+            obstacles.append(Sphere(floats(center), float(radius), friction))
         else:
             turn = angle + 2 * math.pi * np.arange(sides) / sides
             vertices = center + radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
             obstacles.append(Polygon(tuple((float(x), float(y)) for x, y in vertices), friction))
     return tuple(obstacles)
-
-
-def _floats(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(float(v) for v in values)
 
 
 def _bodies(config: BodyScene, shapes: tuple[Shape, ...], rng: np.random.Generator) -> list[_Body] | None:
@@ -316,11 +371,6 @@ def _bodies(config: BodyScene, shapes: tuple[Shape, ...], rng: np.random.Generat
     return placed
 
 
-def _velocity(config: BodyScene, rng: np.random.Generator) -> np.ndarray:
-    """Velocity of a body [dim] in m/s: any horizontal direction, mostly downward."""
-    return config.max_speed * np.array([*(rng.uniform(-1.0, 1.0) for _ in range(config.dim - 1)), rng.uniform(-1.0, 0.25)])
-
-
 def _body(count: int, spacing: float, material: str, dim: int, rng: np.random.Generator) -> _Body:
     """A randomly turned body of ``count`` lattice points around the origin; jittered unless it is meshed.
 
@@ -328,7 +378,7 @@ def _body(count: int, spacing: float, material: str, dim: int, rng: np.random.Ge
     """
     gauge = _gauge(rng, dim)
     reach = math.ceil(2.0 * count ** (1 / dim)) + 2
-    lattice = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    lattice = integer_lattice(np.full(dim, -reach), np.full(dim, reach))
     is_meshed = material in MESHED
     jitter = 0.0 if is_meshed else rng.uniform(-JITTER, JITTER, lattice.shape)
     points = lattice + jitter + rng.uniform(-0.5, 0.5, dim)

@@ -13,10 +13,19 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from gpe_pl.geometry import Box, Polygon, Shape, Sphere, domain_walls, signed_distance
+from gpe_pl.geometry import Box, Polygon, Shape, Sphere, signed_distance
 from gpe_pl.meshing import TETRAHEDRA_PER_CUBE, MeshingError, quadrangulate, random_outline, random_solid, tetrahedralise, triangulate
-from gpe_pl.schema import STICKY, node_code
-from gpe_pl.solvers.scenes import MAX_ATTEMPTS
+from gpe_pl.schema import node_code
+from gpe_pl.solvers.scenes import (
+    MAX_ATTEMPTS,
+    check_domain,
+    check_ranges,
+    check_surroundings,
+    draw_friction,
+    draw_velocity,
+    draw_walls,
+    floats,
+)
 from gpe_pl.trajectory import Boundary, State, Stress
 
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -73,14 +82,9 @@ class SolidScene:
         axes = 3 if self.cell == "tetrahedron" else 2
         if len(self.bounds) != axes or len(self.gravity) != axes:
             raise ValueError(f"cell={self.cell} needs bounds and gravity of {axes} axes, got {len(self.bounds)} and {len(self.gravity)}")
-        if any(not high > low for low, high in self.bounds):
-            raise ValueError(f"bounds must be (low, high) with low < high, got {self.bounds}")
-        for name in ("num_obstacles", "obstacle_radius", "drop_height", "coulomb_friction"):
-            low, high = getattr(self, name)
-            if low > high:
-                raise ValueError(f"{name} must be (low, high) with low <= high, got {(low, high)}")
-        if self.sticky_probability + self.slip_probability > 1:
-            raise ValueError("sticky_probability and slip_probability must not exceed 1 together")
+        check_domain(self.bounds, self.gravity)
+        check_ranges(self, "num_obstacles", "obstacle_radius", "drop_height")
+        check_surroundings(self)
 
     @property
     def dim(self) -> int:
@@ -91,8 +95,8 @@ class SolidScene:
         return ("solid",)
 
     @property
-    def input_files(self) -> tuple[str, ...]:
-        return ()
+    def input_files(self) -> dict[str, str]:
+        return {}
 
     @property
     def spacing(self) -> float:
@@ -133,7 +137,7 @@ class SolidScene:
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
         body, cells = _body(self, rng)
         for _ in range(MAX_ATTEMPTS):
-            shapes = (*_walls(self, rng), *_obstacles(self, rng))
+            shapes = (*draw_walls(self, rng), *_obstacles(self, rng))
             placed = _placed(self, body, shapes, rng)
             if placed is not None:
                 break
@@ -191,19 +195,6 @@ def _lumped_masses(points: np.ndarray, cells: np.ndarray, density: float) -> np.
     return np.bincount(cells.ravel(), np.repeat(density * volume / cells.shape[1], cells.shape[1]), minlength=len(points))
 
 
-def _friction(config: SolidScene, rng: np.random.Generator, may_slip: bool = True) -> float:
-    kind, coulomb = rng.random(), rng.uniform(*config.coulomb_friction)
-    if kind < config.sticky_probability:
-        return STICKY
-    return 0.0 if may_slip and kind < config.sticky_probability + config.slip_probability else float(coulomb)
-
-
-def _walls(config: SolidScene, rng: np.random.Generator) -> tuple[Shape, ...]:
-    names = [f"{axis}_{side}" for axis in "xyz"[: config.dim] for side in ("low", "high")]
-    floor = f"{'xyz'[config.dim - 1]}_low"  # on a frictionless floor a body slides for ever
-    return domain_walls(config.bounds, {name: _friction(config, rng, may_slip=name != floor) for name in names})
-
-
 def _obstacles(config: SolidScene, rng: np.random.Generator) -> tuple[Shape, ...]:
     """Boxes, balls and, in 2D, irregular polygons in the lower part of the domain, clear of the walls and of each other."""
     obstacles: list[Shape] = []
@@ -211,7 +202,7 @@ def _obstacles(config: SolidScene, rng: np.random.Generator) -> tuple[Shape, ...
     low, high = np.array(config.bounds).T
     gap = 2.0 * config.spacing
     for _ in range(rng.integers(config.num_obstacles[0], config.num_obstacles[1] + 1)):
-        radius, friction = float(rng.uniform(*config.obstacle_radius)), _friction(config, rng)
+        radius, friction = float(rng.uniform(*config.obstacle_radius)), draw_friction(config, rng)
         room_low, room_high = low + radius + gap, high - radius - gap
         room_high[-1] = min(room_high[-1], max(room_low[-1], low[-1] + config.obstacle_height * (high - low)[-1]))
         if np.any(room_low > room_high):
@@ -229,18 +220,14 @@ def _obstacle(center: np.ndarray, radius: float, friction: float, rng: np.random
     if kind == 0:
         half = rng.uniform(0.4, 1.0, len(center))
         half *= radius / np.linalg.norm(half)
-        return Box(_floats(center - half), _floats(center + half), friction)
+        return Box(floats(center - half), floats(center + half), friction)
     if kind == 1 or len(center) == 3:
-        return Sphere(_floats(center), radius, friction)
+        return Sphere(floats(center), radius, friction)
     corners = int(rng.integers(3, 9))
     angle = 2 * math.pi * (np.arange(corners) + rng.uniform(-0.3, 0.3, corners) + rng.random()) / corners
     reach = radius * rng.uniform(0.6, 1.0, corners)
     vertices = center + reach[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     return Polygon(tuple((float(x), float(y)) for x, y in vertices), friction)
-
-
-def _floats(values: np.ndarray) -> tuple[float, ...]:
-    return tuple(float(v) for v in values)
 
 
 def _placed(config: SolidScene, body: np.ndarray, shapes: tuple[Shape, ...], rng: np.random.Generator) -> np.ndarray | None:
@@ -266,7 +253,7 @@ def _placed(config: SolidScene, body: np.ndarray, shapes: tuple[Shape, ...], rng
 def _velocity(config: SolidScene, pos: np.ndarray, mass: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Velocities [node, dim] in m/s of a rigid motion: any horizontal direction, mostly downward, with a spin about the centre of mass."""
     dim = config.dim
-    middle = config.max_speed * np.array([*rng.uniform(-1.0, 1.0, dim - 1), rng.uniform(-1.0, 0.25)])
+    middle = draw_velocity(config.max_speed, dim, rng)
     arm = pos - mass @ pos / mass.sum()
     if dim == 2:
         return middle + rng.uniform(-config.max_spin, config.max_spin) * np.stack([-arm[:, 1], arm[:, 0]], axis=-1)

@@ -120,7 +120,8 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
         [
             f"{settings.num_trajectories} training scenes per case at evenly spread parameter values, their first {settings.num_frames} frames, "
             f"from which those of whole trajectories follow; {settings.num_workers} processes at the same time, a core each. Compression: bytes in memory "
-            "over bytes on disk. Prototype: figures of an earlier, minimal implementation on one core of another machine.",
+            "over bytes on disk. Prototype: figures of an earlier, minimal implementation on another machine; substeps per second and ms per frame on one "
+            "core, trajectories per minute on two.",
             "",
             "| case | nodes | substeps per frame | 10⁶ node-substeps per second and core | ms per frame | trajectories per minute | "
             "hours for 2,600 trajectories | MB per trajectory | compression | prototype |",

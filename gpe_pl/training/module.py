@@ -5,12 +5,15 @@ from __future__ import annotations
 import logging
 import math
 import shutil
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Annotated, Any, Literal
 
 import lightning as L
 import torch
 from pydantic import Field
 from torch import Tensor
+from torch.utils._pytree import tree_leaves
 from torch_geometric.data import HeteroData
 
 from gpe_pl.errors import GpeError
@@ -24,6 +27,11 @@ COMPILE_PAYS_AFTER = 3000
 """Steps from which ``compile: auto`` repays the time that compilation takes."""
 
 log = logging.getLogger(__name__)
+
+
+def _rows(tensor: Tensor) -> int:
+    """Nodes or edges in a tensor of a graph; ``edge_index`` has its edges in columns."""
+    return tensor.shape[1] if tensor.dtype == torch.int64 and tensor.dim() == 2 else tensor.shape[0]
 
 
 class TrainingError(GpeError, RuntimeError):
@@ -43,6 +51,7 @@ class TrainingModule(L.LightningModule):
         final_learning_rate: at the end.
         schedule: ``exponential`` decays geometrically (paper: 5e-5 to 1e-6); ``cosine`` warms up and follows a half cosine (short budgets).
         warmup_steps: linear warm-up of the ``cosine`` schedule.
+        stress_weight: of the mean squared error of the normalised stress, where the model decodes one, beside that of the acceleration.
         compile: ``torch.compile`` the model: ``auto`` does so when the run is long enough and a C++ compiler is found.
     """
 
@@ -54,14 +63,17 @@ class TrainingModule(L.LightningModule):
         final_learning_rate: Annotated[float, Field(gt=0)] = 1e-5,
         schedule: Schedule = "cosine",
         warmup_steps: Annotated[int, Field(ge=0)] = 100,
+        stress_weight: Annotated[float, Field(gt=0)] = 1.0,
         compile: Compile = "auto",
     ) -> None:
         super().__init__()
         self.simulator = simulator
         self.num_steps, self.schedule, self.warmup_steps = num_steps, schedule, warmup_steps
         self.learning_rate, self.final_learning_rate = learning_rate, final_learning_rate
+        self.stress_weight = stress_weight
         self.compile_mode: Compile = compile
         self.val_nmse = OneStepNMSE()
+        self._compilation = ExitStack()
         self._windows: list[tuple[int, int]] = []  # (trajectory, frame) of the current batch
 
     def configure_optimizers(self) -> Any:
@@ -81,41 +93,55 @@ class TrainingModule(L.LightningModule):
         return ratio + (1 - ratio) * 0.5 * (1 + math.cos(math.pi * progress))
 
     def on_fit_start(self) -> None:
-        wanted = self.compile_mode == "on" or (self.compile_mode == "auto" and self.num_steps - self.global_step >= COMPILE_PAYS_AFTER)
-        if not wanted:
-            return
-        if self.compile_mode == "auto" and not any(shutil.which(c) for c in ("c++", "g++", "clang++", "cl")):
-            log.warning("compile: auto found no C++ compiler, training runs without torch.compile")
-            return
+        self._compilation.enter_context(self.compiled())
+
+    def on_fit_end(self) -> None:
+        self._compilation.close()
+
+    @contextmanager
+    def compiled(self) -> Iterator[None]:
+        """Inside, training steps run the model's ``compute`` through ``torch.compile``, if that is wanted and works here."""
         model: Any = self.simulator.model
-        plain = model.compute
-        compiled = torch.compile(plain, dynamic=True)
+        wanted = self.compile_mode == "on" or (self.compile_mode == "auto" and self.num_steps - self.global_step >= COMPILE_PAYS_AFTER)
+        if wanted and self.compile_mode == "auto" and not any(shutil.which(c) for c in ("c++", "g++", "clang++", "cl")):
+            log.warning("compile: auto found no C++ compiler, training runs without torch.compile")
+            wanted = False
+        if not wanted:
+            yield
+            return
+        plain, fast = model.compute, torch.compile(model.compute, dynamic=True)
         compiler_works = True
 
-        def compute(x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: dict[Any, tuple[Tensor, ...]]) -> Any:
+        def compute(*args: Any) -> Any:
             # only training steps, and no sizes of one, which the compiler would specialise on: else it recompiles until it gives up
-            sizes = [t.shape[0] for t in x.values()] + [odd.shape[0] for _, odd, _ in edges.values()]
             nonlocal compiler_works
-            if compiler_works and torch.is_grad_enabled() and min(sizes, default=0) > 1:
+            if compiler_works and torch.is_grad_enabled() and all(_rows(t) > 1 for t in tree_leaves(args)):
                 try:
-                    return compiled(x, params, mass, edges)
+                    return fast(*args)
                 except Exception as error:  # whatever the machine's tool chain lacks
                     if self.compile_mode == "on":
                         raise
                     log.warning("compile: auto does without torch.compile (%s)", type(error).__name__)
                     compiler_works = False
-            return plain(x, params, mass, edges)
+            return plain(*args)
 
         model.compute = compute
-
-    def on_fit_end(self) -> None:
-        self.simulator.model.__dict__.pop("compute", None)  # back to the plain method
+        try:
+            yield
+        finally:
+            del model.compute  # back to the class's own
 
     def loss(self, batch: HeteroData) -> Tensor:
-        """Mean squared error of the normalised accelerations."""
-        predicted = self.simulator(batch).acceleration
-        errors = [(predicted[m] - self._normalized(batch[m].target)).square() for m in predicted]
-        return torch.cat(errors).mean()
+        """Mean squared error of the normalised accelerations, and of the normalised stress where there is one."""
+        predicted = self.simulator(batch)
+        loss = torch.cat([(a - self._normalized(batch[m].target)).square() for m, a in predicted.acceleration.items()]).mean()
+        if predicted.stress:
+            std = self.simulator.stress_std.float()
+            loss = (
+                loss
+                + self.stress_weight * torch.cat([(s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]).mean()
+            )
+        return loss
 
     def training_step(self, batch: HeteroData, batch_idx: int) -> Tensor:
         loss = self.loss(batch)

@@ -31,9 +31,13 @@ class RunError(GpeError, RuntimeError):
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """Everything about the optimisation; see ``TrainingModule``, ``TrajectoryDataModule`` and ``data.noise`` for the meaning of each value."""
+    """Everything about the optimisation; see ``TrainingModule``, ``TrajectoryDataModule`` and ``data.noise`` for the meaning of each value.
+
+    ``budget_minutes``, of one core or GPU, replaces ``num_steps`` (see ``training.budget``).
+    """
 
     num_steps: Annotated[int, Field(ge=1)]
+    budget_minutes: Annotated[float, Field(gt=0)] | None = None
     batch_size: Annotated[int, Field(ge=1)] = 2
     learning_rate: Annotated[float, Field(gt=0)] = 1e-3
     final_learning_rate: Annotated[float, Field(gt=0)] = 1e-5
@@ -43,6 +47,7 @@ class TrainingSettings:
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999
     noise: NoiseKind = "velocity"
     noise_std: Annotated[float, Field(ge=0, le=100)] = 0.3
+    stress_weight: Annotated[float, Field(gt=0)] = 1.0
     compile: Compile = "auto"
     val_interval: Annotated[int, Field(ge=1)] = 1000
     num_val_rollouts: Annotated[int, Field(ge=1)] = 4

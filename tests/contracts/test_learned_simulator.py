@@ -373,3 +373,23 @@ def test_a_scene_of_other_scales_or_materials_is_refused(change: dict[str, Any])
     assert simulator.initial_state(fitting, 1).num_nodes == 3
     with pytest.raises(SceneError, match="the model was trained with frame_dt=0.005 s and spacing=0.05 m in 2D on sand"):
         simulator.initial_state(replace(fitting, metadata=replace(build.metadata, **change)), 1)
+
+
+def test_material_parameters_outside_the_training_data_are_named() -> None:
+    build = scenes.builder(("sand", "snow"), history=1)
+    simulator = learned(build)
+    state = scenes.state(40, ("sand", "snow")).to_torch()
+    assert simulator.untrained_parameters(state) == []  # not fitted: no range is known
+    graph = build(state)
+    for material in ("sand", "snow"):
+        graph[material].target = torch.ones(graph[material].num_nodes, 2)
+    simulator.fit_statistics([graph])
+    assert simulator.untrained_parameters(state) == []
+    params = state.material_params.clone()
+    sand = state.node_type == 0
+    params[sand.nonzero()[0], 0] = 75.0
+    (line,) = simulator.untrained_parameters(replace(state, material_params=params))
+    assert line.startswith("friction_angle of sand is 75 deg, trained were ")
+    again = LearnedSimulator.from_description(simulator.description())
+    again.load_state_dict(simulator.state_dict())
+    assert again.untrained_parameters(replace(state, material_params=params)) == [line]

@@ -1,9 +1,13 @@
 """Generation is resumable, reproducible, and refuses to mix data sets."""
 
 import contextlib
+import dataclasses
+import hashlib
 import json
+import logging
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +15,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -20,8 +25,10 @@ from gpe_pl.generation import (
     DatasetSpec,
     GenerationError,
     ParameterValues,
+    discard_damaged,
     generate,
     generate_trajectory,
+    initial_state,
     parameter_values,
     plan,
     scene_seed,
@@ -96,6 +103,40 @@ def test_resume_equals_uninterrupted(folder, tmp_path, num_workers):
     assert (again / "train" / "shard-00000.h5").stat().st_mtime_ns == kept
 
 
+def test_damage_in_place_is_found_and_repaired(folder, tmp_path, caplog):
+    """A shard that opens but whose bytes have changed is generated again, with a line in the log; the others are left alone."""
+    again = tmp_path / SPEC.name / SPEC.size
+    shutil.copytree(folder, again)
+    discard_damaged(tmp_path, SPEC)
+    assert not caplog.records and contents(again) == contents(folder)
+    array, text = again / "train" / "shard-00001.h5", again / "val" / "shard-00000.h5"
+    with h5py.File(array) as file:
+        place = file["00002/pos"].id.get_chunk_info(0).byte_offset
+    for path, where in ((array, place + 40), (text, text.read_bytes().index(b'"frame_dt": ') + 15)):
+        damaged = bytearray(path.read_bytes())
+        damaged[where] ^= 1
+        path.write_bytes(damaged)
+    generate(tmp_path, SPEC)
+    assert contents(again) != contents(folder)  # it opens, and nobody looked inside
+    with caplog.at_level(logging.WARNING):
+        discard_damaged(tmp_path, SPEC)
+    messages = [record.getMessage() for record in caplog.records]
+    assert len(messages) == 2 and all(str(path) in "".join(messages) for path in (array, text))
+    assert not array.exists() and not text.exists()
+    generate(tmp_path, SPEC)
+    assert contents(again) == contents(folder)
+
+
+def test_nothing_of_another_data_set_is_discarded(folder, tmp_path):
+    again = tmp_path / SPEC.name / SPEC.size
+    shutil.copytree(folder, again)
+    shard = again / "train" / "shard-00000.h5"
+    shard.write_bytes(b"damaged")
+    with pytest.raises(GenerationError, match="seed is 1, now 2"):
+        discard_damaged(tmp_path, replace(SPEC, seed=2))
+    assert shard.exists()
+
+
 def test_killed_run_resumes(folder, tmp_path):
     """SIGKILL in the middle, then again: the same bytes as an uninterrupted run."""
     script = (
@@ -124,29 +165,40 @@ def test_killed_run_resumes(folder, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("data", ["sand", "snow", "elastomer", "fluid", "fem"])
 def test_killed_at_random_moments(tmp_path, data):
-    """Four times SIGKILL (twenty over the five data sets) at random moments of the command, with two workers, then to the end: every shard is sound and
-    all bytes are those of an uninterrupted run."""
+    """Four times SIGKILL (twenty over the five data sets) of the command with two workers, then to the end: every shard is sound and all bytes are those of
+    an uninterrupted run.
+
+    The first comes at a random moment, which mostly is while the contact sheet is drawn; the others after a random number of new shards.
+    """
     counts = {"num_train": 12, "num_val": 2, "num_test": 2, "num_test_unseen": 2, "num_frames": 60, "trajectories_per_shard": 2}
     overrides = [f"data={data}", *(f"data.sizes.tiny.{key}={value}" for key, value in counts.items())]
     whole = generate(tmp_path / "whole", dataset_spec(compose("simulate", *overrides)), 2)
+    num_shards = len(list(whole.rglob("shard-*.h5")))
     command = [sys.executable, "-m", "gpe_pl.simulate", *overrides, f"paths.data={tmp_path / 'killed'}", "num_workers=2"]
     killed = tmp_path / "killed" / whole.parent.name / whole.name
-    rng, num_killed = np.random.default_rng(list(data.encode())), 0
-    while num_killed < 4:
+    rng = np.random.default_rng(list(data.encode()))
+    left: list[int] = []  # shards that are there after each kill
+
+    def shards() -> list[Path]:
+        return sorted(killed.rglob("shard-*.h5"))
+
+    while len(left) < 4:
+        present = shards()
+        for k in rng.permutation(len(present))[4:]:  # so that there is something to do
+            present[k].unlink()
+        goal = int(rng.integers(len(shards()) + 1, num_shards - 2)) if left else 0
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=Path(generation.__file__).parents[1])
-        while not killed.exists() and process.poll() is None:  # imports take longer than the work
+        while process.poll() is None and not (killed.exists() and len(shards()) >= goal):  # imports take longer than the work
             time.sleep(0.01)
         with contextlib.suppress(subprocess.TimeoutExpired):
-            process.wait(rng.uniform(0.0, 4.0))
-        if process.poll() is not None:  # it was faster: lose some shards and try again
+            process.wait(rng.uniform(0.0, 0.1 if left else 4.0))
+        if process.poll() is not None:  # it was faster: try again
             assert process.returncode == 0
-            for shard in rng.permutation(sorted(killed.rglob("*.h5")))[:4]:
-                Path(shard).unlink()
-            (killed / "statistics.json").unlink()
             continue
         process.kill()
         process.wait()
-        num_killed += 1
+        left.append(len(shards()))
+    assert any(0 < number < num_shards for number in left), left
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=Path(generation.__file__).parents[1])
     assert contents(killed) == contents(whole)
     assert not validate([killed]).violations
@@ -173,6 +225,33 @@ def test_folder_with_foreign_shards_is_refused(tmp_path):
     shard.write_bytes(b"")
     with pytest.raises(GenerationError, match=r"holds shards but no dataset\.json"):
         generate(tmp_path, SPEC)
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneOfAFile:
+    """The scene above, which claims to depend on a file."""
+
+    path: str
+
+    @property
+    def input_files(self) -> dict[str, str]:
+        return {"terrain": self.path}
+
+    def __getattr__(self, name):
+        return getattr(SCENE, name)
+
+
+def test_input_files_are_hashed_and_must_exist(tmp_path):
+    terrain = tmp_path / "valley.obj"
+    terrain.write_text("v 0 0 0")
+    spec = replace(SPEC, scene=SceneOfAFile(str(terrain)))
+    before = spec.as_dict()
+    assert before["input_files"] == {str(terrain): hashlib.sha256(b"v 0 0 0").hexdigest()}
+    terrain.write_text("v 0 0 1")
+    assert spec.as_dict()["input_files"] != before["input_files"]
+    terrain.unlink()
+    with pytest.raises(ValueError, match=rf"scene\.terrain = {terrain}: No such file"):
+        replace(SPEC, scene=SceneOfAFile(str(terrain)))
 
 
 def test_trajectory_is_a_pure_function(folder):
@@ -242,6 +321,25 @@ def test_small_disk_is_refused_before_anything_is_written(tmp_path):
     assert not list(tmp_path.rglob("*.h5"))
 
 
+@pytest.mark.parametrize("materials", [("sand",), ("sand", "snow", "elastomer")])
+def test_sheet_shows_the_first_scene_with_all_materials(monkeypatch, materials):
+    """It looks no further than it must: at no scene where there is one material, else up to the first with all of them."""
+    scene = replace(SCENE, materials=materials, max_bodies=3)
+    values = {"sand": (20.0, 30.0), "snow": (5.0, 8.0), "elastomer": (5e4, 1e5)}
+    parameters = {m: ParameterValues(seen=values[m]) for m in materials}
+    spec = replace(SPEC, scene=scene, solver=replace(SOLVER, materials=materials), parameters=parameters, num_train=40, num_test_unseen=0)
+    number = [len(np.unique(generation.initial_state(spec, "train", i).node_type)) for i in range(20)]
+    expected, sampled = number.index(len(materials)), []
+
+    def spy(spec, split, index):
+        sampled.append(index)
+        return initial_state(spec, split, index)
+
+    monkeypatch.setattr(generation, "initial_state", spy)
+    assert generation._most_varied_scene(spec) == expected
+    assert sampled == ([] if len(materials) == 1 else list(range(expected + 1)))
+
+
 def test_disk_estimate_is_near_the_truth(folder):
     written = sum(p.stat().st_size for p in folder.rglob("*.h5")) / sum(SPEC.counts.values())
     assert 0.7 * written < generation._bytes_per_trajectory(SPEC) < 2 * written
@@ -276,9 +374,13 @@ def test_parts_share_the_work_and_give_the_same_bytes(folder, tmp_path):
 
 def test_plan_counts_what_is_missing(folder, tmp_path):
     nothing = plan(tmp_path / "new", SPEC)
+    assert nothing.missing == tuple(generation._shards(SPEC)) and nothing.fits
     assert (nothing.num_done, nothing.num_missing) == (0, 15) and nothing.bytes_needed == generation.dataset_bytes(SPEC)
+    parts = [plan(tmp_path / "new", SPEC, (k, 3)) for k in range(3)]
+    assert sorted(shard for p in parts for shard in p.missing) == sorted(nothing.missing)
+    assert sum(p.num_missing for p in parts) == 15 and sum(p.bytes_needed for p in parts) == nothing.bytes_needed
     complete = plan(folder.parents[1], SPEC)
-    assert (complete.num_done, complete.num_missing, complete.bytes_needed) == (15, 0, 0)
+    assert (complete.missing, complete.num_done, complete.num_missing, complete.bytes_needed) == ((), 15, 0, 0)
     assert seconds_per_trajectory(SPEC, budget=0.01) > 0
 
 

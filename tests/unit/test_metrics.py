@@ -8,7 +8,7 @@ from jaxtyping import TypeCheckError
 
 from gpe_pl.geometry import domain_walls
 from gpe_pl.metrics import UNITS, OneStepNMSE, RolloutMSE, bootstrap_interval, energy_distance, per_frame_mse, rollout_metrics
-from gpe_pl.trajectory import Boundary, Metadata, Termination, Trajectory
+from gpe_pl.trajectory import Boundary, Metadata, Stress, Termination, Trajectory
 
 DT = 0.1
 
@@ -56,7 +56,7 @@ def test_rollout_mse_is_the_mean_over_frames_one_to_horizon(ground_truth):
     records = rollout_metrics(shifted(ground_truth, 0.1 * np.arange(11)), ground_truth, (2, "full"))
     assert value(records, "rollout_mse", 2) == pytest.approx((0.01 + 0.04) / 2 / 2)
     assert value(records, "rollout_mse", "full") == pytest.approx(0.01 * 385 / 10 / 2)
-    assert {r.metric for r in records} == set(UNITS)
+    assert {r.metric for r in records} == set(UNITS) - {"von_mises_error"}
 
 
 def test_a_perfect_rollout_is_zero_everywhere(ground_truth):
@@ -67,6 +67,26 @@ def test_unreached_horizons_are_left_out(ground_truth):
     assert {r.horizon for r in rollout_metrics(ground_truth, ground_truth, (5, 10, 11, 20))} == {5, 10}
     short = ground_truth.frames(0, 6)  # a shorter rollout that did not fail
     assert {r.horizon for r in rollout_metrics(short, ground_truth, (5, 6, "full"))} == {5}
+
+
+def test_relative_errors_by_hand():
+    """Two nodes move by 2 and 4 per frame; the prediction's first node moves by 1 per frame more."""
+    frames = np.arange(3)[:, None, None]
+    truth = trajectory(frames * np.array([[2.0, 0.0], [0.0, 4.0]]))
+    wrong = replace(truth, pos=truth.pos + (frames * np.array([[1.0, 0.0], [0.0, 0.0]])).astype(truth.pos.dtype))
+    records = rollout_metrics(wrong, truth, (2,))
+    assert value(records, "displacement_error", 2) == pytest.approx(np.sqrt((1 + 4) / (4 + 16 + 16 + 64)))
+    assert value(records, "velocity_error", 2) == pytest.approx(np.sqrt(2 / (2 * (4 + 16))))
+
+
+def test_von_mises_error_is_reported_where_both_have_a_stress():
+    truth = trajectory(np.zeros((3, 2, 2)))
+    uniaxial = np.zeros((3, 2, 4), np.float32)
+    uniaxial[..., 0] = 2.0  # von Mises stress 2
+    truth = replace(truth, stress=Stress(uniaxial, uniaxial[:, :1]))
+    wrong = replace(truth, stress=Stress(1.5 * uniaxial, uniaxial[:, :1]))
+    assert value(rollout_metrics(wrong, truth, (2,)), "von_mises_error", 2) == pytest.approx(0.5)
+    assert "von_mises_error" not in {r.metric for r in rollout_metrics(replace(wrong, stress=None), truth, (2,))}
 
 
 def test_an_early_stop_is_infinitely_wrong_beyond_its_last_good_frame(ground_truth):
@@ -110,7 +130,7 @@ def test_periodic_axes_take_the_short_way():
     wrapped = np.where(pos >= 10, pos - 20, pos)
     truth, prediction = trajectory(pos, periodic=(True, False)), trajectory(wrapped, periodic=(True, False))
     records = rollout_metrics(prediction, truth, (2,))
-    assert {r.metric for r in records} == set(UNITS) - {"energy_distance", "angular_momentum_error"}
+    assert {r.metric for r in records} == set(UNITS) - {"energy_distance", "angular_momentum_error", "von_mises_error"}
     assert all(r.value == pytest.approx(0, abs=1e-12) for r in records)
 
 

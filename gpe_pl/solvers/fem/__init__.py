@@ -20,6 +20,7 @@ from numba import njit
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from gpe_pl.geometry import check_bounds
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, node_code
 from gpe_pl.solvers.fem.contact import Obstacles, collect, push_out_corners, push_out_nodes, resist_corners, resist_nodes
@@ -69,11 +70,7 @@ class FEM:
     stores_stress: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if len(self.bounds) not in (2, 3):
-            raise ValueError(f"bounds must have two or three axes, got {len(self.bounds)}")
-        for axis, (low, high) in enumerate(self.bounds):
-            if not (math.isfinite(high - low) and low < high):
-                raise ValueError(f"bounds[{axis}] = ({low}, {high}) must be finite with low < high")
+        check_bounds(self.bounds)
         if self.materials != ("solid",):
             raise ValueError(f"materials must be ('solid',), got {self.materials}")
 

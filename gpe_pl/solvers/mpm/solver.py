@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as validated_dataclass
 
+from gpe_pl.geometry import check_whole_cells
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, NODE_TYPES, node_code, param_names
 from gpe_pl.solvers.materials import Elastomer, Sand, Snow
@@ -76,16 +77,10 @@ class MPM:
 
     name: ClassVar[str] = "mpm"
     version: ClassVar[str] = "3"
+    stores_stress: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if len(self.bounds) not in (2, 3):
-            raise ValueError(f"bounds must have 2 or 3 axes, got {len(self.bounds)}")
-        for axis, (low, high) in enumerate(self.bounds):
-            cells = (high - low) / self.grid_spacing
-            if not (math.isfinite(cells) and cells > 0.5 and abs(cells - round(cells)) < 1e-6 * cells):
-                raise ValueError(
-                    f"bounds[{axis}] = ({low}, {high}) must span a whole number of grid cells of {self.grid_spacing} m, got {cells:g}"
-                )
+        check_whole_cells(self.bounds, self.grid_spacing)
         unknown = [m for m in self.materials if m not in KNOWN]
         if unknown or not self.materials:
             raise ValueError(f"MPM has no law for material {', '.join(unknown) or '(none)'}; known: {', '.join(KNOWN)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from scipy.spatial import cKDTree
 from gpe_pl.geometry import Bowl, Box, DistanceGrid, domain_walls, shape_from_dict, shape_to_dict, signed_distance
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers.fluid_scenes import CLEARANCE, FluidScene, TerrainOptions
+from gpe_pl.terrain import TerrainError
 from gpe_pl.trajectory import State
 
 EARTH_2D = (0.0, -9.81)
@@ -243,6 +245,14 @@ def test_canyon_from_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert scene.sample({"fluid": 0.05}, 0).boundary.shapes != state.boundary.shapes
     with pytest.raises(ValueError, match="missing.obj: no such file"):
         dataclasses.replace(scene, terrain="missing.obj").sample({"fluid": 0.05}, 0)  # type: ignore[type-var]
+
+
+def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "valley.obj").write_text("v 0 0 0")
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    scene = dataclasses.replace(SCENES["canyon"], terrain=str(tmp_path / "valley.obj"))  # type: ignore[type-var]
+    with pytest.raises(TerrainError, match=r"valley\.obj: needs the package trimesh.*gpe_pl\[terrain\]"):
+        scene.sample({"fluid": 0.05}, 0)
 
 
 def test_canyon_from_a_mesh(tmp_path: Path) -> None:

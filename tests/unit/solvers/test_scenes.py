@@ -109,6 +109,9 @@ def test_impossible_scene_says_what_to_change():
         {"sticky_probability": 0.8, "slip_probability": 0.8},
         {"bounds": ((0, 1), (0, 1), (0, 1))},
         {"bounds": ((0, 1), (1, 1))},
+        {"bounds": ((0, 1), (0, math.inf))},
+        {"gravity": (0.0, math.nan)},
+        {"coulomb_friction": (0.8, 0.1)},
         {"misspelt": 1},
     ],
 )

@@ -131,6 +131,7 @@ def test_rolls_out_with_stress_in_every_frame(config):
         {"density": -1.0},
         {"num_obstacles": (3, 1)},
         {"drop_height": (0.2, 0.1)},
+        {"coulomb_friction": (0.8, 0.1)},
         {"sticky_probability": 0.7, "slip_probability": 0.7},
         {"misspelt": 1},
     ],

@@ -1,0 +1,190 @@
+"""Table 1 of the paper from a sweep over domains, models and seeds: one table of numbers for machines, one for people, and two figures.
+
+The number judged is the rollout MSE over all frames, mean over the trajectories of a domain's unseen material parameters, median over seeds.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.evaluation import LEARNED
+from gpe_pl.metrics import Interval, bootstrap_interval
+from gpe_pl.report import Run, finished_runs, groups_of, replace_text, table_row, values_by_seed
+
+log = logging.getLogger(__name__)
+
+TABLE_CSV, TABLE_MD, FIGURE, PARAMETER_FIGURE = "table1.csv", "table1.md", "table1.png", "error_by_parameter.png"
+OWN = "GPE"
+TRIVIAL = ("ballistic", "constant_velocity")
+NOT_LEARNED = 2.0
+"""A model that is not this many times better than ballistic flight has learned nothing worth comparing."""
+
+PAPER = {
+    "sand": {"DPINet": 5.15, "GNS": 3.80, "ContinuousConvNet": 3.51, "GPE": 2.37},
+    "snow": {"DPINet": 4.91, "GNS": 5.49, "ContinuousConvNet": 5.24, "GPE": 3.94},
+    "elastomer": {"DPINet": 2.07, "GNS": 3.58, "ContinuousConvNet": 2.82, "GPE": 1.35},
+    "fem": {"DPINet": 1.76, "GNS": 5.03, "ContinuousConvNet": 4.96, "GPE": 1.27},
+    "fluid": {"DPINet": 3.31, "GNS": 3.78, "ContinuousConvNet": 2.75, "GPE": 3.22},
+}
+"""Yang et al. 2022, table 1: average MSE ×1e-3 in the paper's own units, which are not ours; only ratios compare."""
+
+JUDGED_GROUP = {"fem": "test_unseen"}
+"""Unseen values that lie between trained ones; FEM is also judged outside, as in the paper (trained on 1–4 MPa, tested on 0.5–10 MPa)."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A model in a domain: its interval [m²], how many seeds, and the same trajectories' error in ballistic flight [m²]."""
+
+    interval: Interval
+    num_seeds: int
+    ballistic: float
+
+    @property
+    def is_learned(self) -> bool:
+        return self.interval.estimate * NOT_LEARNED <= self.ballistic
+
+
+def judged_group(domain: str) -> str:
+    """The trajectories that a domain is judged on, as a split or part of one."""
+    return JUDGED_GROUP.get(domain, "test_unseen/interpolated")
+
+
+def compares_models(folder: Path) -> bool:
+    """Whether the runs below a folder are of several models or domains."""
+    return len({(domain_of(run), model_of(run)) for run in finished_runs(folder)}) > 1
+
+
+def report_domains(folder: Path) -> None:
+    """Write table and figures of all finished runs below a folder."""
+    runs = finished_runs(folder)
+    if not runs:
+        log.warning("%s: no finished run", folder)
+        return
+    by_cell: dict[tuple[str, str], list[Run]] = defaultdict(list)
+    for run in runs:
+        by_cell[domain_of(run), model_of(run)].append(run)
+    _write_csv(folder / TABLE_CSV, runs)
+    domains = sorted({d for d, _ in by_cell}, key=lambda d: ([*PAPER, d].index(d), d))
+    models = sorted({m for _, m in by_cell}, key=lambda m: (m == OWN, m))
+    cells = {key: cell for key, members in by_cell.items() if (cell := _cell(members, key[0])) is not None}
+    replace_text(folder / TABLE_MD, _markdown(domains, models, cells, by_cell))
+    _figures(folder, domains, models, cells, by_cell)
+
+
+def domain_of(run: Run) -> str:
+    """Name of the data set that a run was trained on."""
+    return str(run.config["data.name"])
+
+
+def model_of(run: Run) -> str:
+    """Class name of a run's model."""
+    return str(run.config["model._target_"]).rpartition(".")[2]
+
+
+def _cell(runs: list[Run], domain: str) -> Cell | None:
+    group = judged_group(domain)
+    values = values_by_seed(runs, LEARNED, group, "rollout_mse", "full")
+    trivial = values_by_seed(runs[:1], "ballistic", group, "rollout_mse", "full")
+    if not values or not trivial:
+        return None
+    return Cell(bootstrap_interval(values, statistic=_median_of_means), len(values), float(np.mean(trivial[0])))
+
+
+def _median_of_means(table: np.ndarray) -> float:
+    return float(np.median(table.mean(axis=1)))
+
+
+def _write_csv(path: Path, runs: Sequence[Run]) -> None:
+    """One line per domain, model, seed, split, metric and horizon: the mean over trajectories. Trivial models have no seed."""
+    lines: dict[tuple[str, ...], float] = {}
+    for run in runs:
+        groups: dict[tuple[str, ...], list[float]] = defaultdict(list)
+        for row in run.rows:
+            model, seed = (model_of(run), str(run.config.get("seed"))) if row.model == LEARNED else (row.model, "")
+            for split in groups_of(row):
+                groups[domain_of(run), model, seed, split, row.metric, row.horizon].append(row.value)
+        lines |= {key: float(np.mean(values)) for key, values in groups.items()}
+    temporary = path.with_suffix(".part")
+    with open(temporary, "w", newline="") as handle:
+        writer = csv.writer(handle)
+        writer.writerow(["domain", "model", "seed", "split", "metric", "horizon", "value"])
+        writer.writerows([*key, value] for key, value in sorted(lines.items()))
+    temporary.replace(path)
+
+
+def _markdown(domains: list[str], models: list[str], cells: dict[tuple[str, str], Cell], by_cell: dict[tuple[str, str], list[Run]]) -> str:
+    header = ["domain", *models, "ballistic", f"{OWN} / best baseline", "paper"]
+    lines = [table_row(header), "|" + "---|" * len(header)]
+    for domain in domains:
+        own = {m: cells[domain, m] for m in models if (domain, m) in cells}
+        ballistic = next((c.ballistic for c in own.values()), float("nan"))
+        texts = [_text(own.get(m)) for m in models]
+        lines.append(table_row([domain, *texts, f"{1e3 * ballistic:.3g}", _ratio(own), _paper_ratio(domain)]))
+    budget = ["", "Training, one row per model: steps and seeds.", "", table_row(["domain", *models]), "|" + "---|" * (len(models) + 1)]
+    for domain in domains:
+        steps = [
+            ", ".join(sorted({f"{int(r.config['training.num_steps']):,}" for r in by_cell[domain, m]})) + f" × {len(by_cell[domain, m])}"
+            if (domain, m) in by_cell
+            else "–"
+            for m in models
+        ]
+        budget.append(table_row([domain, *steps]))
+    note = (
+        "Rollout MSE ×1e-3 [m²] over all frames on material parameters not seen in training (between the trained ones; FEM also outside): mean over "
+        "trajectories, median over seeds, 95 % bootstrap interval over both. A model that is not twice as good as ballistic flight is *not learned* and "
+        "wins nothing. Last column: the paper's ratio, from its table 1; its units are not ours."
+    )
+    return "\n".join([*lines, "", note, *budget, ""])
+
+
+def _text(cell: Cell | None) -> str:
+    if cell is None:
+        return "–"
+    i = cell.interval
+    numbers = f"{1e3 * i.estimate:.3g} [{1e3 * i.low:.3g}, {1e3 * i.high:.3g}]"
+    return numbers if cell.is_learned else f"*not learned* ({numbers})"
+
+
+def _ratio(cells: dict[str, Cell]) -> str:
+    baselines = [c for m, c in cells.items() if m != OWN and c.is_learned]
+    own = cells.get(OWN)
+    if own is None or not own.is_learned:
+        return "–"
+    if not baselines:
+        return "no baseline learned"
+    return f"**{own.interval.estimate / min(c.interval.estimate for c in baselines):.2f}**"
+
+
+def _paper_ratio(domain: str) -> str:
+    values = PAPER.get(domain, {})
+    others = [v for m, v in values.items() if m != OWN]
+    return f"{values[OWN] / min(others):.2f}" if others else "–"
+
+
+def _figures(
+    folder: Path, domains: list[str], models: list[str], cells: dict[tuple[str, str], Cell], by_cell: dict[tuple[str, str], list[Run]]
+) -> None:
+    from gpe_pl.viz.comparison import comparison_figure, parameter_figure
+
+    shown = {d: {m: cells[d, m].interval for m in models if (d, m) in cells} for d in domains}
+    references = {d: next(c.ballistic for (domain, _), c in cells.items() if domain == d) for d in domains if shown[d]}
+    if any(shown.values()):
+        comparison_figure({d: s for d, s in shown.items() if s}, references, "rollout MSE [m²]").savefig(folder / FIGURE, dpi=150)
+    curves: dict[str, dict[str, dict[float, list[float]]]] = {}
+    for (domain, model), runs in by_cell.items():
+        points = curves.setdefault(domain, {}).setdefault(model, {})
+        for run in runs:
+            for row in run.rows:
+                if (row.model, row.metric, row.horizon) == (LEARNED, "rollout_mse", "full") and np.isfinite(row.parameter):
+                    points.setdefault(row.parameter, []).append(row.value)
+    seen = {d: sorted({r.parameter for run in by_cell[d, m] for r in run.rows if r.parameter_group == "seen"}) for d, m in by_cell}
+    if curves:
+        parameter_figure({d: curves[d] for d in domains}, seen, "rollout MSE [m²]").savefig(folder / PARAMETER_FIGURE, dpi=150)

@@ -1,0 +1,102 @@
+"""Equal time for every model: a budget of minutes becomes a number of steps, from a step time that is measured once and then written down.
+
+Runs count steps only, so a resumed run ends where an uninterrupted one does; all seeds of a sweep share the measurement.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from filelock import FileLock
+from torch_geometric.data import Batch
+
+from gpe_pl.data.dataset import StepSampler, WindowDataset
+from gpe_pl.errors import GpeError
+from gpe_pl.training.module import TrainingModule
+from gpe_pl.training.run import TrainingSettings
+
+log = logging.getLogger(__name__)
+
+WARM_UP_STEPS = 15
+MEASURED_STEPS = 60
+
+
+def digest(settings: Any) -> str:
+    """A short name for settings: equal for equal ones."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+
+
+class BudgetError(GpeError, ValueError):
+    """The file of measured step times cannot be used; names it and what to do."""
+
+
+def step_time(module: TrainingModule, data: WindowDataset, settings: TrainingSettings) -> float:
+    """Seconds per optimiser step, the building of its graphs included: processor time, which other processes do not lengthen, or on a GPU wall time."""
+    on_gpu = next(module.parameters()).is_cuda
+    clock = time.perf_counter if on_gpu else time.process_time
+    optimizer = torch.optim.Adam(module.parameters(), lr=0.0, fused=True)
+    batches = _batches(data, settings.batch_size)
+    start = 0.0
+    with module.compiled():
+        for step in range(WARM_UP_STEPS + MEASURED_STEPS):
+            if step == WARM_UP_STEPS:
+                start = clock()
+            optimizer.zero_grad()
+            module.loss(next(batches).to(module.device)).backward()
+            torch.nn.utils.clip_grad_norm_(module.parameters(), settings.gradient_clip)
+            optimizer.step()
+        if on_gpu:
+            torch.cuda.synchronize()
+        return (clock() - start) / MEASURED_STEPS
+
+
+def _batches(data: WindowDataset, batch_size: int) -> Iterator[Batch]:
+    samples = iter(StepSampler(len(data), seed=0))
+    while True:
+        yield Batch.from_data_list([data[next(samples)] for _ in range(batch_size)])
+
+
+def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Callable[[], float]) -> TrainingSettings:
+    """Settings with the number of steps that ``settings.budget_minutes`` allow, and as many validations as before.
+
+    Args:
+        settings: with a budget.
+        path: JSON file of step times [s], shared by the runs of a sweep.
+        key: in that file, what the step time depends on.
+        measure: step time [s]; called if the file does not have it yet.
+
+    Raises:
+        BudgetError: the file is damaged.
+    """
+    assert settings.budget_minutes is not None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(path.with_suffix(".lock")):
+        times = _read(path)
+        if key not in times:
+            times[key] = measure()
+            log.info("%s: %.1f ms per training step", key, 1e3 * times[key])
+            temporary = path.with_suffix(".part")
+            temporary.write_text(json.dumps(times, indent=1))
+            os.replace(temporary, path)
+    validations = max(1, settings.num_steps // settings.val_interval)
+    interval = max(1, int(60 * settings.budget_minutes / times[key] / validations))
+    return replace(settings, num_steps=interval * validations, val_interval=interval, budget_minutes=None)
+
+
+def _read(path: Path) -> dict[str, float]:
+    if not path.exists():
+        return {}
+    try:
+        times = json.loads(path.read_text())
+        return {str(key): float(value) for key, value in times.items()}
+    except (OSError, ValueError, AttributeError, TypeError) as error:
+        raise BudgetError(f"{path}: not a file of step times ({error}); delete it to measure again") from None

@@ -1,0 +1,92 @@
+"""Figures that compare models over domains: errors with their intervals, and errors against the material parameter."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from gpe_pl.metrics import Interval
+from gpe_pl.viz.coloring import PALETTE
+from gpe_pl.viz.film_strip import TEXT_WIDTH, new_figure
+
+
+def comparison_figure(intervals: Mapping[str, Mapping[str, Interval]], references: Mapping[str, float], label: str) -> Figure:
+    """A group per domain, a mark with its interval per model, on a logarithmic axis; a line across each group marks its reference.
+
+    Args:
+        intervals: by domain and model.
+        references: by domain, such as the error of ballistic flight.
+        label: of the vertical axis.
+    """
+    figure = new_figure(TEXT_WIDTH, 2.6)
+    figure.set_layout_engine("constrained")
+    axes = figure.add_subplot()
+    axes.set_yscale("log")
+    models = list(dict.fromkeys(m for group in intervals.values() for m in group))
+    for k, model in enumerate(models):
+        shift = (k - (len(models) - 1) / 2) * 0.6 / max(1, len(models))
+        found = [(d + shift, group[model]) for d, group in enumerate(intervals.values()) if model in group]
+        x, i = [p for p, _ in found], [v for _, v in found]
+        middle = np.array([v.estimate for v in i])
+        spread = np.abs(np.array([[v.estimate - v.low for v in i], [v.high - v.estimate for v in i]]))
+        finite = np.isfinite(middle) & np.isfinite(spread).all(axis=0)
+        axes.errorbar(
+            np.array(x)[finite], middle[finite], spread[:, finite], fmt="o", markersize=4, linewidth=1, capsize=2, color=PALETTE[k % len(PALETTE)], label=model
+        )  # fmt: skip
+    for d, domain in enumerate(intervals):
+        axes.plot(
+            [d - 0.4, d + 0.4], [references[domain]] * 2, color="0.5", linestyle=":", linewidth=1, label="ballistic" if d == 0 else None
+        )
+    axes.set_xticks(range(len(intervals)), list(intervals), fontsize=8)
+    axes.set_ylabel(label, fontsize=8)
+    axes.tick_params(axis="y", which="both", labelsize=7)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(fontsize=7, frameon=False, ncols=len(models) + 1, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    return figure
+
+
+def parameter_figure(
+    curves: Mapping[str, Mapping[str, Mapping[float, Sequence[float]]]], seen: Mapping[str, Sequence[float]], label: str
+) -> Figure:
+    """One panel per domain: median error over trajectories and seeds against the material parameter; ticks at the bottom mark trained values.
+
+    Args:
+        curves: errors by domain, model and parameter value.
+        seen: trained values by domain.
+        label: of the vertical axis.
+    """
+    figure = new_figure(TEXT_WIDTH, 2.2)
+    figure.set_layout_engine("constrained")
+    panels = figure.subplots(1, len(curves), squeeze=False)[0]
+    models = list(dict.fromkeys(m for domain in curves.values() for m in domain))
+    for axes, (domain, by_model) in zip(panels, curves.items(), strict=True):
+        values = [p for points in by_model.values() for p in points]
+        axes.set_yscale("log")
+        if values and min(values) > 0 and max(values) > 30 * min(values):
+            axes.set_xscale("log")
+        for k, model in enumerate(models):
+            points = sorted((p, float(np.median(v))) for p, v in by_model.get(model, {}).items())
+            points = [p for p in points if np.isfinite(p[1])]
+            axes.plot(
+                [p for p, _ in points],
+                [v for _, v in points],
+                "o-",
+                markersize=2.5,
+                linewidth=0.8,
+                color=PALETTE[k % len(PALETTE)],
+                label=model,
+            )
+        axes.plot(
+            list(seen.get(domain, [])),
+            [0.0] * len(seen.get(domain, [])),
+            "|",
+            color="0.4",
+            transform=axes.get_xaxis_transform(),
+            markersize=6,
+        )
+        axes.set_title(domain, fontsize=8)
+        axes.tick_params(which="both", labelsize=6)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel(label, fontsize=8)
+    panels[-1].legend(fontsize=6, frameon=False)
+    return figure

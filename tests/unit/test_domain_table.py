@@ -1,0 +1,93 @@
+"""Table 1 from run folders whose numbers are known."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from gpe_pl.domain_table import compares_models, judged_group, report_domains
+from gpe_pl.evaluation import LEARNED, Row, write_rows
+
+ERRORS = {
+    ("sand", "GPE"): [[1e-3, 3e-3], [2e-3, 2e-3], [8e-3, 8e-3]],  # mean 2, 2 and 8, median 2
+    ("sand", "GNS"): [[4e-3, 4e-3]],
+    ("sand", "DPINet"): [[20e-3, 20e-3]],
+    ("fem", "GPE"): [[5e-3, 5e-3]],
+    ("fem", "GNS"): [[float("inf"), 1e-3]],
+}
+BALLISTIC = {"sand": 30e-3, "fem": 8e-3}
+
+
+def write_run(folder: Path, domain: str, model: str, seed: int, errors: list[float]) -> None:
+    folder.mkdir(parents=True)
+    config = {"seed": seed, "data": {"name": domain}, "model": {"_target_": f"gpe_pl.models.x.{model}"}, "training": {"num_steps": 1000 + seed}}
+    (folder / "config.json").write_text(json.dumps(config))
+    rows = []
+    for name, values in ((LEARNED, errors), ("ballistic", [BALLISTIC[domain]] * len(errors))):
+        for k, value in enumerate(values):
+            rows.append(Row(name, "test_unseen", k, "interpolated", 20.0 + k, "rollout_mse", "full", value))
+        rows.append(Row(name, "test_unseen", 9, "extrapolated", 50.0, "rollout_mse", "full", 5e-3))
+        rows.append(Row(name, "test", 0, "seen", 20.0, "rollout_mse", "full", 1e-3))
+    write_rows(folder / "metrics.csv", rows)
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> Path:
+    for (domain, model), seeds in ERRORS.items():
+        for seed, errors in enumerate(seeds):
+            write_run(tmp_path / domain / model / str(seed), domain, model, seed, errors)
+    return tmp_path
+
+
+def cells(text: str, domain: str) -> dict[str, str]:
+    lines = [[c.strip() for c in line.strip("|").split("|")] for line in text.splitlines() if line.startswith("|")]
+    header = next(line for line in lines if line[0] == "domain")
+    return dict(zip(header, next(line for line in lines if line[0] == domain), strict=True))
+
+
+def test_the_table_judges_medians_over_seeds_on_unseen_parameters(sweep: Path) -> None:
+    report_domains(sweep)
+    text = (sweep / "table1.md").read_text()
+    sand, fem = cells(text, "sand"), cells(text, "fem")
+    assert sand["GPE"].startswith("2 [")
+    assert sand["GNS"].startswith("4 [4, 4]")
+    assert sand["GPE / best baseline"] == "**0.50**"
+    assert sand["DPINet"].startswith("*not learned* (20 ")  # 30 / 20 is less than two
+    assert sand["ballistic"] == "30"
+    assert sand["paper"] == "0.68"
+    assert fem["GPE"].startswith("*not learned* (5 [5, 5])")
+    assert fem["GNS"].startswith("*not learned* (inf")
+    assert fem["GPE / best baseline"] == "–"
+    assert "1,000, 1,001, 1,002 × 3" in text
+
+
+def test_fem_is_judged_on_all_unseen_values() -> None:
+    assert judged_group("fem") == "test_unseen"
+    assert judged_group("fluid") == "test_unseen/interpolated"
+
+
+def test_the_csv_has_every_number_once(sweep: Path) -> None:
+    report_domains(sweep)
+    with open(sweep / "table1.csv", newline="") as handle:
+        reader = csv.DictReader(handle)
+        assert reader.fieldnames == ["domain", "model", "seed", "split", "metric", "horizon", "value"]
+        rows = list(reader)
+    assert len({tuple(r.values())[:-1] for r in rows}) == len(rows)
+    found = {(r["domain"], r["model"], r["seed"], r["split"]): float(r["value"]) for r in rows}
+    assert found["sand", "GPE", "0", "test_unseen/interpolated"] == pytest.approx(2e-3)
+    assert found["sand", "GPE", "0", "test_unseen"] == pytest.approx((1e-3 + 3e-3 + 5e-3) / 3)
+    assert found["sand", "ballistic", "", "test_unseen/interpolated"] == pytest.approx(30e-3)
+
+
+def test_figures_are_drawn(sweep: Path) -> None:
+    report_domains(sweep)
+    assert all((sweep / name).stat().st_size > 1000 for name in ("table1.png", "error_by_parameter.png"))
+
+
+def test_only_sweeps_over_models_or_domains_compare_models(sweep: Path) -> None:
+    assert compares_models(sweep)
+    assert not compares_models(sweep / "sand" / "GPE")
+    assert not compares_models(sweep / "nothing")

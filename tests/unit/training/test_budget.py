@@ -1,0 +1,76 @@
+"""A budget of minutes becomes a number of steps once, and the same number ever after."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from gpe_pl.data.dataset import WindowDataset, open_split
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
+from gpe_pl.training import budget
+from gpe_pl.training.budget import BudgetError, digest, step_time, within_budget
+from gpe_pl.training.module import TrainingModule
+from gpe_pl.training.run import TrainingSettings
+
+SETTINGS = TrainingSettings(num_steps=1000, val_interval=250, budget_minutes=0.5)
+
+
+def test_steps_fill_the_budget_and_validations_keep_their_number(tmp_path: Path) -> None:
+    path, calls = tmp_path / "sweep" / "step_times.json", []
+
+    def measure() -> float:
+        calls.append(1)
+        return 0.0301
+
+    settings = within_budget(SETTINGS, path, "sand GPE", measure)
+    assert (settings.num_steps, settings.val_interval) == (4 * 249, 249)  # 30 s / 30.1 ms / 4 = 249.2
+    assert settings.budget_minutes is None
+    assert within_budget(SETTINGS, path, "sand GPE", measure) == settings
+    assert len(calls) == 1
+    other = within_budget(SETTINGS, path, "sand GNS", lambda: 0.1)
+    assert other.num_steps == 300
+    assert within_budget(SETTINGS, path, "sand GPE", measure) == settings
+
+
+def test_a_step_dearer_than_the_budget_is_taken_once_per_validation(tmp_path: Path) -> None:
+    assert within_budget(SETTINGS, tmp_path / "t.json", "slow", lambda: 1e4).num_steps == 4
+
+
+@pytest.mark.parametrize("content", ["", "[1]", '{"a": "fast"}', "\x00"])
+def test_a_damaged_file_is_named(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "step_times.json"
+    path.write_text(content)
+    with pytest.raises(BudgetError, match=r"step_times\.json: not a file of step times .*delete it"):
+        within_budget(SETTINGS, path, "sand", lambda: 1.0)
+
+
+def test_a_measurement_that_fails_writes_nothing(tmp_path: Path) -> None:
+    def measure() -> float:
+        raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError):
+        within_budget(SETTINGS, tmp_path / "t.json", "sand", measure)
+    assert not (tmp_path / "t.json").exists()
+
+
+def test_equal_settings_have_equal_digests() -> None:
+    a: dict[str, Any] = {"model": {"x": 1, "y": [1, 2]}, "batch_size": 2}
+    assert digest(a) == digest({"batch_size": 2, "model": {"y": [1, 2], "x": 1}})
+    assert digest(a) != digest({**a, "batch_size": 3})
+
+
+def test_measuring_trains_nothing(tiny_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(budget, "WARM_UP_STEPS", 1)
+    monkeypatch.setattr(budget, "MEASURED_STEPS", 2)
+    stored = open_split(tiny_data / "sand" / "tiny", "train")
+    builder = GraphBuilder(GraphConfig(history=2), stored[0].window(0, 1).metadata)
+    module = TrainingModule(LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder), num_steps=10)
+    before = {k: v.clone() for k, v in module.state_dict().items()}
+    assert step_time(module, WindowDataset(stored, builder), SETTINGS) > 0
+    assert all(torch.equal(v, before[k]) for k, v in module.state_dict().items())
