@@ -35,6 +35,8 @@ from gpe_pl.launcher import RESULT, SweepError
 WITHOUT_KEY = {"experiment", "scene", "solver"}
 """Config groups that fill other keys than one of their own."""
 
+launcher.register()  # conf/ names it
+
 CONF = Path(__file__).resolve().parent.parent / "conf"
 T = TypeVar("T")
 
@@ -164,7 +166,6 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             if not CONF.is_dir():
                 _fail(ConfigError(f"{CONF} not found: install gpe_pl from a clone with `pip install -e .`"))
             os.environ["HYDRA_FULL_ERROR"] = "1"  # let exceptions reach us instead of Hydra's own report
-            launcher.register()
             try:
                 return hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
             except SweepError as error:

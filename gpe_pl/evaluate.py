@@ -16,13 +16,13 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     from gpe_pl.evaluation import EvaluationSettings, evaluate
     from gpe_pl.learned_simulator import LearnedSimulator
     from gpe_pl.report import summary
-    from gpe_pl.simulate import ensure_data
+    from gpe_pl.simulate import ensure_data, evaluated_config
 
     if not isinstance(cfg.checkpoint, str):
         raise ConfigError(f"checkpoint={cfg.checkpoint!r}: name a checkpoint of a run, such as runs/sand/checkpoints/best.ckpt")
-    settings = construct(EvaluationSettings, {**cfg.evaluation, "splits": [cfg.split]}, "evaluation")
+    settings = construct(EvaluationSettings, {**{k: v for k, v in cfg.evaluation.items() if k != "data"}, "splits": [cfg.split]}, "evaluation")
     simulator = LearnedSimulator.from_checkpoint(cfg.checkpoint)
-    root = ensure_data(cfg)
+    root = ensure_data(evaluated_config(cfg))
     folder = Path(cfg.paths.runs) / cfg.name
     rows = evaluate(simulator, root, settings, folder)
     print(summary(rows))

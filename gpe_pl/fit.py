@@ -24,7 +24,7 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, read_rows
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
-    from gpe_pl.simulate import ensure_data
+    from gpe_pl.simulate import ensure_data, evaluated_config
     from gpe_pl.training.budget import digest, step_time, within_budget
     from gpe_pl.training.module import TrainingModule
     from gpe_pl.training.run import LoggerSettings, TrainerSettings, TrainingSettings, claim, set_threads, train
@@ -33,7 +33,7 @@ def fit(cfg: DictConfig) -> float:
         raise ConfigError(f"seed={cfg.seed!r}: must be an integer of at least 0")
     training = construct(TrainingSettings, cfg.training, "training")
     trainer = construct(TrainerSettings, cfg.trainer, "trainer")
-    evaluation = construct(EvaluationSettings, cfg.evaluation, "evaluation")
+    evaluation = construct(EvaluationSettings, {k: v for k, v in cfg.evaluation.items() if k != "data"}, "evaluation")
     graph = construct(GraphConfig, cfg.graph, "graph")
     logger = construct(LoggerSettings, cfg.logger, "logger")
     new_model = bind(model_class(cfg.model._target_), {k: v for k, v in cfg.model.items() if k != "_target_"}, "model", "spec")
@@ -43,6 +43,7 @@ def fit(cfg: DictConfig) -> float:
     Path(cfg.paths.data).mkdir(parents=True, exist_ok=True)
     with FileLock(Path(cfg.paths.data) / f".{cfg.data.name}.lock"):  # runs of a sweep start at the same time
         root = ensure_data(cfg)
+        evaluated = ensure_data(evaluated_config(cfg)) if cfg.evaluation.data else root
     device = "cuda" if trainer.accelerator == "gpu" else "cpu"
     datamodule = TrajectoryDataModule(
         root, graph, noise, training.batch_size, cfg.seed, trainer.num_workers, stress=bool(cfg.model.get("stress", False))
@@ -66,7 +67,7 @@ def fit(cfg: DictConfig) -> float:
     claim(run_dir, {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training", "evaluation")})
     if not (run_dir / "metrics.csv").exists():
         best = train(new_module(training), datamodule, training, trainer, logger.loggers(run_dir), run_dir)
-        evaluate(LearnedSimulator.from_checkpoint(best, device), root, evaluation, run_dir)
+        evaluate(LearnedSimulator.from_checkpoint(best, device), evaluated, evaluation, run_dir)
 
     values = [
         r.value

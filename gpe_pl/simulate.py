@@ -29,7 +29,7 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     if cfg.size.name not in cfg.data.sizes:
         raise ConfigError(f"size={cfg.size.name}: data={cfg.data.name} has the sizes {', '.join(cfg.data.sizes)}")
     values: dict[str, Any] = OmegaConf.to_container(cfg.data, resolve=True)  # type: ignore[assignment]
-    for table in ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds"):
+    for table in ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds", "larger"):
         values.pop(table, None)
     scene = construct_target(values.pop("scene"), "data.scene", "gpe_pl.solvers.")
     solver = construct_target(values.pop("solver"), "data.solver", "gpe_pl.solvers.")
@@ -46,6 +46,14 @@ def ensure_data(cfg: DictConfig) -> Path:
         raise ConfigError(f"{folder}: no data; generate it first with `python -m gpe_pl.simulate data={spec.name} size={spec.size}`")
     with progress_bar(f"{spec.name} {spec.size}") as on_progress:
         return generate(cfg.paths.data, spec, os.cpu_count() or 1, on_progress)
+
+
+def evaluated_config(cfg: DictConfig) -> DictConfig:
+    """The config with the data to evaluate on, which ``evaluation.data`` says how to get from those to train on."""
+    from omegaconf import OmegaConf
+
+    merged: Any = OmegaConf.merge(cfg, {"data": cfg.evaluation.data})
+    return merged
 
 
 def simulate(cfg: DictConfig) -> None:

@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from typing import Annotated, Any, NamedTuple, Protocol, runtime_checkable
+from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from pydantic import Field
@@ -22,6 +22,7 @@ from gpe_pl.trajectory import Boundary, Metadata, State
 
 PositiveFloat = Annotated[float, Field(gt=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]
+ObstacleShapes = Literal["plain", "angular"]
 
 MAX_ATTEMPTS = 200
 """Layouts to try before a scene counts as impossible."""
@@ -179,6 +180,7 @@ class BodyScene:
         max_bodies: the number of bodies is uniform in 1 … max_bodies, with several materials in 2 … max_bodies.
         max_obstacles: the number of obstacles is uniform in 0 … max_obstacles.
         obstacle_radius: range of their circumscribed radii [m].
+        obstacle_shapes: ``plain`` are boxes, balls and convex polygons; ``angular``, in 2D, are stars and tilted ramps.
         drop_height: range of the gap between a body and the floor [m].
         max_speed: of a body along each axis [m/s]; upward at most a quarter of it.
         sticky_probability: of a wall or obstacle to be no-slip.
@@ -197,6 +199,7 @@ class BodyScene:
     max_bodies: Annotated[int, Field(ge=1)] = 3
     max_obstacles: Annotated[int, Field(ge=0)] = 2
     obstacle_radius: tuple[PositiveFloat, PositiveFloat] = (0.05, 0.15)
+    obstacle_shapes: ObstacleShapes = "plain"
     drop_height: tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]] = (0.02, 0.2)
     max_speed: Annotated[float, Field(ge=0)] = 2.0
     sticky_probability: Probability = 0.25
@@ -213,6 +216,7 @@ class BodyScene:
         if lacking:
             raise ValueError(f"density of {', '.join(lacking)} is missing")
         check_ranges(self, "obstacle_radius", "drop_height")
+        check_obstacle_shapes(self.obstacle_shapes, self.dim)
         check_surroundings(self)
 
     @property
@@ -321,7 +325,9 @@ def _obstacles(config: BodyScene, rng: np.random.Generator) -> tuple[Shape, ...]
         if any(np.linalg.norm(center - c) < radius + r + gap for c, r in circles):
             continue
         circles.append((center, radius))
-        if kind == 0:
+        if config.obstacle_shapes == "angular":
+            obstacles.append(angular_obstacle(center, radius, friction, rng))
+        elif kind == 0:
             half = radius * np.array([math.cos(share * math.pi / 2), math.sin(share * math.pi / 2), 0.5][: config.dim])
             obstacles.append(Box(floats(center - half), floats(center + half), friction))
         elif kind == 1:
@@ -331,6 +337,25 @@ def _obstacles(config: BodyScene, rng: np.random.Generator) -> tuple[Shape, ...]
             vertices = center + radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
             obstacles.append(Polygon(tuple((float(x), float(y)) for x, y in vertices), friction))
     return tuple(obstacles)
+
+
+def check_obstacle_shapes(shapes: ObstacleShapes, dim: int) -> None:
+    """Raise ``ValueError`` where obstacles of this kind do not exist."""
+    if shapes == "angular" and dim != 2:
+        raise ValueError("obstacle_shapes='angular' are polygons, which exist in 2D only; use 'plain'")
+
+
+def angular_obstacle(center: np.ndarray, radius: float, friction: float, rng: np.random.Generator) -> Polygon:
+    """A star of four to six points or a tilted ramp four times as long as thick, within a circle."""
+    angle = rng.uniform(0, 2 * math.pi)
+    if rng.random() < 0.5:
+        points = 2 * int(rng.integers(4, 7))
+        turn, reach = angle + 2 * math.pi * np.arange(points) / points, np.where(np.arange(points) % 2, 0.5, 1.0)
+    else:
+        half = math.atan2(1.0, 4.0)
+        turn, reach = angle + np.array([-half, half, math.pi - half, math.pi + half]), np.ones(4)
+    vertices = center + radius * reach[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    return Polygon(tuple((float(x), float(y)) for x, y in vertices), friction)
 
 
 def _bodies(config: BodyScene, shapes: tuple[Shape, ...], rng: np.random.Generator) -> list[_Body] | None:

@@ -18,7 +18,10 @@ from gpe_pl.meshing import TETRAHEDRA_PER_CUBE, MeshingError, quadrangulate, ran
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.scenes import (
     MAX_ATTEMPTS,
+    ObstacleShapes,
+    angular_obstacle,
     check_domain,
+    check_obstacle_shapes,
     check_ranges,
     check_surroundings,
     draw_friction,
@@ -49,6 +52,7 @@ class SolidScene:
         gravity: [m/s²].
         num_obstacles: range of their number.
         obstacle_radius: range of their circumscribed radii [m].
+        obstacle_shapes: ``plain`` are boxes, balls and, in 2D, irregular polygons; ``angular``, in 2D, are stars and tilted ramps.
         obstacle_height: obstacles have their centres in this lowest fraction of the domain.
         drop_height: range of the gap between the body and the floor, or more where obstacles are in the way [m].
         max_speed: of the body along each axis [m/s]; upward at most a quarter of it.
@@ -68,6 +72,7 @@ class SolidScene:
     gravity: tuple[float, ...] = (0.0, -9.81)
     num_obstacles: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] = (1, 3)
     obstacle_radius: tuple[PositiveFloat, PositiveFloat] = (0.06, 0.15)
+    obstacle_shapes: ObstacleShapes = "plain"
     obstacle_height: Probability = 0.5
     drop_height: tuple[NonNegativeFloat, NonNegativeFloat] = (0.05, 0.3)
     max_speed: NonNegativeFloat = 2.0
@@ -84,6 +89,7 @@ class SolidScene:
             raise ValueError(f"cell={self.cell} needs bounds and gravity of {axes} axes, got {len(self.bounds)} and {len(self.gravity)}")
         check_domain(self.bounds, self.gravity)
         check_ranges(self, "num_obstacles", "obstacle_radius", "drop_height")
+        check_obstacle_shapes(self.obstacle_shapes, self.dim)
         check_surroundings(self)
 
     @property
@@ -208,7 +214,8 @@ def _obstacles(config: SolidScene, rng: np.random.Generator) -> tuple[Shape, ...
         if np.any(room_low > room_high):
             continue
         center = rng.uniform(room_low, room_high)
-        shape = _obstacle(center, radius, friction, rng)
+        make = angular_obstacle if config.obstacle_shapes == "angular" else _obstacle
+        shape = make(center, radius, friction, rng)
         if all(np.linalg.norm(center - c) >= radius + r + gap for c, r in taken):
             taken.append((center, radius))
             obstacles.append(shape)

@@ -39,28 +39,38 @@ def _drop(inside, outside):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def extend_into_solids(active, strides, area, cell_room, half, density, viscous, touched):
-    """Give open cells whose centre is solid the mean density of the neighbours whose centre is not, weighted by the opening between them.
-
-    Their own density is measured in too little room, and liquid that seems empty would suck in its surroundings. Cells reached are marked as touched.
-    """
+def reach_into_solids(active, strides, area, cell_room, half, density, touched):
+    """Mark as touched the open cells whose centre is solid next to cells with mass whose centre is not."""
     for n in active:
         if not density[n] > 0.0 or cell_room[n] < half:
             continue
         for m in range(2 * strides.shape[0]):
             c = n + strides[m // 2] if m % 2 == 0 else n - strides[m // 2]
-            if cell_room[c] >= half or not area[m // 2, max(n, c)] > 0.0:
-                continue
-            touched[c] = True
-            opening = total = total_viscous = 0.0
-            for k in range(2 * strides.shape[0]):
-                other = c + strides[k // 2] if k % 2 == 0 else c - strides[k // 2]
-                if cell_room[other] >= half:
-                    share = area[k // 2, max(c, other)]
-                    opening += share
-                    total += share * density[other]
-                    total_viscous += share * viscous[other]
-            density[c], viscous[c] = total / opening, total_viscous / opening
+            if cell_room[c] < half and area[m // 2, max(n, c)] > 0.0:
+                touched[c] = True
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def extend_into_solids(active, strides, area, cell_room, half, density, viscous):
+    """Give cells whose centre is solid their density together with as much liquid as ``half`` a cell of their open neighbours holds.
+
+    Alone, too few particles measure it: liquid that seems empty would suck in its surroundings. Without its own mass, particles would gather in it.
+    """
+    for c in active:
+        if cell_room[c] >= half:
+            continue
+        opening = total = total_viscous = 0.0
+        for k in range(2 * strides.shape[0]):
+            other = c + strides[k // 2] if k % 2 == 0 else c - strides[k // 2]
+            if cell_room[other] >= half:
+                share = area[k // 2, max(c, other)]
+                opening += share
+                total += share * density[other]
+                total_viscous += share * viscous[other]
+        if opening > 0.0:
+            density[c] = (density[c] + half * total / opening) / (cell_room[c] + half)
+            viscous[c] = (viscous[c] + half * total_viscous / opening) / (cell_room[c] + half)
 
 
 @njit(cache=True, error_model="numpy")

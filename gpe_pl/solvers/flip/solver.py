@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as validated_dataclass
 
-from gpe_pl.geometry import Wall, domain_walls, outward_normal, signed_distance, thickness
+from gpe_pl.geometry import Wall, check_whole_cells, domain_walls, outward_normal, signed_distance, thickness
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, NODE_TYPES, node_code, param_names
 from gpe_pl.solvers.flip import islands, pressure, transfer, viscosity
@@ -110,6 +110,9 @@ class FLIP:
     slip, whatever their friction; at a small viscosity the layer at rest is as thin as physics makes it. Bodies of liquid that touch no solid follow a
     parabola exactly. Obstacles and gaps should be at least two cells wide.
 
+    The share ``pic`` acts like a further kinematic viscosity ``Δ²/(6τ)`` with ``τ = -10 ms / ln(1 - pic)``, however long the substeps are: a trip to the grid
+    and back spreads momentum with the variance Δ²/3 along each axis. It is ``numerical_viscosity``; flows of a liquid that is thinner differ little.
+
     Attributes:
         bounds: ``(low, high)`` per axis of the domain [m], two or three axes; whole multiples of the grid spacing apart.
         grid_spacing: Δ [m]; about two particles per cell and axis.
@@ -139,17 +142,11 @@ class FLIP:
     max_iterations: Annotated[int, Field(ge=1)] = 2000
 
     name: ClassVar[str] = "flip"
-    version: ClassVar[str] = "1"
+    version: ClassVar[str] = "2"
+    stores_stress: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if len(self.bounds) not in (2, 3):
-            raise ValueError(f"bounds must have 2 or 3 axes, got {len(self.bounds)}")
-        for axis, (low, high) in enumerate(self.bounds):
-            cells = (high - low) / self.grid_spacing
-            if not (math.isfinite(cells) and cells > 0.5 and abs(cells - round(cells)) < 1e-6 * cells):
-                raise ValueError(
-                    f"bounds[{axis}] = ({low}, {high}) must span a whole number of grid cells of {self.grid_spacing} m, got {cells:g}"
-                )
+        check_whole_cells(self.bounds, self.grid_spacing)
         if self.materials != (MATERIAL,):
             raise ValueError(f"FLIP simulates materials ({MATERIAL!r},) only, got {self.materials}")
 
@@ -157,6 +154,12 @@ class FLIP:
     def solver_dt(self) -> float:
         """Largest substep in s."""
         return self.frame_dt
+
+    @property
+    def numerical_viscosity(self) -> float:
+        """Kinematic viscosity in m²/s that ``pic`` adds to that of the liquid; infinite for ``pic = 1``, which acts once per substep."""
+        rate = math.inf if self.pic == 1 else -math.log1p(-self.pic) / SHARE_TIME
+        return rate * self.grid_spacing**2 / 6.0
 
     def compile_kernels(self) -> None:
         """Compile every kernel and fill Numba's cache on disk, so that worker processes started afterwards only load it; good for 2D and 3D."""
@@ -211,10 +214,10 @@ class FLIP:
         transfer.normalize(
             active, solids.cell_room, solids.face_room, HALF, fields.velocity, fields.old, fields.weight, fields.density, fields.viscous
         )
-        pressure.extend_into_solids(
-            active, grid.strides, solids.area, solids.cell_room, HALF, fields.density, fields.viscous, fields.touched
-        )
-        return np.flatnonzero(fields.touched)
+        pressure.reach_into_solids(active, grid.strides, solids.area, solids.cell_room, HALF, fields.density, fields.touched)
+        active = np.flatnonzero(fields.touched)
+        pressure.extend_into_solids(active, grid.strides, solids.area, solids.cell_room, HALF, fields.density, fields.viscous)
+        return active
 
     def diffuse(self, active: np.ndarray, solids: Solids, fields: Fields, h: float) -> None:
         """Let viscosity act on the grid's velocities for a time h [s]."""

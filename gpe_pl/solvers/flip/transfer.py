@@ -80,11 +80,14 @@ def scatter(pos, vel, volume, viscosity, origin, inverse, strides, counts, corne
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def normalize(active, cell_room, face_room, smallest_room, velocity, old, weight, density, viscous):
-    """Turn the sums of ``scatter`` into velocities, kept in ``old`` too, and into densities relative to the room that solids leave."""
+    """Turn the sums of ``scatter`` into velocities, kept in ``old`` too, and into densities relative to the room that solids leave.
+
+    Cells with less than ``smallest_room`` keep their sums.
+    """
     for c in active:
-        room = max(cell_room[c], smallest_room)
-        density[c] /= room
-        viscous[c] /= room
+        if cell_room[c] >= smallest_room:
+            density[c] /= cell_room[c]
+            viscous[c] /= cell_room[c]
         for a in range(velocity.shape[0]):
             if weight[a, c] > 0.0:
                 velocity[a, c] /= weight[a, c]
