@@ -110,6 +110,8 @@ def _predict(
     history = simulator.builder.config.history
     truths = [trajectory.frames(history) for trajectory in trajectories]
     starts = [_start(simulator, *pair) for pair in zip(trajectories, truths, strict=True)]
+    for line in sorted({line for start in starts for line in simulator.untrained_parameters(start.state)}):
+        log.warning("outside the training data: %s", line)
     num_corrected = [0] * len(starts)
 
     def count(scene: int, _: int, state: State) -> None:

@@ -239,7 +239,7 @@ def _training_table(names: list[str], variants: dict[tuple[str, ...], list[Run]]
 
 
 def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]], first: Run) -> list[str]:
-    splits = sorted({s for r in first.rows for s in groups_of(r)})
+    splits = sorted({r.split for r in first.rows})  # table.csv also has the parts of test_unseen
     horizons = sorted({r.horizon for r in first.rows if r.metric == "rollout_mse"}, key=lambda h: (h == "full", h.zfill(6)))[
         -TABLE_HORIZONS:
     ]
@@ -261,8 +261,8 @@ def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]],
             lines.append(table_row([baseline, *[""] * (len(names) - 1), split, *cells]))
     note = (
         "Rollout MSE ×1e-3 [m²] over frames 1 … h, nodes and axes: mean over trajectories and seeds, 95 % bootstrap interval over both (too narrow where "
-        "seeds or trajectories are few), and how many times lower than the best trivial baseline. `test_unseen` holds friction angles that training did "
-        "not have, between the trained ones (interpolated) and outside their range (extrapolated)."
+        "seeds or trajectories are few), and how many times lower than the best trivial baseline. `test_unseen` holds material parameters that training "
+        "did not have, between the trained ones and outside their range; `table.csv` has these two apart."
     )
     return [*lines, "", note]
 

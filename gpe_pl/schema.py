@@ -41,6 +41,9 @@ MATERIALS: dict[str, MaterialParameter] = {
 }
 """Dynamic node types with their material parameter; the order fixes the integer codes of ``node_type``."""
 
+MESH_MATERIALS = ("elastomer", "solid")
+"""Materials that keep their neighbours: with ``graph.mesh`` they are connected along their cells."""
+
 BOUNDARY = "boundary"
 NODE_TYPES: tuple[str, ...] = (*MATERIALS, BOUNDARY)
 RADIUS, CELL, SAME, DOWN = "radius", "cell", "same", "down"
@@ -57,6 +60,22 @@ ParameterGroup = Literal["seen", "interpolated", "extrapolated"]
 def grid(level: int) -> str:
     """Node type of the virtual nodes of a level; level 1 lies above the mesh nodes."""
     return f"grid_{level}"
+
+
+def level_of(node_type: str) -> int:
+    """Level of a type of virtual nodes."""
+    return int(node_type.removeprefix("grid_"))
+
+
+def role(node_type: str) -> str:
+    """What statistics and weights are shared by: the virtual nodes of all levels have one role, every other node type has its own."""
+    return "grid" if node_type.startswith("grid_") else node_type
+
+
+def is_symmetric(relation: EdgeType) -> bool:
+    """Whether the two ends of an edge can change places: ends of one type, unless one is the parent of the other."""
+    source, name, target = relation
+    return source == target and name != DOWN
 
 
 def node_code(name: str) -> int:
@@ -77,6 +96,16 @@ def radius_relations(materials: tuple[str, ...]) -> tuple[EdgeType, ...]:
     names = [m for m in MATERIALS if m in materials]
     pairs = [(a, RADIUS, b) for i, a in enumerate(names) for b in names[i:]]
     return (*pairs, *((BOUNDARY, RADIUS, m) for m in names))
+
+
+def mesh_relations(materials: tuple[str, ...], num_levels: int) -> tuple[EdgeType, ...]:
+    """The relations that meshes add: along cells, and level by level between virtual nodes and from each to its children."""
+    meshes = [m for m in MESH_MATERIALS if m in materials]
+    if not meshes:
+        return ()
+    same = [(grid(level), SAME, grid(level)) for level in range(1, num_levels + 1)]
+    down = [(grid(level), DOWN, grid(level - 1)) for level in range(2, num_levels + 1)]
+    return (*((m, CELL, m) for m in meshes), *((grid(1), DOWN, m) for m in meshes if num_levels), *same, *down)
 
 
 @dataclass(frozen=True)

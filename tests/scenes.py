@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from scipy.spatial import Delaunay
 from torch_geometric.data import HeteroData
 
 from gpe_pl.geometry import domain_walls
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.schema import STICKY, node_code, param_names
+from gpe_pl.schema import MESH_MATERIALS, STICKY, node_code, param_names
 from gpe_pl.trajectory import Boundary, Metadata, State
 
 SPACING = 0.05
@@ -64,6 +65,63 @@ def state(
     )
 
 
+def mesh(kind: str, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Points in rest spacings and cells of one body: a ``lattice`` of quadrilaterals, unstructured ``triangles`` or ``tetrahedra``."""
+    rng = np.random.default_rng(seed)
+    if kind == "lattice":
+        number = np.arange(np.prod(shape := tuple(rng.integers(3, 8, 2)))).reshape(shape)
+        cells = np.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], axis=-1).reshape(-1, 4)
+        return np.argwhere(number >= 0).astype(float), cells
+    size: tuple[int, ...] = (5, 7) if kind == "triangles" else (3, 4, 3)
+    points = np.argwhere(np.ones(size)) + rng.uniform(-0.3, 0.3, (int(np.prod(size)), len(size)))
+    return points, Delaunay(points).simplices.astype(np.int64)
+
+
+def mesh_state(
+    kind: str = "triangles",
+    materials: tuple[str, ...] = ("elastomer",),
+    num_bodies: int = 2,
+    gap: float = 1.5,
+    history: int = 1,
+    seed: int = 0,
+    walls: bool = True,
+) -> State:
+    """Bodies of ``mesh`` side by side, ``gap`` spacings apart, strained and moving; the other materials of the scene are clouds; node order is random."""
+    dim, rng = 3 if kind == "tetrahedra" else 2, np.random.default_rng(seed)
+    meshes = [m for m in materials if m in MESH_MATERIALS]
+    points, cells, edge = [np.empty((0, dim))], [], 1.0
+    kinds: list[str] = []
+    for k in range(num_bodies):
+        x, c = mesh(kind, seed + k)
+        x = x - x.min(axis=0)
+        x[:, 0] += edge
+        x[:, 1:] += 1.0
+        edge = x[:, 0].max() + gap
+        cells.append(c + len(kinds))
+        points.append(x)
+        kinds += [meshes[k % len(meshes)]] * len(x)
+    rest = SPACING * np.concatenate(points)
+    others = [m for m in materials if m not in MESH_MATERIALS]
+    s = state(len(kinds) + 15 * len(others), materials, history, seed, walls, dim)
+    assert s.velocity_history is not None
+    kinds += [others[k % len(others)] for k in range(15 * len(others))]
+    pos = s.pos.copy()
+    pos[: len(rest)] = rest @ (np.eye(dim) + 0.05 * rng.normal(size=(dim, dim))) + 0.002 * rng.normal(size=rest.shape)
+    names = param_names(materials)
+    params = np.full((len(kinds), len(names)), np.nan)
+    for row, material in enumerate(kinds):
+        params[row, names.index(param_names((material,))[0])] = rng.uniform(1.0, 40.0)
+    s = replace(
+        s,
+        pos=pos,
+        node_type=np.array([node_code(m) for m in kinds], dtype=np.uint8),
+        material_params=params,
+        rest_pos=np.concatenate([rest, pos[len(rest) :]]),
+        cells=np.concatenate(cells),
+    )
+    return permuted(s, rng.permutation(s.num_nodes))
+
+
 def builder(materials: tuple[str, ...] = ("sand",), dim: int = 2, **config: object) -> GraphBuilder:
     """A graph builder for such states."""
     return GraphBuilder(GraphConfig(**{"history": 1, **config}), metadata(materials, dim))  # type: ignore[arg-type]
@@ -85,10 +143,13 @@ def to_dtype(data: HeteroData, dtype: torch.dtype) -> HeteroData:
 
 
 def permuted(s: State, order: np.ndarray) -> State:
-    """The same state with its nodes in another order."""
+    """The same state with its nodes in another order, or some of them (then without its mesh)."""
     assert s.velocity_history is not None
+    rest_pos, cells = (s.rest_pos, s.cells) if len(order) == s.num_nodes else (None, None)
     return replace(
         s,
+        rest_pos=None if rest_pos is None else rest_pos[order],
+        cells=None if cells is None else np.argsort(order)[cells],
         pos=s.pos[order],
         vel=s.vel[order],
         node_type=s.node_type[order],

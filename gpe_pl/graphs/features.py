@@ -1,18 +1,30 @@
 """Node and edge features, made dimensionless with the data set's own scales.
 
-``paper``: the relative displacement only (paper, section 2.1). ``contact``: also the unit vector, the relative velocity, the gap in units of the rest
-spacing, and how the pair meets a wall; odd channels change sign when source and target swap, even channels do not.
+``paper``: the relative displacement only (paper, section 2.1). ``contact``: also how a pair moves, how near it is to touching, how it meets a wall, and in a
+mesh how far it is from its rest shape. Odd channels change sign when source and target swap, even channels do not.
 """
 
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int64
 from pydantic import Field
 from torch import Tensor
 
-from gpe_pl.schema import BOUNDARY, FeatureSpec, param_names, radius_relations
+from gpe_pl.graphs.multiscale import levels_of
+from gpe_pl.schema import (
+    BOUNDARY,
+    CELL,
+    MESH_MATERIALS,
+    RADIUS,
+    EdgeType,
+    FeatureSpec,
+    grid,
+    mesh_relations,
+    param_names,
+    radius_relations,
+)
 from gpe_pl.trajectory import Boundary, Metadata, State
 
 Features = Literal["paper", "contact"]
@@ -33,12 +45,16 @@ class GraphConfig:
         history: velocities per node.
         connectivity_radius: neighbour radius [m]; None takes the data set's.
         trim_boundary: leave out boundary nodes without an edge, which cannot influence anything.
+        mesh: connect ``schema.MESH_MATERIALS`` along their cells and put levels of virtual nodes above them; without it they are particles like the others.
+        num_levels: of virtual nodes; None takes as many as lead to one root in any body of the domain.
     """
 
     features: Features = "contact"
     history: Annotated[int, Field(ge=1, le=20)] = 5
     connectivity_radius: Annotated[float, Field(gt=0)] | None = None
     trim_boundary: bool = True
+    mesh: bool = False
+    num_levels: Annotated[int, Field(ge=0, le=20)] | None = None
 
 
 @dataclass(frozen=True)
@@ -67,18 +83,38 @@ def scales_of(config: GraphConfig, metadata: Metadata) -> Scales:
 
 def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
     """Channel counts of the graphs that ``config`` makes of a data set."""
-    dim = metadata.dim
-    materials = tuple(m for m in metadata.materials)
-    relations = radius_relations(materials)
+    dim, materials = metadata.dim, metadata.materials
+    meshes = set(materials) & set(MESH_MATERIALS) if config.mesh else set()
+    if not meshes:
+        num_levels = 0
+    elif config.num_levels is not None:
+        num_levels = config.num_levels
+    else:
+        num_levels = levels_of(max(high - low for low, high in metadata.bounds), metadata.spacing)
+    relations = (*radius_relations(materials), *(mesh_relations(materials, num_levels) if meshes else ()))
+    motion = (config.history + 1) * dim
+    virtual = {grid(level): motion + 1 for level in range(1, num_levels + 1)}
+    channels = {r: _edge_channels(config.features, r, dim) for r in relations}
     return FeatureSpec(
         dim=dim,
         materials=materials,
-        node_channels={**dict.fromkeys(materials, (config.history + 1) * dim), BOUNDARY: 2 * dim + 2},
+        node_channels={**dict.fromkeys(materials, motion), BOUNDARY: 2 * dim + 2, **virtual},
         param_channels={m: len(param_names((m,))) for m in materials},
         relations=relations,
-        odd_channels=dict.fromkeys(relations, dim if config.features == "paper" else 3 * dim),
-        even_channels=dict.fromkeys(relations, 0 if config.features == "paper" else 4),
+        odd_channels={r: odd for r, (odd, _) in channels.items()},
+        even_channels={r: even for r, (_, even) in channels.items()},
+        stress_channels={"solid": 4 if dim == 2 else 6} if "solid" in materials else {},
+        num_levels=num_levels,
     )
+
+
+def _edge_channels(features: Features, relation: EdgeType, dim: int) -> tuple[int, int]:
+    """Odd and even channels of ``edge_features`` (``radius``) and ``mesh_features`` (all other relations)."""
+    if features == "paper":
+        return dim, 0
+    if relation[1] == RADIUS:
+        return 3 * dim, 4
+    return 4 * dim, 3 if relation[1] == CELL else 4
 
 
 def material_features(velocity_history: Float64[Tensor, "node history dim"], gravity: Float64[Tensor, " dim"], scales: Scales) -> Tensor:
@@ -133,6 +169,54 @@ def edge_features(
     odd = torch.cat([relative, unit, velocity], dim=1)
     even = torch.cat([gap, approach, wall, wall_approach], dim=1)
     return odd.float(), even.float()
+
+
+def virtual_features(
+    velocity_history: Float64[Tensor, "node history dim"], level: Int64[Tensor, " node"], gravity: Float64[Tensor, " dim"], scales: Scales
+) -> Tensor:
+    """Features of virtual nodes [node, (history + 1) · dim + 1]: those of material nodes, and the level, which is log₂ of width over rest spacing."""
+    return torch.cat([material_features(velocity_history, gravity, scales), level[:, None].float()], dim=1)
+
+
+def mesh_features(
+    features: Features,
+    displacement: Float64[Tensor, "edge dim"],
+    rest_displacement: Float64[Tensor, "edge dim"],
+    relative_velocity: Float64[Tensor, "edge dim"],
+    level: Int64[Tensor, " edge"] | None,
+    scales: Scales,
+) -> tuple[Float[Tensor, "edge odd"], Float[Tensor, "edge even"]]:
+    """Odd and even channels of the edges of meshes, in units of the level's width, so that all levels of a uniformly strained body look alike.
+
+    With x the displacement, X that at rest and x̂ = x/|x|: odd are x, the relative velocity, X and (|x| − |X|) x̂, along which a spring pulls; even are
+    |x| − |X|, the velocity along x̂ and |X|, and between virtual nodes the level.
+
+    Args:
+        features: which set.
+        displacement: x_target − x_source [m].
+        rest_displacement: the same at rest [m].
+        relative_velocity: v_target − v_source [m/s].
+        level: of the source; None for cell edges, which have width one spacing.
+        scales: units.
+    """
+    width = scales.spacing if level is None else scales.spacing * torch.exp2(level.double())[:, None]
+    relative, rest = _without_rounding(displacement / width), _without_rounding(rest_displacement / width)
+    if features == "paper":
+        return relative.float(), relative.new_empty((len(relative), 0)).float()
+    velocity = relative_velocity * scales.frame_dt / width
+    length = (relative.square().sum(dim=1, keepdim=True) + TINY**2).sqrt()
+    rest_length = rest.norm(dim=1, keepdim=True)
+    unit, stretch = relative / length, length - rest_length  # the unit vector is zero for coincident nodes
+    odd = [relative, velocity, rest, stretch * unit]
+    even = [stretch, (velocity * unit).sum(dim=1, keepdim=True), rest_length]
+    if level is not None:
+        even.append(level[:, None].double())
+    return torch.cat(odd, dim=1).float(), torch.cat(even, dim=1).float()
+
+
+def _without_rounding(displacement: Tensor) -> Tensor:
+    """Zero where it is not above the rounding of a mean of positions: rows of virtual nodes above a lattice stay exactly in line, as its own rows do."""
+    return torch.where(displacement.abs() < 1e-9, 0.0, displacement)
 
 
 def history_of(state: State) -> Float64[Tensor, "node history dim"]:

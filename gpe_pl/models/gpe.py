@@ -6,6 +6,9 @@ Encoder, processor and decoder over typed nodes and relations, one parameter set
     m_ij  = f_e(h_i, h_j, e_ij),  m_ji = −m_ij           (nn.momentum_conv)
     h_i  += f_v(Σ_j m_ij)                                e_ij += m_ij
     a_i   = f_d(h_i)                                     or a sum of antisymmetric pair forces over the true mass
+
+Virtual nodes above meshes take part as nodes of their own types and carry hidden messages only. ``simultaneous``, as in Algorithm 1, lets a message climb one
+level per step; ``sweep`` climbs all levels, passes messages within each, and comes down again, so that every step couples the whole body.
 """
 
 from typing import Annotated, Literal, cast
@@ -16,13 +19,22 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
+from gpe_pl.errors import GpeError
 from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import MLP
 from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction, MomentumConv, orient
-from gpe_pl.schema import BOUNDARY, EdgeType, FeatureSpec
+from gpe_pl.schema import CELL, DOWN, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
 
 Decoder = Literal["node", "pair"]
+LevelWeights = Literal["shared", "separate"]
+Schedule = Literal["simultaneous", "sweep"]
+Edges = dict[EdgeType, tuple[Tensor, Tensor, Tensor]]
+"""``edge_index``, ``odd`` and ``even`` of the relations that have edges."""
 MaterialEmbeddingKind = Literal["affine", "mlp"]
+
+
+class StressError(GpeError, ValueError):
+    """A stress decoder was asked for where the data set stores no stress."""
 
 
 class MaterialEmbedding(nn.Module):
@@ -82,8 +94,23 @@ class PairForce(nn.Module):
         return self.lin_out(forward - reverse)
 
 
-def _key(relation: EdgeType) -> str:
-    return "__".join(relation)
+def _merge_levels(x: dict[str, Tensor], edges: Edges) -> tuple[dict[str, Tensor], Edges]:
+    """All levels of virtual nodes as one node type: the same messages in fewer calls, for weights that all levels share."""
+    first: dict[str, int] = {}
+    nodes: dict[str, list[Tensor]] = {}
+    for node_type, value in x.items():
+        parts = nodes.setdefault(role(node_type), [])
+        first[node_type] = sum(len(part) for part in parts)
+        parts.append(value)
+    merged: dict[EdgeType, list[tuple[Tensor, Tensor, Tensor]]] = {}
+    for (source, name, target), (index, odd, even) in edges.items():
+        offset = index.new_tensor([[first[source]], [first[target]]])
+        merged.setdefault((role(source), name, role(target)), []).append((index + offset, odd, even))
+    joined: Edges = {}
+    for relation, stores in merged.items():
+        indices, odds, evens = zip(*stores, strict=True)
+        joined[relation] = torch.cat(indices, dim=1), torch.cat(odds), torch.cat(evens)
+    return {t: torch.cat(parts) for t, parts in nodes.items()}, joined
 
 
 class GPE(nn.Module):
@@ -98,6 +125,12 @@ class GPE(nn.Module):
         num_message_passing_steps: processor layers; 12 in the paper.
         hidden_channels: width of everything; 128 in the paper.
         implementation: ``factored`` or ``plain``; the same function of the same parameters.
+        level_weights: one set for all levels of virtual nodes, which then serves any number of levels, or one per level (paper).
+        schedule: the order of messages between levels; ``simultaneous`` (paper) or ``sweep``.
+        stress: also decode the stress of materials that have one.
+
+    Raises:
+        StressError: ``stress`` without a material that has one.
     """
 
     def __init__(
@@ -110,6 +143,9 @@ class GPE(nn.Module):
         num_message_passing_steps: Annotated[int, Field(ge=1, le=64)] = 12,
         hidden_channels: Annotated[int, Field(ge=1, le=4096)] = 128,
         implementation: Implementation = "factored",
+        level_weights: LevelWeights = "shared",
+        schedule: Schedule = "simultaneous",
+        stress: bool = False,
     ) -> None:
         super().__init__()
         self.settings = {
@@ -120,93 +156,156 @@ class GPE(nn.Module):
             "num_message_passing_steps": num_message_passing_steps,
             "hidden_channels": hidden_channels,
             "implementation": implementation,
+            "level_weights": level_weights,
+            "schedule": schedule,
+            "stress": stress,
         }
+        if stress and not spec.stress_channels:
+            raise StressError(
+                f"model.stress=true, but no stress is stored of {', '.join(spec.materials)}; choose model.stress=false or data=fem"
+            )
         self.spec, self.interaction, self.decoder, self.edge_state = spec, interaction, decoder, edge_state
+        self.level_weights, self.schedule = level_weights, schedule
         self.num_message_passing_steps = num_message_passing_steps
         hidden = hidden_channels
         params = {m: c for m, c in spec.param_channels.items() if c}
         self.material_embedding = nn.ModuleDict({m: MaterialEmbedding(c, hidden, material_embedding) for m, c in params.items()})
-        self.node_encoder = nn.ModuleDict(
-            {t: MLP(spec.node_channels[t] + (hidden if t in params else 0), hidden, hidden) for t in spec.node_types}
-        )
-        self.edge_encoder = nn.ModuleDict()
-        if edge_state == "latent":
-            for relation in spec.relations:
+        readable = self._readable()
+        relations = [r for r in spec.relations if {r[0], r[2]} & readable[0]]
+        ends = readable[0].union(*({r[0], r[2]} for r in relations))
+        self.node_encoder, self.edge_encoder = nn.ModuleDict(), nn.ModuleDict()
+        for t in spec.node_types:
+            if t in ends and self.type_key(t) not in self.node_encoder:
+                self.node_encoder[self.type_key(t)] = MLP(spec.node_channels[t] + (hidden if t in params else 0), hidden, hidden)
+        for relation in relations if edge_state == "latent" else []:
+            if self.key(relation) not in self.edge_encoder:
                 odd, even = spec.odd_channels[relation], spec.even_channels[relation]
                 is_odd = self._interaction(relation) in ("odd", "odd_even")
-                self.edge_encoder[_key(relation)] = OddEncoder(odd, even, hidden) if is_odd else MLP(odd + even, hidden, hidden)
+                self.edge_encoder[self.key(relation)] = OddEncoder(odd, even, hidden) if is_odd else MLP(odd + even, hidden, hidden)
         self.convs, self.updates = nn.ModuleList(), nn.ModuleList()
-        for step in range(num_message_passing_steps):
+        for types in readable:
             convs = nn.ModuleDict()
-            for relation in spec.relations:
+            for relation in relations:
+                if self.key(relation) in convs or not {relation[0], relation[2]} & types:
+                    continue
                 kind = self._interaction(relation)
                 odd, even = spec.odd_channels[relation], spec.even_channels[relation]
                 raw_edge = odd if kind in ("odd", "odd_even") else odd + even
                 edge_channels = hidden if edge_state == "latent" else raw_edge
-                convs[_key(relation)] = MomentumConv(hidden, edge_channels, even, kind, implementation)
+                convs[self.key(relation)] = MomentumConv(hidden, edge_channels, even, kind, implementation)
             self.convs.append(convs)
-            last = step == num_message_passing_steps - 1  # nobody reads the boundary's state after the last step
-            self.updates.append(nn.ModuleDict({t: MLP(hidden, hidden, hidden) for t in (spec.materials if last else spec.node_types)}))
+            keys = dict.fromkeys(self.type_key(t) for t in spec.node_types if t in types)
+            self.updates.append(nn.ModuleDict({k: MLP(hidden, hidden, hidden) for k in keys}))
         if decoder == "node":
             self.node_decoder = nn.ModuleDict({m: MLP(hidden, hidden, spec.dim) for m in spec.materials})
         else:
-            self.pair_decoder = nn.ModuleDict({_key(r): PairForce(spec, r, hidden) for r in spec.relations})
+            forces = [r for r in spec.relations if r[1] in (RADIUS, CELL)]
+            self.pair_decoder = nn.ModuleDict({self.key(r): PairForce(spec, r, hidden) for r in forces})
+        if stress:
+            self.stress_decoder = nn.ModuleDict({m: MLP(hidden, hidden, c) for m, c in spec.stress_channels.items()})
+
+    def type_key(self, node_type: str) -> str:
+        """Under which name the weights of a node type are kept."""
+        return role(node_type) if self.level_weights == "shared" else node_type
+
+    def key(self, relation: EdgeType) -> str:
+        """Under which name the weights of a relation are kept."""
+        source, name, target = relation
+        return f"{self.type_key(source)}__{name}__{self.type_key(target)}"
 
     def _interaction(self, relation: EdgeType) -> Interaction:
-        same = relation[0] == relation[2]
-        return self.interaction if same or self.interaction == "directed" else "negated"
+        return self.interaction if is_symmetric(relation) or self.interaction == "directed" else "negated"
+
+    def _readable(self) -> list[set[str]]:
+        """For every step, the node types whose state after it can still reach a material."""
+        if self.schedule == "sweep":  # within a step, messages go everywhere; only the boundary's last state has no reader
+            virtual = {grid(level) for level in range(1, self.spec.num_levels + 1)}
+            return [{*self.spec.node_types}] * (self.num_message_passing_steps - 1) + [{*self.spec.materials} | virtual]
+        readable = [{*self.spec.materials}]
+        while len(readable) < self.num_message_passing_steps:
+            readers = readable[-1]
+            readable.append(readers.union(*({r[0], r[2]} for r in self.spec.relations if {r[0], r[2]} & readers)))
+        return readable[::-1]
 
     def forward(self, data: HeteroData) -> Prediction:
-        """Accelerations without gravity per material, in units of the data set's acceleration scale; types and relations without members are skipped."""
-        x = {t: data[t].x for t in self.spec.node_types if data[t].x.shape[0]}
+        """Accelerations without gravity per material, in units of the data set's acceleration scale, and stresses.
+
+        Node types and relations that have no members, or cannot reach a material in so many steps, are skipped.
+        """
+        x = {t: data[t].x for t in self.spec.node_types if self.type_key(t) in self.node_encoder and data[t].x.shape[0]}
         params = {m: data[m].material_params for m in self.material_embedding if m in x}
         mass = {m: data[m].mass for m in self.spec.materials if m in x}
-        edges = {r: (data[r].edge_index, data[r].odd, data[r].even) for r in self.spec.relations if data[r].edge_index.shape[1]}
-        return Prediction(self.compute(x, params, mass, edges))
+        convs = cast(nn.ModuleDict, self.convs[0])
+        relations = [r for r in self.spec.relations if self.key(r) in convs and data[r].edge_index.shape[1]]
+        edges = {r: (data[r].edge_index, data[r].odd, data[r].even) for r in relations}
+        if grid(1) in x and self.level_weights == "shared" and self.schedule == "simultaneous":
+            x, edges = _merge_levels(x, edges)
+        return Prediction(*self.compute(x, params, mass, edges))
 
     def compute(
         self,
         x: dict[str, Tensor],
         params: dict[str, Tensor],
         mass: dict[str, Tensor],
-        edges: dict[EdgeType, tuple[Tensor, Tensor, Tensor]],
-    ) -> dict[str, Tensor]:
-        """``forward`` on plain tensors: the part that ``torch.compile`` sees."""
+        edges: Edges,
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """``forward`` on plain tensors: the part that ``torch.compile`` sees. Accelerations and stresses per material."""
         if self.interaction == "negated":
-            edges = {r: (*orient(index, odd), even) if r[0] == r[2] else (index, odd, even) for r, (index, odd, even) in edges.items()}
+            edges = {r: (*orient(index, odd), even) if is_symmetric(r) else (index, odd, even) for r, (index, odd, even) in edges.items()}
         h = {t: self._encode_node(t, x[t], params.get(t)) for t in x}
         e = {r: self._encode_edge(r, odd, even) for r, (_, odd, even) in edges.items()}
 
+        phases = self._phases([*x], edges)
         for step in range(self.num_message_passing_steps):
-            last = step == self.num_message_passing_steps - 1
-            with_messages = self.edge_state == "latent" and not last
-            total: dict[str, Tensor] = {}
-            for relation, (edge_index, _, even) in edges.items():
-                source, _, target = relation
-                conv = cast(nn.ModuleDict, self.convs[step])[_key(relation)]
-                at_target, at_source, messages = conv(h[source], h[target], edge_index, e[relation], even, with_messages)
-                total[target] = total[target] + at_target if target in total else at_target
-                if not (last and source == BOUNDARY):
-                    total[source] = total[source] + at_source if source in total else at_source
-                if with_messages:
-                    e[relation] = e[relation] + messages
-            for node_type, update in cast(nn.ModuleDict, self.updates[step]).items():
-                if node_type in h:
-                    incoming = total[node_type] if node_type in total else torch.zeros_like(h[node_type])
-                    h[node_type] = h[node_type] + update(incoming)
+            with_messages = self.edge_state == "latent" and step < self.num_message_passing_steps - 1
+            convs, updates = cast(nn.ModuleDict, self.convs[step]), cast(nn.ModuleDict, self.updates[step])
+            for relations, receivers in phases:
+                total: dict[str, Tensor] = {}
+                for relation in relations:
+                    if self.key(relation) not in convs:
+                        continue
+                    source, _, target = relation
+                    edge_index, _, even = edges[relation]
+                    conv = convs[self.key(relation)]
+                    at_target, at_source, messages = conv(h[source], h[target], edge_index, e[relation], even, with_messages)
+                    if target in receivers:
+                        total[target] = total[target] + at_target if target in total else at_target
+                    if source in receivers and self.type_key(source) in updates:
+                        total[source] = total[source] + at_source if source in total else at_source
+                    if with_messages:
+                        e[relation] = e[relation] + messages
+                for node_type, rows in receivers.items():
+                    if self.type_key(node_type) not in updates:
+                        continue
+                    update, state = updates[self.type_key(node_type)], h[node_type]
+                    incoming = total[node_type] if node_type in total else torch.zeros_like(state)
+                    h[node_type] = state + update(incoming) if rows is None else state.index_add(0, rows, update(incoming[rows]))
 
+        stress = {m: self.stress_decoder[m](h[m]) for m in self.spec.stress_channels if m in h} if self.settings["stress"] else {}
         if self.decoder == "node":
-            return {m: self.node_decoder[m](h[m]) for m in mass}
-        return self._pair_accelerations(h, mass, edges)
+            return {m: self.node_decoder[m](h[m]) for m in mass}, stress
+        return self._pair_accelerations(h, mass, edges), stress
+
+    def _phases(self, types: list[str], edges: Edges) -> list[tuple[list[EdgeType], dict[str, Tensor | None]]]:
+        """What happens one after the other within a step: relations that compute messages, and node types that receive them, or only these rows."""
+        if self.schedule == "simultaneous":
+            return [([*edges], dict.fromkeys(types))]
+        levels = [grid(level) for level in range(1, self.spec.num_levels + 1) if grid(level) in types]
+        below = {level: [r for r in edges if r[1] == DOWN and r[0] == level] for level in levels}
+        phases: list[tuple[list[EdgeType], dict[str, Tensor | None]]] = [(below[level], {level: None}) for level in levels]
+        phases.append(([r for r in edges if r[1] != DOWN], dict.fromkeys(types)))
+        for level in reversed(levels):
+            phases.append((below[level], {r[2]: edges[r][0][1] for r in below[level]}))  # not every node has a parent
+        return phases
 
     def _encode_node(self, node_type: str, x: Tensor, params: Tensor | None) -> Tensor:
         if params is not None:
             x = torch.cat([x, self.material_embedding[node_type](params)], dim=1)
-        return self.node_encoder[node_type](x)
+        return self.node_encoder[self.type_key(node_type)](x)
 
     def _encode_edge(self, relation: EdgeType, odd: Tensor, even: Tensor) -> Tensor:
         kind = self._interaction(relation)
-        encoder = self.edge_encoder[_key(relation)] if self.edge_state == "latent" else None
+        encoder = self.edge_encoder[self.key(relation)] if self.edge_state == "latent" else None
         if kind in ("odd", "odd_even"):
             return odd if encoder is None else encoder(odd, even)
         features = torch.cat([odd, even], dim=1)
@@ -214,13 +313,13 @@ class GPE(nn.Module):
             features = torch.cat([features, torch.cat([-odd, even], dim=1)])
         return features if encoder is None else encoder(features)
 
-    def _pair_accelerations(
-        self, h: dict[str, Tensor], mass: dict[str, Tensor], edges: dict[EdgeType, tuple[Tensor, Tensor, Tensor]]
-    ) -> dict[str, Tensor]:
+    def _pair_accelerations(self, h: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges) -> dict[str, Tensor]:
         force = {m: h[m].new_zeros(h[m].shape[0], self.spec.dim) for m in mass}
         for relation, (edge_index, odd, even) in edges.items():
+            if self.key(relation) not in self.pair_decoder:
+                continue
             source, _, target = relation
-            f = self.pair_decoder[_key(relation)](h[source], h[target], edge_index, odd, even)
+            f = self.pair_decoder[self.key(relation)](h[source], h[target], edge_index, odd, even)
             force[target] = force[target].index_add(0, edge_index[1], f)
             if source in force:
                 force[source] = force[source].index_add(0, edge_index[0], -f)

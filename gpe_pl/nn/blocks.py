@@ -3,8 +3,9 @@
 from collections.abc import Iterable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor, nn
+from torch.nn import functional
 
 
 class MLP(nn.Sequential):
@@ -12,6 +13,43 @@ class MLP(nn.Sequential):
 
     def __init__(self, in_channels: int, hidden_channels: int, out_channels: int) -> None:
         super().__init__(nn.Linear(in_channels, hidden_channels), nn.PReLU(), nn.Linear(hidden_channels, out_channels))
+
+
+class ReluMLP(nn.Sequential):
+    """Hidden linear layers with a ReLU after each, then a linear layer, then LayerNorm if asked for: the baselines' networks."""
+
+    def __init__(self, in_channels: int, hidden_channels: int, out_channels: int, num_hidden_layers: int, norm: bool = False) -> None:
+        layers: list[nn.Module] = []
+        for k in range(num_hidden_layers):
+            layers += [nn.Linear(hidden_channels if k else in_channels, hidden_channels), nn.ReLU()]
+        layers.append(nn.Linear(hidden_channels if num_hidden_layers else in_channels, out_channels))
+        super().__init__(*layers, *([nn.LayerNorm(out_channels)] if norm else []))
+
+
+class EdgeLinear(nn.Module):
+    """A linear map of (edge, target, source), which multiplies nodes before it gathers them to edges::
+
+    W [e, h_i, h_j] + b = W_e e + (W_i h + b)_i + (W_j h)_j                              (i target, j source)
+    """
+
+    def __init__(self, edge_channels: int, node_channels: int, out_channels: int) -> None:
+        super().__init__()
+        self.widths = [edge_channels, node_channels, node_channels]
+        self.linear = nn.Linear(sum(self.widths), out_channels)
+
+    def forward(self, e: Float[Tensor, "edge state"], h: Float[Tensor, "node hidden"], edge_index: Int64[Tensor, "2 edge"]) -> Tensor:
+        return self.nodes(h, edge_index).add_(self.edges(e))
+
+    def edges(self, e: Float[Tensor, "edge state"]) -> Float[Tensor, "edge out"]:
+        """W_e e, which a loop with constant edge states computes once."""
+        return functional.linear(e, self.linear.weight[:, : self.widths[0]])
+
+    def nodes(self, h: Float[Tensor, "node hidden"], edge_index: Int64[Tensor, "2 edge"]) -> Float[Tensor, "edge out"]:
+        """(W_i h + b)_i + (W_j h)_j."""
+        _, target, source = self.linear.weight.split(self.widths, dim=1)
+        j, i = edge_index
+        at_target = functional.linear(h, target, self.linear.bias).index_select(0, i)  # its gradient sums faster than that of [i]
+        return at_target.add_(functional.linear(h, source).index_select(0, j))
 
 
 class Standardize(nn.Module):

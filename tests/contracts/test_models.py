@@ -14,25 +14,39 @@ from torch_geometric.data import Batch, HeteroData
 
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import GraphStandardizer, LearnedSimulator
+from gpe_pl.models.cconv import ContinuousConvNet
+from gpe_pl.models.dpinet import DPINet
+from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
-from gpe_pl.schema import FeatureSpec
+from gpe_pl.schema import FeatureSpec, is_symmetric
 from tests import scenes
 
 Factory = Callable[[FeatureSpec], Any]
 
 
-def gpe(**settings: Any) -> Factory:
+def factory(model: Any, **settings: Any) -> Factory:
     def make(spec: FeatureSpec) -> torch.nn.Module:
         torch.manual_seed(0)
-        return GPE(spec, num_message_passing_steps=3, hidden_channels=16, **settings).double()
+        return model(spec, **settings).double()
 
     return make
 
 
+def gpe(**settings: Any) -> Factory:
+    return factory(GPE, num_message_passing_steps=3, hidden_channels=16, **settings)
+
+
 MODELS: dict[str, Factory] = {
-    f"gpe-{i}-{d}-{e}": gpe(interaction=i, decoder=d, edge_state=e)
-    for i, d, e in itertools.product(("directed", "negated", "odd", "odd_even"), ("node", "pair"), ("latent", "geometry"))
-} | {"gpe-mlp-embedding": gpe(material_embedding="mlp"), "gpe-plain": gpe(implementation="plain")}
+    **{
+        f"gpe-{i}-{d}-{e}": gpe(interaction=i, decoder=d, edge_state=e)
+        for i, d, e in itertools.product(("directed", "negated", "odd", "odd_even"), ("node", "pair"), ("latent", "geometry"))
+    },
+    "gpe-mlp-embedding": gpe(material_embedding="mlp"),
+    "gpe-plain": gpe(implementation="plain"),
+    "gns": factory(GNS, num_message_passing_steps=3, hidden_channels=16),
+    "dpinet": factory(DPINet, hidden_channels=16),
+    "cconv": factory(ContinuousConvNet, hidden_channels=16),
+}
 
 TWO = ("sand", "snow")
 
@@ -69,17 +83,25 @@ def test_edge_orientation_and_order_do_not_matter(make: Factory) -> None:
     build = scenes.builder(TWO)
     data = scenes.to_dtype(build(scenes.state(materials=TWO).to_torch()), torch.float64)
     model = make(build.spec)
-    flipped = data.clone()
-    for relation in build.spec.relations:
-        store = flipped[relation]
+    assert_close(predict(model, turned(data, build.spec), 40), predict(model, data, 40))
+
+
+def turned(data: HeteroData, spec: FeatureSpec) -> HeteroData:
+    """The same graph with edges in another order, and half of those stored the other way round that can be."""
+    out = data.clone()
+    for relation in spec.relations:
+        store = out[relation]
         count = store.edge_index.shape[1]
-        if relation[0] == relation[2]:
+        if is_symmetric(relation):
             turn = torch.rand(count, generator=torch.Generator().manual_seed(0)) < 0.5
             store.edge_index = torch.where(turn, store.edge_index.flip(0), store.edge_index)
-            store.odd = torch.where(turn[:, None], -store.odd, store.odd)
+            for key in {"odd", "offset"} & set(store.keys()):
+                store[key] = torch.where(turn[:, None], -store[key], store[key])
         order = torch.randperm(count, generator=torch.Generator().manual_seed(1))
-        store.edge_index, store.odd, store.even = store.edge_index[:, order], store.odd[order], store.even[order]
-    assert_close(predict(model, flipped, 40), predict(model, data, 40))
+        store.edge_index = store.edge_index[:, order]
+        for key in {"odd", "even", "offset"} & set(store.keys()):
+            store[key] = store[key][order]
+    return out
 
 
 def test_translation_changes_nothing(make: Factory) -> None:
@@ -174,7 +196,8 @@ def test_gradients_are_correct(make: Factory) -> None:
 
     def f(x: torch.Tensor, odd: torch.Tensor) -> torch.Tensor:
         d = data.clone()
-        d["sand"].x, d["sand", "radius", "sand"].odd = x, odd
+        store = d["sand", "radius", "sand"]
+        d["sand"].x, store.odd, store.offset = x, odd, odd[:, :2]
         return model(d).acceleration["sand"]
 
     x = data["sand"].x.clone().requires_grad_()
@@ -222,3 +245,57 @@ def test_all_features_work(make: Factory, features: str, history: int) -> None:
     out = make(build.spec)(standardizer(data)).acceleration["sand"]
     assert out.shape == (40, 2)
     assert torch.isfinite(out).all()
+
+
+# --- meshes ---------------------------------------------------------------------------------------------------------------------------------
+
+MESH = ("sand", "elastomer")
+
+
+@pytest.fixture(params=["gpe-negated-node-latent", "gpe-odd-pair-geometry", "gns", "dpinet"])
+def make_on_mesh(request: pytest.FixtureRequest) -> Factory:
+    return MODELS[request.param]
+
+
+def test_relabelling_and_turning_a_mesh_change_nothing(make_on_mesh: Factory) -> None:
+    build = scenes.builder(MESH, mesh=True)
+    assert build.spec.num_levels > 1
+    s = scenes.mesh_state(materials=MESH)
+    order = np.random.default_rng(1).permutation(s.num_nodes)
+    model = make_on_mesh(build.spec)
+    data = scenes.to_dtype(build(s.to_torch()), torch.float64)
+    y = predict(model, data, s.num_nodes)
+    relabelled = scenes.to_dtype(build(scenes.permuted(s, order).to_torch()), torch.float64)
+    assert_close(predict(model, relabelled, s.num_nodes), y[order], 1e-5)  # features are float32, and means over children round by order
+    assert_close(predict(model, turned(data, build.spec), s.num_nodes), y)
+
+
+def test_batch_of_scenes_with_and_without_mesh_equals_singles(make_on_mesh: Factory) -> None:
+    build = scenes.builder(MESH, mesh=True)
+    sand = scenes.state(20, ("sand",), seed=2)
+    states = [
+        scenes.mesh_state(materials=MESH),
+        replace(sand, material_params=_columns(sand, 2)),
+        scenes.mesh_state("lattice", MESH, seed=3),
+    ]
+    graphs = [scenes.to_dtype(build(s.to_torch()), torch.float64) for s in states]
+    model = make_on_mesh(build.spec)
+    singles = [predict(model, g, s.num_nodes) for g, s in zip(graphs, states, strict=True)]
+    for order in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        batch = Batch.from_data_list([graphs[k] for k in order])
+        for material, value in model(batch).acceleration.items():
+            for position, k in enumerate(order):
+                expected = singles[k][graphs[k][material].node_id]
+                rows = batch[material].batch == position
+                assert rows.sum() == len(expected)
+                if len(expected):
+                    assert_close(value[rows], expected)
+
+
+def test_a_step_of_a_mesh_is_independent_of_the_order_of_calls(make_on_mesh: Factory) -> None:
+    build = scenes.builder(MESH, mesh=True)
+    simulator = LearnedSimulator(make_on_mesh(build.spec).float(), build)
+    s = scenes.mesh_state(materials=MESH).to_torch()
+    first = simulator.step(s)
+    simulator.step(scenes.mesh_state("lattice", MESH, seed=7).to_torch())
+    assert torch.equal(simulator.step(s).pos, first.pos)

@@ -1,0 +1,198 @@
+"""The multi-scale graph of meshes: cell edges, and above every connected body virtual nodes that merge 2×2(×2) level by level (paper, section 2.2).
+
+A virtual node of level l stands for the mesh nodes in a box of rest space, 2^l rest spacings wide: a quadtree or octree, which works on any mesh and merges
+exactly 2×2(×2) on a lattice. The body lies in the middle of its root's box, so that siblings are of similar size. Only the positions of virtual nodes change
+with time, so the graph of a mesh is built once and then found by the content of its arrays: a rollout, the windows of a trajectory and copies of a state
+share it.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from gpe_pl.errors import GpeError
+
+SNAP = 1e-3
+"""Nodes this near (in rest spacings) below the face of a box count as on it, so that rounding does not tear the rows of a lattice apart."""
+
+MESHES_HELD = 256
+"""Multi-scale graphs kept in memory; one of a thousand nodes takes about 0.2 MB."""
+
+
+class MeshError(GpeError, ValueError):
+    """Cells and rest positions do not make a mesh; names the cell or node."""
+
+
+@dataclass(frozen=True)
+class MultiscaleGraph:
+    """What stays the same about the mesh of a scene. Points are the nodes of the state, followed by the virtual nodes in the order of their levels.
+
+    Attributes:
+        rest_pos: of the nodes of the state [m].
+        body: connected body of each point; a node of no cell is a body of its own.
+        level: of each point, 0 for the nodes of the state.
+        parent: virtual node one level up, or -1: roots, nodes of no cell, and the top of bodies that are deeper than the levels asked for.
+        cell_edges: pairs of nodes that share a cell, first node lower.
+        same_edges: pairs of neighbouring virtual nodes of one level and body, by level.
+        down_edges: pairs of a virtual node and each of its children, by level.
+        descent: pairs of a virtual node and each mesh node below it.
+    """
+
+    rest_pos: Float64[np.ndarray, "node dim"]
+    body: Int64[np.ndarray, "point"]
+    level: Int64[np.ndarray, "point"]
+    parent: Int64[np.ndarray, "point"]
+    cell_edges: Int64[np.ndarray, "2 cell_edge"]
+    same_edges: Int64[np.ndarray, "2 same_edge"]
+    down_edges: Int64[np.ndarray, "2 down_edge"]
+    descent: Int64[np.ndarray, "2 pair"]
+
+    @property
+    def num_nodes(self) -> int:
+        """Nodes of the state."""
+        return len(self.rest_pos)
+
+    def are_in_contact(self, pairs: Int64[np.ndarray, "2 edge"], radius: float) -> Bool[np.ndarray, " edge"]:
+        """Which near pairs of nodes touch rather than belong together.
+
+        Two bodies touch where they are near. A body touches itself where nodes are near that are more than two radii [m] apart at rest and share no cell.
+        """
+        j, i = pairs
+        contact = self.body[j] != self.body[i]
+        inside = np.flatnonzero(~contact)
+        far = ((self.rest_pos[i[inside]] - self.rest_pos[j[inside]]) ** 2).sum(axis=1) > (2 * radius) ** 2
+        inside = inside[far]
+        contact[inside] = ~np.isin(_keys(pairs[:, inside], self.num_nodes), _keys(self.cell_edges, self.num_nodes))
+        return contact
+
+
+def levels_of(extent: float, spacing: float) -> int:
+    """Levels up to one root for any body inside a domain whose longest side is ``extent`` [m]."""
+    return max(1, math.ceil(math.log2(extent / spacing)))
+
+
+def multiscale_graph(
+    rest_pos: Float64[np.ndarray, "node dim"], cells: Int64[np.ndarray, "cell corner"], spacing: float, num_levels: int
+) -> MultiscaleGraph:
+    """The multi-scale graph of a mesh, built once for equal arguments; its arrays are read-only.
+
+    Args:
+        rest_pos: undeformed positions [m].
+        cells: nodes of each cell.
+        spacing: rest spacing [m].
+        num_levels: the most levels of virtual nodes; a body ends at its root or here.
+
+    Raises:
+        MeshError: a cell has a node that does not exist, or a rest position is not finite.
+    """
+    rest_pos, cells = np.ascontiguousarray(rest_pos, np.float64), np.ascontiguousarray(cells, np.int64)
+    return _cached(rest_pos.tobytes(), rest_pos.shape, cells.tobytes(), cells.shape, spacing, num_levels)
+
+
+@lru_cache(maxsize=MESHES_HELD)
+def _cached(
+    rest_pos: bytes, rest_shape: tuple[int, ...], cells: bytes, cells_shape: tuple[int, ...], spacing: float, num_levels: int
+) -> MultiscaleGraph:
+    graph = build(np.frombuffer(rest_pos).reshape(rest_shape), np.frombuffer(cells, np.int64).reshape(cells_shape), spacing, num_levels)
+    for array in vars(graph).values():
+        if isinstance(array, np.ndarray):
+            array.setflags(write=False)
+    return graph
+
+
+def build(rest_pos: np.ndarray, cells: np.ndarray, spacing: float, num_levels: int) -> MultiscaleGraph:
+    """``multiscale_graph`` without memory."""
+    num_nodes = len(rest_pos)
+    bad = np.flatnonzero(((cells < 0) | (cells >= num_nodes)).any(axis=1))
+    if len(bad):
+        raise MeshError(f"cell {bad[0]} has the nodes {cells[bad[0]].tolist()}, there are {num_nodes} nodes")
+    bad = np.flatnonzero(~np.isfinite(rest_pos).all(axis=1))
+    if len(bad):
+        raise MeshError(f"node {bad[0]} has a rest position that is not finite")
+    edges = cell_edges(cells, num_nodes)
+    ones = np.ones(edges.shape[1], dtype=bool)
+    num_bodies, body = connected_components(coo_array((ones, tuple(edges)), shape=(num_nodes, num_nodes)), directed=False)
+    body = body.astype(np.int64)
+
+    nodes = np.unique(cells)  # in cells
+    box, depth = _smallest_boxes(rest_pos, nodes, body, num_bodies, spacing)
+    bodies, boxes, levels, parents = [body], [box], [np.zeros(num_nodes, dtype=np.int64)], []
+    same, descent = [np.empty((2, 0), dtype=np.int64)], [np.empty((2, 0), dtype=np.int64)]
+    children, lower_edges, ancestor, first = nodes, edges, np.arange(num_nodes), 0  # of the level below; ``first`` is its first point
+    for level in range(1, num_levels + 1):
+        merged = boxes[-1][children - first] >> 1
+        merged_body = bodies[-1][children - first]
+        above = first + len(bodies[-1])
+        _, example, number = np.unique(_box_keys(merged_body, merged), return_index=True, return_inverse=True)
+        parent = np.full(len(bodies[-1]), -1)
+        parent[children - first] = above + number
+        parents.append(parent)
+        bodies.append(merged_body[example])
+        boxes.append(merged[example])
+        levels.append(np.full(len(example), level))
+
+        joined = parent[lower_edges - first]
+        joined = joined[:, (joined >= 0).all(axis=0)]  # bodies that end below have no parents
+        lower_edges = _unique_pairs(joined[:, joined[0] != joined[1]], above + len(example))
+        same.append(lower_edges)
+        nodes = nodes[parent[ancestor[nodes] - first] >= 0]
+        ancestor[nodes] = parent[ancestor[nodes] - first]
+        descent.append(np.stack([ancestor[nodes], nodes]))
+        first = above
+        children = first + np.flatnonzero((depth[bodies[-1]] > level).any(axis=1))
+    parents.append(np.full(len(bodies[-1]), -1))
+
+    parent = np.concatenate(parents)
+    child = np.flatnonzero(parent >= 0)
+    return MultiscaleGraph(
+        rest_pos, np.concatenate(bodies), np.concatenate(levels), parent, edges,
+        np.concatenate(same, axis=1), np.stack([parent[child], child]), np.concatenate(descent, axis=1),
+    )  # fmt: skip
+
+
+def _smallest_boxes(
+    rest_pos: np.ndarray, nodes: np.ndarray, body: np.ndarray, num_bodies: int, spacing: float
+) -> tuple[Int64[np.ndarray, "node dim"], Int64[np.ndarray, "body dim"]]:
+    """Integer coordinates of each node in its body, in rest spacings, and how often they must be halved along each axis until all are zero."""
+    box, low = np.zeros(rest_pos.shape, dtype=np.int64), np.full((num_bodies, rest_pos.shape[1]), np.inf)
+    np.minimum.at(low, body[nodes], rest_pos[nodes])
+    box[nodes] = np.floor((rest_pos[nodes] - low[body[nodes]]) / spacing + SNAP)
+    width = np.ones(low.shape, dtype=np.int64)
+    np.maximum.at(width, body[nodes], box[nodes] + 1)
+    depth = np.ceil(np.log2(width)).astype(np.int64)
+    margin = (2**depth - width) // 4 * 2  # on either side; even, so that the rows at the low corner merge in pairs
+    box[nodes] += margin[body[nodes]]
+    return box, depth
+
+
+def cell_edges(cells: Int64[np.ndarray, "cell corner"], num_nodes: int) -> Int64[np.ndarray, "2 edge"]:
+    """Pairs of nodes that share a cell, each once, the lower node first."""
+    pairs = [cells[:, [a, b]].T for a, b in itertools.combinations(range(cells.shape[1]), 2)]
+    return _unique_pairs(np.concatenate([np.empty((2, 0), dtype=np.int64), *pairs], axis=1), num_nodes)
+
+
+def _keys(pairs: np.ndarray, count: int) -> Any:
+    """One number per unordered pair of two numbers below ``count``."""
+    return pairs.min(axis=0) * count + pairs.max(axis=0)
+
+
+def _unique_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
+    keys = np.unique(_keys(pairs, count))
+    return np.stack([keys // count, keys % count])
+
+
+def _box_keys(body: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """One number per body and box."""
+    key = body
+    for column in box.T:
+        key = key * (column.max(initial=0) + 1) + column
+    return key

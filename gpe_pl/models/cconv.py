@@ -1,0 +1,130 @@
+"""ConvNet: continuous convolutions over particles [Ummenhofer et al. 2020, "Lagrangian Fluid Simulation with Continuous Convolutions", ICLR, section 4;
+code: github.com/isl-org/DeepLagrangianFluids, ``models/default_torch.py``].
+
+Layers of the paper, with features f of particles and g of boundary nodes, ReLU φ and channels 32, 64, 64, d::
+
+    f¹ = [conv(g), conv(f), dense(f)]            f^{k+1} = conv(φ(f^k)) + dense(φ(f^k)) (+ f^k where the widths agree)
+
+Filters have 4^d points and the radius of the graph; a particle is no neighbour of itself, the dense layers stand for that.
+
+Where this differs from the paper, because all models here share graphs, inputs and targets:
+- the output is the acceleration without gravity in units of its standard deviation, not 1/128 of a position correction after a step under gravity;
+- particles carry the standardised features of the graph (velocity history, gravity, material parameter) and one column per material, which is the paper's
+  constant 1 if there is one material; boundary nodes carry velocity, normal and boundary condition, the paper's the normal;
+- all materials share filters; edges join all pairs within the radius, which is 4.5 particle radii in the paper.
+"""
+
+import itertools
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional
+from torch_geometric.data import HeteroData
+
+from gpe_pl.errors import GpeError
+from gpe_pl.models.base import Prediction
+from gpe_pl.nn.continuous_conv import ContinuousConv, interpolate
+from gpe_pl.nn.homogeneous import Homogeneous, first_rows
+from gpe_pl.schema import BOUNDARY, RADIUS, EdgeType, FeatureSpec
+
+Offsets = dict[EdgeType, tuple[Tensor, Tensor]]
+"""``edge_index`` and (x_target − x_source) / R of the relations that have edges."""
+
+
+class NotAParticleGraphError(GpeError, ValueError):
+    """The graph has relations over which nothing can be convolved."""
+
+
+class ContinuousConvNet(nn.Module):
+    """The paper's network.
+
+    Args:
+        spec: channels of the graphs, which have ``radius`` relations only.
+        num_convolutions: layers, the first and the last included; 4 in the paper.
+        hidden_channels: width between them, half of it in each of the three parts of the first layer; 64 in the paper.
+        kernel_size: filter points per axis; 4 in the paper.
+
+    Raises:
+        NotAParticleGraphError: the graphs have relations of meshes.
+    """
+
+    def __init__(
+        self,
+        spec: FeatureSpec,
+        num_convolutions: Annotated[int, Field(ge=2, le=64)] = 4,
+        hidden_channels: Annotated[int, Field(ge=2, le=4096)] = 64,
+        kernel_size: Annotated[int, Field(ge=2, le=16)] = 4,
+    ) -> None:
+        super().__init__()
+        others = sorted({r[1] for r in spec.relations} - {RADIUS})
+        if others:
+            raise NotAParticleGraphError(
+                f"ContinuousConvNet convolves over {RADIUS} edges; the graph also has {', '.join(others)}: set graph=particles"
+            )
+        self.settings = {"num_convolutions": num_convolutions, "hidden_channels": hidden_channels, "kernel_size": kernel_size}
+        self.spec, self.kernel_size = spec, kernel_size
+        self.particles = Homogeneous(spec, spec.materials)
+        in_channels, first = self.particles.node_channels + self.particles.num_kinds, hidden_channels // 2
+        self.conv_boundary = ContinuousConv(spec.node_channels[BOUNDARY], first, spec.dim, kernel_size)
+        self.conv_particles = ContinuousConv(in_channels, first, spec.dim, kernel_size)
+        self.dense_particles = _dense(in_channels, first)
+        widths = [3 * first, *[hidden_channels] * (num_convolutions - 2), spec.dim]
+        pairs = list(itertools.pairwise(widths))
+        self.convs = nn.ModuleList([ContinuousConv(a, b, spec.dim, kernel_size) for a, b in pairs])
+        self.denses = nn.ModuleList([_dense(a, b) for a, b in pairs])
+
+    def forward(self, data: HeteroData) -> Prediction:
+        """Accelerations without gravity per material, in units of the data set's acceleration scale."""
+        x = {t: data[t].x for t in self.spec.node_types if data[t].x.shape[0]}
+        params = {m: data[m].material_params for m in self.spec.materials if m in x}
+        edges = {r: (data[r].edge_index, data[r].offset) for r in self.spec.relations if data[r].edge_index.shape[1]}
+        return Prediction(self.compute(x, params, edges) if params else {})
+
+    def compute(self, x: dict[str, Tensor], params: dict[str, Tensor], edges: Offsets) -> dict[str, Tensor]:
+        """``forward`` on plain tensors: the part that ``torch.compile`` sees."""
+        particles = {m: x[m] for m in params}
+        features, kind = self.particles.nodes(particles, params)
+        features = torch.cat([features, functional.one_hot(kind, self.particles.num_kinds).to(features.dtype)], dim=1)
+        n, start = features.shape[0], first_rows(particles)
+
+        index, offset = self._neighbors(edges, start, features)
+        from_boundary, boundary_offset = self._boundary(edges, start, features)
+        neighbors = (index, *interpolate(offset, self.kernel_size), n)
+        at_boundary = (from_boundary, *interpolate(boundary_offset, self.kernel_size), n)
+        boundary = x[BOUNDARY] if BOUNDARY in x else features.new_zeros(0, self.spec.node_channels[BOUNDARY])
+        parts = [self.conv_boundary(boundary, *at_boundary), self.conv_particles(features, *neighbors), self.dense_particles(features)]
+        f = torch.cat(parts, dim=1)
+        for conv, dense in zip(self.convs, self.denses, strict=True):
+            active = functional.relu(f)
+            out = conv(active, *neighbors) + dense(active)
+            f = out + f if out.shape[1] == f.shape[1] else out
+        return dict(zip(params, f.split([x[m].shape[0] for m in params]), strict=True))
+
+    def _neighbors(self, edges: Offsets, start: dict[str, int], like: Tensor) -> tuple[Tensor, Tensor]:
+        """Both directions of all edges between particles, and (x_source − x_target) / R."""
+        indices, offsets = [torch.empty((2, 0), dtype=torch.int64, device=like.device)], [like.new_empty((0, self.spec.dim))]
+        for (source, _, target), (edge_index, offset) in edges.items():
+            if source != BOUNDARY:
+                index = torch.stack([edge_index[0] + start[source], edge_index[1] + start[target]])
+                indices += [index, index.flip(0)]
+                offsets += [-offset, offset]
+        return torch.cat(indices, dim=1), torch.cat(offsets)
+
+    def _boundary(self, edges: Offsets, start: dict[str, int], like: Tensor) -> tuple[Tensor, Tensor]:
+        """Edges from boundary nodes to particles, and (x_source − x_target) / R."""
+        indices, offsets = [torch.empty((2, 0), dtype=torch.int64, device=like.device)], [like.new_empty((0, self.spec.dim))]
+        for (source, _, target), (edge_index, offset) in edges.items():
+            if source == BOUNDARY:
+                indices.append(torch.stack([edge_index[0], edge_index[1] + start[target]]))
+                offsets.append(-offset)
+        return torch.cat(indices, dim=1), torch.cat(offsets)
+
+
+def _dense(in_channels: int, out_channels: int) -> nn.Linear:
+    """A linear layer that starts as the authors': Xavier-uniform weights, no bias."""
+    layer = nn.Linear(in_channels, out_channels)
+    nn.init.xavier_uniform_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer

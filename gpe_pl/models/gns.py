@@ -1,0 +1,109 @@
+"""GNS, the Graph Network-based Simulator [Sanchez-Gonzalez et al. 2020, "Learning to Simulate Complex Physics with Graph Networks", section 4 and
+supplement B; code: github.com/google-deepmind/deepmind-research, ``learning_to_simulate``].
+
+Encode, process, decode on one graph of all particles, with every function shared by all types; MLPs of two hidden layers with ReLU, LayerNorm after each but
+the decoder::
+
+    h_i  = MLP([features, embedding of the type])       e_ij = MLP([displacement, its length])       both directions of every edge
+    e'   = MLP([e_ij, h_i, h_j])                        h'   = MLP([h_i, Σ_j e'])
+    e_ij += e',  h_i += h'                              M times, with weights of their own
+    a_i  = MLP(h_i)
+
+Where this differs from the paper, because all models here share graphs, inputs and targets:
+- edges carry the channels that ``graph.features`` asks for, and the length of the standardised displacement; relations of meshes, if the graph has any, carry
+  theirs (the paper's topology is ``graph=particles``);
+- walls are boundary nodes with velocity, normal and boundary condition, as in the other models, instead of distances to the box; they have no edges among
+  themselves;
+- gravity and the material parameter are inputs, and the target is the acceleration without gravity.
+"""
+
+from typing import Annotated
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch_geometric.data import HeteroData
+
+from gpe_pl.models.base import Prediction
+from gpe_pl.nn.blocks import EdgeLinear, ReluMLP
+from gpe_pl.nn.homogeneous import Edges, Homogeneous
+from gpe_pl.schema import FeatureSpec
+
+TINY = 1e-12
+
+
+class InteractionNetwork(nn.Module):
+    """e' and h' of one processor step."""
+
+    def __init__(self, hidden_channels: int, num_hidden_layers: int) -> None:
+        super().__init__()
+        hidden = hidden_channels
+        self.edge_in = EdgeLinear(hidden, hidden, hidden)
+        self.edge_out = nn.Sequential(nn.ReLU(), *ReluMLP(hidden, hidden, hidden, num_hidden_layers - 1, norm=True))
+        self.node = ReluMLP(2 * hidden, hidden, hidden, num_hidden_layers, norm=True)
+
+    def forward(self, h: Tensor, e: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
+        messages = self.edge_out(self.edge_in(e, h, edge_index))
+        total = torch.zeros_like(h).index_add(0, edge_index[1], messages)
+        return self.node(torch.cat([h, total], dim=1)), messages
+
+
+class GNS(nn.Module):
+    """The paper's model.
+
+    Args:
+        spec: channels of the graphs.
+        num_message_passing_steps: M; 10 in the paper.
+        hidden_channels: width of everything; 128 in the paper.
+        num_hidden_layers: of every MLP; 2 in the paper, 1 in LagrangeBench's GNS-10-128.
+        type_channels: width of the embedding of the particle type; 16 in the paper.
+    """
+
+    def __init__(
+        self,
+        spec: FeatureSpec,
+        num_message_passing_steps: Annotated[int, Field(ge=1, le=64)] = 10,
+        hidden_channels: Annotated[int, Field(ge=1, le=4096)] = 128,
+        num_hidden_layers: Annotated[int, Field(ge=1, le=8)] = 2,
+        type_channels: Annotated[int, Field(ge=1, le=1024)] = 16,
+    ) -> None:
+        super().__init__()
+        self.settings = {
+            "num_message_passing_steps": num_message_passing_steps,
+            "hidden_channels": hidden_channels,
+            "num_hidden_layers": num_hidden_layers,
+            "type_channels": type_channels,
+        }
+        self.spec = spec
+        self.graph = Homogeneous(spec, spec.node_types)
+        hidden, layers = hidden_channels, num_hidden_layers
+        self.type_embedding = nn.Embedding(self.graph.num_kinds, type_channels)
+        self.node_encoder = ReluMLP(self.graph.node_channels + type_channels, hidden, hidden, layers, norm=True)
+        self.edge_encoder = ReluMLP(self.graph.edge_channels + 1, hidden, hidden, layers, norm=True)
+        self.processor = nn.ModuleList([InteractionNetwork(hidden, layers) for _ in range(num_message_passing_steps)])
+        self.decoder = ReluMLP(hidden, hidden, spec.dim, layers)
+
+    def forward(self, data: HeteroData) -> Prediction:
+        """Accelerations without gravity per material, in units of the data set's acceleration scale."""
+        x = {t: data[t].x for t in self.spec.node_types if data[t].x.shape[0]}
+        params = {m: data[m].material_params for m in self.spec.materials if m in x}
+        edges = {r: (data[r].edge_index, data[r].odd, data[r].even) for r in self.spec.relations if data[r].edge_index.shape[1]}
+        return Prediction(self.compute(x, params, edges) if params else {})
+
+    def compute(self, x: dict[str, Tensor], params: dict[str, Tensor], edges: Edges) -> dict[str, Tensor]:
+        """``forward`` on plain tensors: the part that ``torch.compile`` sees."""
+        features, kind = self.graph.nodes(x, params)
+        edge_index, edge_features = self.graph.edges(x, edges, edges, edges)
+        length = self._lengths(edges, edge_features)
+        h = self.node_encoder(torch.cat([features, self.type_embedding(kind)], dim=1))
+        e = self.edge_encoder(torch.cat([edge_features, length], dim=1))
+        for step in self.processor:
+            update, messages = step(h, e, edge_index)
+            h, e = h + update, e + messages
+        sizes = [x[m].shape[0] for m in params]
+        return dict(zip(params, self.decoder(h[: sum(sizes)]).split(sizes), strict=True))
+
+    def _lengths(self, edges: Edges, like: Tensor) -> Tensor:
+        """Length of the displacement, which is the first odd channels, per directed edge."""
+        lengths = [(odd[:, : self.spec.dim].square().sum(dim=1, keepdim=True) + TINY**2).sqrt() for _, odd, _ in edges.values()]
+        return torch.cat([*lengths, *lengths]) if lengths else like.new_empty((0, 1))

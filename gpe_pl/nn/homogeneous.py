@@ -1,0 +1,110 @@
+"""A typed graph as one graph of one node type, for models whose layers are shared by all particles and which tell types apart by their input.
+
+Nodes stand one type after another in the order of ``FeatureSpec.node_types``. Features of different meaning stand in columns of their own and are zero for
+nodes or edges that do not have them: motion of materials, boundary nodes, virtual nodes, one block per material's parameters; and one block per relation.
+"""
+
+from collections.abc import Iterable
+
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor
+from torch.nn import functional
+
+from gpe_pl.schema import EdgeType, FeatureSpec, role
+
+Edges = dict[EdgeType, tuple[Tensor, Tensor, Tensor]]
+"""``edge_index``, ``odd`` and ``even`` of the relations that have edges."""
+
+
+class Homogeneous:
+    """Where types and relations of a ``FeatureSpec`` go in the homogeneous graph.
+
+    Args:
+        spec: channels of the typed graphs.
+        node_types: that take part, all materials among them.
+
+    Attributes:
+        kind: per node type, the number under which a model knows it; virtual nodes of all levels have the same.
+        num_kinds: how many those are.
+        node_channels: columns of ``nodes``.
+        edge_channels: columns of ``edges``.
+    """
+
+    def __init__(self, spec: FeatureSpec, node_types: tuple[str, ...]) -> None:
+        kinds = list(dict.fromkeys(role(t) for t in node_types))
+        self.kind = {t: kinds.index(role(t)) for t in node_types}
+        self.num_kinds = len(kinds)
+
+        block = {t: "material" if t in spec.materials else role(t) for t in node_types}
+        widths: dict[str, int] = {}
+        for t in node_types:
+            widths[block[t]] = max(widths.get(block[t], 0), spec.node_channels[t])
+        widths |= {f"parameters of {m}": spec.param_channels[m] for m in spec.materials}
+        first = _first_columns(widths)
+        self._x = {t: first[block[t]] for t in node_types}
+        self._params = {m: first[f"parameters of {m}"] for m in spec.materials}
+        self.node_channels = sum(widths.values())
+
+        edge_widths: dict[str, int] = {}
+        for relation in spec.relations:
+            for sign, channels in (("odd", spec.odd_channels), ("even", spec.even_channels)):
+                key = f"{relation[1]} {sign}"
+                edge_widths[key] = max(edge_widths.get(key, 0), channels[relation])
+        self._edge = _first_columns(edge_widths)
+        self.edge_channels = sum(edge_widths.values())
+
+    def nodes(self, x: dict[str, Tensor], params: dict[str, Tensor]) -> tuple[Float[Tensor, "node channel"], Int64[Tensor, " node"]]:
+        """Features and kinds of all nodes."""
+        rows, kinds = [], []
+        for t, features in x.items():
+            row = _place(features, self._x[t], self.node_channels)
+            if t in params:
+                row = row + _place(params[t], self._params[t], self.node_channels)
+            rows.append(row)
+            kinds.append(torch.full((features.shape[0],), self.kind[t], dtype=torch.int64, device=features.device))
+        return torch.cat(rows), torch.cat(kinds)
+
+    def edges(
+        self, x: dict[str, Tensor], edges: Edges, forward: Iterable[EdgeType], backward: Iterable[EdgeType]
+    ) -> tuple[Int64[Tensor, "2 edge"], Float[Tensor, "edge channel"]]:
+        """Directed edges (row 0 source, row 1 target) and their features: the relations in ``forward`` as stored, those in ``backward`` turned around."""
+        start = first_rows(x)
+        indices, features = [], []
+        for relations, sign in ((forward, 1), (backward, -1)):
+            for relation in relations:
+                if relation not in edges:
+                    continue
+                source, kind, target = relation
+                edge_index, odd, even = edges[relation]
+                index = torch.stack([edge_index[0] + start[source], edge_index[1] + start[target]])
+                indices.append(index if sign > 0 else index.flip(0))
+                placed = _place(odd if sign > 0 else -odd, self._edge[f"{kind} odd"], self.edge_channels)
+                features.append(placed + _place(even, self._edge[f"{kind} even"], self.edge_channels))
+        if not indices:
+            some = next(iter(x.values()))
+            return torch.empty((2, 0), dtype=torch.int64, device=some.device), some.new_empty((0, self.edge_channels))
+        return torch.cat(indices, dim=1), torch.cat(features)
+
+
+def first_rows(x: dict[str, Tensor]) -> dict[str, int]:
+    """The row at which each node type starts."""
+    start, rows = {}, 0
+    for t, features in x.items():
+        start[t] = rows
+        rows += features.shape[0]
+    return start
+
+
+def _first_columns(widths: dict[str, int]) -> dict[str, int]:
+    """The first column of each block."""
+    first, column = {}, 0
+    for name, width in widths.items():
+        first[name] = column
+        column += width
+    return first
+
+
+def _place(values: Tensor, first: int, channels: int) -> Tensor:
+    """Columns ``first``, ``first + 1``, … of ``channels``, the others zero."""
+    return functional.pad(values, (first, channels - first - values.shape[1]))
