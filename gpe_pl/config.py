@@ -30,7 +30,7 @@ from pydantic import ConfigDict, ValidationError, create_model
 
 from gpe_pl import launcher
 from gpe_pl.errors import GpeError
-from gpe_pl.launcher import RESULT, SweepError
+from gpe_pl.launcher import RESULT, USAGE_ERROR, SweepError
 
 WITHOUT_KEY = {"experiment", "scene", "solver"}
 """Config groups that fill other keys than one of their own."""
@@ -182,7 +182,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 
 def _fail(error: Exception) -> None:
     print("error: " + " ".join(str(error).split()), file=sys.stderr)
-    sys.exit(2)
+    sys.exit(USAGE_ERROR if RESULT in os.environ and isinstance(error, ConfigError) else 2)
 
 
 def explain(error: Exception, config_name: str, overrides: list[str]) -> str:

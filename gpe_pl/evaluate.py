@@ -20,7 +20,9 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
 
     if not isinstance(cfg.checkpoint, str):
         raise ConfigError(f"checkpoint={cfg.checkpoint!r}: name a checkpoint of a run, such as runs/sand/checkpoints/best.ckpt")
-    settings = construct(EvaluationSettings, {**{k: v for k, v in cfg.evaluation.items() if k != "data"}, "splits": [cfg.split]}, "evaluation")
+    settings = construct(
+        EvaluationSettings, {**{k: v for k, v in cfg.evaluation.items() if k != "data"}, "splits": [cfg.split]}, "evaluation"
+    )
     simulator = LearnedSimulator.from_checkpoint(cfg.checkpoint)
     root = ensure_data(evaluated_config(cfg))
     folder = Path(cfg.paths.runs) / cfg.name

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 def fit(cfg: DictConfig) -> float:
     """Generate what data is missing, train or resume, evaluate; returns the mean full-length rollout MSE [m²] on the first split evaluated."""
     from dataclasses import asdict
+    from functools import cache
 
     import lightning as L
     from filelock import FileLock
@@ -45,15 +46,17 @@ def fit(cfg: DictConfig) -> float:
         root = ensure_data(cfg)
         evaluated = ensure_data(evaluated_config(cfg)) if cfg.evaluation.data else root
     device = "cuda" if trainer.accelerator == "gpu" else "cpu"
-    datamodule = TrajectoryDataModule(
-        root, graph, noise, training.batch_size, cfg.seed, trainer.num_workers, stress=bool(cfg.model.get("stress", False))
-    )
     set_threads(trainer)
+
+    @cache
+    def data() -> TrajectoryDataModule:
+        stress = bool(cfg.model.get("stress", False))
+        return TrajectoryDataModule(root, graph, noise, training.batch_size, cfg.seed, trainer.num_workers, stress=stress)
 
     def new_module(training: TrainingSettings) -> TrainingModule:
         L.seed_everything(cfg.seed, verbose=False)
-        simulator = LearnedSimulator(new_model(spec=datamodule.builder.spec), datamodule.builder)
-        simulator.fit_statistics(datamodule.statistics_sample())
+        simulator = LearnedSimulator(new_model(spec=data().builder.spec), data().builder)
+        simulator.fit_statistics(data().statistics_sample())
         names = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "stress_weight", "compile")
         return TrainingModule(simulator, **{n: getattr(training, n) for n in names})
 
@@ -61,12 +64,12 @@ def fit(cfg: DictConfig) -> float:
     if training.budget_minutes is not None:
         parts = {k: settings[k] for k in ("data", "graph", "model")} | {"batch_size": training.batch_size, "device": device}
         key = f"{cfg.data.name} {cfg.size.name} {cfg.model._target_.rpartition('.')[2]} {digest(parts)}"
-        measure = lambda: step_time(new_module(training).to(device), datamodule.train_set, training)
-        training = within_budget(training, Path(cfg.paths.runs) / cfg.name / "step_times.json", key, measure)
+        times = Path(cfg.paths.runs) / cfg.name / "step_times.json"
+        training = within_budget(training, times, key, lambda: step_time(new_module(training).to(device), data().train_set, training))
     settings["training"] = asdict(training)
     claim(run_dir, {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training", "evaluation")})
     if not (run_dir / "metrics.csv").exists():
-        best = train(new_module(training), datamodule, training, trainer, logger.loggers(run_dir), run_dir)
+        best = train(new_module(training), data(), training, trainer, logger.loggers(run_dir), run_dir)
         evaluate(LearnedSimulator.from_checkpoint(best, device), evaluated, evaluation, run_dir)
 
     values = [

@@ -31,6 +31,8 @@ from gpe_pl.errors import GpeError
 LOG = "output.log"
 RESULT = "GPE_PL_RESULT"
 """Environment variable: the file in which a command leaves the value that it returns."""
+USAGE_ERROR = 64
+"""Exit status of a run whose configuration is wrong: the rest of the sweep is not started."""
 PLUGINS = "hydra_plugins"
 """Hydra takes plugins only from this namespace package, which exists where another plugin is installed."""
 
@@ -60,6 +62,8 @@ class Job:
             command = [sys.executable, "-m", module, *self.overrides, *here]
             environment = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"} | {RESULT: str(result)}
             code = subprocess.run(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, env=environment).returncode
+        if code == USAGE_ERROR:
+            raise SweepError(self._last_words(code))
         if code:
             return JobReturn(self.overrides, status=JobStatus.FAILED, _return_value=SweepError(self._last_words(code)))
         value = json.loads(result.read_text())
@@ -79,7 +83,7 @@ class ProcessLauncher(Launcher):
         num_processes: jobs at once; None: as many as there are cores, at ``trainer.num_threads`` each (one job if that is None).
 
     Raises:
-        SweepError: some runs failed; all others have been run.
+        SweepError: a run's configuration is wrong; or some runs failed, and all others have been run.
     """
 
     def __init__(self, num_processes: int | None = None) -> None:
@@ -96,7 +100,7 @@ class ProcessLauncher(Launcher):
         module = sys.modules["__main__"].__spec__
         assert module is not None, "a sweep is started by python -m"
         number = min(len(jobs), self.num_processes or default_processes(OmegaConf.select(self.config, "trainer.num_threads")))
-        console = Console(stderr=True, highlight=False, soft_wrap=True)
+        console = Console(highlight=False, soft_wrap=True)
         console.print(f"{len(jobs)} runs, {number} at a time; each has its {LOG} below {self.config.hydra.sweep.dir}")
         returns: dict[int, JobReturn] = {}
         pool = ThreadPoolExecutor(number)

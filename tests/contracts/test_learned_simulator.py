@@ -310,9 +310,9 @@ def test_a_damaged_checkpoint_is_named(simulator: LearnedSimulator, tmp_path: Pa
     ("changes", "message"),
     [
         ({"simulator": 3}, "not a checkpoint of gpe_pl"),
-        ({"simulator": {}}, "format None, this version reads 1"),
-        ({"simulator": {"format": 2}}, "format 2, this version reads 1"),
-        ({"simulator": {"format": 1}}, "KeyError: 'graph'"),
+        ({"simulator": {}}, "format None, this version reads 2"),
+        ({"simulator": {"format": 3}}, "format 3, this version reads 2"),
+        ({"simulator": {"format": 2}}, "KeyError: 'graph'"),
         ({"state_dict": {}}, "Missing key"),
     ],
 )

@@ -26,20 +26,27 @@ def finished(folder: Path) -> dict[Path, int]:
 
 @pytest.mark.slow
 def test_failures_are_named_and_the_others_run_and_a_rerun_finishes_them(tiny_data: Path, tmp_path: Path) -> None:
-    result = sweep(tiny_data, tmp_path, "training.learning_rate=1e-3,-1", "seed=0,1")
+    result = sweep(tiny_data, tmp_path, "training.learning_rate=1e-3,1e30", "seed=0,1")
     assert result.returncode == 2
     assert "2 of 4 runs failed" in result.stderr
-    assert "training.learning_rate=-1" in result.stderr
-    assert "greater than 0" in result.stderr
+    assert "training.learning_rate=1e" in result.stderr
     assert "output.log" in result.stderr
     assert "Traceback" not in result.stderr
     before = finished(tmp_path)
     assert len(before) == 2
     again = sweep(tiny_data, tmp_path, "training.learning_rate=1e-3", "seed=0,1")
     assert again.returncode == 0, again.stderr
-    assert "2/2 done" in again.stderr
+    assert "2/2 done" in again.stdout
     assert finished(tmp_path) == before  # finished runs are left as they are
     assert (tmp_path / "sweep" / "table.md").exists()
+
+
+@pytest.mark.slow
+def test_a_wrong_configuration_is_said_once(tiny_data: Path, tmp_path: Path) -> None:
+    result = sweep(tiny_data, tmp_path, "training.learning_rate=-1", "seed=0,1,2,3")
+    assert result.returncode == 2
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert "training.learning_rate=-1" in result.stderr and "greater than 0" in result.stderr
 
 
 def test_as_many_runs_at_once_as_there_are_cores() -> None:

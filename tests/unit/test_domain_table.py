@@ -23,7 +23,12 @@ BALLISTIC = {"sand": 30e-3, "fem": 8e-3}
 
 def write_run(folder: Path, domain: str, model: str, seed: int, errors: list[float]) -> None:
     folder.mkdir(parents=True)
-    config = {"seed": seed, "data": {"name": domain}, "model": {"_target_": f"gpe_pl.models.x.{model}"}, "training": {"num_steps": 1000 + seed}}
+    config = {
+        "seed": seed,
+        "data": {"name": domain},
+        "model": {"_target_": f"gpe_pl.models.x.{model}"},
+        "training": {"num_steps": 1000 + seed},
+    }
     (folder / "config.json").write_text(json.dumps(config))
     rows = []
     for name, values in ((LEARNED, errors), ("ballistic", [BALLISTIC[domain]] * len(errors))):
