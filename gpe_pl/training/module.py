@@ -23,7 +23,7 @@ from gpe_pl.metrics import OneStepNMSE
 Schedule = Literal["cosine", "exponential"]
 Compile = Literal["auto", "on", "off"]
 
-COMPILE_PAYS_AFTER = 10000
+COMPILE_PAYS_AFTER = 10_000
 """Steps from which ``compile: auto`` repays the time that compilation takes."""
 
 log = logging.getLogger(__name__)
