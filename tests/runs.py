@@ -16,7 +16,8 @@ from gpe_pl.simulate import dataset_spec
 DATA = [
     "size=tiny",
     *(f"++data.sizes.tiny.{key}={value}" for key, value in {
-        "num_train": 2, "num_val": 1, "num_test": 1, "num_test_unseen": 2, "num_frames": 12, "d2.num_particles": 30, "larger_num_particles": 60, "trajectories_per_shard": 2,
+        "num_train": 2, "num_val": 1, "num_test": 1, "num_test_unseen": 2, "num_frames": 12,
+        "d2.num_particles": 30, "larger_num_particles": 60, "trajectories_per_shard": 2,
     }.items()),
 ]  # fmt: skip
 RUN = [
