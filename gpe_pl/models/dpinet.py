@@ -32,7 +32,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import EdgeLinear, ReluMLP
-from gpe_pl.nn.homogeneous import Edges, Homogeneous, first_rows
+from gpe_pl.nn.homogeneous import Edges, Homogeneous, first_rows, present
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, RADIUS, SAME, EdgeType, FeatureSpec
 
 Relations = list[EdgeType]
@@ -95,9 +95,7 @@ class DPINet(nn.Module):
 
     def forward(self, data: HeteroData) -> Prediction:
         """Accelerations without gravity per material, in units of the data set's acceleration scale."""
-        x = {t: data[t].x for t in self.spec.node_types if data[t].x.shape[0]}
-        params = {m: data[m].material_params for m in self.spec.materials if m in x}
-        edges = {r: (data[r].edge_index, data[r].odd, data[r].even) for r in self.spec.relations if data[r].edge_index.shape[1]}
+        x, params, edges = present(data, self.spec)
         return Prediction(self.compute(x, params, edges) if params else {})
 
     def compute(self, x: dict[str, Tensor], params: dict[str, Tensor], edges: Edges) -> dict[str, Tensor]:

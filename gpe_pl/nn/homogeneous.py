@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor
 from torch.nn import functional
+from torch_geometric.data import HeteroData
 
 from gpe_pl.schema import EdgeType, FeatureSpec, role
 
@@ -85,6 +86,13 @@ class Homogeneous:
             some = next(iter(x.values()))
             return torch.empty((2, 0), dtype=torch.int64, device=some.device), some.new_empty((0, self.edge_channels))
         return torch.cat(indices, dim=1), torch.cat(features)
+
+
+def present(data: HeteroData, spec: FeatureSpec) -> tuple[dict[str, Tensor], dict[str, Tensor], Edges]:
+    """What a graph has any of: features of its node types, parameters of its materials, and its relations."""
+    x = {t: data[t].x for t in spec.node_types if data[t].x.shape[0]}
+    params = {m: data[m].material_params for m in spec.materials if m in x}
+    return x, params, {r: (data[r].edge_index, data[r].odd, data[r].even) for r in spec.relations if data[r].edge_index.shape[1]}
 
 
 def first_rows(x: dict[str, Tensor]) -> dict[str, int]:
