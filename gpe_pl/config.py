@@ -32,7 +32,7 @@ from gpe_pl import launcher
 from gpe_pl.errors import GpeError
 from gpe_pl.launcher import RESULT, USAGE_ERROR, SweepError
 
-WITHOUT_KEY = {"experiment", "scene", "solver"}
+WITHOUT_KEY = {"comparison", "experiment", "scene", "solver"}
 """Config groups that fill other keys than one of their own."""
 
 launcher.register()  # conf/ names it

@@ -14,6 +14,7 @@ from typing import Annotated
 import numpy as np
 import torch
 from pydantic import Field
+from torch_geometric.data import Batch
 
 from gpe_pl.baselines import Ballistic, ConstantVelocity
 from gpe_pl.containment import TOLERANCE, Contained
@@ -30,8 +31,8 @@ LEARNED = "learned"
 MAX_SPEED_FACTOR = 20.0
 """A learned rollout faster than this many times the fastest particle of the ground truth has exploded."""
 ONE_STEP_WINDOWS = 256
-ROLLOUTS_AT_ONCE = 16
-"""Scenes that one pass of the model advances together."""
+SCENES_AT_ONCE = 16
+"""Scenes, or windows, that one pass of the model takes together."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class EvaluationSettings:
         horizons: in frames; the full length is always added.
         num_trajectories: per split, from its start; None takes all.
         containment: put particles that cross a wall back on its surface.
+        num_uncontained: trajectories per split that are also rolled out without containment, to see what it corrects; None takes all.
         num_pictures: trajectories per split that get a figure and an animation.
     """
 
@@ -50,6 +52,7 @@ class EvaluationSettings:
     horizons: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [5, 20, 50, 100])
     num_trajectories: Annotated[int, Field(ge=1)] | None = None
     containment: bool = True
+    num_uncontained: Annotated[int, Field(ge=0)] | None = None
     num_pictures: Annotated[int, Field(ge=0)] = 2
 
 
@@ -71,7 +74,7 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     """Roll out every trajectory of the splits and write ``metrics.csv``, ``error_curve_*.png``, ``rollout_*.png`` and ``rollout_*.gif``.
 
     All rollouts start at the first frame with enough history and run to the end of the ground truth. Share outside with containment off is reported as
-    ``share_outside_uncontained``, the share of corrected particle-steps as ``share_corrected``.
+    ``share_outside_uncontained``, where it was asked for, the share of corrected particle-steps as ``share_corrected``.
     """
     run_dir.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
@@ -80,8 +83,9 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
         rows += [Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split))]
         trajectories = islice(iter_trajectories(root, split), settings.num_trajectories)
         number, truth = 0, None
-        while batch := list(islice(trajectories, ROLLOUTS_AT_ONCE)):
-            for trajectory, (predictions, extra) in zip(batch, _predict(simulator, batch, settings.containment, label), strict=True):
+        while batch := list(islice(trajectories, SCENES_AT_ONCE)):
+            left = len(batch) if settings.num_uncontained is None else max(0, settings.num_uncontained - number)
+            for trajectory, (predictions, extra) in zip(batch, _predict(simulator, batch, settings.containment, left, label), strict=True):
                 truth = trajectory.frames(simulator.builder.config.history)
                 values = np.asarray(trajectory.material_params, dtype=np.float64)
                 parameter = float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
@@ -104,7 +108,7 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
 
 
 def _predict(
-    simulator: LearnedSimulator, trajectories: list[Trajectory], containment: bool, label: str
+    simulator: LearnedSimulator, trajectories: list[Trajectory], containment: bool, num_uncontained: int, label: str
 ) -> Iterator[tuple[dict[str, Trajectory], dict[str, float]]]:
     """Predictions of all models, and further numbers of the learned one, for each trajectory."""
     history = simulator.builder.config.history
@@ -117,7 +121,7 @@ def _predict(
     def count(scene: int, _: int, state: State) -> None:
         num_corrected[scene] += state.num_corrected
 
-    free = rollouts(simulator, starts)
+    free = rollouts(simulator, starts[:num_uncontained] if containment else starts)
     contained = rollouts(Contained(simulator, truths[0].metadata.frame_dt), starts, count) if containment else free
     for scene, (trajectory, truth) in enumerate(zip(trajectories, truths, strict=True)):
         dt, steps, spacing = truth.metadata.frame_dt, truth.num_frames - 1, truth.metadata.spacing
@@ -126,15 +130,14 @@ def _predict(
         for name, baseline in (("ballistic", Ballistic(dt)), ("constant_velocity", ConstantVelocity(dt))):
             predictions[name] = rollout(baseline, trajectory.state(history, history), steps, truth.metadata)
         num_steps = truth.num_nodes * max(1, prediction.num_frames - 1)
-        yield (
-            predictions,
-            {
-                "share_outside_uncontained": _share_outside(free[scene], 1, steps, tolerance=1e-3 * spacing),
-                "share_outside_at_end": _share_outside(prediction, steps, steps, tolerance=TOLERANCE),
-                "num_good_frames": float(prediction.num_frames - 1),
-                "share_corrected": num_corrected[scene] / num_steps,
-            },
-        )
+        extra = {
+            "share_outside_at_end": _share_outside(prediction, steps, steps, tolerance=TOLERANCE),
+            "num_good_frames": float(prediction.num_frames - 1),
+            "share_corrected": num_corrected[scene] / num_steps,
+        }
+        if scene < len(free):
+            extra["share_outside_uncontained"] = _share_outside(free[scene], 1, steps, tolerance=1e-3 * spacing)
+        yield predictions, extra
 
 
 def _start(simulator: LearnedSimulator, trajectory: Trajectory, truth: Trajectory) -> Start:
@@ -158,8 +161,8 @@ def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windo
     windows = np.unique(np.linspace(0, len(dataset) - 1, min(len(dataset), num_windows)).round().astype(int))
     metric = OneStepNMSE()
     with torch.inference_mode():
-        for window in windows:
-            data = dataset[int(window)]
+        for chosen in np.array_split(windows, -(-len(windows) // SCENES_AT_ONCE)):
+            data = Batch.from_data_list([dataset[int(window)] for window in chosen])
             for material, value in simulator(data).acceleration.items():
                 metric.update(value, data[material].target / simulator.acceleration_std.float())
     return float(metric.compute())

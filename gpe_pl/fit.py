@@ -28,7 +28,7 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.simulate import ensure_data, evaluated_config
     from gpe_pl.training.budget import digest, step_time, within_budget
     from gpe_pl.training.module import TrainingModule
-    from gpe_pl.training.run import LoggerSettings, TrainerSettings, TrainingSettings, claim, set_threads, train
+    from gpe_pl.training.run import LoggerSettings, TrainerSettings, TrainingSettings, adopt, claim, set_threads, train
 
     if type(cfg.seed) is not int or cfg.seed < 0:
         raise ConfigError(f"seed={cfg.seed!r}: must be an integer of at least 0")
@@ -38,7 +38,7 @@ def fit(cfg: DictConfig) -> float:
     graph = construct(GraphConfig, cfg.graph, "graph")
     logger = construct(LoggerSettings, cfg.logger, "logger")
     new_model = bind(model_class(cfg.model._target_), {k: v for k, v in cfg.model.items() if k != "_target_"}, "model", "spec")
-    noise = Noise(training.noise, training.noise_std)
+    noise = Noise(training.noise, training.noise_std, training.noise_correction)
 
     run_dir = output_dir(cfg)
     Path(cfg.paths.data).mkdir(parents=True, exist_ok=True)
@@ -64,12 +64,16 @@ def fit(cfg: DictConfig) -> float:
     if training.budget_minutes is not None:
         parts = {k: settings[k] for k in ("data", "graph", "model")} | {"batch_size": training.batch_size, "device": device}
         key = f"{cfg.data.name} {cfg.size.name} {cfg.model._target_.rpartition('.')[2]} {digest(parts)}"
-        times = Path(cfg.paths.runs) / cfg.name / "step_times.json"
-        training = within_budget(training, times, key, lambda: step_time(new_module(training).to(device), data().train_set, training))
+        times = Path(cfg.paths.runs) / (cfg.reuse or cfg.name) / "step_times.json"
+        training = within_budget(
+            training, times, key, lambda settings: step_time(new_module(settings).to(device), data().train_set, settings)
+        )
     settings["training"] = asdict(training)
-    claim(run_dir, {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training", "evaluation")})
+    trained = {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training")}
+    claim(run_dir, trained | {"evaluation": settings["evaluation"]})
     if not (run_dir / "metrics.csv").exists():
-        best = train(new_module(training), data(), training, trainer, logger.loggers(run_dir), run_dir)
+        best = None if cfg.reuse is None else adopt(Path(cfg.paths.runs) / cfg.reuse, trained, run_dir)
+        best = best or train(new_module(training), data(), training, trainer, logger.loggers(run_dir), run_dir)
         evaluate(LearnedSimulator.from_checkpoint(best, device), evaluated, evaluation, run_dir)
 
     values = [

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import importlib
 import inspect
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -28,7 +29,7 @@ from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, EdgeType, FeatureSpec, node_code, role
 from gpe_pl.trajectory import Metadata, State, Stress, Trajectory
 
-CHECKPOINT_FORMAT = 2
+CHECKPOINT_FORMAT = 3
 
 RANGE_TOLERANCE = 1e-5
 """Material parameters are stored in single precision; differences below this share of the value are none."""
@@ -251,6 +252,15 @@ class LearnedSimulator(nn.Module):
             raise ValueError(f"checkpoint format {values.get('format')!r}, this version reads {CHECKPOINT_FORMAT}")
         builder = GraphBuilder(GraphConfig(**values["graph"]), Metadata(**values["metadata"]))
         return cls(model_class(values["model"])(builder.spec, **values["settings"]), builder)
+
+    def save(self, path: Path | str) -> None:
+        """Write weights and description alone, which ``from_checkpoint`` reads, atomically; a training checkpoint also holds the optimiser's state."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        weights = {f"simulator.{name}": value.detach().cpu().clone() for name, value in self.state_dict().items()}
+        temporary = path.with_suffix(".part")
+        torch.save({"simulator": self.description(), "state_dict": weights}, temporary)
+        os.replace(temporary, path)
 
     @classmethod
     def from_checkpoint(cls, path: Path | str, device: Any = "cpu") -> LearnedSimulator:

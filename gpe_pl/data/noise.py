@@ -25,10 +25,13 @@ class Noise:
     Attributes:
         kind: see the module's text.
         std: for ``paper`` in m; for ``velocity`` in units of the data's acceleration std × frame interval, that is of one frame's velocity change.
+        correction: of ``velocity``, the share of the last position's noise that the target takes back within the step; a model that is to bring nodes back to
+            where they belong needs some [γ of Pfaff et al. 2021, appendix A.2.2].
     """
 
     kind: NoiseKind = "velocity"
     std: Annotated[float, Field(ge=0, le=100)] = 0.3
+    correction: Annotated[float, Field(ge=0, le=1)] = 0.0
 
     def apply(
         self, window: Float64[np.ndarray, "window node dim"], velocity_unit: float, frame_dt: float, rng: np.random.Generator
@@ -49,5 +52,5 @@ class Noise:
         steps = rng.normal(scale=self.std * velocity_unit / np.sqrt(history), size=(history, *window.shape[1:]))
         offset = np.zeros_like(window)
         offset[1:-1] = np.cumsum(np.cumsum(steps, axis=0) * frame_dt, axis=0)
-        offset[-1] = offset[-2]
+        offset[-1] = (1 - self.correction) * offset[-2]
         return window + offset

@@ -43,7 +43,7 @@ class GraphConfig:
     Attributes:
         features: edge features, ``paper`` or ``contact``.
         history: velocities per node.
-        connectivity_radius: neighbour radius [m]; None takes the data set's.
+        connectivity_spacings: neighbour radius in rest spacings; None takes the data set's radius.
         trim_boundary: leave out boundary nodes without an edge, which cannot influence anything.
         mesh: connect ``schema.MESH_MATERIALS`` along their cells and put levels of virtual nodes above them; without it they are particles like the others.
         num_levels: of virtual nodes; None takes as many as lead to one root in any body of the domain.
@@ -51,7 +51,7 @@ class GraphConfig:
 
     features: Features = "contact"
     history: Annotated[int, Field(ge=1, le=20)] = 5
-    connectivity_radius: Annotated[float, Field(gt=0)] | None = None
+    connectivity_spacings: Annotated[float, Field(gt=0)] | None = None
     trim_boundary: bool = True
     mesh: bool = False
     num_levels: Annotated[int, Field(ge=0, le=20)] | None = None
@@ -78,7 +78,8 @@ class Scales:
 
 def scales_of(config: GraphConfig, metadata: Metadata) -> Scales:
     """Scales from the metadata, with the radius of the graph configuration if it names one."""
-    return Scales(config.connectivity_radius or metadata.connectivity_radius, metadata.spacing, metadata.frame_dt)
+    own = config.connectivity_spacings
+    return Scales(metadata.connectivity_radius if own is None else own * metadata.spacing, metadata.spacing, metadata.frame_dt)
 
 
 def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:

@@ -37,7 +37,7 @@ class Settings:
 
 def synthetic_graph(num_nodes: int, num_edges: int, config: GraphConfig, seed: int = 0) -> tuple[GraphBuilder, HeteroData]:
     """A layer of sand without walls: a jittered lattice whose radius is chosen to give about ``num_edges`` undirected edges."""
-    config = replace(config, connectivity_radius=None)
+    config = replace(config, connectivity_spacings=None)
     rng = np.random.default_rng(seed)
     side = int(np.ceil(np.sqrt(num_nodes)))
     lattice = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2)[:num_nodes]

@@ -21,7 +21,7 @@ from torch_geometric.data import Batch
 
 from gpe_pl.data.dataset import StepSampler, WindowDataset
 from gpe_pl.errors import GpeError
-from gpe_pl.training.module import TrainingModule
+from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
 from gpe_pl.training.run import TrainingSettings
 
 log = logging.getLogger(__name__)
@@ -65,14 +65,16 @@ def _batches(data: WindowDataset, batch_size: int) -> Iterator[Batch]:
         yield Batch.from_data_list([data[next(samples)] for _ in range(batch_size)])
 
 
-def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Callable[[], float]) -> TrainingSettings:
+def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Callable[[TrainingSettings], float]) -> TrainingSettings:
     """Settings with the number of steps that ``settings.budget_minutes`` allow, and as many validations as before.
+
+    The time of compiling, where a run is long enough for it, is not part of the budget.
 
     Args:
         settings: with a budget.
         path: JSON file of step times [s], shared by the runs of a sweep.
         key: in that file, what the step time depends on.
-        measure: step time [s]; called if the file does not have it yet.
+        measure: step time [s] under given settings; called if the file does not have it yet.
 
     Raises:
         BudgetError: the file is damaged.
@@ -82,7 +84,7 @@ def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Cal
     with FileLock(path.with_suffix(".lock")):
         times = _read(path)
         if key not in times:
-            times[key] = measure()
+            times[key] = _measured(settings, measure)
             log.info("%s: %.1f ms per training step", key, 1e3 * times[key])
             temporary = path.with_suffix(".part")
             temporary.write_text(json.dumps(times, indent=1))
@@ -90,6 +92,16 @@ def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Cal
     validations = max(1, settings.num_steps // settings.val_interval)
     interval = max(1, int(60 * settings.budget_minutes / times[key] / validations))
     return replace(settings, num_steps=interval * validations, val_interval=interval, budget_minutes=None)
+
+
+def _measured(settings: TrainingSettings, measure: Callable[[TrainingSettings], float]) -> float:
+    """Step time as the run will have it: ``compile: auto`` depends on the number of steps."""
+    assert settings.budget_minutes is not None
+    if settings.compile != "auto":
+        return measure(settings)
+    plain = measure(replace(settings, compile="off"))
+    num_steps = int(60 * settings.budget_minutes / plain)
+    return measure(replace(settings, num_steps=num_steps, val_interval=num_steps)) if num_steps >= COMPILE_PAYS_AFTER else plain
 
 
 def _read(path: Path) -> dict[str, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -47,6 +48,7 @@ class TrainingSettings:
     ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999
     noise: NoiseKind = "velocity"
     noise_std: Annotated[float, Field(ge=0, le=100)] = 0.3
+    noise_correction: Annotated[float, Field(ge=0, le=1)] = 0.0
     stress_weight: Annotated[float, Field(gt=0)] = 1.0
     compile: Compile = "auto"
     val_interval: Annotated[int, Field(ge=1)] = 1000
@@ -121,6 +123,22 @@ def claim(run_dir: Path, config: dict[str, Any]) -> None:
     temporary = path.with_suffix(".part")
     temporary.write_text(json.dumps(config, indent=1, sort_keys=True))
     os.replace(temporary, path)
+
+
+def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
+    """Copy the checkpoint of a finished run below ``folder`` whose configuration has all values of ``config``; None if there is no such run."""
+    for path in sorted(folder.rglob("config.json")):
+        trained = path.parent / "checkpoints" / "best.ckpt"
+        if (path.parent / "metrics.csv").exists() and trained.exists():
+            there = json.loads(path.read_text())
+            if not _differences({key: there.get(key) for key in config}, config):
+                log.info("taking the model that was trained in %s", path.parent)
+                own = run_dir / "checkpoints" / "best.ckpt"
+                own.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(trained, own.with_suffix(".part"))
+                os.replace(own.with_suffix(".part"), own)
+                return own
+    return None
 
 
 def _differences(a: Any, b: Any, path: str = "") -> list[str]:

@@ -73,7 +73,7 @@ def test_edges_are_all_pairs_within_the_radius(dim: int, materials: tuple[str, .
 def test_pairs_exactly_at_the_radius_are_neighbours(radius: float, brute_force_radius: Pairs) -> None:
     grid = np.stack(np.meshgrid(*[np.arange(1, 6) / 8] * 2, indexing="ij"), axis=-1).reshape(-1, 2)  # exact in binary
     s = replace(scenes.state(len(grid), walls=False), pos=grid)
-    build = builder(connectivity_radius=radius)
+    build = builder(connectivity_spacings=radius / scenes.SPACING)
     assert assert_edges_are_exact(build, s, brute_force_radius) == (40 if radius == 0.125 else 40 + 32 + 30)
     floor = Boundary(np.zeros((1, 2)), np.zeros((1, 2)), np.array([[0.0, 1.0]]), np.zeros(1), np.zeros(1))
     beside = replace(scenes.state(2), pos=np.array([[radius, 0.0], [np.nextafter(radius, 1), 0.0]]), boundary=floor)

@@ -18,7 +18,7 @@ from gpe_pl.containment import Contained
 from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator, SceneError, UnknownModelError, model_class
+from gpe_pl.learned_simulator import CHECKPOINT_FORMAT, CheckpointError, LearnedSimulator, SceneError, UnknownModelError, model_class
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout import Guard, rollout
 from gpe_pl.trajectory import State, Trajectory, iter_trajectories, write_shard
@@ -256,6 +256,18 @@ def test_a_checkpoint_rebuilds_the_simulator(simulator: LearnedSimulator, tmp_pa
     assert float(again.acceleration_std) == pytest.approx(3.0)
 
 
+def test_a_saved_simulator_holds_itself_and_nothing_else(simulator: LearnedSimulator, tmp_path: Path) -> None:
+    path = tmp_path / "models" / "a.ckpt"
+    simulator.save(path)
+    assert [p.name for p in path.parent.iterdir()] == ["a.ckpt"]
+    again = LearnedSimulator.from_checkpoint(path)
+    assert again.description() == simulator.description()
+    for name, value in simulator.state_dict().items():
+        assert torch.equal(again.state_dict()[name], value)
+    weights = sum(value.nbytes for value in simulator.state_dict().values())
+    assert path.stat().st_size < 2 * weights + 100_000
+
+
 def test_a_description_is_plain_values(simulator: LearnedSimulator) -> None:
     def check(value: Any) -> None:
         if isinstance(value, dict):
@@ -310,9 +322,9 @@ def test_a_damaged_checkpoint_is_named(simulator: LearnedSimulator, tmp_path: Pa
     ("changes", "message"),
     [
         ({"simulator": 3}, "not a checkpoint of gpe_pl"),
-        ({"simulator": {}}, "format None, this version reads 2"),
-        ({"simulator": {"format": 3}}, "format 3, this version reads 2"),
-        ({"simulator": {"format": 2}}, "KeyError: 'graph'"),
+        ({"simulator": {}}, f"format None, this version reads {CHECKPOINT_FORMAT}"),
+        ({"simulator": {"format": CHECKPOINT_FORMAT + 1}}, f"format {CHECKPOINT_FORMAT + 1}, this version reads {CHECKPOINT_FORMAT}"),
+        ({"simulator": {"format": CHECKPOINT_FORMAT}}, "KeyError: 'graph'"),
         ({"state_dict": {}}, "Missing key"),
     ],
 )

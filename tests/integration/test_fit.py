@@ -259,6 +259,34 @@ def test_metrics_hold_the_model_and_the_baselines(tiny_data: Path, tmp_path: Pat
     assert len(set(ballistic.values())) == 3
 
 
+def test_what_containment_corrects_is_looked_at_where_asked_for(tiny_data: Path, tmp_path: Path) -> None:
+    fit(tiny(tiny_data, tmp_path, "evaluation.num_uncontained=1"))
+    rows = list(read_rows(tmp_path / "fit" / "metrics.csv"))
+    assert [(r.split, r.trajectory) for r in rows if r.metric == "share_outside_uncontained"] == [("test", 0), ("test_unseen", 0)]
+    assert [(r.split, r.trajectory) for r in rows if r.metric == "share_corrected"] == [("test", 0), ("test_unseen", 0), ("test_unseen", 1)]
+
+
+def test_a_trained_model_is_evaluated_again_without_training(tiny_data: Path, tmp_path: Path) -> None:
+    first = tiny(tiny_data, tmp_path, "name=first")
+    fit(first)
+    other = tiny(tiny_data, tmp_path, "name=other", "reuse=first", "seed=1")
+    fit(other)  # no such model there: trains its own
+    assert len(list((tmp_path / "other" / "log").iterdir())) == 1
+    again = tiny(tiny_data, tmp_path, "name=again", "reuse=first", "evaluation.splits=[test_unseen]")
+    fit(again)
+    assert not (tmp_path / "again" / "log").exists()
+    assert_equal(checkpoint(again, "best")["state_dict"], checkpoint(first, "best")["state_dict"])
+    before, now = (
+        {
+            (r.trajectory, r.metric, r.horizon): r.value
+            for r in read_rows(tmp_path / name / "metrics.csv")
+            if r.model == "learned" and r.split == "test_unseen"
+        }
+        for name in ("first", "again")
+    )
+    assert now == pytest.approx(before, rel=1e-9)
+
+
 def test_a_trained_checkpoint_holds_the_averaged_weights(tiny_data: Path, tmp_path: Path) -> None:
     cfg = tiny(tiny_data, tmp_path, *STEPS)
     fit(cfg)

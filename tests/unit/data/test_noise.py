@@ -80,3 +80,13 @@ def test_velocity_noise_is_in_units_of_one_frames_velocity_change(history: int) 
     for k in range(history):  # a random walk: variance grows linearly and ends at the stated value
         assert np.std(error[k]) == pytest.approx(0.4 * UNIT * np.sqrt((k + 1) / history), rel=0.02)
     np.testing.assert_allclose(error[history], 0.0, atol=1e-11)
+
+
+@pytest.mark.parametrize("correction", [0.25, 1.0])
+def test_the_target_takes_back_a_share_of_the_position_noise(correction: float) -> None:
+    clean = window(3)
+    plain, result = noisy(Noise("velocity", 0.5), clean), noisy(Noise("velocity", 0.5, correction), clean)
+    np.testing.assert_array_equal(result[:-1], plain[:-1])  # inputs are the same
+    position_error = result[-2] - clean[-2]
+    assert np.abs(position_error).min() > 0
+    np.testing.assert_allclose(result[-1] - clean[-1], (1 - correction) * position_error, atol=1e-15)

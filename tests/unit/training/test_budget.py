@@ -15,7 +15,7 @@ from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.training import budget
 from gpe_pl.training.budget import BudgetError, digest, step_time, within_budget
-from gpe_pl.training.module import TrainingModule
+from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
 from gpe_pl.training.run import TrainingSettings
 
 SETTINGS = TrainingSettings(num_steps=1000, val_interval=250, budget_minutes=0.5)
@@ -24,7 +24,7 @@ SETTINGS = TrainingSettings(num_steps=1000, val_interval=250, budget_minutes=0.5
 def test_steps_fill_the_budget_and_validations_keep_their_number(tmp_path: Path) -> None:
     path, calls = tmp_path / "sweep" / "step_times.json", []
 
-    def measure() -> float:
+    def measure(_: TrainingSettings) -> float:
         calls.append(1)
         return 0.0301
 
@@ -33,13 +33,27 @@ def test_steps_fill_the_budget_and_validations_keep_their_number(tmp_path: Path)
     assert settings.budget_minutes is None
     assert within_budget(SETTINGS, path, "sand GPE", measure) == settings
     assert len(calls) == 1
-    other = within_budget(SETTINGS, path, "sand GNS", lambda: 0.1)
+    other = within_budget(SETTINGS, path, "sand GNS", lambda _: 0.1)
     assert other.num_steps == 300
     assert within_budget(SETTINGS, path, "sand GPE", measure) == settings
 
 
 def test_a_step_dearer_than_the_budget_is_taken_once_per_validation(tmp_path: Path) -> None:
-    assert within_budget(SETTINGS, tmp_path / "t.json", "slow", lambda: 1e4).num_steps == 4
+    assert within_budget(SETTINGS, tmp_path / "t.json", "slow", lambda _: 1e4).num_steps == 4
+
+
+@pytest.mark.parametrize(("plain", "asked"), [(0.1, ["off"]), (0.001, ["off", "auto"])])
+def test_the_step_is_measured_as_the_run_will_take_it(tmp_path: Path, plain: float, asked: list[str]) -> None:
+    seen = []
+
+    def measure(settings: TrainingSettings) -> float:
+        seen.append(settings.compile)
+        assert settings.compile == "off" or settings.num_steps >= COMPILE_PAYS_AFTER
+        return plain if settings.compile == "off" else plain / 2
+
+    result = within_budget(SETTINGS, tmp_path / "t.json", "sand", measure)
+    assert seen == asked
+    assert result.num_steps == (300 if plain == 0.1 else 60_000)
 
 
 @pytest.mark.parametrize("content", ["", "[1]", '{"a": "fast"}', "\x00"])
@@ -47,11 +61,11 @@ def test_a_damaged_file_is_named(tmp_path: Path, content: str) -> None:
     path = tmp_path / "step_times.json"
     path.write_text(content)
     with pytest.raises(BudgetError, match=r"step_times\.json: not a file of step times .*delete it"):
-        within_budget(SETTINGS, path, "sand", lambda: 1.0)
+        within_budget(SETTINGS, path, "sand", lambda _: 1.0)
 
 
 def test_a_measurement_that_fails_writes_nothing(tmp_path: Path) -> None:
-    def measure() -> float:
+    def measure(_: TrainingSettings) -> float:
         raise RuntimeError("no")
 
     with pytest.raises(RuntimeError):

@@ -1,0 +1,28 @@
+"""Shipped models: small, described, and found by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.pretrained import FOLDER, checkpoint_path, names
+
+LIMIT = 2_000_000
+
+
+def test_a_path_stays_a_path() -> None:
+    assert checkpoint_path("runs/sand/best.ckpt") == Path("runs/sand/best.ckpt")
+    assert checkpoint_path("no such model") == Path("no such model")
+
+
+@pytest.mark.parametrize("name", names())
+def test_a_shipped_model_is_small_described_and_loads(name: str) -> None:
+    path = checkpoint_path(name)
+    assert path.parent == FOLDER
+    assert path.stat().st_size <= LIMIT
+    card = path.with_suffix(".md").read_text()
+    simulator = LearnedSimulator.from_checkpoint(path)
+    assert simulator.builder.metadata.dataset in card
+    assert "python -m gpe_pl.fit" in card
