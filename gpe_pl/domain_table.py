@@ -22,7 +22,6 @@ log = logging.getLogger(__name__)
 
 TABLE_CSV, TABLE_MD, FIGURE, PARAMETER_FIGURE = "table1.csv", "table1.md", "table1.png", "error_by_parameter.png"
 OWN = "GPE"
-TRIVIAL = ("ballistic", "constant_velocity")
 NOT_LEARNED = 2.0
 """A model that is not this many times better than ballistic flight has learned nothing worth comparing."""
 

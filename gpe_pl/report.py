@@ -22,6 +22,7 @@ from gpe_pl.timing import paired_ratio, paired_times
 
 log = logging.getLogger(__name__)
 
+TRIVIAL = ("ballistic", "constant_velocity")
 TABLE_HORIZONS = 4
 """The longest horizons, shown in the Markdown table; ``table.csv`` has all."""
 
@@ -95,13 +96,20 @@ def _report(folder: Path, runs: list[Run]) -> None:
 
 
 def summary(rows: list[Row]) -> str:
-    """Mean over trajectories of every metric, as plain text: one line per model, split, metric and horizon."""
-    groups: dict[tuple[str, str, str, str], list[float]] = defaultdict(list)
+    """Means over trajectories as plain text: a line per split, metric and model, a column per horizon. Trivial models have their rollout MSE only."""
+    groups: dict[tuple[str, str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
-        for split in groups_of(row):
-            groups[row.model, split, row.metric, row.horizon].append(row.value)
-    lines = [f"{model:18} {split:25} {metric:28} {horizon:>5} {np.mean(v):12.5g}" for (model, split, metric, horizon), v in groups.items()]
-    return "\n".join([f"{'model':18} {'split':25} {'metric':28} {'frame':>5} {'mean':>12}", *lines])
+        if row.model not in TRIVIAL or row.metric == "rollout_mse":
+            for split in groups_of(row):
+                groups[split, row.metric, row.model][row.horizon].append(row.value)
+    horizons = sorted({row.horizon for row in rows} - {"1", "full"}, key=int)
+    lines = [f"{'split':25} {'metric':22} {'model':18}" + "".join(f"{h:>11}" for h in (*horizons, "full"))]
+    for (split, metric, model), values in sorted(groups.items()):
+        if "1" in values:  # of one step, or of a rollout as a whole
+            values["full"] = values["1"]
+        cells = [f"{np.mean(values[h]):11.4g}" if h in values else " " * 11 for h in (*horizons, "full")]
+        lines.append(f"{split:25} {metric:22} {model:18}" + "".join(cells))
+    return "\n".join(lines)
 
 
 def _column(axis: str) -> str:

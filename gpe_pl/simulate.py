@@ -29,7 +29,7 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     if cfg.size.name not in cfg.data.sizes:
         raise ConfigError(f"size={cfg.size.name}: data={cfg.data.name} has the sizes {', '.join(cfg.data.sizes)}")
     values: dict[str, Any] = OmegaConf.to_container(cfg.data, resolve=True)  # type: ignore[assignment]
-    for table in ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds", "larger"):
+    for table in ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds", "larger", "comparison"):
         values.pop(table, None)
     scene = construct_target(values.pop("scene"), "data.scene", "gpe_pl.solvers.")
     solver = construct_target(values.pop("solver"), "data.solver", "gpe_pl.solvers.")

@@ -1,0 +1,69 @@
+"""Make a trained run one of the models that come with the package.
+
+``python docs/ship_model.py RUN_FOLDER NAME 'COMMAND'`` writes weights without the optimiser's state, and a model card whose numbers are the run's own, to
+``gpe_pl/pretrained``. COMMAND is what trained it.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from gpe_pl.evaluation import Row, read_rows
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.pretrained import FOLDER
+from gpe_pl.report import summary
+from gpe_pl.schema import MATERIALS
+
+
+def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows: list[Row], settings: dict[str, object]) -> str:
+    """The model card."""
+    metadata, model = simulator.builder.metadata, type(simulator.model).__name__
+    size = sum(p.numel() for p in simulator.parameters())
+    ranges = []
+    for material, count in simulator.builder.spec.param_channels.items():
+        low, high = simulator.get_buffer(f"trained_{material}").tolist() if count else ([], [])
+        ranges += [
+            f"| {MATERIALS[material].name} of {material} | {a:g} – {b:g} {MATERIALS[material].unit} |"
+            for a, b in zip(low, high, strict=True)
+        ]
+    training = settings["training"]
+    assert isinstance(training, dict)
+    lines = [
+        f"# {name}",
+        "",
+        f"{model} with {size:,} parameters, for {', '.join(metadata.materials)} in {metadata.dim}D: data set `{metadata.dataset}`, "
+        f"frames of {1e3 * metadata.frame_dt:g} ms, nodes {metadata.spacing:.4g} m apart. Other frame intervals and spacings are refused.",
+        "",
+        f"Trained with `{command}` (commit {commit}), {training['num_steps']:,} steps of {training['batch_size']} graphs.",
+        "",
+        "| trained range | |",
+        "|---|---|",
+        *ranges,
+        "",
+        "Values outside are warned of; the errors below say what to expect.",
+        "",
+        "```",
+        summary(rows),
+        "```",
+        "",
+        "It knows boxes with the obstacles of that data set. Fracture, other contact laws and other materials are beyond it.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def main(arguments: list[str]) -> int:
+    """Write checkpoint and card; the exit status."""
+    run, name, command = Path(arguments[0]), arguments[1], arguments[2]
+    simulator = LearnedSimulator.from_checkpoint(run / "checkpoints" / "best.ckpt")
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
+    settings = json.loads((run / "config.json").read_text())
+    simulator.save(FOLDER / f"{name}.ckpt")
+    (FOLDER / f"{name}.md").write_text(card(name, command, commit, simulator, list(read_rows(run / "metrics.csv")), settings))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,69 @@
+"""``python -m gpe_pl.evaluate``: any model's checkpoint, wherever its run lies now, or a shipped model by its name."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from gpe_pl import pretrained
+from gpe_pl.config import ConfigError
+from gpe_pl.evaluate import evaluate_checkpoint
+from gpe_pl.evaluation import Row, read_rows
+from gpe_pl.fit import fit
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.report import summary
+from tests.runs import DATA, compose, tiny
+
+
+def evaluate(data: Path, runs: Path, checkpoint: Path | str, *overrides: str) -> list[Row]:
+    shared = [f"paths.data={data}", f"paths.runs={runs}", "evaluation.horizons=[5]", "split=test_unseen"]
+    evaluate_checkpoint(compose("evaluate", *DATA, *shared, f"checkpoint={checkpoint}", *overrides))
+    return list(read_rows(runs / "evaluation_test_unseen" / "metrics.csv"))
+
+
+def key(row: Row) -> tuple[str, int, str, str]:
+    return row.model, row.trajectory, row.metric, row.horizon
+
+
+@pytest.mark.parametrize("model", ["gpe", "gns", "dpinet", "cconv"])
+def test_a_run_that_was_moved_gives_the_same_numbers(
+    model: str, tiny_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fit(tiny(tiny_data, tmp_path / "runs", f"model={model}"))
+    known = {key(r): r.value for r in read_rows(tmp_path / "runs" / "fit" / "metrics.csv") if r.split == "test_unseen"}
+    shutil.move(tmp_path / "runs" / "fit", tmp_path / "elsewhere")
+    rows = evaluate(tiny_data, tmp_path / "new", tmp_path / "elsewhere" / "checkpoints" / "best.ckpt", "evaluation.num_pictures=1")
+    assert {key(r): r.value for r in rows} == pytest.approx(known, rel=1e-9)
+    written = {path.name for path in (tmp_path / "new" / "evaluation_test_unseen").iterdir()}
+    assert {"rollout_test_unseen_00.png", "rollout_test_unseen_00.gif", "error_curve_test_unseen.png"} <= written
+    assert "rollout_mse            learned" in capsys.readouterr().out
+
+
+def test_a_shipped_model_is_named(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fit(tiny(tiny_data, tmp_path))
+    monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "shipped")
+    LearnedSimulator.from_checkpoint(tmp_path / "fit" / "checkpoints" / "best.ckpt").save(tmp_path / "shipped" / "sand.ckpt")
+    rows = evaluate(tiny_data, tmp_path, "sand", "evaluation.num_pictures=0")
+    assert {r.model for r in rows} == {"learned", "ballistic", "constant_velocity"}
+    with pytest.raises(ConfigError, match=r"checkpoint=None: name a checkpoint of a run.*, or a shipped model: sand"):
+        evaluate(tiny_data, tmp_path, "null")
+
+
+def test_a_summary_has_a_line_per_metric_and_a_column_per_horizon() -> None:
+    def row(model: str, metric: str, horizon: str, value: float, group: str = "seen") -> Row:
+        return Row(model, "test", 0, group, 1.0, metric, horizon, value)
+
+    rows = [
+        *(row("learned", "rollout_mse", h, v) for h, v in (("20", 2.0), ("100", 3.0), ("full", 4.0), ("full", 6.0))),
+        row("learned", "one_step_nmse", "1", 0.25),
+        *(row("ballistic", metric, "full", 7.0) for metric in ("rollout_mse", "velocity_error")),
+    ]
+    header, *lines = summary(rows).splitlines()
+    assert header.split() == ["split", "metric", "model", "20", "100", "full"]
+    assert [line.split() for line in lines] == [
+        ["test", "one_step_nmse", "learned", "0.25"],
+        ["test", "rollout_mse", "ballistic", "7"],
+        ["test", "rollout_mse", "learned", "2", "3", "5"],
+    ]
