@@ -155,6 +155,7 @@ class FeatureSpec:
         even_channels: per relation, edge channels that do not.
         stress_channels: components of the Cauchy stress per material that has one, in the order of ``STRESS_COMPONENTS``.
         num_levels: of virtual nodes above meshes.
+        islands: whether graphs say which nodes hang together, and which of these groups nothing else touches.
     """
 
     dim: int
@@ -166,6 +167,7 @@ class FeatureSpec:
     even_channels: dict[EdgeType, int]
     stress_channels: dict[str, int] = field(default_factory=dict)
     num_levels: int = 0
+    islands: bool = False
 
     @property
     def node_types(self) -> tuple[str, ...]:

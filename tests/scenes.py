@@ -124,7 +124,7 @@ def mesh_state(
 
 def builder(materials: tuple[str, ...] = ("sand",), dim: int = 2, **config: object) -> GraphBuilder:
     """A graph builder for such states."""
-    return GraphBuilder(GraphConfig(**{"history": 1, **config}), metadata(materials, dim))  # type: ignore[arg-type]
+    return GraphBuilder(GraphConfig(**{"history": 1, "islands": True, **config}), metadata(materials, dim))  # type: ignore[arg-type]
 
 
 def graph(materials: tuple[str, ...] = ("sand",), dtype: torch.dtype = torch.float64, **settings: object) -> HeteroData:

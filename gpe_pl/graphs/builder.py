@@ -28,6 +28,7 @@ from gpe_pl.graphs.features import (
     scales_of,
     virtual_features,
 )
+from gpe_pl.graphs.islands import find_islands
 from gpe_pl.graphs.multiscale import MultiscaleGraph, multiscale_graph
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of, node_code
@@ -45,6 +46,8 @@ class GraphBuilder:
     Node stores of a material hold ``x``, ``material_params`` (SI), ``mass`` and ``node_id`` (row in the state); ``boundary`` and virtual nodes hold ``x``.
     Edge stores hold ``edge_index`` (row 0 source, row 1 target), ``odd`` and ``even``. Those of ``radius`` also hold
     ``offset``: the displacement over the radius, which standardisation leaves as it is.
+
+    With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph ``island_is_free`` [island] and ``num_islands`` [1].
     """
 
     config: GraphConfig
@@ -91,6 +94,8 @@ class GraphBuilder:
             self._add_mesh(data, state, rows, mesh)
         elif self._meshes:
             self._add_empty_mesh(data, state)
+        if self.config.islands:
+            self._add_islands(data, state, rows)
         return data
 
     @cached_property
@@ -157,6 +162,24 @@ class GraphBuilder:
             if relation[0] == BOUNDARY:
                 edges[relation] = torch.stack([new_row[edge_index[0]], edge_index[1]])
         return kept
+
+    def _add_islands(self, data: HeteroData, state: State, rows: dict[str, Tensor]) -> None:
+        """Groups of nodes connected by edges between materials, and whether a group has no edge with the boundary."""
+        between, touching = [torch.empty(2, 0, dtype=torch.int64)], torch.zeros(state.num_nodes, dtype=torch.bool)
+        for source, name, target in self.spec.relations:
+            if name in (RADIUS, CELL):
+                j, i = data[source, name, target].edge_index
+                if source == BOUNDARY:
+                    touching[rows[target][i].cpu()] = True
+                else:
+                    between.append(torch.stack([rows[source][j], rows[target][i]]).cpu())
+        islands = find_islands(state.num_nodes, torch.cat(between, dim=1).numpy(), touching.numpy())
+        label = torch.from_numpy(islands.label).to(state.pos.device)
+        for material, r in rows.items():
+            data[material].pos = state.pos[r].float()
+            data[material].island = label[r]
+        data.island_is_free = torch.from_numpy(islands.is_free).to(state.pos.device)
+        data.num_islands = torch.tensor([len(islands.is_free)], device=state.pos.device)
 
     # --- meshes ---------------------------------------------------------------------------------------------------------------------------
 

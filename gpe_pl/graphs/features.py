@@ -47,6 +47,7 @@ class GraphConfig:
         trim_boundary: leave out boundary nodes without an edge, which cannot influence anything.
         mesh: connect ``schema.MESH_MATERIALS`` along their cells and put levels of virtual nodes above them; without it they are particles like the others.
         num_levels: of virtual nodes; None takes as many as lead to one root in any body of the domain.
+        islands: find the connected groups of nodes and which of them nothing touches; see ``nn.island_momentum``.
     """
 
     features: Features = "contact"
@@ -55,6 +56,7 @@ class GraphConfig:
     trim_boundary: bool = True
     mesh: bool = False
     num_levels: Annotated[int, Field(ge=0, le=20)] | None = None
+    islands: bool = False
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
         even_channels={r: even for r, (_, even) in channels.items()},
         stress_channels={"solid": 4 if dim == 2 else 6} if "solid" in materials else {},
         num_levels=num_levels,
+        islands=config.islands,
     )
 
 

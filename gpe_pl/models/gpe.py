@@ -22,6 +22,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl.errors import GpeError
 from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import MLP
+from gpe_pl.nn.island_momentum import IslandMomentum, conserve
 from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction, MomentumConv, orient
 from gpe_pl.schema import CELL, DOWN, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
 
@@ -35,6 +36,10 @@ MaterialEmbeddingKind = Literal["affine", "mlp"]
 
 class StressError(GpeError, ValueError):
     """A stress decoder was asked for where the data set stores no stress."""
+
+
+class IslandError(GpeError, ValueError):
+    """Momentum of islands is to be kept in graphs that do not know their islands."""
 
 
 class MaterialEmbedding(nn.Module):
@@ -128,9 +133,11 @@ class GPE(nn.Module):
         level_weights: one set for all levels of virtual nodes, which then serves any number of levels, or one per level (paper).
         schedule: the order of messages between levels; ``simultaneous`` (paper) or ``sweep``.
         stress: also decode the stress of materials that have one.
+        island_momentum: of what flies freely, keep the ``linear``, or also the ``angular`` momentum exactly (see ``nn.island_momentum``); or ``ignored``.
 
     Raises:
         StressError: ``stress`` without a material that has one.
+        IslandError: ``island_momentum`` with graphs that do not know their islands.
     """
 
     def __init__(
@@ -146,6 +153,7 @@ class GPE(nn.Module):
         level_weights: LevelWeights = "shared",
         schedule: Schedule = "simultaneous",
         stress: bool = False,
+        island_momentum: IslandMomentum = "ignored",
     ) -> None:
         super().__init__()
         self.settings = {
@@ -159,7 +167,10 @@ class GPE(nn.Module):
             "level_weights": level_weights,
             "schedule": schedule,
             "stress": stress,
+            "island_momentum": island_momentum,
         }
+        if island_momentum != "ignored" and not spec.islands:
+            raise IslandError(f"model.island_momentum={island_momentum} needs graph.islands=true")
         if stress and not spec.stress_channels:
             raise StressError(
                 f"model.stress=true, but no stress is stored of {', '.join(spec.materials)}; choose model.stress=false or data=fem"
@@ -240,7 +251,20 @@ class GPE(nn.Module):
         edges = {r: (data[r].edge_index, data[r].odd, data[r].even) for r in relations}
         if grid(1) in x and self.level_weights == "shared" and self.schedule == "simultaneous":
             x, edges = _merge_levels(x, edges)
-        return Prediction(*self.compute(x, params, mass, edges))
+        acceleration, stress = self.compute(x, params, mass, edges)
+        if acceleration and self.settings["island_momentum"] != "ignored":
+            acceleration = self._conserve(data, acceleration)
+        return Prediction(acceleration, stress)
+
+    def _conserve(self, data: HeteroData, acceleration: dict[str, Tensor]) -> dict[str, Tensor]:
+        stores = [data[m] for m in acceleration]
+        count = data.num_islands
+        start = torch.cumsum(count, dim=0) - count  # graphs of a batch number their islands from 0
+        island = torch.cat([s.island + start[s.batch] if "batch" in s else s.island for s in stores])
+        mass, pos = torch.cat([s.mass for s in stores]), torch.cat([s.pos for s in stores])
+        angular = self.settings["island_momentum"] == "angular"
+        kept = conserve(torch.cat([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
+        return dict(zip(acceleration, kept.split([len(a) for a in acceleration.values()]), strict=True))
 
     def compute(
         self,

@@ -43,6 +43,8 @@ MODELS: dict[str, Factory] = {
     },
     "gpe-mlp-embedding": gpe(material_embedding="mlp"),
     "gpe-plain": gpe(implementation="plain"),
+    "gpe-linear": gpe(island_momentum="linear"),
+    "gpe-angular": gpe(island_momentum="angular"),
     "gns": factory(GNS, num_message_passing_steps=3, hidden_channels=16),
     "dpinet": factory(DPINet, hidden_channels=16),
     "cconv": factory(ContinuousConvNet, hidden_channels=16),
@@ -238,7 +240,7 @@ def test_a_step_is_independent_of_the_order_of_calls(make: Factory) -> None:
 @pytest.mark.parametrize("features", ["paper", "contact"])
 def test_all_features_work(make: Factory, features: str, history: int) -> None:
     build = scenes.builder(features=features, history=history)
-    assert build.config == GraphConfig(features=features, history=history)  # type: ignore[arg-type]
+    assert build.config == GraphConfig(features=features, history=history, islands=True)  # type: ignore[arg-type]
     data = scenes.to_dtype(build(scenes.state(history=history).to_torch()), torch.float64)
     standardizer = GraphStandardizer(build.spec).double()
     standardizer.fit([data])
@@ -252,7 +254,7 @@ def test_all_features_work(make: Factory, features: str, history: int) -> None:
 MESH = ("sand", "elastomer")
 
 
-@pytest.fixture(params=["gpe-negated-node-latent", "gpe-odd-pair-geometry", "gns", "dpinet"])
+@pytest.fixture(params=["gpe-negated-node-latent", "gpe-odd-pair-geometry", "gpe-angular", "gns", "dpinet"])
 def make_on_mesh(request: pytest.FixtureRequest) -> Factory:
     return MODELS[request.param]
 

@@ -1,0 +1,60 @@
+"""Exact momentum of islands in free flight: what no edge ties to anything outside keeps its linear and angular momentum, whatever a network says.
+
+With a the accelerations without gravity of an island's nodes, m their masses and r their positions relative to the island's centre of mass::
+
+    a ← a − Σ m a / Σ m                                  linear: the centre of mass falls freely
+    a ← a − α × r,   J α = Σ m r × a                     angular: J is the inertia tensor
+
+which is the smallest change in the mass-weighted sense that makes Σ m a and Σ m r × a vanish.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+IslandMomentum = Literal["ignored", "linear", "angular"]
+SMALLEST_PRINCIPAL_SHARE = 1e-4
+"""Of the largest principal moment of inertia: about axes below it an island cannot be said to turn (a single node, nodes in a row)."""
+
+
+def conserve(
+    acceleration: Float[Tensor, "node dim"],
+    mass: Float[Tensor, " node"],
+    pos: Float[Tensor, "node dim"],
+    island: Int64[Tensor, " node"],
+    is_free: Bool[Tensor, " island"],
+    angular: bool,
+) -> Float[Tensor, "node dim"]:
+    """Accelerations without gravity that give every free island no momentum, and without angular momentum if ``angular``."""
+    rows = torch.nonzero(is_free[island]).flatten()
+    if not len(rows):
+        return acceleration
+    label, m, a = island[rows], mass[rows, None], acceleration[rows]
+    total = _sum(m, label, len(is_free)).clamp(min=torch.finfo(m.dtype).tiny)
+    a = a - (_sum(m * a, label, len(is_free)) / total)[label]
+    if angular:
+        r = pos[rows] - (_sum(m * pos[rows], label, len(is_free)) / total)[label]
+        a = a - _rotation(a, m, r, label, len(is_free))
+    return acceleration.index_copy(0, rows, a)
+
+
+def _sum(values: Tensor, label: Tensor, count: int) -> Tensor:
+    return values.new_zeros(count, *values.shape[1:]).index_add_(0, label, values)
+
+
+def _rotation(a: Tensor, m: Tensor, r: Tensor, label: Tensor, count: int) -> Tensor:
+    """α × r of each node: the part of the accelerations in which its island turns."""
+    if a.shape[1] == 2:
+        moment = _sum(m * (r[:, :1] * a[:, 1:] - r[:, 1:] * a[:, :1]), label, count)
+        inertia = _sum(m * r.square().sum(dim=1, keepdim=True), label, count)
+        alpha = torch.where(inertia > 0, moment / inertia.clamp(min=torch.finfo(m.dtype).tiny), 0.0)[label]
+        return alpha * torch.stack([-r[:, 1], r[:, 0]], dim=1)
+    moment = _sum(m * torch.linalg.cross(r, a), label, count)
+    squares = r.square().sum(dim=1)[:, None, None] * torch.eye(3, dtype=r.dtype, device=r.device) - r[:, :, None] * r[:, None, :]
+    inertia = _sum(m[:, :, None] * squares, label, count)
+    alpha = torch.linalg.pinv(inertia, rtol=SMALLEST_PRINCIPAL_SHARE, hermitian=True) @ moment[:, :, None]
+    return torch.linalg.cross(alpha[label, :, 0], r)

@@ -1,0 +1,79 @@
+"""Graphs that know their islands, and a model that keeps their momentum."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from torch_geometric.data import Batch
+
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE, IslandError
+from gpe_pl.trajectory import State
+from tests import scenes
+
+TWO = ("sand", "snow")
+
+
+def two_clouds(gap: float) -> State:
+    """One near the floor and one ``gap`` above it, of two materials."""
+    low, high = scenes.state(20, TWO, history=2, seed=1, high=0.25), scenes.state(15, TWO, history=2, seed=2, high=0.25)
+    high = replace(high, pos=high.pos + np.array([0.3, gap]))
+    assert low.velocity_history is not None and high.velocity_history is not None
+    together: dict[str, Any] = {
+        name: np.concatenate([getattr(low, name), getattr(high, name)])
+        for name in ("pos", "vel", "node_type", "mass", "material_params", "velocity_history")
+    }
+    return replace(low, **together)
+
+
+def test_islands_are_components_across_materials() -> None:
+    build = scenes.builder(TWO, history=2)
+    s = two_clouds(0.4)
+    graph = build(s.to_torch())
+    distance = np.linalg.norm(s.pos[:, None] - s.pos, axis=-1)
+    near = distance <= build.scales.radius
+    count, label = connected_components(coo_array(near), directed=False)
+    wall = (np.linalg.norm(s.pos[:, None] - s.boundary.pos, axis=-1) <= build.scales.radius).any(axis=1)
+    found = np.empty(s.num_nodes, dtype=np.int64)
+    for m in TWO:
+        found[graph[m].node_id.numpy()] = graph[m].island.numpy()
+    assert int(graph.num_islands) == count == len(graph.island_is_free)
+    assert len({*zip(found.tolist(), label.tolist(), strict=True)}) == count
+    free = [not wall[found == k].any() for k in range(count)]
+    assert graph.island_is_free.tolist() == free
+    assert {True, False} == set(free)
+
+
+def test_a_batch_keeps_the_momentum_of_each_of_its_islands() -> None:
+    build = scenes.builder(TWO, history=2)
+    torch.manual_seed(0)
+    simulator = LearnedSimulator(GPE(build.spec, num_message_passing_steps=2, hidden_channels=8, island_momentum="angular"), build)
+    states = [two_clouds(gap).to_torch() for gap in (0.4, 0.45, 0.02)]
+    graphs = [build(s) for s in states]
+    assert [int(g.num_islands) for g in graphs] != [1, 1, 1]
+    together = simulator(Batch.from_data_list(graphs)).acceleration
+    for m in TWO:
+        alone = torch.cat([simulator(g).acceleration[m] for g in graphs])
+        torch.testing.assert_close(together[m], alone, rtol=1e-4, atol=1e-6)
+    before, after = states[0], simulator.step(states[0])
+    rows = torch.arange(20, 35)
+    mass = before.mass[rows, None]
+    expected = (mass * before.vel[rows]).sum(0) + mass.sum() * before.gravity * build.metadata.frame_dt
+    torch.testing.assert_close((mass * after.vel[rows]).sum(0), expected, rtol=0, atol=1e-5)
+    other = torch.arange(20)
+    assert not torch.allclose(
+        (before.mass[other, None] * (after.vel - before.vel)[other]).sum(0),
+        before.mass[other].sum() * before.gravity * build.metadata.frame_dt,
+        atol=1e-4,
+    )  # which stands on the floor
+
+
+def test_a_graph_without_islands_is_refused() -> None:
+    with pytest.raises(IslandError, match="model.island_momentum=linear needs graph.islands=true"):
+        GPE(scenes.builder(islands=False).spec, island_momentum="linear")

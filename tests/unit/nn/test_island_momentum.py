@@ -1,0 +1,85 @@
+"""Free islands keep their momentum exactly, everything else is left as it is."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from gpe_pl.nn.island_momentum import conserve
+
+SIZES = (40, 1, 2, 25, 3)
+FREE = torch.tensor([True, True, True, False, True])
+
+
+def scene(dim: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    island = torch.repeat_interleave(torch.arange(len(SIZES)), torch.tensor(SIZES))
+    order = torch.randperm(len(island), generator=generator)
+    n = len(island)
+    random = [torch.randn(n, dim, generator=generator, dtype=torch.float64) for _ in range(2)]
+    mass = torch.rand(n, generator=generator, dtype=torch.float64) + 0.1
+    return random[0], mass, 5 + random[1], island[order]
+
+
+def momenta(a: Tensor, mass: Tensor, pos: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    m, r = mass[rows, None], pos[rows] - (mass[rows, None] * pos[rows]).sum(0) / mass[rows].sum()
+    if a.shape[1] == 2:
+        return (m * a[rows]).sum(0), (m[:, 0] * (r[:, 0] * a[rows, 1] - r[:, 1] * a[rows, 0])).sum()
+    return (m * a[rows]).sum(0), (m * torch.linalg.cross(r, a[rows])).sum(0)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("angular", [False, True])
+def test_free_islands_gain_no_momentum(dim: int, angular: bool) -> None:
+    a, mass, pos, island = scene(dim)
+    kept = conserve(a, mass, pos, island, FREE, angular)
+    for k, free in enumerate(FREE.tolist()):
+        rows = torch.nonzero(island == k).flatten()
+        linear, about_center = momenta(kept, mass, pos, rows)
+        if not free:
+            assert torch.equal(kept[rows], a[rows])
+            continue
+        assert linear.abs().max() < 1e-12
+        if angular:
+            assert about_center.abs().max() < 1e-11
+        elif len(rows) > 2:
+            assert about_center.abs().max() > 1e-3  # there was something to remove
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_change_is_a_rigid_motion_and_a_second_one_none(dim: int) -> None:
+    a, mass, pos, island = scene(dim)
+    kept = conserve(a, mass, pos, island, FREE, angular=True)
+    torch.testing.assert_close(conserve(kept, mass, pos, island, FREE, angular=True), kept)
+    rows = torch.nonzero(island == 0).flatten()
+    change, r = (a - kept)[rows], pos[rows] - pos[rows].mean(0)
+    gradient = torch.linalg.lstsq(torch.cat([r, torch.ones(len(rows), 1, dtype=r.dtype)], dim=1), change).solution
+    torch.testing.assert_close(torch.cat([r, torch.ones(len(rows), 1, dtype=r.dtype)], dim=1) @ gradient, change)
+    spin = gradient[:dim]
+    torch.testing.assert_close(spin, -spin.T)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_single_node_falls_freely(dim: int) -> None:
+    a, mass, pos, island = scene(dim)
+    kept = conserve(a, mass, pos, island, FREE, angular=True)
+    assert kept[island == 1].abs().max() < 1e-15
+
+
+def test_nothing_free_leaves_everything() -> None:
+    a, mass, pos, island = scene(2)
+    assert conserve(a, mass, pos, island, torch.zeros_like(FREE), angular=True) is a
+    empty = conserve(a[:0], mass[:0], pos[:0], island[:0], FREE[:0], angular=True)
+    assert empty.shape == (0, 2)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_gradients_are_finite_and_orthogonal_to_momentum(dim: int) -> None:
+    a, mass, pos, island = scene(dim)
+    a.requires_grad_()
+    conserve(a, mass, pos, island, FREE, angular=True).square().sum().backward()
+    assert a.grad is not None
+    assert torch.isfinite(a.grad).all()
+    rows = torch.nonzero(island == 0).flatten()
+    assert (a.grad[rows]).sum(0).abs().max() < 1e-10  # adding the same to all nodes changes nothing
