@@ -40,10 +40,10 @@ JUDGED_GROUP = {"fem": "test_unseen"}
 
 @dataclass(frozen=True)
 class Cell:
-    """A model in a domain: its interval [m²], how many seeds, and the same trajectories' error in ballistic flight [m²]."""
+    """A model in a domain: its interval [m²], the errors of single rollouts [m²], infinite for failed ones, and that of ballistic flight [m²]."""
 
     interval: Interval
-    num_seeds: int
+    errors: np.ndarray
     ballistic: float
 
     @property
@@ -94,7 +94,7 @@ def _cell(runs: list[Run], domain: str) -> Cell | None:
     trivial = values_by_seed(runs[:1], "ballistic", group, "rollout_mse", "full")
     if not values or not trivial:
         return None
-    return Cell(bootstrap_interval(values, statistic=_median_of_means), len(values), float(np.mean(trivial[0])))
+    return Cell(bootstrap_interval(values, statistic=_median_of_means), np.concatenate(values), float(np.mean(trivial[0])))
 
 
 def _median_of_means(table: np.ndarray) -> float:
@@ -138,8 +138,9 @@ def _markdown(domains: list[str], models: list[str], cells: dict[tuple[str, str]
         budget.append(table_row([domain, *steps]))
     note = (
         "Rollout MSE ×1e-3 [m²] over all frames on material parameters not seen in training (between the trained ones; FEM also outside): mean over "
-        "trajectories, median over seeds, 95 % bootstrap interval over both. A model that is not twice as good as ballistic flight is *not learned* and "
-        "wins nothing. Last column: the paper's ratio, from its table 1; its units are not ours."
+        "trajectories, median over seeds, 95 % bootstrap interval over both; a rollout that had to be stopped has failed, and the mean with it. A model "
+        "that is not twice as good as ballistic flight is *not learned* and wins nothing. Last column: the paper's ratio, from its table 1; its units are "
+        "not ours."
     )
     return "\n".join([*lines, "", note, *budget, ""])
 
@@ -149,6 +150,9 @@ def _text(cell: Cell | None) -> str:
         return "–"
     i = cell.interval
     numbers = f"{1e3 * i.estimate:.3g} [{1e3 * i.low:.3g}, {1e3 * i.high:.3g}]"
+    failed = int((~np.isfinite(cell.errors)).sum())
+    if failed:
+        numbers = f"{failed} of {len(cell.errors)} failed, median {1e3 * np.median(cell.errors):.3g}"
     return numbers if cell.is_learned else f"*not learned* ({numbers})"
 
 
