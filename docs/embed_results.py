@@ -16,7 +16,8 @@ README = DOCS.parent / "README.md"
 BLOCK = re.compile(r"(<!-- begin (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 FILES = (
     *("table.md", "table.csv", "metrics.csv", "config.json", "results.json"),
-    *("validation_loss.png", "error_curve_*.png", "rollout_test_*.png", "rollout_test_00.gif"),
+    *("table1.md", "table1.csv", "table1.png", "error_by_parameter.png", "step_times.json"),
+    *("validation_loss.png", "error_curve_*.png", "rollout_test_*.png", "rollout_test_00.gif", "stress_*_00.png"),
 )
 
 

@@ -71,7 +71,8 @@ class Row:
 
 
 def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettings, run_dir: Path, label: str = LEARNED) -> list[Row]:
-    """Roll out every trajectory of the splits and write ``metrics.csv``, ``error_curve_*.png``, ``rollout_*.png`` and ``rollout_*.gif``.
+    """Roll out every trajectory of the splits; writes ``metrics.csv``, ``error_curve_*.png``, ``rollout_*.png`` and ``rollout_*.gif``
+    of some, and their ``stress_*.png`` where the model decodes a stress.
 
     All rollouts start at the first frame with enough history and run to the end of the ground truth. Share outside with containment off is reported as
     ``share_outside_uncontained``, where it was asked for, the share of corrected particle-steps as ``share_corrected``.
@@ -201,6 +202,9 @@ def _pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predict
 
     stem = run_dir / f"rollout_{split}_{number:02d}"
     rollout_figure(truth, predictions).savefig(stem.with_suffix(".png"), dpi=150, bbox_inches="tight")
+    if truth.stress is not None and all(p.stress is not None for p in predictions.values()):
+        figure = rollout_figure(truth, predictions, color="von_mises")
+        figure.savefig(run_dir / f"stress_{split}_{number:02d}.png", dpi=150, bbox_inches="tight")
     stride = max(1, truth.num_frames // 60)
     write_animation(stem.with_suffix(".gif"), truth, predictions, fps=20, stride=stride)
 

@@ -24,7 +24,7 @@ from gpe_pl.errors import GpeError
 SNAP = 1e-3
 """Nodes this near (in rest spacings) below the face of a box count as on it, so that rounding does not tear the rows of a lattice apart."""
 
-MESHES_HELD = 256
+MESHES_HELD = 1024
 """Multi-scale graphs kept in memory; one of a thousand nodes takes about 0.2 MB."""
 
 

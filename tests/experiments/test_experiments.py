@@ -41,3 +41,15 @@ def test_the_ablation_sweeps_every_interaction_over_seeds() -> None:
     assert hydra.mode.name == "MULTIRUN"
     assert hydra.sweeper.params["model.interaction"].split(",") == ["directed", "negated", "odd", "odd_even"]
     assert len(str(hydra.sweeper.params.seed).split(",")) >= 2
+
+
+def test_a_learned_stress_is_drawn_and_compared(tiny_data: Path, tmp_path: Path) -> None:
+    cfg = tiny(tiny_data, tmp_path, "experiment=fem_stress", "evaluation.splits=[test]", "evaluation.num_pictures=1")
+    fit(cfg)
+    folder = tmp_path / "fem_stress"
+    assert (folder / "stress_test_00.png").stat().st_size > 1000
+    errors = [
+        r.value for r in read_rows(folder / "metrics.csv") if (r.model, r.metric, r.horizon) == ("learned", "von_mises_error", "full")
+    ]
+    assert len(errors) == 1
+    assert 0 < errors[0] < 100
