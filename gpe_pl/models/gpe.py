@@ -215,6 +215,11 @@ class GPE(nn.Module):
         if stress:
             self.stress_decoder = nn.ModuleDict({m: MLP(hidden, hidden, c) for m, c in spec.stress_channels.items()})
 
+    @property
+    def is_fused(self) -> bool:
+        """Whether the messages are computed in one pass over the edges, on a CPU (see ``nn.fused_messages``)."""
+        return self.edge_state == "geometry" and self.interaction == "negated" and self.settings["implementation"] == "factored"
+
     def type_key(self, node_type: str) -> str:
         """Under which name the weights of a node type are kept."""
         return role(node_type) if self.level_weights == "shared" else node_type

@@ -20,6 +20,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch_geometric.nn import MessagePassing
 
+from gpe_pl.nn.fused_messages import fused_messages, works_on
+
 Interaction = Literal["directed", "negated", "odd", "odd_even"]
 EdgeState = Literal["latent", "geometry"]
 Implementation = Literal["factored", "plain"]
@@ -83,6 +85,8 @@ class MomentumConv(MessagePassing):
         then None. In a relation of one type with itself pass the same tensor twice and add the two sums.
         """
         size = (h_source.shape[0], h_target.shape[0])
+        if self.implementation == "factored" and self.interaction == "negated" and not with_messages and works_on(h_source, h_target, e):
+            return *self._fused(h_source, h_target, edge_index, e), None
         if self.implementation == "plain":
             terms = {"a": (h_source, h_target), "b": (None, None), "e": e, "s": s}
         else:
@@ -100,6 +104,13 @@ class MomentumConv(MessagePassing):
                 "s": s if self.is_odd and self.widths[3] else None,
             }
         return self.propagate(edge_index, size=size, with_messages=with_messages, **terms)
+
+    def _fused(self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:
+        a, b, w, _ = self.lin_in.weight.split(self.widths, dim=1)
+        at, bs = functional.linear(h_target, a, self.lin_in.bias), functional.linear(h_source, b)
+        at_target, at_source = fused_messages(at, bs, e, w, self.act.weight, edge_index)
+        j, i = edge_index
+        return self._last_linear(at_target, i, 1), self._last_linear(at_source, j, -1)
 
     def message(
         self, a_i: MaybeTensor, a_j: MaybeTensor, b_i: MaybeTensor, b_j: MaybeTensor, e: Tensor, s: MaybeTensor
@@ -166,10 +177,11 @@ class MomentumConv(MessagePassing):
     def _sum(self, x: Tensor, index: Tensor, size: int, sign: int, are_messages: bool) -> Tensor:
         """±Σ of messages, or of activations that the last linear map then turns into messages."""
         total = x.new_zeros(size, x.shape[1]).index_add_(0, index, x, alpha=sign)
-        if are_messages:
-            return total
-        total = functional.linear(total, self.lin_out.weight)
+        return total if are_messages else self._last_linear(total, index, sign)
+
+    def _last_linear(self, total: Tensor, index: Tensor, sign: int) -> Tensor:
+        """Sums of messages from sums of activations, of as many edges as ``index`` names a node."""
         if self.lin_out.bias is None:
-            return total
-        degree = x.new_zeros(size).index_add_(0, index, x.new_ones(index.shape[0]), alpha=sign)
-        return total + degree[:, None] * self.lin_out.bias
+            return functional.linear(total, self.lin_out.weight)
+        degree = total.new_zeros(total.shape[0]).index_add_(0, index, total.new_ones(index.shape[0]), alpha=sign)
+        return torch.addmm(degree[:, None] * self.lin_out.bias, total, self.lin_out.weight.t())

@@ -52,7 +52,8 @@ class TrainingModule(L.LightningModule):
         schedule: ``exponential`` decays geometrically (paper: 5e-5 to 1e-6); ``cosine`` warms up and follows a half cosine (short budgets).
         warmup_steps: linear warm-up of the ``cosine`` schedule.
         stress_weight: of the mean squared error of the normalised stress, where the model decodes one, beside that of the acceleration.
-        compile: ``torch.compile`` the model: ``auto`` does so when the run is long enough and a C++ compiler is found.
+        compile: ``torch.compile`` the model: ``auto`` does so when the run is long enough, the model has no faster code of its own (``is_fused``, on a CPU)
+            and a C++ compiler is found.
     """
 
     def __init__(
@@ -102,7 +103,9 @@ class TrainingModule(L.LightningModule):
     def compiled(self) -> Iterator[None]:
         """Inside, training steps run the model's ``compute`` through ``torch.compile``, if that is wanted and works here."""
         model: Any = self.simulator.model
-        wanted = self.compile_mode == "on" or (self.compile_mode == "auto" and self.num_steps - self.global_step >= COMPILE_PAYS_AFTER)
+        is_long = self.num_steps - self.global_step >= COMPILE_PAYS_AFTER
+        is_fast_already = self.device.type == "cpu" and getattr(model, "is_fused", False)
+        wanted = self.compile_mode == "on" or (self.compile_mode == "auto" and is_long and not is_fast_already)
         if wanted and self.compile_mode == "auto" and not any(shutil.which(c) for c in ("c++", "g++", "clang++", "cl")):
             log.warning("compile: auto found no C++ compiler, training runs without torch.compile")
             wanted = False
