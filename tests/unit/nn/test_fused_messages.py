@@ -31,10 +31,9 @@ def plain(a: Tensor, b: Tensor, e: Tensor, weight: Tensor, slope: Tensor, edge_i
 def test_sums_and_gradients_equal_the_plain_ones(num_edges: int, dtype: torch.dtype, tolerance: float) -> None:
     results = []
     for function in (plain, fused_messages):
-        *values, index = inputs(num_edges, dtype)
-        for value in values:
-            value.requires_grad_()
-        sums = function(*values, index)
+        a, b, e, weight, slope, index = inputs(num_edges, dtype)
+        values = [v.requires_grad_() for v in (a, b, e, weight, slope)]
+        sums = function(a, b, e, weight, slope, index)
         loss = sum((torch.sin(torch.arange(s.numel(), dtype=dtype)).view_as(s) * s).sum() for s in sums)
         assert isinstance(loss, Tensor)
         results.append((*sums, *torch.autograd.grad(loss, values)))
@@ -54,9 +53,9 @@ def test_views_and_slices_are_read_as_they_are() -> None:
 
 
 def test_not_a_number_stays_one() -> None:
-    *values, index = inputs(10, torch.float64)
-    values[2][4, 1] = float("nan")
-    at_target, at_source = fused_messages(*values, index)
+    a, b, e, weight, slope, index = inputs(10, torch.float64)
+    e[4, 1] = float("nan")
+    at_target, at_source = fused_messages(a, b, e, weight, slope, index)
     assert at_target[index[1, 4]].isnan().all()
     assert at_source[index[0, 4]].isnan().all()
 
