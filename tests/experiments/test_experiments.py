@@ -12,10 +12,12 @@ from gpe_pl.fit import fit
 from tests.runs import compose, first_choices, tiny
 
 EXPERIMENTS = sorted(p.stem for p in (CONF / "experiment").glob("*.yaml"))
+QUICK = {"smoke", "sand", "ablation_momentum", "table1"}
+"""These run with the fast tests, all others with the slow ones."""
 
 
 def test_there_are_experiments() -> None:
-    assert {"ablation_momentum", "sand"} <= set(EXPERIMENTS)
+    assert set(EXPERIMENTS) > QUICK
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
@@ -23,7 +25,7 @@ def test_an_experiment_states_its_own_name(experiment: str) -> None:
     assert compose("fit", f"experiment={experiment}").name == experiment
 
 
-@pytest.mark.parametrize("experiment", EXPERIMENTS)
+@pytest.mark.parametrize("experiment", [e if e in QUICK else pytest.param(e, marks=pytest.mark.slow) for e in EXPERIMENTS])
 def test_an_experiment_trains_and_evaluates(experiment: str, tiny_data: Path, tmp_path: Path) -> None:
     cfg = tiny(tiny_data, tmp_path, f"experiment={experiment}", *first_choices(experiment))
     value = fit(cfg)
