@@ -32,6 +32,8 @@ def fit(cfg: DictConfig) -> float:
 
     if type(cfg.seed) is not int or cfg.seed < 0:
         raise ConfigError(f"seed={cfg.seed!r}: must be an integer of at least 0")
+    if not (cfg.reuse is None or isinstance(cfg.reuse, str)):
+        raise ConfigError(f"reuse={cfg.reuse!r}: must be null or the name of other runs")
     training = construct(TrainingSettings, cfg.training, "training")
     trainer = construct(TrainerSettings, cfg.trainer, "trainer")
     evaluation = construct(EvaluationSettings, {k: v for k, v in cfg.evaluation.items() if k != "data"}, "evaluation")

@@ -22,17 +22,24 @@ from torch import Tensor
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
 @no_type_check
+def _add_up(z, a, b, e, w, i, j, k):
+    """z of edge k, from j to i."""
+    for c in range(len(z)):
+        z[c] = a[i, c] + b[j, c]
+    for q in range(e.shape[1]):
+        feature = e[k, q]
+        for c in range(len(z)):
+            z[c] += feature * w[q, c]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
+@no_type_check
 def _forward(a, b, e, w, slope, source, target, at_target, at_source):
-    width, channels = a.shape[1], e.shape[1]
+    width = a.shape[1]
     z = np.empty(width, a.dtype)
     for k in range(len(source)):
         i, j = target[k], source[k]
-        for c in range(width):
-            z[c] = a[i, c] + b[j, c]
-        for q in range(channels):
-            feature = e[k, q]
-            for c in range(width):
-                z[c] += feature * w[q, c]
+        _add_up(z, a, b, e, w, i, j, k)
         for c in range(width):
             x = z[c] if z[c] > 0 else slope * z[c]
             at_target[i, c] += x
@@ -46,12 +53,7 @@ def _backward(a, b, e, w, slope, source, target, grad_target, grad_source, grad_
     z, g, below = np.empty(width, a.dtype), np.empty(width, a.dtype), np.zeros(width, a.dtype)
     for k in range(len(source)):
         i, j = target[k], source[k]
-        for c in range(width):
-            z[c] = a[i, c] + b[j, c]
-        for q in range(channels):
-            feature = e[k, q]
-            for c in range(width):
-                z[c] += feature * w[q, c]
+        _add_up(z, a, b, e, w, i, j, k)
         for c in range(width):
             x = grad_target[i, c] - grad_source[j, c]
             negative = z[c] <= 0

@@ -110,11 +110,7 @@ def claim(run_dir: Path, config: dict[str, Any]) -> None:
     run_dir.mkdir(parents=True, exist_ok=True)
     path = run_dir / "config.json"
     if path.exists() and any((run_dir / name).exists() for name in ("checkpoints/last.ckpt", "metrics.csv")):
-        try:
-            before = json.loads(path.read_text())
-        except json.JSONDecodeError:
-            raise RunError(f"{path} is damaged; delete the folder {run_dir} or choose another name=…") from None
-        different = sorted(_differences(before, config))
+        different = sorted(_differences(_config_in(path), config))
         if different:
             raise RunError(
                 f"{run_dir} holds a run with another configuration ({'; '.join(different[:3])}); choose another name=… or delete the folder"
@@ -130,7 +126,7 @@ def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
     for path in sorted(folder.rglob("config.json")):
         trained = path.parent / "checkpoints" / "best.ckpt"
         if (path.parent / "metrics.csv").exists() and trained.exists():
-            there = json.loads(path.read_text())
+            there = _config_in(path)
             if not _differences({key: there.get(key) for key in config}, config):
                 log.info("taking the model that was trained in %s", path.parent)
                 own = run_dir / "checkpoints" / "best.ckpt"
@@ -139,6 +135,13 @@ def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
                 os.replace(own.with_suffix(".part"), own)
                 return own
     return None
+
+
+def _config_in(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text()))
+    except ValueError:
+        raise RunError(f"{path} is damaged; delete the folder {path.parent} or choose another name=…") from None
 
 
 def _differences(a: Any, b: Any, path: str = "") -> list[str]:
