@@ -25,8 +25,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from gpe_pl.geometry import Shape
-from gpe_pl.graphs.islands import Islands, find_islands
-from gpe_pl.graphs.neighbors import radius_between, radius_pairs
+from gpe_pl.graphs.islands import Islands, free_since, islands_within
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup, param_names
 from gpe_pl.trajectory import (
     Metadata,
@@ -142,18 +141,12 @@ def disturbed_islands(metadata: Metadata, arrays: dict[str, np.ndarray]) -> Iter
     mesh = np.concatenate([np.stack([cells[:, 0], cells[:, k]]) for k in range(1, cells.shape[1])], axis=1)
 
     def islands_of(frame: int) -> Islands:
-        touches = np.zeros(pos.shape[1], dtype=bool)
-        touches[radius_between(boundary, pos[frame], radius)[1]] = True
-        return find_islands(pos.shape[1], np.concatenate([radius_pairs(pos[frame], radius), mesh], axis=1), touches)
+        return islands_within(radius, pos[frame], boundary, mesh)
 
     for frame in np.unique(np.linspace(1, len(pos) - 2, min(len(pos) - 2, ISLAND_FRAMES)).astype(int)).tolist():
         before, islands = islands_of(frame - 1), islands_of(frame)
         count = len(islands.is_free)
-        # an island that lost a part since the frame before still carries that part's push in its last velocity
-        together = np.zeros((len(before.is_free), count), dtype=bool)
-        together[before.label, islands.label] = True
-        whole = together.sum(axis=1) == 1
-        free = islands.is_free & ~np.any(together & ~(whole & before.is_free)[:, None], axis=0)
+        free = free_since(before, islands)
         acceleration = np.diff([islands.mean(x, mass) for x in pos[frame - 1 : frame + 2]], 2, axis=0)[0] / dt**2
         limit = np.maximum(tolerance, resolution / np.sqrt(np.bincount(islands.label, minlength=count)))
         yield count, int(free.sum()), int(np.sum(free & (np.linalg.norm(acceleration - gravity, axis=-1) > limit)))

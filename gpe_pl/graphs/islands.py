@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from gpe_pl.graphs.neighbors import radius_between, radius_pairs
+
 
 @dataclass(frozen=True)
 class Islands:
@@ -43,3 +45,26 @@ def find_islands(num_nodes: int, edge_index: Int64[np.ndarray, "2 edge"], touche
     is_free = np.ones(count, dtype=bool)
     is_free[label[touches_boundary]] = False
     return Islands(label.astype(np.int64), is_free)
+
+
+def islands_within(
+    radius: float,
+    pos: Float64[np.ndarray, "node dim"],
+    boundary_pos: Float64[np.ndarray, "boundary dim"],
+    mesh_edges: Int64[np.ndarray, "2 edge"],
+) -> Islands:
+    """Islands of nodes that a radius [m] or a mesh connects; free where no boundary node lies within the radius."""
+    touches = np.zeros(len(pos), dtype=bool)
+    touches[radius_between(boundary_pos, pos, radius)[1]] = True
+    return find_islands(len(pos), np.concatenate([radius_pairs(pos, radius), mesh_edges], axis=1), touches)
+
+
+def free_since(before: Islands, now: Islands) -> Bool[np.ndarray, "island"]:
+    """Islands that are free and already were so in the frame before, as one or several.
+
+    One that lost a part since then, or that then touched something, still carries that push in its last velocity.
+    """
+    together = np.zeros((len(before.is_free), len(now.is_free)), dtype=bool)
+    together[before.label, now.label] = True
+    whole = together.sum(axis=1) == 1
+    return now.is_free & ~np.any(together & ~(whole & before.is_free)[:, None], axis=0)

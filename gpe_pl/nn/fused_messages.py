@@ -23,7 +23,7 @@ from torch import Tensor
 @njit(cache=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
 @no_type_check
 def _add_up(z, a, b, e, w, i, j, k):
-    """z of edge k, from j to i."""
+    """Z of edge k, from j to i."""
     for c in range(len(z)):
         z[c] = a[i, c] + b[j, c]
     for q in range(e.shape[1]):
