@@ -254,9 +254,12 @@ class Report(Callback):
         try:
             from gpe_pl.domain_table import compares_models, report_domains
             from gpe_pl.report import report, report_sweep
+            from gpe_pl.trial_table import compares_settings, report_trials
 
             if not is_sweep:
                 report(folder)
+            elif compares_settings(folder):
+                report_trials(folder)
             elif compares_models(folder):
                 report_domains(folder)
             else:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from numba import njit
 
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 
@@ -39,12 +39,38 @@ def find_islands(num_nodes: int, edge_index: Int64[np.ndarray, "2 edge"], touche
         edge_index: edges between them, in any direction.
         touches_boundary: nodes that have an edge with a boundary node.
     """
-    source, target = edge_index
-    graph = coo_array((np.ones(len(source), dtype=bool), (source, target)), shape=(num_nodes, num_nodes))
-    count, label = connected_components(graph, directed=False)
+    label, count = _components(num_nodes, edge_index)
     is_free = np.ones(count, dtype=bool)
     is_free[label[touches_boundary]] = False
-    return Islands(label.astype(np.int64), is_free)
+    return Islands(label, is_free)
+
+
+@njit(cache=True)
+@no_type_check
+def _components(num_nodes, edge_index):
+    """Component of each node, numbered in order of their first nodes, and their number: union–find with path halving [Tarjan & van Leeuwen 1984]."""
+    parent = np.arange(num_nodes)
+    for k in range(edge_index.shape[1]):
+        a, b = edge_index[0, k], edge_index[1, k]
+        while parent[a] != a:
+            parent[a] = parent[parent[a]]
+            a = parent[a]
+        while parent[b] != b:
+            parent[b] = parent[parent[b]]
+            b = parent[b]
+        if a < b:
+            parent[b] = a
+        else:
+            parent[a] = b
+    label = np.empty(num_nodes, np.int64)
+    count = 0
+    for n in range(num_nodes):  # a parent comes before its children
+        if parent[n] == n:
+            label[n] = count
+            count += 1
+        else:
+            label[n] = label[parent[n]]
+    return label, count
 
 
 def islands_within(

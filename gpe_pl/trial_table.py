@@ -1,0 +1,91 @@
+"""Trials of settings for several models or domains: within each, which setting did best.
+
+The number compared is the rollout MSE over all frames, mean over the trajectories of a split, median over seeds.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.domain_table import domain_of, model_of
+from gpe_pl.evaluation import LEARNED
+from gpe_pl.report import Run, axes_of, finished_runs, replace_text, table_row, validation_curve, values_by_seed
+
+TRIALS_CSV, TRIALS_MD = "trials.csv", "trials.md"
+CONSEQUENCES = ("training.num_steps", "training.val_interval", "seed")
+"""What differs between trials without having been tried: it follows from a budget of time, or is chance."""
+
+
+def compares_settings(folder: Path) -> bool:
+    """Whether the runs below a folder are of several models or domains, and one of these with several settings."""
+    groups = _by_model(finished_runs(folder))
+    return len(groups) > 1 and any(_settings(runs) for runs in groups.values())
+
+
+def report_trials(folder: Path) -> None:
+    """Write ``trials.csv``, a line per run and split, and ``trials.md``, a line per setting with the best of each domain and model in bold."""
+    runs = finished_runs(folder)
+    groups = _by_model(runs)
+    settings = sorted({key for members in groups.values() for key in _settings(members)})
+    splits = sorted({row.split for run in runs for row in run.rows})
+    columns = [key.rpartition(".")[2] for key in settings]
+    _write_csv(folder / TRIALS_CSV, groups, settings, columns, splits)
+    header = ["domain", "model", *columns, "seeds", "one-step nMSE", *splits]
+    lines = [table_row(header), "|" + "---|" * len(header)]
+    for (domain, model), members in sorted(groups.items()):
+        variants: dict[tuple[str, ...], list[Run]] = defaultdict(list)
+        for run in members:
+            variants[tuple(str(run.config.get(key)) for key in settings)].append(run)
+        error = {v: {s: _error(runs, s) for s in splits} for v, runs in variants.items()}
+        best = {s: min(error[v][s] for v in variants) for s in splits}
+        for v, runs in sorted(variants.items()):
+            cells = [_cell(runs, s, error[v][s], is_best=error[v][s] == best[s] and np.isfinite(best[s])) for s in splits]
+            losses = [loss[-1] for _, loss in (validation_curve(r.folder) for r in runs) if len(loss)]
+            lines.append(table_row([domain, model, *v, str(len(runs)), f"{np.mean(losses):.3f}" if losses else "–", *cells]))
+    note = (
+        "Rollout MSE ×1e-3 [m²] over all frames: mean over the trajectories of a split, median over seeds; a rollout that had to be stopped has failed, "
+        "and the mean with it. Bold: best of a domain and model. One-step nMSE: of the validation split, relative to free fall."
+    )
+    replace_text(folder / TRIALS_MD, "\n".join([*lines, "", note, ""]))
+
+
+def _by_model(runs: list[Run]) -> dict[tuple[str, str], list[Run]]:
+    groups: dict[tuple[str, str], list[Run]] = defaultdict(list)
+    for run in runs:
+        groups[domain_of(run), model_of(run)].append(run)
+    return groups
+
+
+def _settings(runs: list[Run]) -> list[str]:
+    """Configuration keys that were tried."""
+    return [key for key in axes_of(runs) if key not in CONSEQUENCES]
+
+
+def _error(runs: list[Run], split: str) -> float:
+    means = [np.mean(values) for values in values_by_seed(runs, LEARNED, split, "rollout_mse", "full")]
+    return float(np.median(means)) if means else float("inf")
+
+
+def _cell(runs: list[Run], split: str, error: float, *, is_best: bool) -> str:
+    values = np.array([v for run in values_by_seed(runs, LEARNED, split, "rollout_mse", "full") for v in run])
+    failed = int((~np.isfinite(values)).sum())
+    text = f"{1e3 * error:.3g}" if np.isfinite(error) else f"{failed} of {len(values)} failed"
+    return f"**{text}**" if is_best else text
+
+
+def _write_csv(path: Path, groups: dict[tuple[str, str], list[Run]], settings: list[str], columns: list[str], splits: list[str]) -> None:
+    temporary = path.with_suffix(".part")
+    with open(temporary, "w", newline="") as handle:
+        writer = csv.writer(handle)
+        writer.writerow(["domain", "model", *columns, "num_steps", "seed", "split", "num_trajectories", "num_failed", "rollout_mse"])
+        for (domain, model), runs in sorted(groups.items()):
+            for run in runs:
+                for split in splits:
+                    for values in values_by_seed([run], LEARNED, split, "rollout_mse", "full"):
+                        about = [domain, model, *(run.config.get(key) for key in settings), run.config["training.num_steps"], run.config["seed"]]
+                        writer.writerow([*about, split, len(values), int((~np.isfinite(values)).sum()), float(np.mean(values))])
+    temporary.replace(path)
