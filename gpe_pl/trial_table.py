@@ -43,7 +43,7 @@ def report_trials(folder: Path) -> None:
         error = {v: {s: _error(runs, s) for s in splits} for v, runs in variants.items()}
         best = {s: min(error[v][s] for v in variants) for s in splits}
         for v, runs in sorted(variants.items()):
-            cells = [_cell(runs, s, error[v][s], is_best=error[v][s] == best[s] and np.isfinite(best[s])) for s in splits]
+            cells = [_cell(runs, s, error[v][s], is_best=bool(np.isfinite(error[v][s]) and error[v][s] == best[s])) for s in splits]
             losses = [loss[-1] for _, loss in (validation_curve(r.folder) for r in runs) if len(loss)]
             lines.append(table_row([domain, model, *v, str(len(runs)), f"{np.mean(losses):.3f}" if losses else "–", *cells]))
     note = (
@@ -86,6 +86,12 @@ def _write_csv(path: Path, groups: dict[tuple[str, str], list[Run]], settings: l
             for run in runs:
                 for split in splits:
                     for values in values_by_seed([run], LEARNED, split, "rollout_mse", "full"):
-                        about = [domain, model, *(run.config.get(key) for key in settings), run.config["training.num_steps"], run.config["seed"]]
+                        about = [
+                            domain,
+                            model,
+                            *(run.config.get(key) for key in settings),
+                            run.config["training.num_steps"],
+                            run.config["seed"],
+                        ]
                         writer.writerow([*about, split, len(values), int((~np.isfinite(values)).sum()), float(np.mean(values))])
     temporary.replace(path)
