@@ -27,6 +27,7 @@ from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import Standardize
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, EdgeType, FeatureSpec, node_code, role
+from gpe_pl.skips import Skips
 from gpe_pl.trajectory import Metadata, State, Stress, Trajectory
 
 CHECKPOINT_FORMAT = 3
@@ -87,17 +88,24 @@ class GraphStandardizer(nn.Module):
         if sum(len(x) for x in mass):
             self.mass.copy_(torch.cat(mass).double().mean())
 
-    def forward(self, data: HeteroData) -> HeteroData:
-        """A graph with standardised features; the input is left as it is."""
+    def forward(self, data: HeteroData, skip_absent: bool = True) -> HeteroData:
+        """A graph with standardised features, on request also those that it has no rows of; the input is left as it is."""
+
+        def wanted(values: Tensor) -> bool:
+            return len(values) > 0 or not skip_absent
+
         out = copy.copy(data)
         for t in self.spec.node_types:
-            out[t].x = self.node[role(t)](data[t].x)
+            if wanted(data[t].x):
+                out[t].x = self.node[role(t)](data[t].x)
         for m in self.spec.materials:
-            out[m].material_params = self.params[m](self._material_scale(m, data[m].material_params))
-            out[m].mass = data[m].mass / self.mass
+            if wanted(data[m].x):
+                out[m].material_params = self.params[m](self._material_scale(m, data[m].material_params))
+                out[m].mass = data[m].mass / self.mass
         for relation in self.spec.relations:
-            out[relation].odd = self.odd[self._key(relation)](data[relation].odd)
-            out[relation].even = self.even[self._key(relation)](data[relation].even)
+            if wanted(data[relation].odd):
+                out[relation].odd = self.odd[self._key(relation)](data[relation].odd)
+                out[relation].even = self.even[self._key(relation)](data[relation].even)
         return out
 
 
@@ -107,6 +115,9 @@ class LearnedSimulator(nn.Module):
     Args:
         model: any ``models.base.Model``; its ``settings`` rebuild it from a checkpoint.
         builder: makes the graphs.
+
+    Attributes:
+        skips: what steps leave out; may be changed at any time and is no part of a checkpoint.
     """
 
     acceleration_std: Tensor
@@ -122,6 +133,15 @@ class LearnedSimulator(nn.Module):
             self.register_buffer(
                 f"trained_{material}", torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).expand(2, count).clone()
             )
+
+    @property
+    def skips(self) -> Skips:
+        return self.builder.skips
+
+    @skips.setter
+    def skips(self, skips: Skips) -> None:
+        self.builder = replace(self.builder, skips=skips)
+        cast(Any, self.model).skips = skips
 
     @torch.no_grad()
     def fit_statistics(self, graphs: Iterable[HeteroData]) -> None:
@@ -165,7 +185,7 @@ class LearnedSimulator(nn.Module):
 
     def forward(self, data: HeteroData) -> Prediction:
         """Accelerations without gravity per material, in units of ``acceleration_std``."""
-        return self.model(self.standardizer(data))
+        return self.model(self.standardizer(data, self.skips.absent_types))
 
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
         """The state at a frame with the velocity history that the graph needs, on this model's device.

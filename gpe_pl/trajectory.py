@@ -13,6 +13,7 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,19 @@ class Boundary:
     def empty(cls, dim: int) -> Boundary:
         """No boundary at all."""
         return cls.sample((), 1.0, dim)
+
+    @cached_property
+    def tree(self) -> Any:
+        """``search_tree`` of the positions, built once: a boundary stays where it is."""
+        return search_tree(self.pos)
+
+
+def search_tree(pos: Array) -> Any:
+    """A k-d tree of positions [node, dim] for neighbour search on the CPU: quick to build, so that moving nodes can have a new one in every step."""
+    from scipy.spatial import cKDTree
+
+    pos = pos if isinstance(pos, np.ndarray) else pos.detach().cpu().numpy()
+    return cKDTree(np.ascontiguousarray(pos), balanced_tree=False, compact_nodes=False)
 
 
 @dataclass(frozen=True)

@@ -7,22 +7,29 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 
+from gpe_pl.trajectory import search_tree
+
 
 def radius_pairs(pos: Float64[np.ndarray, "node dim"], radius: float) -> Int64[np.ndarray, "2 edge"]:
     """Unordered pairs of distinct nodes at most ``radius`` [m] apart; row 0 is the source, row 1 the target, each pair once."""
     if len(pos) < 2:
         return np.empty((2, 0), dtype=np.int64)
-    pairs = cKDTree(pos, balanced_tree=False, compact_nodes=False).query_pairs(radius, output_type="ndarray")
+    pairs = search_tree(pos).query_pairs(radius, output_type="ndarray")
     return np.ascontiguousarray(pairs.T, dtype=np.int64)
 
 
 def radius_between(
-    source_pos: Float64[np.ndarray, "source dim"], target_pos: Float64[np.ndarray, "target dim"], radius: float
+    source: Float64[np.ndarray, "source dim"] | cKDTree, target: Float64[np.ndarray, "target dim"], radius: float
 ) -> Int64[np.ndarray, "2 edge"]:
-    """Pairs of a source node and a target node of two different sets at most ``radius`` [m] apart."""
-    if len(source_pos) == 0 or len(target_pos) == 0:
+    """Pairs of a source node and a target node of two different sets at most ``radius`` [m] apart.
+
+    Args:
+        source: positions [m], or ``search_tree`` of them.
+        target: positions [m].
+        radius: [m].
+    """
+    tree = source if isinstance(source, cKDTree) else search_tree(source)
+    if tree.n == 0 or len(target) == 0:
         return np.empty((2, 0), dtype=np.int64)
-    source = cKDTree(source_pos, balanced_tree=False, compact_nodes=False)
-    target = cKDTree(target_pos, balanced_tree=False, compact_nodes=False)
-    found = source.sparse_distance_matrix(target, radius, output_type="ndarray")
+    found = tree.sparse_distance_matrix(search_tree(target), radius, output_type="ndarray")
     return np.stack([found["i"], found["j"]]).astype(np.int64)
