@@ -143,6 +143,11 @@ class LearnedSimulator(nn.Module):
         self.builder = replace(self.builder, skips=skips)
         cast(Any, self.model).skips = skips
 
+    @property
+    def num_hops(self) -> int:
+        """How many edges away a node can still count."""
+        return int(cast(Any, self.model).num_hops)
+
     @torch.no_grad()
     def fit_statistics(self, graphs: Iterable[HeteroData]) -> None:
         """Set feature statistics, the range of material parameters, and the scales of acceleration and stress from training graphs with ``target``.

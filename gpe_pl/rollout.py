@@ -97,6 +97,8 @@ class Guard:
 
 def step_all(simulator: Simulator, states: list[State]) -> list[State | SimulationError]:
     """One step of every state, together if the simulator can; errors of single scenes are returned, so that the others go on."""
+    if not states:
+        return []
     if isinstance(simulator, BatchSimulator):
         return simulator.step_all(states)
     return [_step(simulator, state) for state in states]

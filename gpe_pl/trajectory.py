@@ -143,6 +143,8 @@ class State:
         stress: of the mesh, where the solver computes it.
         num_substeps: that a solver took to come here from the frame before.
         num_corrected: nodes that containment put back in coming here from the frame before.
+        num_asleep: nodes that a simulator left alone in coming here from the frame before.
+        lost_impulse: momentum [kg m/s], in sum of magnitudes, that it took from them.
         internal: opaque part of a solver (deformation gradient, …), carried so that a restart equals a run-through.
     """
 
@@ -160,6 +162,8 @@ class State:
     stress: Stress | None = None
     num_substeps: int = 0
     num_corrected: int = 0
+    num_asleep: int = 0
+    lost_impulse: float = 0.0
     internal: Any = None
 
     @property

@@ -218,6 +218,10 @@ class GPE(nn.Module):
             self.stress_decoder = nn.ModuleDict({m: MLP(hidden, hidden, c) for m, c in spec.stress_channels.items()})
 
     @property
+    def num_hops(self) -> int:
+        return self.num_message_passing_steps + (self.decoder == "pair")  # a pair force reads the state of the other end
+
+    @property
     def is_fused(self) -> bool:
         """Whether the messages are computed in one pass over the edges, on a CPU (see ``nn.fused_messages``)."""
         return self.edge_state == "geometry" and self.interaction == "negated" and self.settings["implementation"] == "factored"

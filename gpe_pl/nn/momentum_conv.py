@@ -126,7 +126,7 @@ class MomentumConv(MessagePassing):
         at_source, at_target = (e.new_zeros(n, width) for n in size)
         even_source, even_target = (at_source, at_target) if self.lin_even is None else (e.new_zeros(n, width) for n in size)
         directions, sign = e.split(count), 1  # of ``directed`` two
-        messages = [d.new_empty(count, width) for d in directions] if with_messages else []
+        messages = e.new_empty(e.shape[0], width) if with_messages else None
         for first in range(0, count, chunk):
             part = slice(first, first + chunk)
             j, i = edge_index[:, part]
@@ -139,16 +139,17 @@ class MomentumConv(MessagePassing):
             x, y, sign = self._outgoing(forward, reverse, with_messages)
             at_target.index_add_(0, i, x)
             at_source.index_add_(0, j, y, alpha=sign)
-            for whole, values in zip(messages, (x, y), strict=False):
-                whole[part] = values
+            if messages is not None:
+                for whole, values in zip(messages.split(count), (x, y), strict=False):
+                    whole[part] = values
             if self.lin_even is not None:
                 even_target.index_add_(0, i, forward + reverse)
                 even_source.index_add_(0, j, forward + reverse)
-        if not with_messages:
+        if messages is None:
             at_target, at_source = self._last_linear(at_target, edge_index[1], 1), self._last_linear(at_source, edge_index[0], sign)
         if self.lin_even is not None:
             at_target, at_source = at_target + self.lin_even(even_target), at_source + self.lin_even(even_source)
-        return at_target, at_source, torch.cat(messages) if with_messages else None
+        return at_target, at_source, messages
 
     def message(
         self, a_i: MaybeTensor, a_j: MaybeTensor, b_i: MaybeTensor, b_j: MaybeTensor, e: Tensor, s: MaybeTensor
