@@ -133,7 +133,7 @@ def test_a_single_restless_node_keeps_its_island_awake() -> None:
 
 def test_momentum_is_lost_once_and_counted() -> None:
     simulated = silenced(simulator(scenes.builder(), rest_speed=0.1))
-    state = two_heaps().to_torch()
+    state = two_heaps(gap=1.0).to_torch()
     vel = state.vel.clone()
     vel[:20] = 0.05 * torch.nn.functional.normalize(torch.randn(20, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
     state, sleeping, lost = replace(state, vel=vel, velocity_history=vel[:, None]), Sleeping(simulated), []
