@@ -174,7 +174,7 @@ def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
         found: dict[str, dict[int, float]] = {}
         for r in records:
             if r["metric"] == metric:
-                found.setdefault(f"{r['dimension']}D", {})[r["num_nodes"]] = r["value"]
+                found.setdefault(f"{r['dimension']}D", {})[r["num_nodes"]] = float(r["value"])
         return found
 
     return {"scaling": scaling_figure(curves("step_time"), "time of a step [s]", curves("peak_memory"), "peak memory [B]")}
