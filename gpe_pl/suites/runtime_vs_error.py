@@ -57,7 +57,7 @@ class Settings:
 
     Attributes:
         cases: data sets, by name.
-        runs: folder of the finished runs whose models take part; those that were trained on a case's data set do.
+        runs: folders of finished runs; the models among them that were trained on a case's data set take part.
         factors: how many times coarser than the data the solver is also run.
         split, num_trajectories: scenes.
         horizons: frames over which errors are averaged; the full length is always added.
@@ -65,7 +65,7 @@ class Settings:
     """
 
     cases: dict[str, Case]
-    runs: str
+    runs: list[str]
     factors: list[Annotated[float, Field(gt=1)]] = field(default_factory=lambda: [1.5, 2.0, 3.0])
     split: Split = "test_unseen"
     num_trajectories: Annotated[int, Field(ge=1)] = 5
@@ -107,12 +107,14 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
     torch.set_num_threads(settings.num_threads)
     records: list[dict[str, Any]] = []
     parts = []
-    finished = finished_runs(Path(settings.runs))
+    finished = [run for folder in settings.runs for run in finished_runs(Path(folder))]
     for name, spec in specs.items():
         models = _models(finished, spec)
         if not models:
-            raise ComparisonError(f"{settings.runs} has no finished run that was trained on the data set {spec.name!r} of size {spec.size!r}; train with "
-                                  f"`python -m gpe_pl.fit experiment=table1 size={spec.size}` or set suite.runs")  # fmt: skip
+            raise ComparisonError(
+                f"{' and '.join(settings.runs)}: no finished run that was trained on the data set {spec.name!r} of size {spec.size!r}; train with "
+                f"`python -m gpe_pl.fit experiment=table1 size={spec.size}` or set suite.runs"
+            )
         log.info("%s: %d models", name, len(models))
         points, order = compare(spec, models, settings)
         records += list(_records(name, points, order))

@@ -77,7 +77,7 @@ def untrained() -> LearnedSimulator:
 
 def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
-    settings = Settings({}, "", factors=[2.0], num_trajectories=1, horizons=[10])
+    settings = Settings({}, [], factors=[2.0], num_trajectories=1, horizons=[10])
     points, order = compare(spec, {"GPE 1 × 8": (untrained(), 60.0)}, settings)
     by_name = {p.name: p for p in points}
     assert {DATA, "GPE 1 × 8", "ballistic", "constant velocity"} < set(by_name)
@@ -99,7 +99,7 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
         p.distance = [1e-3]
     monkeypatch.setattr(module, "_models", lambda *_: {"model": None})
     monkeypatch.setattr(module, "compare", lambda *_: (points, 1.3))
-    records, table = run(Settings({"sand": Case(OVERRIDES)}, str(tmp_path)), {"sand": spec})
+    records, table = run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec})
     assert "model @full: wins, 1.3 times as fast" in table and "slow model @full: a solver of the same error takes 0.15 times" in table
     assert "order of convergence is 1.3" in table
     axes = figures(records)["cost_error_sand"].axes[0]
@@ -108,5 +108,5 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
 
 def test_nothing_to_compare_says_so(tmp_path: Path) -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
-    with pytest.raises(ComparisonError, match="no finished run that was trained on the data set 'sand' of size 'tiny'"):
-        run(Settings({"sand": Case(OVERRIDES)}, str(tmp_path)), {"sand": spec})
+    with pytest.raises(ComparisonError, match=": no finished run that was trained on the data set 'sand' of size 'tiny'"):
+        run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec})
