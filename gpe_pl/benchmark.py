@@ -50,7 +50,7 @@ def _dataset(overrides: list[str]) -> DatasetSpec:
 
 
 def benchmark(cfg: DictConfig) -> None:
-    """Run one suite and write ``results.json`` and ``table.md``."""
+    """Run one suite and write ``results.json``, ``table.md`` and its figures."""
     from omegaconf import OmegaConf
 
     suites = sorted(m.name for m in pkgutil.iter_modules(gpe_pl.suites.__path__))
@@ -63,6 +63,8 @@ def benchmark(cfg: DictConfig) -> None:
     records, table = suite.run(settings) if cases is None else suite.run(settings, {k: _dataset(c.overrides) for k, c in cases.items()})
     folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name
     folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in getattr(suite, "figures", lambda _: {})(records).items():
+        figure.savefig(folder / f"{name}.png", dpi=150)
     results = {"environment": environment(), "settings": asdict(settings), "records": records}
     for name, text in (("results.json", json.dumps(results, indent=1)), ("table.md", table + "\n")):
         temporary = folder / f".{name}.part"

@@ -20,11 +20,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch_geometric.nn import MessagePassing
 
+from gpe_pl.nn.fused_latent import fused_latent
 from gpe_pl.nn.fused_messages import fused_messages, works_on
 
 Interaction = Literal["directed", "negated", "odd", "odd_even"]
 EdgeState = Literal["latent", "geometry"]
 Implementation = Literal["factored", "plain"]
+RAW = 32
+"""Up to so many edge channels are multiplied where they are used; more go through a matrix product."""
 MaybeTensor = Optional[Tensor]  # noqa: UP045 - PyG's code generator reads the signatures below and does not understand unions written with |
 
 
@@ -78,19 +81,19 @@ class MomentumConv(MessagePassing):
         edge_index: Int64[Tensor, "2 edge"],
         e: Float[Tensor, "directed_edge state"],
         s: Float[Tensor, "edge even"],
-        with_messages: bool = True,
+        update_edges: bool = True,
         edges_at_once: int | None = None,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Sums at the target nodes, at the source nodes, and the messages m_ij per edge.
+        """Sums of messages at the target nodes, at the source nodes, and the new edge states e_ij + m_ij, which need as many channels as the messages.
+
+        Without ``update_edges`` the last linear map is applied after the sum (it commutes), once per node instead of once per edge; the new states are
+        then None. In a relation of one type with itself pass the same tensor twice and add the two sums.
 
         With ``edges_at_once``, what is computed on the way exists for so many edges only; this is meant for inference.
-
-        Without ``with_messages`` the last linear map is applied after the sum (it commutes), once per node instead of once per edge; the messages are
-        then None. In a relation of one type with itself pass the same tensor twice and add the two sums.
         """
         size = (h_source.shape[0], h_target.shape[0])
-        if self.implementation == "factored" and self.interaction == "negated" and not with_messages and works_on(h_source, h_target, e):
-            return *self._fused(h_source, h_target, edge_index, e), None
+        if self._is_fused(h_source, h_target, e):
+            return self._fused(h_source, h_target, edge_index, e, s, update_edges)
         w = None
         if self.implementation == "plain":
             terms = {"a": (h_source, h_target), "b": (None, None), "s": s}
@@ -108,25 +111,41 @@ class MomentumConv(MessagePassing):
                 "s": s if self.is_odd and self.widths[3] else None,
             }
         if edges_at_once is not None and edges_at_once < edge_index.shape[1]:
-            return self._in_parts(edge_index, e, w, terms, size, with_messages, edges_at_once)
-        return self.propagate(edge_index, size=size, with_messages=with_messages, e=e if w is None else functional.linear(e, w), **terms)
+            return self._in_parts(edge_index, e, w, terms, size, update_edges, edges_at_once)
+        terms["e"] = e if w is None else functional.linear(e, w)
+        at_target, at_source, messages = self.propagate(edge_index, size=size, with_messages=update_edges, **terms)
+        return at_target, at_source, e + messages if update_edges else None
 
-    def _fused(self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:
-        a, b, w, _ = self.lin_in.weight.split(self.widths, dim=1)
+    def _is_fused(self, h_source: Tensor, h_target: Tensor, e: Tensor) -> bool:
+        """Whether the passes over the edges that are made for a CPU can do it, here and now."""
+        kind = self.interaction == "negated" or (self.interaction == "odd" and h_source is h_target)
+        return self.implementation == "factored" and kind and works_on(h_source, h_target, e)
+
+    def _fused(
+        self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, e: Tensor, s: Tensor, update_edges: bool
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        a, b, w, v = self.lin_in.weight.split(self.widths, dim=1)
         at, bs = functional.linear(h_target, a, self.lin_in.bias), functional.linear(h_source, b)
-        at_target, at_source = fused_messages(at, bs, e, w, self.act.weight, edge_index)
+        if update_edges or self.is_odd or self.widths[2] > RAW:
+            out = (self.lin_out.weight, self.lin_out.bias) if update_edges else None
+            at_target, at_source, state = fused_latent(at, bs, e, s if self.is_odd else None, w, v, self.act.weight, out, edge_index)
+        else:
+            at_target, at_source = fused_messages(at, bs, e, w, self.act.weight, edge_index)
+            state = None
+        if update_edges:
+            return at_target, at_source, state
         j, i = edge_index
-        return self._last_linear(at_target, i, 1), self._last_linear(at_source, j, -1)
+        return self._last_linear(at_target, i, 1), self._last_linear(at_source, j, -1), None
 
     def _in_parts(
-        self, edge_index: Tensor, e: Tensor, w: MaybeTensor, terms: dict[str, Any], size: tuple[int, int], with_messages: bool, chunk: int
+        self, edge_index: Tensor, e: Tensor, w: MaybeTensor, terms: dict[str, Any], size: tuple[int, int], update_edges: bool, chunk: int
     ) -> tuple[Tensor, Tensor, MaybeTensor]:
-        """``propagate`` for ``chunk`` edges after the other."""
+        """What follows the products per node, for ``chunk`` edges after the other."""
         count, width = edge_index.shape[1], self.lin_out.in_features
         at_source, at_target = (e.new_zeros(n, width) for n in size)
         even_source, even_target = (at_source, at_target) if self.lin_even is None else (e.new_zeros(n, width) for n in size)
         directions, sign = e.split(count), 1  # of ``directed`` two
-        messages = e.new_empty(e.shape[0], width) if with_messages else None
+        new = torch.empty_like(e) if update_edges else None
         for first in range(0, count, chunk):
             part = slice(first, first + chunk)
             j, i = edge_index[:, part]
@@ -136,20 +155,20 @@ class MomentumConv(MessagePassing):
             edge = torch.cat([d[part] for d in directions])
             s = None if terms["s"] is None else terms["s"][part]
             forward, reverse = cast(Any, self.message(**ends, e=edge if w is None else functional.linear(edge, w), s=s))
-            x, y, sign = self._outgoing(forward, reverse, with_messages)
+            x, y, sign = self._outgoing(forward, reverse, update_edges)
             at_target.index_add_(0, i, x)
             at_source.index_add_(0, j, y, alpha=sign)
-            if messages is not None:
-                for whole, values in zip(messages.split(count), (x, y), strict=False):
-                    whole[part] = values
+            if new is not None:
+                for updated, state, message in zip(new.split(count), directions, (x, y), strict=False):
+                    torch.add(state[part], message, out=updated[part])
             if self.lin_even is not None:
                 even_target.index_add_(0, i, forward + reverse)
                 even_source.index_add_(0, j, forward + reverse)
-        if messages is None:
+        if not update_edges:
             at_target, at_source = self._last_linear(at_target, edge_index[1], 1), self._last_linear(at_source, edge_index[0], sign)
         if self.lin_even is not None:
             at_target, at_source = at_target + self.lin_even(even_target), at_source + self.lin_even(even_source)
-        return at_target, at_source, messages
+        return at_target, at_source, new
 
     def message(
         self, a_i: MaybeTensor, a_j: MaybeTensor, b_i: MaybeTensor, b_j: MaybeTensor, e: Tensor, s: MaybeTensor
