@@ -199,7 +199,23 @@ class LearnedSimulator(nn.Module):
             IndexError: too few frames before ``frame``.
             SceneError: another frame interval, dimension or material than in training, or a value that is not finite; names the node.
         """
-        own, scene = self.builder.metadata, trajectory.metadata
+        self._check_scene(trajectory.metadata)
+        state = trajectory.state(frame, history=self.builder.config.history).to_torch(self.acceleration_std.device)
+        return self._checked(state, f"frame {frame}")
+
+    def standing(self, state: State, scene: Metadata) -> State:
+        """A scene's state as if it had never moved otherwise, on this model's device: what a rollout without frames before it starts from.
+
+        Raises:
+            SceneError: as ``initial_state``.
+        """
+        self._check_scene(scene)
+        state = state.to_torch(self.acceleration_std.device)
+        history = state.vel[:, None].expand(-1, self.builder.config.history, -1)
+        return self._checked(replace(state, velocity_history=history.clone()), "start")
+
+    def _check_scene(self, scene: Metadata) -> None:
+        own = self.builder.metadata
         same_scales = abs(scene.frame_dt / own.frame_dt - 1) < 1e-6 and abs(scene.spacing / own.spacing - 1) < 0.01
         if not same_scales or scene.dim != own.dim or scene.param_names != own.param_names:
             raise SceneError(
@@ -207,11 +223,12 @@ class LearnedSimulator(nn.Module):
                 f"the scene has frame_dt={scene.frame_dt:g} s and spacing={scene.spacing:g} m in {scene.dim}D and "
                 f"{', '.join(scene.materials)}; choose the data set with data=… size=…"
             )
-        state = trajectory.state(frame, history=self.builder.config.history).to_torch(self.acceleration_std.device)
+
+    def _checked(self, state: State, where: str) -> State:
         for name, values in (("pos", state.pos), ("velocity", history_of(state))):
             bad = ~torch.isfinite(values).flatten(1).all(dim=1)
             if bad.any():
-                raise SceneError(f"frame {frame}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
+                raise SceneError(f"{where}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
         for material, spec in MATERIALS.items():
             if material in self.builder.metadata.materials:
                 rows = torch.nonzero(state.node_type == node_code(material)).flatten()

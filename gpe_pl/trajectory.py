@@ -77,6 +77,12 @@ class Boundary:
         """No boundary at all."""
         return cls.sample((), 1.0, dim)
 
+    def to_numpy(self) -> Boundary:
+        """The same with NumPy arrays of its own."""
+        return replace(
+            self, **{name: np.array(_numpy(getattr(self, name))) for name in ("pos", "vel", "normal", "friction", "restitution")}
+        )
+
     @cached_property
     def tree(self) -> Any:
         """``search_tree`` of the positions, built once: a boundary stays where it is."""
@@ -87,8 +93,11 @@ def search_tree(pos: Array) -> Any:
     """A k-d tree of positions [node, dim] for neighbour search on the CPU: quick to build, so that moving nodes can have a new one in every step."""
     from scipy.spatial import cKDTree
 
-    pos = pos if isinstance(pos, np.ndarray) else pos.detach().cpu().numpy()
-    return cKDTree(np.ascontiguousarray(pos), balanced_tree=False, compact_nodes=False)
+    return cKDTree(np.ascontiguousarray(_numpy(pos)), balanced_tree=False, compact_nodes=False)
+
+
+def _numpy(x: Array) -> np.ndarray:
+    return x if isinstance(x, np.ndarray) else x.detach().cpu().numpy()
 
 
 @dataclass(frozen=True)
