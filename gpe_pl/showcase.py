@@ -161,7 +161,9 @@ class _Film:
             self.metadata,
             pos := np.stack(self.pos),
             np.broadcast_to(np.float32(0), pos.shape),  # not shown
-            *(x.cpu().numpy() for x in (self.state.node_type, self.state.mass, self.state.material_params)),
+            self.state.node_type.cpu().numpy(),
+            self.state.mass.cpu().numpy(),
+            self.state.material_params.cpu().numpy(),
             self.state.boundary.to_numpy(),
         )
         columns = evenly_spaced_frames(trajectory.num_frames, 4)

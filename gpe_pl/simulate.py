@@ -57,7 +57,8 @@ def ensure_split(cfg: DictConfig, split: str) -> Path:
 
     if not (Path(cfg.paths.data) / cfg.data.name / cfg.size.name / SPEC_FILE).exists():
         counts = {f"num_{s}": cfg.data[f"num_{s}"] if s == split else int(s == "train") for s in SPLITS}
-        cfg = OmegaConf.merge(cfg, {"data": {"name": f"{cfg.data.name}_{split}", **counts}})
+        only: Any = OmegaConf.merge(cfg, {"data": {"name": f"{cfg.data.name}_{split}", **counts}})
+        return ensure_data(only)
     return ensure_data(cfg)
 
 

@@ -79,9 +79,10 @@ class Boundary:
 
     def to_numpy(self) -> Boundary:
         """The same with NumPy arrays of its own."""
-        return replace(
-            self, **{name: np.array(_numpy(getattr(self, name))) for name in ("pos", "vel", "normal", "friction", "restitution")}
+        pos, vel, normal, friction, restitution = (
+            np.array(_numpy(x)) for x in (self.pos, self.vel, self.normal, self.friction, self.restitution)
         )
+        return Boundary(pos, vel, normal, friction, restitution, self.shapes)
 
     @cached_property
     def tree(self) -> Any:
