@@ -138,7 +138,7 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
     lines = []
     for edge_state in settings.edge_states:
         for growth in growths(settings, builder, scene):
-            small = simulator(settings, edge_state, builder, growth.off)
+            small = simulator(settings, edge_state, builder, Skips())
             alternatives = {"small": _step(small, scene)}
             for level in ("on", "off"):
                 runner = simulator(settings, edge_state, growth.builder, getattr(growth, level))
