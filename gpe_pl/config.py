@@ -37,6 +37,14 @@ WITHOUT_KEY = {"comparison", "experiment", "scene", "solver"}
 
 launcher.register()  # conf/ names it
 
+
+def _for_model(values: Mapping[str, Any], target: str) -> Any:
+    """``${for_model:values,target}`` in conf/: what a table holds for a model's class, or its ``default``."""
+    return values.get(target.rpartition(".")[2], values["default"])
+
+
+OmegaConf.register_new_resolver("for_model", _for_model, replace=True)
+
 CONF = Path(__file__).resolve().parent.parent / "conf"
 T = TypeVar("T")
 
