@@ -32,6 +32,7 @@ Schedule = Literal["simultaneous", "sweep"]
 Edges = dict[EdgeType, tuple[Tensor, Tensor, Tensor]]
 """``edge_index``, ``odd`` and ``even`` of the relations that have edges."""
 MaterialEmbeddingKind = Literal["affine", "mlp"]
+NodeNorm = Literal["none", "layer"]
 
 
 class StressError(GpeError, ValueError):
@@ -133,6 +134,8 @@ class GPE(nn.Module):
         level_weights: one set for all levels of virtual nodes, which then serves any number of levels, or one per level (paper).
         schedule: the order of messages between levels; ``simultaneous`` (paper) or ``sweep``.
         stress: also decode the stress of materials that have one.
+        node_norm: ``layer`` normalises the encoded state of every node, and what each step adds to it, as GNS does; however far a rollout strays, its
+            accelerations stay bounded. ``none`` as in the paper.
         island_momentum: of what flies freely, keep the ``linear``, or also the ``angular`` momentum exactly (see ``nn.island_momentum``); or ``ignored``.
 
     Raises:
@@ -153,6 +156,7 @@ class GPE(nn.Module):
         level_weights: LevelWeights = "shared",
         schedule: Schedule = "simultaneous",
         stress: bool = False,
+        node_norm: NodeNorm = "none",
         island_momentum: IslandMomentum = "ignored",
     ) -> None:
         super().__init__()
@@ -167,6 +171,7 @@ class GPE(nn.Module):
             "level_weights": level_weights,
             "schedule": schedule,
             "stress": stress,
+            "node_norm": node_norm,
             "island_momentum": island_momentum,
         }
         if island_momentum != "ignored" and not spec.islands:
@@ -178,7 +183,7 @@ class GPE(nn.Module):
         self.spec, self.interaction, self.decoder, self.edge_state = spec, interaction, decoder, edge_state
         self.level_weights, self.schedule = level_weights, schedule
         self.num_message_passing_steps = num_message_passing_steps
-        hidden = hidden_channels
+        hidden, norm = hidden_channels, node_norm == "layer"
         params = {m: c for m, c in spec.param_channels.items() if c}
         self.material_embedding = nn.ModuleDict({m: MaterialEmbedding(c, hidden, material_embedding) for m, c in params.items()})
         readable = self._readable()
@@ -187,7 +192,7 @@ class GPE(nn.Module):
         self.node_encoder, self.edge_encoder = nn.ModuleDict(), nn.ModuleDict()
         for t in spec.node_types:
             if t in ends and self.type_key(t) not in self.node_encoder:
-                self.node_encoder[self.type_key(t)] = MLP(spec.node_channels[t] + (hidden if t in params else 0), hidden, hidden)
+                self.node_encoder[self.type_key(t)] = MLP(spec.node_channels[t] + (hidden if t in params else 0), hidden, hidden, norm)
         for relation in relations if edge_state == "latent" else []:
             if self.key(relation) not in self.edge_encoder:
                 odd, even = spec.odd_channels[relation], spec.even_channels[relation]
@@ -206,7 +211,7 @@ class GPE(nn.Module):
                 convs[self.key(relation)] = MomentumConv(hidden, edge_channels, even, kind, implementation)
             self.convs.append(convs)
             keys = dict.fromkeys(self.type_key(t) for t in spec.node_types if t in types)
-            self.updates.append(nn.ModuleDict({k: MLP(hidden, hidden, hidden) for k in keys}))
+            self.updates.append(nn.ModuleDict({k: MLP(hidden, hidden, hidden, norm) for k in keys}))
         if decoder == "node":
             self.node_decoder = nn.ModuleDict({m: MLP(hidden, hidden, spec.dim) for m in spec.materials})
         else:
