@@ -31,6 +31,8 @@ LEARNED = "learned"
 MAX_SPEED_FACTOR = 20.0
 """A learned rollout faster than this many times the fastest particle of the ground truth has exploded."""
 ONE_STEP_WINDOWS = 256
+VIEWER_BYTES = 2**26
+"""A viewer's arrays before compression; longer rollouts show every so many frames."""
 SCENES_AT_ONCE = 16
 """Scenes, or windows, that one pass of the model takes together."""
 
@@ -45,7 +47,7 @@ class EvaluationSettings:
         num_trajectories: per split, from its start; None takes all.
         containment: put particles that cross a wall back on its surface.
         num_uncontained: trajectories per split that are also rolled out without containment, to see what it corrects; None takes all.
-        num_pictures: trajectories per split that get a figure and an animation.
+        num_pictures: trajectories per split that get a figure, an animation and a viewer.
     """
 
     splits: Annotated[list[Split], Field(min_length=1)] = field(default_factory=lambda: ["test", "test_unseen"])
@@ -71,8 +73,8 @@ class Row:
 
 
 def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettings, run_dir: Path, label: str = LEARNED) -> list[Row]:
-    """Roll out every trajectory of the splits; writes ``metrics.csv``, ``error_curve_*.png``, ``rollout_*.png`` and ``rollout_*.gif``
-    of some, and their ``stress_*.png`` where the model decodes a stress.
+    """Roll out every trajectory of the splits; writes ``metrics.csv``, ``error_curve_*.png``, ``rollout_*.png``, ``rollout_*.gif``
+    and ``rollout_*.html`` (a viewer) of some, and their ``stress_*.png`` where the model decodes a stress.
 
     All rollouts start at the first frame with enough history and run to the end of the ground truth. Share outside with containment off is reported as
     ``share_outside_uncontained``, where it was asked for, the share of corrected particle-steps as ``share_corrected``.
@@ -199,6 +201,7 @@ def read_rows(path: Path) -> Iterator[Row]:
 def _pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predictions: dict[str, Trajectory]) -> None:
     from gpe_pl.viz.figures import rollout_figure
     from gpe_pl.viz.video import write_animation
+    from gpe_pl.viz.viewer import write_viewer
 
     stem = run_dir / f"rollout_{split}_{number:02d}"
     rollout_figure(truth, predictions).savefig(stem.with_suffix(".png"), dpi=150, bbox_inches="tight")
@@ -207,6 +210,8 @@ def _pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predict
         figure.savefig(run_dir / f"stress_{split}_{number:02d}.png", dpi=150, bbox_inches="tight")
     stride = max(1, truth.num_frames // 60)
     write_animation(stem.with_suffix(".gif"), truth, predictions, fps=20, stride=stride)
+    size = (1 + len(predictions)) * (truth.pos.nbytes + truth.vel.nbytes)
+    write_viewer(stem.with_suffix(".html"), truth, predictions, stride=-(-size // VIEWER_BYTES))
 
 
 def _error_curve(path: Path, curves: dict[str, list[np.ndarray]], frame_dt: float) -> None:
