@@ -217,8 +217,8 @@ class GPE(nn.Module):
 
     @property
     def is_fused(self) -> bool:
-        """Whether the messages are computed in one pass over the edges, on a CPU (see ``nn.fused_messages``)."""
-        return self.edge_state == "geometry" and self.interaction == "negated" and self.settings["implementation"] == "factored"
+        """Whether messages have code of their own for a CPU (see ``nn.fused_messages`` and ``nn.fused_latent``)."""
+        return self.interaction in ("negated", "odd") and self.settings["implementation"] == "factored"
 
     def type_key(self, node_type: str) -> str:
         """Under which name the weights of a node type are kept."""
@@ -286,7 +286,7 @@ class GPE(nn.Module):
 
         phases = self._phases([*x], edges)
         for step in range(self.num_message_passing_steps):
-            with_messages = self.edge_state == "latent" and step < self.num_message_passing_steps - 1
+            update_edges = self.edge_state == "latent" and step < self.num_message_passing_steps - 1
             convs, updates = cast(nn.ModuleDict, self.convs[step]), cast(nn.ModuleDict, self.updates[step])
             for relations, receivers in phases:
                 total: dict[str, Tensor] = {}
@@ -296,13 +296,13 @@ class GPE(nn.Module):
                     source, _, target = relation
                     edge_index, _, even = edges[relation]
                     conv = convs[self.key(relation)]
-                    at_target, at_source, messages = conv(h[source], h[target], edge_index, e[relation], even, with_messages)
+                    at_target, at_source, state = conv(h[source], h[target], edge_index, e[relation], even, update_edges)
                     if target in receivers:
                         total[target] = total[target] + at_target if target in total else at_target
                     if source in receivers and self.type_key(source) in updates:
                         total[source] = total[source] + at_source if source in total else at_source
-                    if with_messages:
-                        e[relation] = e[relation] + messages
+                    if update_edges:
+                        e[relation] = state
                 for node_type, rows in receivers.items():
                     if self.type_key(node_type) not in updates:
                         continue
