@@ -279,12 +279,13 @@ def _mesh(trajectory: Trajectory) -> dict[str, np.ndarray]:
     """Triangles and edges of meshes, outlines of 2D meshes, and the nodes that stand for themselves."""
     faces, _ = drawn_faces(trajectory)
     pairs = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+    meshed = np.empty(0, int) if trajectory.cells is None or len(faces) == 0 else trajectory.cells
     fans = [faces[:, [0, k, k + 1]] for k in range(1, faces.shape[1] - 1)]
     return {
         "triangles": np.concatenate([np.empty((0, 3), int), *fans]),
         "edges": np.unique(np.sort(pairs, axis=1), axis=0),
         "outline": outline(trajectory),
-        "loose": np.setdiff1d(np.arange(trajectory.num_nodes), trajectory.cells if len(faces) else []),
+        "loose": np.setdiff1d(np.arange(trajectory.num_nodes), meshed),
     }
 
 

@@ -39,7 +39,9 @@ class Viewer:
     """An open page, and what went wrong in it."""
 
     def __init__(self, browser: Any, path: Path) -> None:
-        self.page, self.problems, self.requests = browser.new_page(viewport={"width": 900, "height": 420}), [], []
+        self.page = browser.new_page(viewport={"width": 900, "height": 420})
+        self.problems: list[str] = []
+        self.requests: list[str] = []
         self.page.on("pageerror", lambda error: self.problems.append(str(error)))
         self.page.on("console", lambda message: self.problems.append(message.text) if message.type in ("error", "warning") else None)
         self.page.on("request", lambda request: self.requests.append(request.url))
