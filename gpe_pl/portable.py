@@ -38,7 +38,7 @@ Scene = dict[str, Tensor]
 """Tensors by the names of ``describe``."""
 
 DESCRIPTION = "description.json"
-BOUNDARY_FIELDS = ("pos", "vel", "normal", "friction", "restitution")  # in the order of ``Boundary``
+BOUNDARY_FIELDS = ("pos", "vel", "normal", "friction", "restitution")
 
 
 class PortableError(GpeError, ValueError):
@@ -108,7 +108,8 @@ class PortableStep(nn.Module):
         if self.spec.islands:
             data.island_is_free = scene["island_is_free"]
             data.num_islands = torch.full((1,), scene["island_is_free"].shape[0])
-        boundary = Boundary(*(scene[f"boundary.{name}"] for name in BOUNDARY_FIELDS))
+        pos, vel, normal, friction, restitution = (scene[f"boundary.{name}"] for name in BOUNDARY_FIELDS)
+        boundary = Boundary(pos, vel, normal, friction, restitution)
         data[BOUNDARY].x = boundary_features(boundary, self.scales)
         self._add_radius_edges(data, scene, boundary)
         self._add_mesh(data, scene)

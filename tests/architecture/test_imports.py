@@ -73,7 +73,7 @@ def test_every_public_name_is_there_and_known_to_type_checkers() -> None:
 
     tree = ast.parse((ROOT / "gpe_pl" / "__init__.py").read_text())
     imported = {
-        alias.asname: f"{node.module}.{alias.name}"
+        str(alias.asname): f"{node.module}.{alias.name}"
         for block in tree.body
         if isinstance(block, ast.If)
         for node in block.body

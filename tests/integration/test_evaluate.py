@@ -36,7 +36,8 @@ def test_a_run_that_was_moved_gives_the_same_numbers(
     fit(tiny(tiny_data, tmp_path / "runs", f"model={model}"))
     known = {key(r): r.value for r in read_rows(tmp_path / "runs" / "fit" / "metrics.csv") if r.split == "test_unseen"}
     shutil.move(tmp_path / "runs" / "fit", tmp_path / "elsewhere")
-    rows = evaluate(tiny_data, tmp_path / "new", tmp_path / "elsewhere" / "checkpoints" / "best.ckpt", "evaluation.num_pictures=1", "evaluation.export=[vtk,npz]")
+    checkpoint = tmp_path / "elsewhere" / "checkpoints" / "best.ckpt"
+    rows = evaluate(tiny_data, tmp_path / "new", checkpoint, "evaluation.num_pictures=1", "evaluation.export=[vtk,npz]")
     assert {key(r): r.value for r in rows} == pytest.approx(known, rel=1e-9)
     written = {path.name for path in (tmp_path / "new" / "evaluation_test_unseen").iterdir()}
     assert {f"rollout_test_unseen_00.{suffix}" for suffix in ("png", "gif", "html", "pvd", "npz")} <= written
