@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 import logging
 import os
 from collections.abc import Iterator
@@ -19,6 +20,7 @@ from torch_geometric.data import Batch
 from gpe_pl.baselines import Ballistic, ConstantVelocity
 from gpe_pl.containment import TOLERANCE, Contained
 from gpe_pl.data.dataset import WindowDataset, open_split
+from gpe_pl.errors import GpeError
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
 from gpe_pl.portable import export_model
@@ -62,6 +64,10 @@ class EvaluationSettings:
     export: list[Export] = field(default_factory=list)
 
 
+class ExportError(GpeError):
+    """Something that was asked for cannot be written; the message says what is missing."""
+
+
 @dataclass(frozen=True)
 class Row:
     """One number of ``metrics.csv``."""
@@ -82,7 +88,14 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
 
     All rollouts start at the first frame with enough history and run to the end of the ground truth. Share outside with containment off is reported as
     ``share_outside_uncontained``, where it was asked for, the share of corrected particle-steps as ``share_corrected``.
+
+    Raises:
+        ExportError: a format in ``settings.export`` needs a package that is not installed.
     """
+    if "mp4" in settings.export and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ExportError(
+            "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
+        )
     run_dir.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     for split in settings.splits:

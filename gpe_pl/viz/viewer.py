@@ -17,7 +17,7 @@ import os
 import re
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -125,7 +125,7 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
     """What the page knows, as plain values and arrays."""
     truth, about = trajectories["ground truth"], trajectories["ground truth"].metadata
     frames = range(0, truth.num_frames, stride)
-    shown = {name: t.frames(0, truth.num_frames) for name, t in trajectories.items()}
+    shown = {name: _inside(t.frames(0, truth.num_frames)) for name, t in trajectories.items()}
     raster = Raster.of([t.pos[::stride] for t in shown.values()], np.asarray(about.bounds, float))
     colorings = {by: Coloring(by, [*shown.values()], frames, shown["ground truth"]) for by in _colors(shown)}
     steps = {by: _step(by, colorings[by], shown, frames) for by in ("speed", "von_mises") if by in colorings}
@@ -182,6 +182,15 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
     else:
         scenery = _scenery_3d(truth)
     return scene, arrays | scenery
+
+
+def _inside(trajectory: Trajectory) -> Trajectory:
+    """The same with all nodes inside the domain along its periodic axes."""
+    pos = np.array(trajectory.pos)
+    for axis, ((low, high), periodic) in enumerate(zip(trajectory.metadata.bounds, trajectory.metadata.periodic, strict=True)):
+        if periodic:
+            pos[..., axis] = low + np.mod(pos[..., axis] - low, high - low)
+    return replace(trajectory, pos=pos)
 
 
 def _colors(trajectories: Mapping[str, Trajectory]) -> list[ColorBy]:

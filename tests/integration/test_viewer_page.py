@@ -120,6 +120,16 @@ def test_a_mesh_is_coloured_by_its_stress(opened: Any, mesh: Trajectory) -> None
     assert viewer.page.locator(".bar").inner_text().split("\n")[1] == "von Mises stress"
 
 
+def test_cells_do_not_stretch_across_a_periodic_domain(opened: Any) -> None:
+    mesh = falling_mesh(2)
+    metadata = replace(mesh.metadata, periodic=(True, False))
+    viewer = opened(replace(mesh, metadata=metadata, pos=(*mesh.pos, 0.5, 0.0)))
+    viewer.page.select_option("#color", "material")
+    picture = viewer.picture()[:-40]
+    between = picture[:, 450:530]  # of the cells at both sides, and right of the loose particles
+    assert (np.ptp(picture, axis=-1) > 40).sum() > 500 and (np.ptp(between, axis=-1) > 40).sum() == 0
+
+
 def test_predictions_take_turns_and_one_that_stopped_says_why(opened: Any) -> None:
     truth, other = falling(2), falling(2, noise=0.3)
     stopped = replace(other.frames(0, 7), termination=Termination("explosion", 7, 0, "frame 7: too fast"))

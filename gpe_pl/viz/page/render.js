@@ -142,9 +142,10 @@ class Renderer {
     };
     const element = (data) => data && data.length ? { buffer: this.#buffer(data, gl.ELEMENT_ARRAY_BUFFER), count: data.length } : null;
     this.loose = element(arrays.loose);
-    this.triangles = element(arrays.triangles);
-    this.edges = element(arrays.edges);
-    this.outline = element(arrays.outline);
+    const parts = (data, corners) => { const made = element(data); return made && { ...made, data, corners }; };
+    this.triangles = parts(arrays.triangles, 3);
+    this.edges = parts(arrays.edges, 2);
+    this.outline = parts(arrays.outline, 2);
     const vertices = (data, width) => data && data.length ? { buffer: this.#buffer(data), count: data.length / width } : null;
     this.flats = vertices(arrays.flats, 9);
     this.lines = vertices(arrays.lines, 9);
@@ -292,6 +293,23 @@ class Renderer {
     this.gl.drawArrays(this.gl.LINES, 0, this.lines.count);
   }
 
+  /** Puts those faces or edges into the bound buffer that do not reach across a whole periodic domain. */
+  #leaveOutSeams(indices, pos) {
+    const { gl, scene } = this, { data, corners } = indices, kept = [];
+    const limit = scene.periods.map((period, k) => (period ? 0.5 * period / scene.position.extent[k] * 65535 : Infinity));
+    for (let first = 0; first < data.length; first += corners) {
+      let whole = true;
+      for (let c = 1; c < corners; c++) {
+        for (let k = 0; k < scene.dim; k++) {
+          whole &&= Math.abs(pos[data[first + c] * scene.dim + k] - pos[data[first] * scene.dim + k]) <= limit[k];
+        }
+      }
+      if (whole) for (let c = 0; c < corners; c++) kept.push(data[first + c]);
+    }
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, new Uint32Array(kept), gl.DYNAMIC_DRAW);
+    indices.count = kept.length;
+  }
+
   #nodes(number, shared, pos, shades, by) {
     const { gl, scene } = this;
     this.dynamic[number] ??= { pos: gl.createBuffer(), shades: gl.createBuffer() };
@@ -313,6 +331,7 @@ class Renderer {
     gl.bindTexture(gl.TEXTURE_2D, this.maps[by]);
     const draw = (mode, indices) => {
       gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, indices.buffer);
+      if (indices.data && scene.periods.some(Boolean)) this.#leaveOutSeams(indices, pos);
       gl.drawElements(mode, indices.count, gl.UNSIGNED_INT, 0);
     };
     if (this.triangles) {

@@ -126,6 +126,16 @@ def test_what_does_not_fit_is_refused(tmp_path, ground_truth: Trajectory, mesh):
     assert not [*tmp_path.iterdir()]
 
 
+def test_a_periodic_domain_shows_its_nodes_inside(tmp_path, mesh, dim):
+    periodic = replace(mesh, metadata=replace(mesh.metadata, periodic=(True,) + (False,) * (dim - 1)), pos=mesh.pos + 0.6 * np.eye(dim)[0])
+    write_viewer(tmp_path / "a.html", periodic)
+    page = Page(tmp_path / "a.html")
+    across = page.positions(0)[..., 0]
+    assert page.scene["periods"] == [1.0] + [0.0] * (dim - 1) and periodic.pos[..., 0].max() > 1
+    assert across.min() >= 0 and across.max() <= 1
+    np.testing.assert_allclose(across, periodic.pos[..., 0] % 1, atol=1e-5)
+
+
 def test_a_prediction_without_stress_has_none(tmp_path, mesh):
     write_viewer(tmp_path / "a.html", mesh, {"GNS": replace(mesh, stress=None)})
     fields = [t["fields"] for t in Page(tmp_path / "a.html").scene["trajectories"]]
