@@ -123,7 +123,7 @@ def test_a_mesh_is_coloured_by_its_stress(opened: Any, mesh: Trajectory) -> None
 def test_cells_do_not_stretch_across_a_periodic_domain(opened: Any) -> None:
     mesh = falling_mesh(2)
     metadata = replace(mesh.metadata, periodic=(True, False))
-    viewer = opened(replace(mesh, metadata=metadata, pos=(*mesh.pos, 0.5, 0.0)))
+    viewer = opened(replace(mesh, metadata=metadata, pos=mesh.pos + np.array([0.5, 0.0])))
     viewer.page.select_option("#color", "material")
     picture = viewer.picture()[:-40]
     between = picture[:, 450:530]  # of the cells at both sides, and right of the loose particles
