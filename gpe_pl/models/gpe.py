@@ -106,12 +106,12 @@ def _merge_levels(x: dict[str, Tensor], edges: Edges) -> tuple[dict[str, Tensor]
     nodes: dict[str, list[Tensor]] = {}
     for node_type, value in x.items():
         parts = nodes.setdefault(role(node_type), [])
-        first[node_type] = sum(len(part) for part in parts)
+        first[node_type] = sum(part.shape[0] for part in parts)
         parts.append(value)
     merged: dict[EdgeType, list[tuple[Tensor, Tensor, Tensor]]] = {}
     for (source, name, target), (index, odd, even) in edges.items():
-        offset = index.new_tensor([[first[source]], [first[target]]])
-        merged.setdefault((role(source), name, role(target)), []).append((index + offset, odd, even))
+        index = torch.stack([index[0] + first[source], index[1] + first[target]])
+        merged.setdefault((role(source), name, role(target)), []).append((index, odd, even))
     joined: Edges = {}
     for relation, stores in merged.items():
         indices, odds, evens = zip(*stores, strict=True)
@@ -274,7 +274,7 @@ class GPE(nn.Module):
         mass, pos = torch.cat([s.mass for s in stores]), torch.cat([s.pos for s in stores])
         angular = self.settings["island_momentum"] == "angular"
         kept = conserve(torch.cat([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
-        return dict(zip(acceleration, kept.split([len(a) for a in acceleration.values()]), strict=True))
+        return dict(zip(acceleration, kept.split([a.shape[0] for a in acceleration.values()]), strict=True))
 
     def compute(
         self,
