@@ -92,7 +92,7 @@ class GraphStandardizer(nn.Module):
         """A graph with standardised features, on request also those that it has no rows of; the input is left as it is."""
 
         def wanted(values: Tensor) -> bool:
-            return len(values) > 0 or not skip_absent
+            return not skip_absent or values.shape[0] > 0
 
         out = copy.copy(data)
         for t in self.spec.node_types:

@@ -28,7 +28,7 @@ from gpe_pl.graphs.features import (
     scales_of,
     virtual_features,
 )
-from gpe_pl.graphs.islands import free_since, islands_within
+from gpe_pl.graphs.islands import find_islands
 from gpe_pl.graphs.multiscale import MultiscaleGraph, multiscale_graph
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of, node_code
@@ -175,23 +175,24 @@ class GraphBuilder:
             store.offset = store.odd[:, : self.spec.dim]
 
     def _add_islands(self, data: HeteroData, state: State, rows: dict[str, Tensor]) -> None:
-        """Groups of connected nodes, and which of them have been free since the frame before.
+        """Groups of nodes that the graph connects, and which of them no edge ties to the boundary.
 
-        By the data set's own radius, which sees all that the solver's kernel sees, however few neighbours the graph shows a model.
+        What pushes a body from beyond the radius no model can see; held to free fall, it stays stable (docs/results/trials).
         """
-        cells = [torch.empty(2, 0, dtype=torch.int64), *(rows[m][data[m, CELL, m].edge_index].cpu() for m in self._meshes)]
-        mesh = torch.cat(cells, dim=1).numpy()
-        boundary, radius = self._points(state.boundary), self.metadata.connectivity_radius
-        before, now = (
-            islands_within(radius, _array(pos), boundary, mesh)
-            for pos in (state.pos - history_of(state)[:, -1] * self.metadata.frame_dt, state.pos)
-        )
-        label = torch.from_numpy(now.label).to(state.pos.device)
+        between, touches = [], torch.zeros(state.num_nodes, dtype=torch.bool, device=state.pos.device)
+        for source, name, target in self.spec.relations:
+            if source == BOUNDARY:
+                touches[rows[target][data[source, name, target].edge_index[1]]] = True
+            elif source in rows and target in rows:
+                j, i = data[source, name, target].edge_index
+                between.append(torch.stack([rows[source][j], rows[target][i]]))
+        islands = find_islands(state.num_nodes, torch.cat(between, dim=1).cpu().numpy(), touches.cpu().numpy())
+        label = torch.from_numpy(islands.label).to(state.pos.device)
         for material, r in rows.items():
             data[material].pos = state.pos[r].float()
             data[material].island = label[r]
-        data.island_is_free = torch.from_numpy(free_since(before, now)).to(state.pos.device)
-        data.num_islands = torch.tensor([len(now.is_free)], device=state.pos.device)
+        data.island_is_free = torch.from_numpy(islands.is_free).to(state.pos.device)
+        data.num_islands = torch.tensor([len(islands.is_free)], device=state.pos.device)
 
     # --- meshes ---------------------------------------------------------------------------------------------------------------------------
 

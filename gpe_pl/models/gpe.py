@@ -32,6 +32,7 @@ Decoder = Literal["node", "pair"]
 LevelWeights = Literal["shared", "separate"]
 Schedule = Literal["simultaneous", "sweep"]
 MaterialEmbeddingKind = Literal["affine", "mlp"]
+NodeNorm = Literal["none", "layer"]
 
 
 class StressError(GpeError, ValueError):
@@ -105,12 +106,12 @@ def _merge_levels(x: dict[str, Tensor], edges: Edges) -> tuple[dict[str, Tensor]
     nodes: dict[str, list[Tensor]] = {}
     for node_type, value in x.items():
         parts = nodes.setdefault(role(node_type), [])
-        first[node_type] = sum(len(part) for part in parts)
+        first[node_type] = sum(part.shape[0] for part in parts)
         parts.append(value)
     merged: dict[EdgeType, list[tuple[Tensor, Tensor, Tensor]]] = {}
     for (source, name, target), (index, odd, even) in edges.items():
-        offset = index.new_tensor([[first[source]], [first[target]]])
-        merged.setdefault((role(source), name, role(target)), []).append((index + offset, odd, even))
+        index = torch.stack([index[0] + first[source], index[1] + first[target]])
+        merged.setdefault((role(source), name, role(target)), []).append((index, odd, even))
     joined: Edges = {}
     for relation, stores in merged.items():
         indices, odds, evens = zip(*stores, strict=True)
@@ -133,6 +134,8 @@ class GPE(nn.Module):
         level_weights: one set for all levels of virtual nodes, which then serves any number of levels, or one per level (paper).
         schedule: the order of messages between levels; ``simultaneous`` (paper) or ``sweep``.
         stress: also decode the stress of materials that have one.
+        node_norm: ``layer`` normalises the encoded state of every node, and what each step adds to it, as GNS does; however far a rollout strays, its
+            accelerations stay bounded. ``none`` as in the paper.
         island_momentum: of what flies freely, keep the ``linear``, or also the ``angular`` momentum exactly (see ``nn.island_momentum``); or ``ignored``.
 
     Raises:
@@ -155,6 +158,7 @@ class GPE(nn.Module):
         level_weights: LevelWeights = "shared",
         schedule: Schedule = "simultaneous",
         stress: bool = False,
+        node_norm: NodeNorm = "none",
         island_momentum: IslandMomentum = "ignored",
     ) -> None:
         super().__init__()
@@ -169,6 +173,7 @@ class GPE(nn.Module):
             "level_weights": level_weights,
             "schedule": schedule,
             "stress": stress,
+            "node_norm": node_norm,
             "island_momentum": island_momentum,
         }
         if island_momentum != "ignored" and not spec.islands:
@@ -180,7 +185,7 @@ class GPE(nn.Module):
         self.spec, self.interaction, self.decoder, self.edge_state = spec, interaction, decoder, edge_state
         self.level_weights, self.schedule = level_weights, schedule
         self.num_message_passing_steps = num_message_passing_steps
-        hidden = hidden_channels
+        hidden, norm = hidden_channels, node_norm == "layer"
         params = {m: c for m, c in spec.param_channels.items() if c}
         self.material_embedding = nn.ModuleDict({m: MaterialEmbedding(c, hidden, material_embedding) for m, c in params.items()})
         readable = self._readable()
@@ -189,7 +194,7 @@ class GPE(nn.Module):
         self.node_encoder, self.edge_encoder = nn.ModuleDict(), nn.ModuleDict()
         for t in spec.node_types:
             if t in ends and self.type_key(t) not in self.node_encoder:
-                self.node_encoder[self.type_key(t)] = MLP(spec.node_channels[t] + (hidden if t in params else 0), hidden, hidden)
+                self.node_encoder[self.type_key(t)] = MLP(spec.node_channels[t] + (hidden if t in params else 0), hidden, hidden, norm)
         for relation in relations if edge_state == "latent" else []:
             if self.key(relation) not in self.edge_encoder:
                 odd, even = spec.odd_channels[relation], spec.even_channels[relation]
@@ -208,7 +213,7 @@ class GPE(nn.Module):
                 convs[self.key(relation)] = MomentumConv(hidden, edge_channels, even, kind, implementation)
             self.convs.append(convs)
             keys = dict.fromkeys(self.type_key(t) for t in spec.node_types if t in types)
-            self.updates.append(nn.ModuleDict({k: MLP(hidden, hidden, hidden) for k in keys}))
+            self.updates.append(nn.ModuleDict({k: MLP(hidden, hidden, hidden, norm) for k in keys}))
         if decoder == "node":
             self.node_decoder = nn.ModuleDict({m: MLP(hidden, hidden, spec.dim) for m in spec.materials})
         else:
@@ -277,7 +282,7 @@ class GPE(nn.Module):
         mass, pos = torch.cat([s.mass for s in stores]), torch.cat([s.pos for s in stores])
         angular = self.settings["island_momentum"] == "angular"
         kept = conserve(torch.cat([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
-        return dict(zip(acceleration, kept.split([len(a) for a in acceleration.values()]), strict=True))
+        return dict(zip(acceleration, kept.split([a.shape[0] for a in acceleration.values()]), strict=True))
 
     def _compute_apart(
         self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges

@@ -316,3 +316,9 @@ def test_commands_fail_in_one_line(tmp_path: Path, command: str, arguments: list
     assert len(errors) == 1
     assert errors[0].startswith(line)
     assert "Traceback" not in child.stdout + child.stderr
+
+
+def test_a_table_by_model_has_a_default() -> None:
+    table = ["+comparison=equal_steps", "data.comparison.noise_std.default=0.5", "+data.comparison.noise_std.GNS=2.0"]
+    assert compose("fit", *table).training.noise_std == 0.5
+    assert compose("fit", *table, "model=gns").training.noise_std == 2.0

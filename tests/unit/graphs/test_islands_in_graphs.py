@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch_geometric.data import Batch
 
+from gpe_pl.graphs.islands import islands_within
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE, IslandError
 from gpe_pl.trajectory import State
@@ -79,25 +80,22 @@ def test_a_graph_without_islands_is_refused() -> None:
         GPE(scenes.builder(islands=False).spec, island_momentum="linear")
 
 
-def test_islands_are_found_by_the_data_sets_own_radius() -> None:
+def test_islands_are_those_that_the_graphs_own_radius_shows() -> None:
     s = two_clouds(0.4).to_torch()
     wide, narrow = scenes.builder(TWO, history=2)(s), scenes.builder(TWO, history=2, connectivity_spacings=0.5)(s)
-    edges = ("sand", "radius", "sand")
-    assert narrow[edges].edge_index.shape[1] < wide[edges].edge_index.shape[1]
-    assert torch.equal(narrow.island_is_free, wide.island_is_free)
-    for m in TWO:
-        assert torch.equal(narrow[m].island, wide[m].island)
+    assert int(narrow.num_islands) > int(wide.num_islands)
 
 
-def test_what_touched_something_a_frame_ago_is_not_yet_free() -> None:
-    build = scenes.builder(TWO, history=2)
-    s = two_clouds(0.4)
-    resting = build(s.to_torch())
-    assert resting.island_is_free.any()
-    upwards = np.array([0.0, 0.4 / build.metadata.frame_dt])  # the upper cloud was beside the lower one
-    assert s.velocity_history is not None
-    past = s.velocity_history.copy()
-    past[20:, -1] += upwards
-    leaving = build(replace(s, vel=past[:, -1], velocity_history=past).to_torch())
-    upper = int(leaving["sand"].island[leaving["sand"].node_id >= 20][0])
-    assert not leaving.island_is_free[upper]
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("trim", [True, False])
+def test_islands_of_edges_are_those_of_the_radius(dim: int, trim: bool) -> None:
+    build = scenes.builder(("sand", "snow"), dim, trim_boundary=trim)
+    s = scenes.state(60, ("sand", "snow"), dim=dim, high=0.8)
+    data = build(s.to_torch())
+    expected = islands_within(build.scales.radius, s.pos, s.boundary.pos, np.empty((2, 0), dtype=np.int64))
+    label = np.empty(60, dtype=np.int64)
+    for m in ("sand", "snow"):
+        label[data[m].node_id] = data[m].island
+    np.testing.assert_array_equal(label, expected.label)
+    np.testing.assert_array_equal(data.island_is_free, expected.is_free)
+    assert 2 < len(expected.is_free) < 60 and 0 < expected.is_free.sum() < len(expected.is_free)
