@@ -6,6 +6,7 @@ Memory stays flat, however long the rollout: only the frames of the animation ar
 from __future__ import annotations
 
 import json
+import math
 import os
 import time
 from collections.abc import Callable
@@ -107,18 +108,20 @@ def run(
         outside.append(1.0 if isinstance(item, Termination) else _share_deeper(item, DEPTH * metadata.spacing))
         if on_progress is not None:
             on_progress(settings.num_steps + frame, total)
-    records = [
-        Record("num_nodes", state.num_nodes, "1"),
-        Record("num_boundary_nodes", len(state.boundary.pos), "1"),
-        Record("num_steps", len(seconds), "1"),
-        Record("seconds_per_step", float(np.median(seconds)) if seconds else float("nan"), "s"),
-        Record("peak_memory", peak_resident(), "B"),
-        Record("share_corrected", num_corrected / max(1, len(seconds) * state.num_nodes), "1"),
-        Record("share_outside_at_end", _share_deeper(end, TOLERANCE), "1"),
-        Record("max_speed", top_speed, "m/s"),
-    ]
+    num_steps, size = len(seconds), state.num_nodes
+    found: dict[str, tuple[float, str]] = {
+        "num_nodes": (size, "1"),
+        "num_boundary_nodes": (len(state.boundary.pos), "1"),
+        "num_steps": (num_steps, "1"),
+        "seconds_per_step": (float(np.median(seconds)) if seconds else math.nan, "s"),
+        "peak_memory": (peak_resident(), "B"),
+        "share_corrected": (num_corrected / (num_steps * size) if seconds else math.nan, "1"),
+        "share_outside_at_end": (_share_deeper(end, TOLERANCE), "1"),
+        "max_speed": (top_speed, "m/s"),
+    }
     if outside:
-        records.append(Record("share_outside_uncontained", float(np.mean(outside)), "1"))
+        found["share_outside_uncontained"] = float(np.mean(outside)), "1"
+    records = [Record(metric, float(value), unit) for metric, (value, unit) in found.items()]
     _write(folder / "showcase.json", {"records": [vars(r) for r in records], "stopped": None if stop is None else stop.message})
     film.write(folder / "showcase")
     return records
