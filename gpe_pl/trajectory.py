@@ -13,6 +13,7 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from pydantic import TypeAdapter, ValidationError
 from gpe_pl import integrators
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import Shape, shape_from_dict, shape_to_dict
+from gpe_pl.periodicity import NOWHERE, Periodicity
 from gpe_pl.schema import FIELDS, NODE_TYPES, SCHEMA_VERSION, node_code
 
 Array = Any
@@ -130,6 +132,7 @@ class State:
         num_substeps: that a solver took to come here from the frame before.
         num_corrected: nodes that containment put back in coming here from the frame before.
         internal: opaque part of a solver (deformation gradient, …), carried so that a restart equals a run-through.
+        periodicity: axes along which space repeats.
     """
 
     pos: Array
@@ -147,6 +150,7 @@ class State:
     num_substeps: int = 0
     num_corrected: int = 0
     internal: Any = None
+    periodicity: Periodicity = NOWHERE
 
     @property
     def num_nodes(self) -> int:
@@ -224,6 +228,10 @@ class Metadata:
     def dim(self) -> int:
         return len(self.bounds)
 
+    @cached_property
+    def periodicity(self) -> Periodicity:
+        return Periodicity(self.bounds, self.periodic)
+
 
 @dataclass(frozen=True)
 class Termination:
@@ -285,13 +293,13 @@ class Trajectory:
         pos, vel, past = self.pos[frame].astype(np.float64), self.vel[frame].astype(np.float64), None
         if history:
             window = self.pos[frame - history : frame + 1].astype(np.float64)
-            past = np.ascontiguousarray(integrators.velocities(window, self.metadata.frame_dt).swapaxes(0, 1))
+            past = np.ascontiguousarray(integrators.velocities(window, self.metadata.frame_dt, self.metadata.periodicity).swapaxes(0, 1))
             vel = past[:, -1]
         rest_pos = None if self.rest_pos is None else self.rest_pos.astype(np.float64)
         stress = None if self.stress is None else Stress(self.stress.node[frame], self.stress.cell[frame])
         return State(
             pos, vel, self.node_type, self.mass, self.material_params, self.boundary, gravity, past, frame * self.metadata.frame_dt,
-            rest_pos, self.cells, stress,
+            rest_pos, self.cells, stress, periodicity=self.metadata.periodicity,
         )  # fmt: skip
 
     def frames(self, start: int, stop: int | None = None) -> Trajectory:
