@@ -66,6 +66,13 @@ class Periodicity:
         repeats = self._row([float(p) for p in self.periodic], pos) > 0
         return xp.where(repeats & (inside >= high), low, inside)  # rounding can lead to the upper bound itself
 
+    def from_corner(self, pos: Array) -> Array:
+        """Positions [..., dim] in m from the domain's lower corner, below the period along periodic axes: what a k-d tree takes."""
+        xp = array_namespace(pos)
+        low, period = self._row([low for low, _ in self.bounds], pos), self._row(self.period, pos)
+        inside = self.wrapped(pos) - low
+        return xp.where((period > 0) & (inside >= period), 0.0 * inside, inside)  # rounded up
+
     def check_radius(self, radius: float) -> None:
         """Raise ``PeriodicityError`` unless a node's nearest image is the only one within the radius [m]."""
         for axis in self.axes:

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
     from gpe_pl.generation import DatasetSpec
 
+IMPORTED = "imported"
+"""Where data that are generated have their size, those that ``convert`` made have this."""
+
 AUTOMATIC_BYTES = 2**30
 """``fit`` generates data sets smaller than this by itself; larger ones are asked for with ``simulate``."""
 
@@ -26,6 +29,10 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
 
     from gpe_pl.generation import DatasetSpec
 
+    if is_imported(cfg):
+        raise ConfigError(
+            f"data=imported: {cfg.data.name} was not simulated; `python -m gpe_pl.convert` imports data, choose another data=…"
+        )
     if cfg.size.name not in cfg.data.sizes:
         raise ConfigError(f"size={cfg.size.name}: data={cfg.data.name} has the sizes {', '.join(cfg.data.sizes)}")
     values: dict[str, Any] = OmegaConf.to_container(cfg.data, resolve=True)  # type: ignore[assignment]
@@ -36,10 +43,31 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     return construct(DatasetSpec, values, "data", scene=scene, solver=solver)
 
 
+def is_imported(cfg: DictConfig) -> bool:
+    """Whether the config names a data set that ``convert`` made; it is used as it is, never generated."""
+    return bool(cfg.data.size == IMPORTED)
+
+
+def imported_data(cfg: DictConfig) -> Path:
+    """Folder of an imported data set; raises ``ConfigError`` where there is none."""
+    if not isinstance(cfg.data.name, str):
+        raise ConfigError("data.name=null: name the imported data set, as `python -m gpe_pl.convert name=…` did")
+    folder = Path(cfg.paths.data) / cfg.data.name / IMPORTED
+    if not (folder / "statistics.json").is_file():
+        there = ", ".join(sorted(path.parent.parent.name for path in Path(cfg.paths.data).glob(f"*/{IMPORTED}/statistics.json"))) or "none"
+        raise ConfigError(
+            f"data.name={cfg.data.name}: no imported data in {folder}; make them with `python -m gpe_pl.convert name={cfg.data.name} format=… source=…` "
+            f"(imported are: {there})"
+        )
+    return folder
+
+
 def ensure_data(cfg: DictConfig) -> Path:
     """Folder of the config's data set; generates what is missing if the data set is small."""
     from gpe_pl.generation import dataset_bytes, generate, progress_bar
 
+    if is_imported(cfg):
+        return imported_data(cfg)
     spec = dataset_spec(cfg)
     folder = Path(cfg.paths.data) / spec.name / spec.size
     if dataset_bytes(spec) > AUTOMATIC_BYTES and not (folder / "statistics.json").exists():

@@ -37,7 +37,4 @@ def radius_between(
 def _tree(pos: np.ndarray, periodicity: Periodicity) -> cKDTree:
     if not periodicity:
         return cKDTree(pos, balanced_tree=False, compact_nodes=False)
-    low = np.array([low for low, _ in periodicity.bounds])
-    inside = periodicity.wrapped(pos) - low
-    inside = np.where((periodicity.period > 0) & (inside >= periodicity.period), 0.0, inside)  # rounded up
-    return cKDTree(inside, balanced_tree=False, compact_nodes=False, boxsize=periodicity.period)
+    return cKDTree(periodicity.from_corner(pos), balanced_tree=False, compact_nodes=False, boxsize=periodicity.period)
