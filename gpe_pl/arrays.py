@@ -148,10 +148,10 @@ def checked_cells(cells: Any, codes: np.ndarray) -> np.ndarray:
     array = np.asarray(cells)
     if array.dtype.kind not in "iu" or array.ndim != 2 or array.shape[1] not in (3, 4):
         raise ArrayError(f"cells: is {array.dtype}{list(array.shape)}, expected integers [cell, 3 or 4 corners]")
-    wrong = ((array < 0) | (array >= len(codes))).any(axis=1)
+    wrong = ((array < 0) | (array >= len(codes))).any(axis=1) | (np.diff(np.sort(array, axis=1), axis=1) == 0).any(axis=1)
     if wrong.any():
         cell = int(wrong.argmax())
-        raise ArrayError(f"cells: cell {cell} has the nodes {array[cell].tolist()}, there are {len(codes)} nodes")
+        raise ArrayError(f"cells: cell {cell} has the nodes {array[cell].tolist()}; they must be different ones of the {len(codes)} nodes")
     kinds = codes[array]
     wrong = (kinds != kinds[:, :1]).any(axis=1) | ~np.isin(kinds[:, 0], [node_code(m) for m in MESH_MATERIALS])
     if wrong.any():

@@ -7,6 +7,7 @@ the frame, and the others imported: read the report.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gpe_pl.config import construct, entry_point
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 def convert(cfg: DictConfig) -> None:
     """Import one data set and print the report."""
-    from gpe_pl.data.importers import PAGE_FILE, ImportSettings, import_dataset
+    from gpe_pl.data.importers import PAGE_FILE, ImportSettings, draw_contact_sheet, import_dataset
     from gpe_pl.generation import progress_bar
 
     settings = construct(ImportSettings, {str(key): value for key, value in cfg.items() if key != "paths"}, "")
@@ -26,7 +27,8 @@ def convert(cfg: DictConfig) -> None:
     print(report.text())
     if {"train", "val", "test"} <= set(report.splits):
         print(f"train on it: python -m gpe_pl.fit data=imported data.name={report.name}")
-    print(f"{report.folder}/{PAGE_FILE}")
+    print(draw_contact_sheet(report))
+    print(Path(report.folder) / PAGE_FILE)
 
 
 main = entry_point("convert")(convert)

@@ -390,7 +390,7 @@ class Trajectory:
             raise ArrayError("rest_pos: only meshes have rest positions; pass cells too, or leave it out")
         return cls(
             Metadata(
-                dataset, names, param_names(names), frame_dt, spacing, radius, bounds, tuple(gravity.tolist()),
+                dataset, names, param_names(names), frame_dt, spacing, radius, bounds, tuple(map(float, gravity)),
                 periodicity.periodic, split=split, solver="import", solver_version="1",
             ),
             pos,

@@ -259,10 +259,10 @@ def test_a_shift_changes_neither_step_nor_rollout(periodic: tuple[bool, ...], is
     simulator = LearnedSimulator(model.double(), build).double().eval()
     simulator.acceleration_std.fill_(100.0)
     s = cloud(space, num_nodes=25, history=2)
-    plain = rollout(simulator, s.to_torch(), 15, build.metadata)
-    assert np.abs(plain.vel[-1] - s.vel - 15 * build.metadata.frame_dt * s.gravity).max() > 0.1  # the network answers
-    for shift in shifts(space):
-        other = rollout(simulator, shifted(s, shift).to_torch(), 15, build.metadata)
+    plain = rollout(simulator, s.to_torch(), 8, build.metadata)
+    assert np.abs(plain.vel[-1] - s.vel - 8 * build.metadata.frame_dt * s.gravity).max() > 0.1  # the network answers
+    for shift in shifts(space, 2):
+        other = rollout(simulator, shifted(s, shift).to_torch(), 8, build.metadata)
         np.testing.assert_allclose(other.vel[1], plain.vel[1], atol=1e-6)
         difference = space.shortest(other.pos - plain.pos - shift)
         assert np.abs(difference).max() < 1e-5

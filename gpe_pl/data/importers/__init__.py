@@ -6,11 +6,22 @@ and once to write. The data set appears complete or not at all, and an existing 
     {root}/{name}/imported/{split}/shard-00000.h5
     {root}/{name}/imported/statistics.json          of the train split
     {root}/{name}/imported/report.{json,md}         what was found, assumed, repaired and refused
-    {root}/{name}/imported/contact_sheet.png        some training scenes, to look at
+    {root}/{name}/imported/contact_sheet.png        some scenes, to look at, from the command
 """
 
-from gpe_pl.data.importers.assemble import FOLDER, import_dataset, save_dataset
+from gpe_pl.data.importers.assemble import FOLDER, draw_contact_sheet, import_dataset, save_dataset
 from gpe_pl.data.importers.report import PAGE_FILE, Report
 from gpe_pl.data.importers.source import Format, ImportFailure, ImportSettings, Refusal
 
-__all__ = ["FOLDER", "PAGE_FILE", "Format", "ImportFailure", "ImportSettings", "Refusal", "Report", "import_dataset", "save_dataset"]
+__all__ = [
+    "FOLDER",
+    "PAGE_FILE",
+    "Format",
+    "ImportFailure",
+    "ImportSettings",
+    "Refusal",
+    "Report",
+    "draw_contact_sheet",
+    "import_dataset",
+    "save_dataset",
+]

@@ -96,6 +96,19 @@ def save_dataset(root: Path | str, name: str, holdout: float = 0.1, **splits: It
     return _Conversion(name, _free_folder(Path(root), name), Source(Facts(), items), holdout, about).run()
 
 
+def draw_contact_sheet(report: Report) -> Path:
+    """Some scenes of an imported data set, to look at; returns the picture's path."""
+    from gpe_pl.viz.contact_sheet import contact_sheet
+
+    folder, split = Path(report.folder), next(iter(report.splits))
+    shown = islice(iter_trajectories(folder, split), NUM_SHOWN)
+    figure = contact_sheet({f"{split} {k}": trajectory for k, trajectory in enumerate(shown)})
+    temporary, path = folder / ".contact_sheet.part.png", folder / "contact_sheet.png"
+    figure.savefig(temporary)
+    os.replace(temporary, path)
+    return path
+
+
 def _held(name: str, trajectory: Trajectory) -> Item:
     return Item(name, lambda _: Loaded(trajectory))
 
@@ -314,7 +327,7 @@ class _Conversion:
                 entry["low"], entry["high"] = min(entry["low"], float(values.min())), max(entry["high"], float(values.max()))
 
     def _summarize(self, folder: Path) -> None:
-        """Statistics, neighbours and a contact sheet of the training trajectories."""
+        """Statistics and neighbours of the training trajectories."""
         split = "train" if "train" in self.survey.good else next(iter(self.survey.good))
         shards = sorted((folder / split).glob("shard-*.h5"))
         statistics = combined([shard_moments(path)[1] for path in shards])
@@ -337,9 +350,6 @@ class _Conversion:
             report.warnings.append(
                 f"{among.mean():.1f} neighbours within the radius are {'few' if among.mean() < FEWEST_NEIGHBOURS else 'many'}; choose connectivity_radius=…"
             )
-        from gpe_pl.viz.contact_sheet import contact_sheet
-
-        contact_sheet({f"{split} {k}": trajectory for k, trajectory in enumerate(sample[:NUM_SHOWN])}).savefig(folder / "contact_sheet.png")
 
     def _look_at_motion(self, sample: Sequence[Trajectory]) -> None:
         report = self.report

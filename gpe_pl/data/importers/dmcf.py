@@ -1,9 +1,9 @@
 """Fluids of DeepLagrangianFluids (Continuous Convolutions) and DMCF.
 
-``source`` is a folder with ``train/``, ``valid/`` and ``test/``, a folder of files, or one file. Files are ``{scene}_{part}.msgpack.zst``: the parts of a scene
-follow each other in time. A file is a list of frames, each with ``pos`` and ``vel`` [node, 3], ``m`` and ``viscosity`` [node], ``frame_id`` and ``scene_id``;
-the first frame of a scene also has ``box`` and ``box_normals`` [boundary_node, 3], and some have ``grav``. Two-dimensional scenes have a third coordinate that
-never changes, which is dropped.
+``source`` is a folder with ``train/``, ``valid/`` and ``test/``, a folder of files, or one file. Files are ``sim_{seed}_{part}.msgpack.zst``, where the parts
+of a scene follow each other in time, or have any other name and a whole scene. A file is a list of frames, each with ``pos`` and ``vel`` [node, 3], ``m`` and
+``viscosity`` [node], ``frame_id`` and ``scene_id``; the first frame of a scene also has ``box`` and ``box_normals`` [boundary_node, 3], and some have ``grav``.
+Two-dimensional scenes have a third coordinate that never changes, which is dropped.
 
 The time between frames is not in these files: 0.02 s unless ``frame_dt`` says otherwise (DMCF's WBC-SPH has 2.5e-3). The report compares it with how far
 particles move at the velocities of the source. Needs ``msgpack`` and ``zstandard`` (``pip install 'gpe_pl[import]'``).
@@ -68,7 +68,7 @@ def _libraries() -> tuple[Any, Any]:
 
 
 def _scene_of(path: Path) -> str:
-    return re.sub(r"_\d+$", "", path.name.removesuffix(ENDING))
+    return re.sub(r"(_\d+)_\d+$", r"\1", path.name.removesuffix(ENDING))
 
 
 def _scenes(folder: Path) -> list[list[Path]]:
@@ -85,6 +85,8 @@ def _load(parts: list[Path], facts: Facts) -> Loaded:
     for k, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise Refusal(f"is {type(frame).__name__}, expected a map", k)
+        if "frame_id" in frame and int(_array(frame, "frame_id", k)) != int(_array(frames[0], "frame_id", 0)) + k:
+            raise Refusal("frame_id does not follow that of the frame before: a part is missing, or parts are of several scenes", k)
         for name, arrays in columns.items():
             arrays.append(_array(frame, name, k))
             if arrays[-1].shape != (len(columns["pos"][0]), 3):

@@ -68,7 +68,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         if parameters["fluid"] != viscosity:
             notes.append(f"viscosity {viscosity:g} is outside {spec.low:g} … {spec.high:g}; {parameters['fluid']:g} {spec.unit} is stored")
     facts = Facts(
-        number(values, "dt", described, low=1e-12) * number({"write_every": 1, **values}, "write_every", described, low=1),
+        number(values, "dt", described, low=1e-12) * number({"write_every": 1, **values}, "write_every", described, low=1.0),
         bounds,
         tuple(periodic[:dim]),
         gravity,
