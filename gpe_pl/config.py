@@ -188,6 +188,8 @@ def _fail(error: Exception) -> None:
 def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
     """One line for a composition error, with the valid keys or choices."""
     text = " ".join(str(error).split())
+    if "'data/imported'" in text:
+        return f"data=imported: {config_name} takes data that it simulates; fit and evaluate take imported ones"
     match = re.search(r"Could not override '([^']+)'", text)
     if match is None:
         override = getattr(error, "override", None)  # of a syntax error

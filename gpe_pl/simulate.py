@@ -29,10 +29,6 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
 
     from gpe_pl.generation import DatasetSpec
 
-    if is_imported(cfg):
-        raise ConfigError(
-            f"data=imported: {cfg.data.name} was not simulated; `python -m gpe_pl.convert` imports data, choose another data=…"
-        )
     if cfg.size.name not in cfg.data.sizes:
         raise ConfigError(f"size={cfg.size.name}: data={cfg.data.name} has the sizes {', '.join(cfg.data.sizes)}")
     values: dict[str, Any] = OmegaConf.to_container(cfg.data, resolve=True)  # type: ignore[assignment]
@@ -41,11 +37,6 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     scene = construct_target(values.pop("scene"), "data.scene", "gpe_pl.solvers.")
     solver = construct_target(values.pop("solver"), "data.solver", "gpe_pl.solvers.")
     return construct(DatasetSpec, values, "data", scene=scene, solver=solver)
-
-
-def is_imported(cfg: DictConfig) -> bool:
-    """Whether the config names a data set that ``convert`` made; it is used as it is, never generated."""
-    return bool(cfg.data.size == IMPORTED)
 
 
 def imported_data(cfg: DictConfig) -> Path:
@@ -66,7 +57,7 @@ def ensure_data(cfg: DictConfig) -> Path:
     """Folder of the config's data set; generates what is missing if the data set is small."""
     from gpe_pl.generation import dataset_bytes, generate, progress_bar
 
-    if is_imported(cfg):
+    if cfg.data.size == IMPORTED:  # used as they are
         return imported_data(cfg)
     spec = dataset_spec(cfg)
     folder = Path(cfg.paths.data) / spec.name / spec.size

@@ -65,7 +65,7 @@ class ImportSettings:
         spacing: rest spacing of neighbours [m].
         connectivity_radius: neighbour radius [m].
         walls: friction of walls at the bounds, by side (``x_low``, ``x_high``, …); ``{}`` for none.
-        materials: material, or ``boundary``, of node types of the source, by their number.
+        materials: material, or ``boundary``, of node types of the source, by their number; the others are as the format has them.
         parameters: parameter of materials of which the source has none.
         max_trajectories: per split, from its start.
         holdout: share of the training trajectories that become ``val`` and ``test`` where the source has none, at least one each; 0 for none.
@@ -82,14 +82,14 @@ class ImportSettings:
     spacing: Annotated[float, Field(gt=0)] | None = None
     connectivity_radius: Annotated[float, Field(gt=0)] | None = None
     walls: dict[str, Annotated[float, Field(ge=0)]] | None = None
-    materials: dict[int, str] = field(default_factory=dict)
-    parameters: dict[str, float] = field(default_factory=dict)
+    materials: dict[int, str] | None = None
+    parameters: dict[str, float] | None = None
     max_trajectories: Annotated[int, Field(ge=1)] | None = None
     holdout: Annotated[float, Field(ge=0, le=0.4)] = 0.1
     allow_pickle: bool = False
 
     def __post_init__(self) -> None:
-        wrong = sorted({*self.materials.values()} - {*NODE_TYPES}) + sorted({*self.parameters} - {*MATERIALS})
+        wrong = sorted({*(self.materials or {}).values()} - {*NODE_TYPES}) + sorted({*(self.parameters or {})} - {*MATERIALS})
         if wrong:
             raise ValueError(f"unknown material {wrong[0]!r}; known: {', '.join(NODE_TYPES)}")
         sides = [f"{axis}_{side}" for axis in "xyz" for side in ("low", "high")]
@@ -131,7 +131,7 @@ class Facts:
         given = {name: getattr(settings, name) for name in names if getattr(settings, name) is not None}
         given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
         notes = (*self.notes, *(f"{name} = {value} was given" for name, value in given.items()))
-        return replace(self, **given, parameters={**self.parameters, **settings.parameters}, notes=notes)
+        return replace(self, **given, parameters={**self.parameters, **(settings.parameters or {})}, notes=notes)
 
 
 @dataclass(frozen=True)
@@ -319,7 +319,7 @@ def _sliding_velocity(pos: np.ndarray, nodes: np.ndarray, facts: Facts, repairs:
 
 def kinds_of(types: np.ndarray, table: Mapping[int, str], settings: ImportSettings) -> np.ndarray:
     """Node type names of a source's integer types [node]; raises ``Refusal`` for one that is not known."""
-    known = {**table, **settings.materials}
+    known = {**table, **(settings.materials or {})}
     unknown = [code for code in np.unique(types).tolist() if code not in known]
     if unknown:
         node = int(np.flatnonzero(types == unknown[0])[0])
