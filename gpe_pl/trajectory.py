@@ -735,7 +735,9 @@ def shards(root: Path | str, split: str) -> list[Path]:
     """Shard files of a split under a data set's folder, in order; raises ``StoreError`` when there is none."""
     found = sorted((Path(root) / split).glob("shard-*.h5"))
     if not found:
-        raise StoreError(f"{root}: no shards of split {split!r}; generate them with `python -m gpe_pl.simulate`")
+        raise StoreError(
+            f"{root}: no shards of split {split!r}; generate them with `python -m gpe_pl.simulate`, or import data that have it"
+        )
     return found
 
 

@@ -14,6 +14,9 @@ from gpe_pl.trajectory import Trajectory, read_trajectory, trajectory_names
 
 STATISTICS_FILE = "statistics.json"
 
+FRAMES_AT_ONCE = 2048
+"""Public data have trajectories of tens of thousands of frames, which in double precision would fill the memory."""
+
 
 def shard_moments(path: Path) -> tuple[str, dict[str, Any]]:
     """Sums over one shard from which the statistics follow, and its path."""
@@ -21,11 +24,13 @@ def shard_moments(path: Path) -> tuple[str, dict[str, Any]]:
     for name in trajectory_names(path):
         trajectory = read_trajectory(path, name)
         dt = trajectory.metadata.frame_dt
-        vel = integrators.velocities(trajectory.pos.astype(np.float64), dt, trajectory.metadata.periodicity)
-        acc = integrators.acceleration(vel[1:], vel[:-1], dt) - np.asarray(trajectory.metadata.gravity)
-        for key, values in (("velocity", vel), ("acceleration", acc)):
-            sums[key][0] += values.size
-            sums[key][1] += float(np.sum(values * values))
+        for start in range(0, max(1, trajectory.num_frames - 2), FRAMES_AT_ONCE):
+            pos = trajectory.pos[start : start + FRAMES_AT_ONCE + 2].astype(np.float64)
+            vel = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
+            acc = integrators.acceleration(vel[1:], vel[:-1], dt) - np.asarray(trajectory.metadata.gravity)
+            for key, values in (("velocity", vel[1:] if start else vel), ("acceleration", acc)):
+                sums[key][0] += values.size
+                sums[key][1] += float(np.sum(values * values))
         params = _scaled(trajectory)
         finite = np.isfinite(params)
         values = np.where(finite, params, 0.0)

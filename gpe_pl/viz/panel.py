@@ -125,7 +125,8 @@ class Panel:
         on_paper, depth = self.camera.project(pos)
         whole = finite[self._faces].all(axis=1)
         faces, dots = self._faces[whole], self._loose[finite[self._loose]]
-        corners, face_colors = self._corners(pos, faces), cell_colors[self._cell_of_face[whole]]
+        corners, shown = self._corners(pos, faces)
+        face_colors = cell_colors[self._cell_of_face[whole][shown]]
         outlines = list(self.camera.project(corners)[0])
         if self._is_3d and len(faces):
             # Dots among faces become polygons, so that all together can be drawn from far to near.
@@ -139,17 +140,26 @@ class Panel:
             dots = dots[:0]
         self.mesh.set_verts(outlines)
         self._paint(self.mesh, face_colors, self._edge)
-        segments = self._corners(pos, self._outline[finite[self._outline].all(axis=1)])
+        segments, _ = self._corners(pos, self._outline[finite[self._outline].all(axis=1)])
         self.outline.set_segments(self.camera.project(segments)[0])
         dots = dots[np.argsort(depth[dots], kind="stable")]
         self.particles.set_offsets(on_paper[dots])
         # One colour per particle even where all are equal: a single one makes Agg round positions to whole pixels.
         self._paint(self.particles, self._seen_from_afar(node_colors[dots], on_paper[dots], depth[dots]), 0.7)
 
-    def _corners(self, pos: Float[np.ndarray, "node dim"], groups: np.ndarray) -> Float[np.ndarray, "group corner dim"]:
-        """Positions of the nodes of faces or edges, which stay together at the seams of periodic domains."""
-        corners, periodicity = pos[groups], self.trajectory.metadata.periodicity
-        return corners[:, :1] + periodicity.shortest(corners - corners[:, :1]) if periodicity else corners
+    def _corners(self, pos: Float[np.ndarray, "node dim"], groups: np.ndarray) -> tuple[Float[np.ndarray, "drawn corner dim"], np.ndarray]:
+        """Positions of the nodes of faces or edges, and which of them each is: those at the seam of a periodic domain appear on both of its sides."""
+        corners, which = pos[groups], np.arange(len(groups))
+        periodicity = self.trajectory.metadata.periodicity
+        if periodicity:
+            corners = corners[:, :1] + periodicity.shortest(corners - corners[:, :1])
+        for axis in periodicity.axes:
+            low, high = periodicity.bounds[axis]
+            step = (high - low) * np.eye(pos.shape[1])[axis]
+            below, above = (corners[..., axis] < low).any(axis=1), (corners[..., axis] > high).any(axis=1)
+            corners = np.concatenate([corners, corners[below] + step, corners[above] - step])
+            which = np.concatenate([which, which[below], which[above]])
+        return corners, which
 
     def _paint(self, artist: Any, colors: Float[np.ndarray, "item 4"], edge: float) -> None:
         artist.set_facecolor(colors)

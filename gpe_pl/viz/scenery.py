@@ -68,6 +68,12 @@ def _draw_2d(axes: Any, trajectory: Trajectory) -> None:
             axes.add_patch(patch)
         else:
             _fill_solid(axes, shape, np.asarray(trajectory.metadata.bounds, float))
+    low, high = np.array(trajectory.metadata.bounds).T
+    for axis in trajectory.metadata.periodicity.axes:
+        for side in (low, high):
+            ends = np.array([low, high])
+            ends[:, axis] = side[axis]
+            axes.plot(*ends.T, color="0.6", linewidth=0.6, linestyle=":", zorder=1)
     pos = trajectory.boundary.pos
     distances = [np.abs(shape.signed_distance(pos)) for shape in shapes]
     loose = pos[np.min(distances, axis=0) > 0.1 * trajectory.metadata.spacing] if shapes else pos

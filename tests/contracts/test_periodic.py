@@ -364,11 +364,18 @@ def test_stored_and_read_back(tmp_path: Path, drifting: Trajectory) -> None:
 def test_a_mesh_at_the_seam_is_drawn_whole(new_trajectory: New) -> None:
     points, cells = scenes.mesh("lattice")
     t = new_trajectory(num_frames=2, num_nodes=len(points), periodic=(True, False))
-    pos = t.metadata.periodicity.wrapped(0.05 * points + np.array([0.9, 0.3]))
+    pos = t.metadata.periodicity.wrapped(0.05 * points + np.array([0.88, 0.3]))
     t = replace(t, pos=np.stack([pos, pos]), rest_pos=0.05 * points, cells=cells)
     panel = Panel(Figure((3, 3)), (0.0, 0.0, 1.0, 1.0), t, Coloring("height", [t], [0]))
     panel.show_frame(1)
-    sizes = [np.ptp(path.vertices, axis=0).max() for path in panel.mesh.get_paths()]
-    assert len(sizes) == len(cells)
-    assert max(sizes) < 0.06
+    drawn = [path.vertices for path in panel.mesh.get_paths()]
+    assert max(np.ptp(corners, axis=0).max() for corners in drawn) < 0.06
     assert max(np.ptp(segment, axis=0).max() for segment in panel.outline.get_segments()) < 0.06
+    crossing = [
+        corners
+        for corners in drawn
+        if corners[:, 0].min() < 1 - 1e-9 < corners[:, 0].max() or corners[:, 0].min() < -1e-9 < corners[:, 0].max()
+    ]
+    assert len(drawn) == len(cells) + len(crossing) // 2  # those at the seam on both of its sides
+    assert len(crossing) > 2
+    assert len(panel.mesh.get_facecolor()) == len(drawn)

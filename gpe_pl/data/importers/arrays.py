@@ -11,15 +11,27 @@ normals are estimated. Needed are ``pos``, ``frame_dt``, ``materials`` and ``par
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gpe_pl.arrays import estimated_normals
+from gpe_pl.arrays import estimated_normals, numbers
 from gpe_pl.data.importers import npz
-from gpe_pl.data.importers.source import SPLIT_NAMES, Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
+from gpe_pl.data.importers.source import (
+    SPLIT_NAMES,
+    Facts,
+    ImportFailure,
+    ImportSettings,
+    Item,
+    Loaded,
+    Refusal,
+    Source,
+    joined,
+    walls_at_bounds,
+)
 from gpe_pl.trajectory import Boundary, Trajectory
 
 KEYS = (
@@ -86,4 +98,11 @@ def _load(path: Path, facts: Facts) -> Loaded:
             wall["normal"] = estimated_normals(wall["pos"], values["pos"], facts.periodicity)
             notes.append("normals of boundary nodes are estimated: they point to where the other nodes have been")
         values["boundary"] = Boundary.from_numpy(wall.pop("pos"), wall.pop("normal"), **wall)
+    if facts.walls:
+        dim = numbers("pos", values["pos"], {"frame": None, "node": None, "dim": None}).shape[2]
+        bounds = None
+        if "bounds" in values:
+            rows = numbers("bounds", values["bounds"], {"axis": dim, "low and high": 2})
+            bounds = tuple((float(low), float(high)) for low, high in rows)
+        values["boundary"] = joined(dim, values.get("boundary", Boundary.empty(dim)), walls_at_bounds(replace(facts, bounds=bounds), dim))
     return Loaded(Trajectory.from_numpy(**values), notes=tuple(notes))

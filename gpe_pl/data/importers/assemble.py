@@ -40,7 +40,11 @@ NUM_SHOWN = 4
 
 FEWEST_NEIGHBOURS, MOST_NEIGHBOURS = 3.0, 60.0
 VELOCITY_RATIO = 1.25
-"""Positions and velocities of a source disagree about time beyond this ratio."""
+"""Positions and velocities of a source disagree about time beyond this ratio, …"""
+FRAMES_COMPARED = 200
+"""… in these first frames."""
+TYPED = ("gns", "lagrangebench", "meshgraphnets")
+"""Formats with types of nodes."""
 
 
 Progress = Callable[[int, int], Any]
@@ -61,6 +65,8 @@ def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Prog
     path = Path(settings.source).expanduser()
     name = settings.name or path.name.partition(".")[0]
     folder = _free_folder(Path(root), name)
+    if settings.materials and settings.format not in TYPED:
+        raise ImportFailure(f"materials={settings.materials}: {settings.format} has no node types; {', '.join(TYPED)} have")
     module = importlib.import_module(f"gpe_pl.data.importers.{settings.format}")
     source = module.open_source(path, settings)
     if settings.max_trajectories is not None:
@@ -212,8 +218,9 @@ class _Conversion:
         if len(survey.spacings) < NUM_SAMPLED:
             survey.spacings.append(m.spacing)
             survey.radii.append(m.connectivity_radius)
-            step = np.linalg.norm(m.periodicity.shortest(np.diff(trajectory.pos.astype(np.float64), axis=0)), axis=-1).mean()
-            speed = np.linalg.norm(trajectory.vel.astype(np.float64), axis=-1)
+            first = trajectory.frames(0, FRAMES_COMPARED)
+            step = np.linalg.norm(m.periodicity.shortest(np.diff(first.pos.astype(np.float64), axis=0)), axis=-1).mean()
+            speed = np.linalg.norm(first.vel.astype(np.float64), axis=-1)
             speed = (0.5 * (speed[1:] + speed[:-1])).mean()
             if speed > 0:
                 survey.velocity_ratios.append(float(step / (speed * m.frame_dt)))
@@ -309,11 +316,8 @@ class _Conversion:
     def _count(self, trajectory: Trajectory, split: str) -> None:
         """Add one stored trajectory to the report."""
         report, m = self.report, trajectory.metadata
-        report.bounds = (
-            [list(b) for b in m.bounds]
-            if not report.bounds
-            else [[min(a[0], b[0]), max(a[1], b[1])] for a, b in zip(report.bounds, m.bounds, strict=True)]
-        )
+        so_far = report.bounds or m.bounds
+        report.bounds = [[min(a[0], b[0]), max(a[1], b[1])] for a, b in zip(so_far, m.bounds, strict=True)]
         report.gravity = list(m.gravity)
         for material in m.materials:
             rows = trajectory.node_type == node_code(material)
@@ -323,6 +327,9 @@ class _Conversion:
                 if split == "train":
                     low, high = self.trained.get(MATERIALS[material].name, (np.inf, -np.inf))
                     self.trained[MATERIALS[material].name] = min(low, float(values.min())), max(high, float(values.max()))
+                elif MATERIALS[material].name not in self.trained and "train" in self.survey.good:
+                    warning = f"{material} occurs in {split} but not in train: no model will know it"
+                    report.warnings += [warning] if warning not in report.warnings else []
                 entry["nodes"] += int(rows.sum())
                 entry["low"], entry["high"] = min(entry["low"], float(values.min())), max(entry["high"], float(values.max()))
 
@@ -355,10 +362,12 @@ class _Conversion:
         report = self.report
         means = []
         for trajectory in sample:
-            m = trajectory.metadata
-            vel = integrators.velocities(trajectory.pos.astype(np.float64), m.frame_dt, m.periodicity)
-            means.append(np.diff(vel, axis=0).mean(axis=(0, 1)) / m.frame_dt)
-            report.max_speed = max(report.max_speed, float(np.linalg.norm(vel, axis=-1).max()))
+            m, last = trajectory.metadata, trajectory.num_frames - 1
+            first, final = (
+                integrators.velocities(trajectory.pos[k : k + 2].astype(np.float64), m.frame_dt, m.periodicity)[0] for k in (0, last - 1)
+            )
+            means.append((final - first).mean(axis=0) / ((last - 1) * m.frame_dt))
+            report.max_speed = max(report.max_speed, float(np.linalg.norm(trajectory.vel, axis=-1).max()))
         report.mean_acceleration = np.mean(means, axis=0).tolist()
         report.step_in_spacings = report.max_speed * report.frame_dt / report.spacing
 

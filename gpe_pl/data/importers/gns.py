@@ -32,15 +32,14 @@ from gpe_pl.data.importers.source import (
     ImportSettings,
     Item,
     Loaded,
-    Nodes,
     Refusal,
     Source,
     bounds_in,
     build,
-    kinds_of,
     number,
     read_json,
     split_files,
+    typed,
 )
 
 TYPES = {0: "solid", 3: "boundary", 5: "fluid", 6: "sand", 7: "snow"}
@@ -85,7 +84,7 @@ def _loaded(
         types = np.full(pos.shape[1], types.item())
     if types.shape != (pos.shape[1],):
         raise Refusal(f"particle_type has shape {list(types.shape)} for {pos.shape[1]} nodes")
-    nodes = Nodes(pos, kinds_of(types, TYPES, settings))
+    nodes = typed(pos, types, TYPES, settings)
     if value is not None:
         if "sand" in set(nodes.kind.tolist()):
             nodes.parameters = {"sand": np.degrees(np.arctan(np.broadcast_to(np.asarray(value, np.float64).ravel(), pos.shape[1])))}

@@ -22,16 +22,15 @@ from gpe_pl.data.importers.source import (
     ImportSettings,
     Item,
     Loaded,
-    Nodes,
     Refusal,
     Repair,
     Source,
     bounds_in,
     build,
-    kinds_of,
     number,
     read_json,
     split_files,
+    typed,
 )
 from gpe_pl.schema import MATERIALS, STICKY
 
@@ -86,7 +85,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         if pos.shape[1:] != (len(types), dim):
             raise Refusal(f"position is {list(pos.shape)} for {len(types)} particle types in {dim}D")
         real = types != PADDING
-        nodes = Nodes(pos[:, real], kinds_of(types[real], TYPES, settings), friction=friction)
+        nodes = typed(pos[:, real], types[real], TYPES, settings, friction=friction)
         if not real.all():
             nodes.repairs.append(Repair(f"{int((~real).sum())} padding nodes left out"))
         return build(nodes, facts)

@@ -29,14 +29,13 @@ from gpe_pl.data.importers.source import (
     ImportSettings,
     Item,
     Loaded,
-    Nodes,
     Refusal,
     Source,
     build,
-    kinds_of,
     number,
     read_json,
     split_files,
+    typed,
 )
 
 TYPES = {0: "elastomer", 1: "boundary", 3: "boundary", 6: "boundary"}
@@ -135,4 +134,4 @@ def _loaded(fields: Mapping[str, np.ndarray], length: int, settings: ImportSetti
         raise Refusal(f"world_pos, mesh_pos and node_type are {list(pos.shape)}, {list(rest.shape)} and {list(types.shape)}")
     flat = np.zeros((num_nodes, dim), np.float64)  # a sheet lies in a plane when at rest
     flat[:, : rest.shape[2]] = rest[0]
-    return build(Nodes(pos, kinds_of(types[0, :, 0], TYPES, settings), cells=cells[0], rest_pos=flat), facts)
+    return build(typed(pos, types[0, :, 0], TYPES, settings, cells=cells[0], rest_pos=flat), facts)

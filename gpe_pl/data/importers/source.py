@@ -206,13 +206,17 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
     """
     if facts.frame_dt is None:
         raise ImportFailure("frame_dt: the source does not say how much time passes between frames; pass frame_dt=… [s]")
+    for name, axes in (("bounds", facts.bounds), ("periodic", facts.periodic)):
+        if axes is not None and len(axes) != nodes.pos.shape[2]:
+            raise ImportFailure(f"{name} = {axes}: has {len(axes)} axes, the data have {nodes.pos.shape[2]}")
     moving = np.flatnonzero(nodes.kind != BOUNDARY)
     if not len(moving):
         raise Refusal("has no nodes but boundary nodes")
     pos, periodicity = nodes.pos[:, moving], facts.periodicity
     repairs, notes = list(nodes.repairs), list(nodes.notes)
-    if periodicity and (outside := np.flatnonzero((periodicity.wrapped(pos.astype(np.float64)) != pos).any(axis=(1, 2)))).size:
-        repairs.append(Repair(f"positions folded into the periodic domain in {outside.size} frames", int(outside[0])))
+    outside = [k for k, frame in enumerate(pos) if periodicity and (periodicity.wrapped(frame.astype(np.float64)) != frame).any()]
+    if outside:
+        repairs.append(Repair(f"positions folded into the periodic domain in {len(outside)} frames", outside[0]))
     kinds = [str(k) for k in nodes.kind[moving]]
     parameters: dict[str, Any] = {}
     for material in dict.fromkeys(kinds):
@@ -280,18 +284,26 @@ def _boundary(nodes: Nodes, visited: np.ndarray, facts: Facts) -> tuple[Boundary
         parts.append(Boundary.from_numpy(*nodes.walls, friction=nodes.friction))
     if parts:
         notes.append(f"friction of boundary nodes is not in the source; {nodes.friction:g} is stored")
-    if facts.walls and facts.bounds is not None:
-        spacing = facts.spacing or (max(high - low for low, high in facts.bounds) / 50)
-        sides = [f"{axis}_{side}" for axis in "xyz"[:dim] for side in ("low", "high")]
-        walls = domain_walls(facts.bounds, {side: facts.walls.get(side, 0.0) for side in sides})
-        parts.append(Boundary.sample(tuple(w for w, side in zip(walls, sides, strict=True) if side in facts.walls), spacing, dim))
-    if not parts:
-        return Boundary.empty(dim), repairs, notes
+    return joined(dim, *parts, walls_at_bounds(facts, dim)), repairs, notes
+
+
+def walls_at_bounds(facts: Facts, dim: int) -> Boundary:
+    """The walls that the facts name, where bounds are known."""
+    if not facts.walls or facts.bounds is None:
+        return Boundary.empty(dim)
+    spacing = facts.spacing or (max(high - low for low, high in facts.bounds) / 50)
+    sides = [f"{axis}_{side}" for axis in "xyz"[:dim] for side in ("low", "high")]
+    walls = domain_walls(facts.bounds, {side: facts.walls.get(side, 0.0) for side in sides})
+    return Boundary.sample(tuple(wall for wall, side in zip(walls, sides, strict=True) if side in facts.walls), spacing, dim)
+
+
+def joined(dim: int, *parts: Boundary) -> Boundary:
+    """All boundary nodes of several boundaries."""
+    parts = (Boundary.empty(dim), *parts)
     pos, vel, normal, friction, restitution = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("pos", "vel", "normal", "friction", "restitution")
     )
-    shapes = tuple(shape for part in parts for shape in part.shapes)
-    return Boundary(pos, vel, normal, friction, restitution, shapes), repairs, notes
+    return Boundary(pos, vel, normal, friction, restitution, tuple(shape for part in parts for shape in part.shapes))
 
 
 def _sliding_velocity(pos: np.ndarray, nodes: np.ndarray, facts: Facts, repairs: list[Repair]) -> Any:
@@ -317,8 +329,16 @@ def _sliding_velocity(pos: np.ndarray, nodes: np.ndarray, facts: Facts, repairs:
     return mean / facts.frame_dt
 
 
-def kinds_of(types: np.ndarray, table: Mapping[int, str], settings: ImportSettings) -> np.ndarray:
-    """Node type names of a source's integer types [node]; raises ``Refusal`` for one that is not known."""
+def typed(pos: np.ndarray, types: np.ndarray, table: Mapping[int, str], settings: ImportSettings, **arrays: Any) -> Nodes:
+    """Nodes by a source's integer types [node]; raises ``Refusal`` for one that is not known.
+
+    Args:
+        pos: positions [frame, node, dim].
+        types: of the nodes.
+        table: what types of the format become, unless the settings say otherwise.
+        settings: of the conversion.
+        arrays: further arguments of ``Nodes``.
+    """
     known = {**table, **(settings.materials or {})}
     unknown = [code for code in np.unique(types).tolist() if code not in known]
     if unknown:
@@ -326,7 +346,9 @@ def kinds_of(types: np.ndarray, table: Mapping[int, str], settings: ImportSettin
         raise Refusal(
             f"node {node} has type {unknown[0]}; known: {', '.join(map(str, sorted(known)))}. Name it with materials={{{unknown[0]}: …}}"
         )
-    return np.array([known[code] for code in types.tolist()], dtype="U16")
+    kind = np.array([known[code] for code in types.tolist()], dtype="U16")
+    notes = [f"type {code} of the source is stored as {known[code]} (materials={{{code}: …}})" for code in np.unique(types).tolist()]
+    return Nodes(pos, kind, notes=notes, **arrays)
 
 
 def read_json(path: Path) -> dict[str, Any]:
