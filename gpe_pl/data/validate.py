@@ -433,7 +433,7 @@ def _documented_attributes(cls: type) -> dict[str, str]:
 _PAGE = """\
 # The trajectory store
 
-This page is generated: `python -m gpe_pl.data.validate --format-page > data/README.md`. Generated data sets go into this folder and are not
+This page is generated: `python -m gpe_pl.data.validate --format-page > data/README.md`. Generated and imported data sets go into this folder and are not
 kept in version control. Check any of them with `python -m gpe_pl.data.validate data`.
 
 Schema version {version}. One HDF5 file per shard, a group per trajectory, SI units, little-endian:
@@ -445,6 +445,8 @@ Schema version {version}. One HDF5 file per shard, a group per trajectory, SI un
         attributes: metadata (JSON), shapes (JSON), node_types (JSON), sha256
         pos  vel  …                        fields, each with its attribute unit
 ```
+
+Imported data sets have the size `imported`, and beside their splits a `report.md` of where they come from.
 
 Files are written under a temporary name and renamed, so a file that exists is complete. Equal content gives equal bytes. Every array has a
 fletcher32 checksum per chunk; arrays with frames are cut along them. `sha256` covers names, shapes, types and bytes of all arrays and the
