@@ -28,7 +28,7 @@ from gpe_pl.graphs.features import (
     scales_of,
     virtual_features,
 )
-from gpe_pl.graphs.islands import islands_within
+from gpe_pl.graphs.islands import islands_within, unwrapped
 from gpe_pl.graphs.multiscale import MultiscaleGraph, multiscale_graph
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of, node_code
@@ -48,14 +48,18 @@ class GraphBuilder:
     ``offset``: the displacement over the radius, which standardisation leaves as it is.
 
     With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph ``island_is_free`` [island] and ``num_islands`` [1].
+    In periodic domains ``pos`` keeps an island together; one that goes around the period has no lever arms, and all its nodes the same ``pos``.
+
+    Raises:
+        PeriodicityError: the neighbour radius is half a period or more.
     """
 
     config: GraphConfig
     metadata: Metadata
 
     def __post_init__(self) -> None:
-        if any(self.metadata.periodic):
-            raise GraphError(f"data set {self.metadata.dataset!r} has periodic axes, which the graph builder does not support")
+        for radius in (self.scales.radius, self.metadata.connectivity_radius):
+            self.metadata.periodicity.check_radius(radius)
 
     @cached_property
     def scales(self) -> Scales:
@@ -69,8 +73,12 @@ class GraphBuilder:
         """Build the graph of a state of float64 tensors.
 
         Raises:
-            GraphError: the state holds a node type that the data set does not have, lacks velocity history, or has cells that do not fit its nodes.
+            GraphError: the state holds a node type that the data set does not have, lacks velocity history, repeats along other axes, or has cells that
+                do not fit its nodes.
         """
+        if state.periodicity.axes != self.metadata.periodicity.axes:
+            own, other = (", ".join("xyz"[a] for a in p.axes) or "no axis" for p in (self.metadata.periodicity, state.periodicity))
+            raise GraphError(f"state is periodic along {other}, the data set {self.metadata.dataset!r} along {own}")
         history = history_of(state)
         if history.shape[1] != self.config.history:
             raise GraphError(f"state has a history of {history.shape[1]} velocities, the graph needs {self.config.history}")
@@ -121,9 +129,9 @@ class GraphBuilder:
             if name != RADIUS:
                 continue
             if source != target:
-                pairs = radius_between(numpy_pos[source], numpy_pos[target], self.scales.radius)
+                pairs = radius_between(numpy_pos[source], numpy_pos[target], self.scales.radius, state.periodicity)
             else:
-                pairs = radius_pairs(numpy_pos[source], self.scales.radius)
+                pairs = radius_pairs(numpy_pos[source], self.scales.radius, state.periodicity)
                 if mesh is not None and source in self._meshes:
                     pairs = pairs[:, mesh.are_in_contact(rows[source].cpu().numpy()[pairs], self.scales.radius)]
             edges[relation] = torch.from_numpy(pairs).to(state.pos.device)
@@ -141,7 +149,7 @@ class GraphBuilder:
             store.edge_index = edge_index
             store.odd, store.even = edge_features(
                 self.config.features,
-                pos[target][i] - pos[source][j],
+                state.periodicity.shortest(pos[target][i] - pos[source][j]),
                 vel[target][i] - vel[source][j],
                 normal[j] if source == BOUNDARY else None,
                 self.scales,
@@ -169,14 +177,25 @@ class GraphBuilder:
         What pushes a body from beyond the radius no model can see; held to free fall, it stays stable (docs/results/trials).
         """
         cells = [torch.empty(2, 0, dtype=torch.int64), *(rows[m][data[m, CELL, m].edge_index].cpu() for m in self._meshes)]
-        pos, boundary = (np.ascontiguousarray(p.cpu().numpy()) for p in (state.pos, state.boundary.pos))
-        islands = islands_within(self.scales.radius, pos, boundary, torch.cat(cells, dim=1).numpy())
+        mesh, radius = torch.cat(cells, dim=1).numpy(), self.scales.radius
+        points, boundary = (np.ascontiguousarray(p.cpu().numpy()) for p in (state.pos, state.boundary.pos))
+        islands = islands_within(radius, points, boundary, mesh, state.periodicity)
         label = torch.from_numpy(islands.label).to(state.pos.device)
+        pos = self._kept_together(state, radius, mesh) if state.periodicity else state.pos
         for material, r in rows.items():
-            data[material].pos = state.pos[r].float()
+            data[material].pos = pos[r].float()
             data[material].island = label[r]
         data.island_is_free = torch.from_numpy(islands.is_free).to(state.pos.device)
         data.num_islands = torch.tensor([len(islands.is_free)], device=state.pos.device)
+
+    @staticmethod
+    def _kept_together(state: State, radius: float, mesh: np.ndarray) -> Tensor:
+        """Positions that do not tear islands apart at the seams of a periodic domain; all zero where an island goes around it."""
+        pos = np.ascontiguousarray(state.pos.cpu().numpy())
+        images, goes_around = unwrapped(
+            pos, np.concatenate([radius_pairs(pos, radius, state.periodicity), mesh], axis=1), state.periodicity
+        )
+        return torch.from_numpy(np.where(goes_around[:, None], 0.0, images)).to(state.pos.device)
 
     # --- meshes ---------------------------------------------------------------------------------------------------------------------------
 
@@ -211,7 +230,7 @@ class GraphBuilder:
             row[r] = torch.arange(len(r), device=device)
         row[n:] = torch.cat([torch.arange(size, device=device) for size in sizes]) if sizes else row[n:]
 
-        values = torch.cat([state.pos, cast(Tensor, state.rest_pos), history_of(state).flatten(1)], dim=1)
+        values = torch.cat([self._kept_whole(state, mesh), cast(Tensor, state.rest_pos), history_of(state).flatten(1)], dim=1)
         above, below = torch.tensor(mesh.descent, device=device)
         above, mass = above - n, state.mass[below][:, None]
         total = mass.new_zeros(sum(sizes), 1).index_add_(0, above, mass)
@@ -244,6 +263,15 @@ class GraphBuilder:
                     chosen = torch.arange(len(i), device=device)[chosen][is_target]
                 store = data[relation]
                 store.edge_index, store.odd, store.even = row[edges[:, chosen]], odd[chosen], even[chosen]
+
+    def _kept_whole(self, state: State, mesh: MultiscaleGraph) -> Tensor:
+        """Positions that do not tear meshes apart at the seams of a periodic domain."""
+        if not state.periodicity:
+            return state.pos
+        pos, goes_around = unwrapped(np.ascontiguousarray(state.pos.cpu().numpy()), mesh.cell_edges, state.periodicity)
+        if goes_around.any():
+            raise GraphError(f"the mesh of node {int(goes_around.argmax())} goes around the periodic domain, so it has no rest shape")
+        return torch.from_numpy(pos).to(state.pos.device)
 
     def _add_empty_mesh(self, data: HeteroData, state: State) -> None:
         """The stores of a mesh for a state without one."""
