@@ -1,1 +1,74 @@
-"""Learned simulators of particles and meshes: the Graph-based Physics Engine and its baselines."""
+"""Learned simulators of particles and meshes: the Graph-based Physics Engine and its baselines.
+
+What most programs need can be imported from here: a trained model on a scene with a parameter that it never saw, beside the ground truth::
+
+    from gpe_pl import LearnedSimulator, dataset, generate_trajectory, roll_out, rollout_figure
+    simulator = LearnedSimulator.from_checkpoint("runs/sand/checkpoints/best.ckpt")
+    truth = generate_trajectory(dataset("data=sand", "size=small"), split="test", index=0, values={"sand": 27.5})
+    prediction = roll_out(simulator, simulator.initial_state(truth, frame=5), num_steps=100, metadata=truth.metadata)
+    rollout_figure(truth.frames(5, 106), {"GPE": prediction}).savefig("rollout.png")
+
+A name is looked up when it is first used, so that nothing is imported that a program does not need. (``roll_out`` is ``rollout.rollout``: the module has
+its name already.)
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gpe_pl.containment import Contained as Contained
+    from gpe_pl.errors import GpeError as GpeError
+    from gpe_pl.export import write_npz as write_npz
+    from gpe_pl.export import write_vtk as write_vtk
+    from gpe_pl.generation import generate_trajectory as generate_trajectory
+    from gpe_pl.learned_simulator import LearnedSimulator as LearnedSimulator
+    from gpe_pl.metrics import rollout_metrics as rollout_metrics
+    from gpe_pl.portable import export_model as export_model
+    from gpe_pl.rollout import rollout as roll_out  # noqa: F401
+    from gpe_pl.simulate import dataset as dataset
+    from gpe_pl.trajectory import Metadata as Metadata
+    from gpe_pl.trajectory import State as State
+    from gpe_pl.trajectory import Trajectory as Trajectory
+    from gpe_pl.trajectory import iter_trajectories as iter_trajectories
+    from gpe_pl.trajectory import read_trajectory as read_trajectory
+    from gpe_pl.viz.figures import rollout_figure as rollout_figure
+    from gpe_pl.viz.video import write_animation as write_animation
+    from gpe_pl.viz.viewer import write_viewer as write_viewer
+
+_MODULES = {
+    "Contained": "containment",
+    "GpeError": "errors",
+    "LearnedSimulator": "learned_simulator",
+    "Metadata": "trajectory",
+    "State": "trajectory",
+    "Trajectory": "trajectory",
+    "dataset": "simulate",
+    "export_model": "portable",
+    "generate_trajectory": "generation",
+    "iter_trajectories": "trajectory",
+    "read_trajectory": "trajectory",
+    "roll_out": "rollout",
+    "rollout_figure": "viz.figures",
+    "rollout_metrics": "metrics",
+    "write_animation": "viz.video",
+    "write_npz": "export",
+    "write_viewer": "viz.viewer",
+    "write_vtk": "export",
+}
+_NAMES_THERE = {"roll_out": "rollout"}
+
+__all__ = [*_MODULES]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'gpe_pl' has no attribute {name!r}; it has {', '.join(_MODULES)}")
+    value = getattr(import_module(f"gpe_pl.{_MODULES[name]}"), _NAMES_THERE.get(name, name))
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_MODULES})

@@ -19,8 +19,6 @@ from gpe_pl.config import ConfigError, construct, entry_point
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-    from gpe_pl.generation import DatasetSpec
-
 
 def environment() -> dict[str, Any]:
     """What a number depends on besides the code: machine, library versions, commit."""
@@ -38,20 +36,11 @@ def environment() -> dict[str, Any]:
     }
 
 
-def _dataset(overrides: list[str]) -> DatasetSpec:
-    import hydra
-    from omegaconf import OmegaConf
-
-    from gpe_pl.simulate import dataset_spec
-
-    cfg = hydra.compose("simulate", overrides)
-    OmegaConf.resolve(cfg)
-    return dataset_spec(cfg)
-
-
 def benchmark(cfg: DictConfig) -> None:
-    """Run one suite and write ``results.json`` and ``table.md``."""
+    """Run one suite and write ``results.json``, ``table.md`` and its figures."""
     from omegaconf import OmegaConf
+
+    from gpe_pl.simulate import dataset
 
     suites = sorted(m.name for m in pkgutil.iter_modules(gpe_pl.suites.__path__))
     if cfg.suite.name not in suites:
@@ -60,9 +49,11 @@ def benchmark(cfg: DictConfig) -> None:
     values: Any = OmegaConf.to_container(cfg.suite, resolve=True)
     settings = construct(suite.Settings, {k: v for k, v in values.items() if k != "name"}, "suite")
     cases = getattr(settings, "cases", None)  # of a suite about data sets
-    records, table = suite.run(settings) if cases is None else suite.run(settings, {k: _dataset(c.overrides) for k, c in cases.items()})
+    records, table = suite.run(settings) if cases is None else suite.run(settings, {k: dataset(*c.overrides) for k, c in cases.items()})
     folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name
     folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in getattr(suite, "figures", lambda _: {})(records).items():
+        figure.savefig(folder / f"{name}.png", dpi=150)
     results = {"environment": environment(), "settings": asdict(settings), "records": records}
     for name, text in (("results.json", json.dumps(results, indent=1)), ("table.md", table + "\n")):
         temporary = folder / f".{name}.part"

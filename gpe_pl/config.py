@@ -13,7 +13,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -36,6 +36,14 @@ WITHOUT_KEY = {"comparison", "experiment", "scene", "solver"}
 """Config groups that fill other keys than one of their own."""
 
 launcher.register()  # conf/ names it
+
+
+def _for_model(values: Mapping[str, Any], target: str) -> Any:
+    """``${for_model:values,target}`` in conf/: what a table holds for a model's class, or its ``default``."""
+    return values.get(target.rpartition(".")[2], values["default"])
+
+
+OmegaConf.register_new_resolver("for_model", _for_model, replace=True)
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 T = TypeVar("T")
@@ -178,6 +186,24 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
         return main
 
     return decorate
+
+
+def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
+    """The resolved config of a command, without running it: what ``python -m gpe_pl.{config_name} {overrides}`` would get.
+
+    Raises:
+        ConfigError: an override does not fit; the message names the valid keys.
+    """
+    try:
+        if GlobalHydra.instance().is_initialized():
+            cfg = hydra.compose(config_name, [*overrides])
+        else:
+            with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+                cfg = hydra.compose(config_name, [*overrides])
+        OmegaConf.resolve(cfg)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(explain(error, config_name, [*overrides])) from None
+    return cfg
 
 
 def _fail(error: Exception) -> None:

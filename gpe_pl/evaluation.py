@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 import logging
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -19,8 +20,10 @@ from torch_geometric.data import Batch
 from gpe_pl.baselines import Ballistic, ConstantVelocity
 from gpe_pl.containment import TOLERANCE, Contained
 from gpe_pl.data.dataset import WindowDataset, open_split
+from gpe_pl.errors import GpeError
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
+from gpe_pl.portable import export_model
 from gpe_pl.rollout import Guard, Start, rollout, rollouts, share_outside
 from gpe_pl.schema import Split
 from gpe_pl.trajectory import State, Trajectory, iter_trajectories
@@ -28,9 +31,12 @@ from gpe_pl.trajectory import State, Trajectory, iter_trajectories
 log = logging.getLogger(__name__)
 
 LEARNED = "learned"
+Export = Literal["vtk", "npz", "mp4", "model"]
 MAX_SPEED_FACTOR = 20.0
 """A learned rollout faster than this many times the fastest particle of the ground truth has exploded."""
 ONE_STEP_WINDOWS = 256
+VIEWER_BYTES = 2**26
+"""A viewer's arrays before compression; longer rollouts show every so many frames."""
 SCENES_AT_ONCE = 16
 """Scenes, or windows, that one pass of the model takes together."""
 
@@ -45,7 +51,8 @@ class EvaluationSettings:
         num_trajectories: per split, from its start; None takes all.
         containment: put particles that cross a wall back on its surface.
         num_uncontained: trajectories per split that are also rolled out without containment, to see what it corrects; None takes all.
-        num_pictures: trajectories per split that get a figure and an animation.
+        num_pictures: trajectories per split that get a figure, an animation and a viewer.
+        export: what to write for other programs: those trajectories as ``vtk`` series, ``npz`` and ``mp4``, and the ``model`` (see ``portable``).
     """
 
     splits: Annotated[list[Split], Field(min_length=1)] = field(default_factory=lambda: ["test", "test_unseen"])
@@ -54,6 +61,11 @@ class EvaluationSettings:
     containment: bool = True
     num_uncontained: Annotated[int, Field(ge=0)] | None = None
     num_pictures: Annotated[int, Field(ge=0)] = 2
+    export: list[Export] = field(default_factory=list)
+
+
+class ExportError(GpeError):
+    """Something that was asked for cannot be written; the message says what is missing."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +83,19 @@ class Row:
 
 
 def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettings, run_dir: Path, label: str = LEARNED) -> list[Row]:
-    """Roll out every trajectory of the splits; writes ``metrics.csv``, ``error_curve_*.png``, ``rollout_*.png`` and ``rollout_*.gif``
-    of some, and their ``stress_*.png`` where the model decodes a stress.
+    """Roll out every trajectory of the splits; writes ``metrics.csv``, ``error_curve_*.png``, ``rollout_*.png``, ``rollout_*.gif``
+    and ``rollout_*.html`` (a viewer) of some, and their ``stress_*.png`` where the model decodes a stress.
 
     All rollouts start at the first frame with enough history and run to the end of the ground truth. Share outside with containment off is reported as
     ``share_outside_uncontained``, where it was asked for, the share of corrected particle-steps as ``share_corrected``.
+
+    Raises:
+        ExportError: a format in ``settings.export`` needs a package that is not installed.
     """
+    if "mp4" in settings.export and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ExportError(
+            "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
+        )
     run_dir.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     for split in settings.splits:
@@ -101,9 +120,12 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
                 rows += [Row(label, *about, metric, "full", value) for metric, value in extra.items()]
                 if number < settings.num_pictures:
                     _pictures(run_dir, split, number, truth, {label: predictions[label]})
+                    _exports(run_dir, split, number, truth, predictions[label], settings.export)
                 number += 1
         if truth is not None:
             _error_curve(run_dir / f"error_curve_{split}.png", curves, truth.metadata.frame_dt)
+    if "model" in settings.export:
+        export_model(simulator, run_dir / "model.pt2")
     write_rows(run_dir / "metrics.csv", rows)
     return rows
 
@@ -199,6 +221,7 @@ def read_rows(path: Path) -> Iterator[Row]:
 def _pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predictions: dict[str, Trajectory]) -> None:
     from gpe_pl.viz.figures import rollout_figure
     from gpe_pl.viz.video import write_animation
+    from gpe_pl.viz.viewer import write_viewer
 
     stem = run_dir / f"rollout_{split}_{number:02d}"
     rollout_figure(truth, predictions).savefig(stem.with_suffix(".png"), dpi=150, bbox_inches="tight")
@@ -207,6 +230,22 @@ def _pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predict
         figure.savefig(run_dir / f"stress_{split}_{number:02d}.png", dpi=150, bbox_inches="tight")
     stride = max(1, truth.num_frames // 60)
     write_animation(stem.with_suffix(".gif"), truth, predictions, fps=20, stride=stride)
+    size = (1 + len(predictions)) * (truth.pos.nbytes + truth.vel.nbytes)
+    write_viewer(stem.with_suffix(".html"), truth, predictions, stride=-(-size // VIEWER_BYTES))
+
+
+def _exports(run_dir: Path, split: str, number: int, truth: Trajectory, prediction: Trajectory, formats: list[Export]) -> None:
+    from gpe_pl.export import write_npz, write_vtk
+    from gpe_pl.viz.video import write_animation
+
+    for kind, trajectory in (("ground_truth", truth), ("rollout", prediction)):
+        stem = run_dir / f"{kind}_{split}_{number:02d}"
+        if "vtk" in formats:
+            write_vtk(stem.with_suffix(".pvd"), trajectory, None if trajectory is truth else truth)
+        if "npz" in formats:
+            write_npz(stem.with_suffix(".npz"), trajectory)
+    if "mp4" in formats:
+        write_animation(stem.with_suffix(".mp4"), truth, {LEARNED: prediction}, fps=20, stride=max(1, truth.num_frames // 200))
 
 
 def _error_curve(path: Path, curves: dict[str, list[np.ndarray]], frame_dt: float) -> None:

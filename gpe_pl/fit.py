@@ -64,7 +64,8 @@ def fit(cfg: DictConfig) -> float:
 
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     if training.budget_minutes is not None:
-        parts = {k: settings[k] for k in ("data", "graph", "model")} | {"batch_size": training.batch_size, "device": device}
+        dataset = {k: v for k, v in settings["data"].items() if k != "comparison"}
+        parts = {k: settings[k] for k in ("graph", "model")} | {"data": dataset, "batch_size": training.batch_size, "device": device}
         key = f"{cfg.data.name} {cfg.size.name} {cfg.model._target_.rpartition('.')[2]} {digest(parts)}"
         times = Path(cfg.paths.runs) / (cfg.reuse or cfg.name) / "step_times.json"
         training = within_budget(

@@ -186,7 +186,7 @@ def _interval(values: list[list[float]], scale: float = 1.0) -> str:
 
 def forward_time_ratios(variants: dict[tuple[str, ...], list[Run]], num_rounds: int = 30) -> dict[tuple[str, ...], float]:
     """Forward time of each variant's trained model over that of the first, as the median of paired ratios on one graph; empty for a single variant."""
-    from gpe_pl.suites.speed import synthetic_graph
+    from gpe_pl.lattice import lattice_graph
 
     if len(variants) < 2:
         return {}
@@ -196,7 +196,7 @@ def forward_time_ratios(variants: dict[tuple[str, ...], list[Run]], num_rounds: 
         simulator = LearnedSimulator.from_checkpoint(members[0].folder / "checkpoints" / "best.ckpt")
         if simulator.builder.spec.materials != ("sand",) or simulator.builder.spec.dim != 2:
             return {}  # the graph below is one layer of sand
-        _, graph = synthetic_graph(600, 6000, simulator.builder.config)
+        _, graph = lattice_graph(600, 6000, simulator.builder.config)
         alternatives[names[v]] = torch.inference_mode()(lambda s=simulator, g=graph: s(g))
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpe_pl.config import ConfigError, construct, construct_target, entry_point
+from gpe_pl.config import ConfigError, compose, construct, construct_target, entry_point
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -37,6 +37,11 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     scene = construct_target(values.pop("scene"), "data.scene", "gpe_pl.solvers.")
     solver = construct_target(values.pop("solver"), "data.solver", "gpe_pl.solvers.")
     return construct(DatasetSpec, values, "data", scene=scene, solver=solver)
+
+
+def dataset(*overrides: str) -> DatasetSpec:
+    """The data set that overrides of the command line describe, such as ``dataset("data=sand", "size=tiny")``."""
+    return dataset_spec(compose("simulate", overrides))
 
 
 def imported_data(cfg: DictConfig) -> Path:

@@ -444,7 +444,8 @@ class Trajectory:
 # --- HDF5 ---------------------------------------------------------------------------------------------------------------------------------
 
 
-def _fields_of(trajectory: Trajectory) -> dict[str, np.ndarray]:
+def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    """The arrays of a trajectory by the names, and with the types, of ``schema.FIELDS``."""
     b = trajectory.boundary
     arrays: dict[str, Any] = {
         "pos": trajectory.pos,
@@ -469,10 +470,11 @@ def _fields_of(trajectory: Trajectory) -> dict[str, np.ndarray]:
 
 def array_bytes(trajectory: Trajectory) -> int:
     """Bytes of what is stored of a trajectory, uncompressed."""
-    return sum(array.nbytes for array in _fields_of(trajectory).values())
+    return sum(array.nbytes for array in stored_arrays(trajectory).values())
 
 
-def _attributes_of(trajectory: Trajectory) -> dict[str, str]:
+def stored_attributes(trajectory: Trajectory) -> dict[str, str]:
+    """What else is stored of a trajectory, as JSON: its metadata, the shapes of its boundary, and the names behind ``node_type``."""
     m = trajectory.metadata
     meta = json.dumps(asdict(m), sort_keys=True)
     shapes = json.dumps([shape_to_dict(s) for s in trajectory.boundary.shapes], sort_keys=True)
@@ -530,7 +532,7 @@ def write_shard(path: Path | str, trajectories: Iterable[Trajectory], names: Ite
                 name = next(name_of, None)
                 if name is None:
                     raise ValueError(f"{path}: {count} names for more than {count} trajectories")
-                arrays, attributes = _fields_of(trajectory), _attributes_of(trajectory)
+                arrays, attributes = stored_arrays(trajectory), stored_attributes(trajectory)
                 group = file.create_group(name)
                 for key, text in attributes.items():
                     _write_text(group, key, text)

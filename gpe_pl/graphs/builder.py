@@ -28,7 +28,7 @@ from gpe_pl.graphs.features import (
     scales_of,
     virtual_features,
 )
-from gpe_pl.graphs.islands import free_since, islands_within, unwrapped
+from gpe_pl.graphs.islands import islands_within, unwrapped
 from gpe_pl.graphs.multiscale import MultiscaleGraph, multiscale_graph
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of, node_code
@@ -172,24 +172,21 @@ class GraphBuilder:
         return kept
 
     def _add_islands(self, data: HeteroData, state: State, rows: dict[str, Tensor]) -> None:
-        """Groups of connected nodes, and which of them have been free since the frame before.
+        """Groups of nodes that the graph connects, and which of them no edge ties to the boundary.
 
-        By the data set's own radius, which sees all that the solver's kernel sees, however few neighbours the graph shows a model.
+        What pushes a body from beyond the radius no model can see; held to free fall, it stays stable (docs/results/trials).
         """
         cells = [torch.empty(2, 0, dtype=torch.int64), *(rows[m][data[m, CELL, m].edge_index].cpu() for m in self._meshes)]
-        mesh = torch.cat(cells, dim=1).numpy()
-        boundary, radius = np.ascontiguousarray(state.boundary.pos.cpu().numpy()), self.metadata.connectivity_radius
-        before, now = (
-            islands_within(radius, np.ascontiguousarray(pos.cpu().numpy()), boundary, mesh, state.periodicity)
-            for pos in (state.pos - history_of(state)[:, -1] * self.metadata.frame_dt, state.pos)
-        )
-        label = torch.from_numpy(now.label).to(state.pos.device)
+        mesh, radius = torch.cat(cells, dim=1).numpy(), self.scales.radius
+        points, boundary = (np.ascontiguousarray(p.cpu().numpy()) for p in (state.pos, state.boundary.pos))
+        islands = islands_within(radius, points, boundary, mesh, state.periodicity)
+        label = torch.from_numpy(islands.label).to(state.pos.device)
         pos = self._kept_together(state, radius, mesh) if state.periodicity else state.pos
         for material, r in rows.items():
             data[material].pos = pos[r].float()
             data[material].island = label[r]
-        data.island_is_free = torch.from_numpy(free_since(before, now)).to(state.pos.device)
-        data.num_islands = torch.tensor([len(now.is_free)], device=state.pos.device)
+        data.island_is_free = torch.from_numpy(islands.is_free).to(state.pos.device)
+        data.num_islands = torch.tensor([len(islands.is_free)], device=state.pos.device)
 
     @staticmethod
     def _kept_together(state: State, radius: float, mesh: np.ndarray) -> Tensor:

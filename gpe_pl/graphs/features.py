@@ -158,14 +158,14 @@ def edge_features(
     """
     relative = displacement / scales.radius
     if features == "paper":
-        return relative.float(), displacement.new_empty((len(displacement), 0)).float()
+        return relative.float(), displacement.new_empty((displacement.shape[0], 0)).float()
     distance = (displacement.square().sum(dim=1, keepdim=True) + TINY**2).sqrt()
     unit = displacement / distance  # zero for coincident nodes
     velocity = relative_velocity / scales.velocity
     gap = ((distance / scales.spacing - 1) / GAP_SCALE).clamp(-GAP_LIMIT, GAP_LIMIT)
     approach = (velocity * unit).sum(dim=1, keepdim=True)
     if normal is None:
-        wall = displacement.new_zeros((len(displacement), 1))
+        wall = displacement.new_zeros((displacement.shape[0], 1))
         wall_approach = wall
     else:
         wall = (displacement * normal).sum(dim=1, keepdim=True) / scales.spacing
@@ -206,7 +206,7 @@ def mesh_features(
     width = scales.spacing if level is None else scales.spacing * torch.exp2(level.double())[:, None]
     relative, rest = _without_rounding(displacement / width), _without_rounding(rest_displacement / width)
     if features == "paper":
-        return relative.float(), relative.new_empty((len(relative), 0)).float()
+        return relative.float(), relative.new_empty((relative.shape[0], 0)).float()
     velocity = relative_velocity * scales.frame_dt / width
     length = (relative.square().sum(dim=1, keepdim=True) + TINY**2).sqrt()
     rest_length = rest.norm(dim=1, keepdim=True)

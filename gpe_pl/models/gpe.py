@@ -32,6 +32,7 @@ Schedule = Literal["simultaneous", "sweep"]
 Edges = dict[EdgeType, tuple[Tensor, Tensor, Tensor]]
 """``edge_index``, ``odd`` and ``even`` of the relations that have edges."""
 MaterialEmbeddingKind = Literal["affine", "mlp"]
+NodeNorm = Literal["none", "layer"]
 
 
 class StressError(GpeError, ValueError):
@@ -105,12 +106,12 @@ def _merge_levels(x: dict[str, Tensor], edges: Edges) -> tuple[dict[str, Tensor]
     nodes: dict[str, list[Tensor]] = {}
     for node_type, value in x.items():
         parts = nodes.setdefault(role(node_type), [])
-        first[node_type] = sum(len(part) for part in parts)
+        first[node_type] = sum(part.shape[0] for part in parts)
         parts.append(value)
     merged: dict[EdgeType, list[tuple[Tensor, Tensor, Tensor]]] = {}
     for (source, name, target), (index, odd, even) in edges.items():
-        offset = index.new_tensor([[first[source]], [first[target]]])
-        merged.setdefault((role(source), name, role(target)), []).append((index + offset, odd, even))
+        index = torch.stack([index[0] + first[source], index[1] + first[target]])
+        merged.setdefault((role(source), name, role(target)), []).append((index, odd, even))
     joined: Edges = {}
     for relation, stores in merged.items():
         indices, odds, evens = zip(*stores, strict=True)
@@ -133,6 +134,8 @@ class GPE(nn.Module):
         level_weights: one set for all levels of virtual nodes, which then serves any number of levels, or one per level (paper).
         schedule: the order of messages between levels; ``simultaneous`` (paper) or ``sweep``.
         stress: also decode the stress of materials that have one.
+        node_norm: ``layer`` normalises the encoded state of every node, and what each step adds to it, as GNS does; however far a rollout strays, its
+            accelerations stay bounded. ``none`` as in the paper.
         island_momentum: of what flies freely, keep the ``linear``, or also the ``angular`` momentum exactly (see ``nn.island_momentum``); or ``ignored``.
 
     Raises:
@@ -153,6 +156,7 @@ class GPE(nn.Module):
         level_weights: LevelWeights = "shared",
         schedule: Schedule = "simultaneous",
         stress: bool = False,
+        node_norm: NodeNorm = "none",
         island_momentum: IslandMomentum = "ignored",
     ) -> None:
         super().__init__()
@@ -167,6 +171,7 @@ class GPE(nn.Module):
             "level_weights": level_weights,
             "schedule": schedule,
             "stress": stress,
+            "node_norm": node_norm,
             "island_momentum": island_momentum,
         }
         if island_momentum != "ignored" and not spec.islands:
@@ -178,7 +183,7 @@ class GPE(nn.Module):
         self.spec, self.interaction, self.decoder, self.edge_state = spec, interaction, decoder, edge_state
         self.level_weights, self.schedule = level_weights, schedule
         self.num_message_passing_steps = num_message_passing_steps
-        hidden = hidden_channels
+        hidden, norm = hidden_channels, node_norm == "layer"
         params = {m: c for m, c in spec.param_channels.items() if c}
         self.material_embedding = nn.ModuleDict({m: MaterialEmbedding(c, hidden, material_embedding) for m, c in params.items()})
         readable = self._readable()
@@ -187,7 +192,7 @@ class GPE(nn.Module):
         self.node_encoder, self.edge_encoder = nn.ModuleDict(), nn.ModuleDict()
         for t in spec.node_types:
             if t in ends and self.type_key(t) not in self.node_encoder:
-                self.node_encoder[self.type_key(t)] = MLP(spec.node_channels[t] + (hidden if t in params else 0), hidden, hidden)
+                self.node_encoder[self.type_key(t)] = MLP(spec.node_channels[t] + (hidden if t in params else 0), hidden, hidden, norm)
         for relation in relations if edge_state == "latent" else []:
             if self.key(relation) not in self.edge_encoder:
                 odd, even = spec.odd_channels[relation], spec.even_channels[relation]
@@ -206,7 +211,7 @@ class GPE(nn.Module):
                 convs[self.key(relation)] = MomentumConv(hidden, edge_channels, even, kind, implementation)
             self.convs.append(convs)
             keys = dict.fromkeys(self.type_key(t) for t in spec.node_types if t in types)
-            self.updates.append(nn.ModuleDict({k: MLP(hidden, hidden, hidden) for k in keys}))
+            self.updates.append(nn.ModuleDict({k: MLP(hidden, hidden, hidden, norm) for k in keys}))
         if decoder == "node":
             self.node_decoder = nn.ModuleDict({m: MLP(hidden, hidden, spec.dim) for m in spec.materials})
         else:
@@ -217,8 +222,8 @@ class GPE(nn.Module):
 
     @property
     def is_fused(self) -> bool:
-        """Whether the messages are computed in one pass over the edges, on a CPU (see ``nn.fused_messages``)."""
-        return self.edge_state == "geometry" and self.interaction == "negated" and self.settings["implementation"] == "factored"
+        """Whether messages have code of their own for a CPU (see ``nn.fused_messages`` and ``nn.fused_latent``)."""
+        return self.interaction in ("negated", "odd") and self.settings["implementation"] == "factored"
 
     def type_key(self, node_type: str) -> str:
         """Under which name the weights of a node type are kept."""
@@ -269,7 +274,7 @@ class GPE(nn.Module):
         mass, pos = torch.cat([s.mass for s in stores]), torch.cat([s.pos for s in stores])
         angular = self.settings["island_momentum"] == "angular"
         kept = conserve(torch.cat([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
-        return dict(zip(acceleration, kept.split([len(a) for a in acceleration.values()]), strict=True))
+        return dict(zip(acceleration, kept.split([a.shape[0] for a in acceleration.values()]), strict=True))
 
     def compute(
         self,
@@ -286,7 +291,7 @@ class GPE(nn.Module):
 
         phases = self._phases([*x], edges)
         for step in range(self.num_message_passing_steps):
-            with_messages = self.edge_state == "latent" and step < self.num_message_passing_steps - 1
+            update_edges = self.edge_state == "latent" and step < self.num_message_passing_steps - 1
             convs, updates = cast(nn.ModuleDict, self.convs[step]), cast(nn.ModuleDict, self.updates[step])
             for relations, receivers in phases:
                 total: dict[str, Tensor] = {}
@@ -296,13 +301,13 @@ class GPE(nn.Module):
                     source, _, target = relation
                     edge_index, _, even = edges[relation]
                     conv = convs[self.key(relation)]
-                    at_target, at_source, messages = conv(h[source], h[target], edge_index, e[relation], even, with_messages)
+                    at_target, at_source, state = conv(h[source], h[target], edge_index, e[relation], even, update_edges)
                     if target in receivers:
                         total[target] = total[target] + at_target if target in total else at_target
                     if source in receivers and self.type_key(source) in updates:
                         total[source] = total[source] + at_source if source in total else at_source
-                    if with_messages:
-                        e[relation] = e[relation] + messages
+                    if update_edges:
+                        e[relation] = state
                 for node_type, rows in receivers.items():
                     if self.type_key(node_type) not in updates:
                         continue

@@ -9,10 +9,11 @@ from torch.nn import functional
 
 
 class MLP(nn.Sequential):
-    """Two linear layers with a PReLU between them: every function of the paper (section 3.2)."""
+    """Two linear layers with a PReLU between them: every function of the paper (section 3.2); then LayerNorm if asked for."""
 
-    def __init__(self, in_channels: int, hidden_channels: int, out_channels: int) -> None:
-        super().__init__(nn.Linear(in_channels, hidden_channels), nn.PReLU(), nn.Linear(hidden_channels, out_channels))
+    def __init__(self, in_channels: int, hidden_channels: int, out_channels: int, norm: bool = False) -> None:
+        layers = [nn.Linear(in_channels, hidden_channels), nn.PReLU(), nn.Linear(hidden_channels, out_channels)]
+        super().__init__(*layers, *([nn.LayerNorm(out_channels)] if norm else []))
 
 
 class ReluMLP(nn.Sequential):

@@ -30,16 +30,25 @@ def conserve(
     angular: bool,
 ) -> Float[Tensor, "node dim"]:
     """Accelerations without gravity that give every free island no momentum, and without angular momentum if ``angular``."""
+    if torch.compiler.is_exporting():  # shapes must not depend on values: all rows, and then only those of free islands
+        rows = torch.arange(island.shape[0], device=island.device)
+        return torch.where(is_free[island][:, None], _kept(acceleration, mass, pos, island, rows, is_free.shape[0], angular), acceleration)
     rows = torch.nonzero(is_free[island]).flatten()
     if not len(rows):
         return acceleration
+    kept = _kept(acceleration, mass, pos, island, rows, is_free.shape[0], angular)
+    return acceleration.index_copy(0, rows, kept)
+
+
+def _kept(acceleration: Tensor, mass: Tensor, pos: Tensor, island: Tensor, rows: Tensor, count: int, angular: bool) -> Tensor:
+    """``conserve`` of these rows, which are whole islands."""
     label, m, a = island[rows], mass[rows, None], acceleration[rows]
-    total = _sum(m, label, len(is_free)).clamp(min=torch.finfo(m.dtype).tiny)
-    a = a - (_sum(m * a, label, len(is_free)) / total)[label]
+    total = _sum(m, label, count).clamp(min=torch.finfo(m.dtype).tiny)
+    a = a - (_sum(m * a, label, count) / total)[label]
     if angular:
-        r = pos[rows] - (_sum(m * pos[rows], label, len(is_free)) / total)[label]
-        a = a - _rotation(a, m, r, label, len(is_free))
-    return acceleration.index_copy(0, rows, a)
+        r = pos[rows] - (_sum(m * pos[rows], label, count) / total)[label]
+        a = a - _rotation(a, m, r, label, count)
+    return a
 
 
 def _sum(values: Tensor, label: Tensor, count: int) -> Tensor:

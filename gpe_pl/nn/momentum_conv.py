@@ -20,11 +20,14 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch_geometric.nn import MessagePassing
 
+from gpe_pl.nn.fused_latent import fused_latent
 from gpe_pl.nn.fused_messages import fused_messages, works_on
 
 Interaction = Literal["directed", "negated", "odd", "odd_even"]
 EdgeState = Literal["latent", "geometry"]
 Implementation = Literal["factored", "plain"]
+RAW = 32
+"""Up to so many edge channels are multiplied where they are used; more go through a matrix product."""
 MaybeTensor = Optional[Tensor]  # noqa: UP045 - PyG's code generator reads the signatures below and does not understand unions written with |
 
 
@@ -77,16 +80,16 @@ class MomentumConv(MessagePassing):
         edge_index: Int64[Tensor, "2 edge"],
         e: Float[Tensor, "directed_edge state"],
         s: Float[Tensor, "edge even"],
-        with_messages: bool = True,
+        update_edges: bool = True,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Sums at the target nodes, at the source nodes, and the messages m_ij per edge.
+        """Sums of messages at the target nodes, at the source nodes, and the new edge states e_ij + m_ij, which need as many channels as the messages.
 
-        Without ``with_messages`` the last linear map is applied after the sum (it commutes), once per node instead of once per edge; the messages are
+        Without ``update_edges`` the last linear map is applied after the sum (it commutes), once per node instead of once per edge; the new states are
         then None. In a relation of one type with itself pass the same tensor twice and add the two sums.
         """
         size = (h_source.shape[0], h_target.shape[0])
-        if self.implementation == "factored" and self.interaction == "negated" and not with_messages and works_on(h_source, h_target, e):
-            return *self._fused(h_source, h_target, edge_index, e), None
+        if self._is_fused(h_source, h_target, e):
+            return self._fused(h_source, h_target, edge_index, e, s, update_edges)
         if self.implementation == "plain":
             terms = {"a": (h_source, h_target), "b": (None, None), "e": e, "s": s}
         else:
@@ -103,14 +106,29 @@ class MomentumConv(MessagePassing):
                 "e": functional.linear(e, w),
                 "s": s if self.is_odd and self.widths[3] else None,
             }
-        return self.propagate(edge_index, size=size, with_messages=with_messages, **terms)
+        at_target, at_source, messages = self.propagate(edge_index, size=size, with_messages=update_edges, **terms)
+        return at_target, at_source, e + messages if update_edges else None
 
-    def _fused(self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, e: Tensor) -> tuple[Tensor, Tensor]:
-        a, b, w, _ = self.lin_in.weight.split(self.widths, dim=1)
+    def _is_fused(self, h_source: Tensor, h_target: Tensor, e: Tensor) -> bool:
+        """Whether the passes over the edges that are made for a CPU can do it, here and now."""
+        kind = self.interaction == "negated" or (self.interaction == "odd" and h_source is h_target)
+        return self.implementation == "factored" and kind and works_on(h_source, h_target, e)
+
+    def _fused(
+        self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, e: Tensor, s: Tensor, update_edges: bool
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        a, b, w, v = self.lin_in.weight.split(self.widths, dim=1)
         at, bs = functional.linear(h_target, a, self.lin_in.bias), functional.linear(h_source, b)
-        at_target, at_source = fused_messages(at, bs, e, w, self.act.weight, edge_index)
+        if update_edges or self.is_odd or self.widths[2] > RAW:
+            out = (self.lin_out.weight, self.lin_out.bias) if update_edges else None
+            at_target, at_source, state = fused_latent(at, bs, e, s if self.is_odd else None, w, v, self.act.weight, out, edge_index)
+        else:
+            at_target, at_source = fused_messages(at, bs, e, w, self.act.weight, edge_index)
+            state = None
+        if update_edges:
+            return at_target, at_source, state
         j, i = edge_index
-        return self._last_linear(at_target, i, 1), self._last_linear(at_source, j, -1)
+        return self._last_linear(at_target, i, 1), self._last_linear(at_source, j, -1), None
 
     def message(
         self, a_i: MaybeTensor, a_j: MaybeTensor, b_i: MaybeTensor, b_j: MaybeTensor, e: Tensor, s: MaybeTensor

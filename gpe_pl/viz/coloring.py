@@ -21,7 +21,7 @@ MATERIAL_COLORS = {"sand": "#E69F00", "snow": "#56B4E9", "fluid": "#0072B2", "el
 REFERENCE = "#7A8B99"
 """What has no value of its own: particles of the ground truth where colour means error, particles outside of meshes where it means stress."""
 
-ColorBy = Literal["error", "height", "material", "von_mises"]
+ColorBy = Literal["error", "height", "material", "speed", "von_mises"]
 
 
 def _shortened(name: str, low: float, high: float) -> Colormap:
@@ -33,10 +33,11 @@ COLOR_MAPS: dict[ColorBy, Colormap] = {
     "error": _shortened("inferno", 0.08, 0.9),
     "height": _shortened("viridis", 0.0, 0.95),
     "material": ListedColormap([MATERIAL_COLORS[name] for name in MATERIALS], name="materials"),
+    "speed": _shortened("YlGnBu", 0.3, 1.0),
     "von_mises": _shortened("YlOrRd", 0.1, 1.0),
 }
 
-BAR_LABELS: dict[ColorBy, str] = {"error": "position error [m]", "von_mises": "von Mises stress"}
+BAR_LABELS: dict[ColorBy, str] = {"error": "position error [m]", "speed": "speed [m/s]", "von_mises": "von Mises stress"}
 """Colours whose values a reader wants to look up."""
 
 
@@ -49,8 +50,8 @@ class Coloring:
     """Colours of all trajectories in one figure, on a common scale.
 
     Args:
-        by: ``error`` is the distance from ``truth``; ``height`` that in the first frame, by which material can be followed; ``material`` and
-            ``von_mises`` (of a mesh) are what they say.
+        by: ``error`` is the distance from ``truth``; ``height`` that in the first frame, by which material can be followed; ``material``,
+            ``speed`` and ``von_mises`` (of a mesh) are what they say.
         trajectories: all that the figure shows.
         frames: those that it shows.
         truth: ground truth, for ``error``.
@@ -102,6 +103,8 @@ class Coloring:
             nodes = trajectory.pos[0, :, vertical_axis(trajectory)].astype(float)
         elif self.by == "material":
             nodes = trajectory.node_type.astype(float)
+        elif self.by == "speed":
+            nodes = np.linalg.norm(trajectory.vel[frame].astype(float), axis=-1)
         else:
             assert self._truth is not None
             nodes = unknown if trajectory is self._truth else position_error(trajectory, self._truth, frame)

@@ -90,3 +90,44 @@ def parameter_figure(
     panels[0].set_ylabel(label, fontsize=8)
     panels[-1].legend(fontsize=6, frameon=False)
     return figure
+
+
+def cost_error_figure(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float, float]]]], x_label: str, y_label: str) -> Figure:
+    """Cost against error on logarithmic axes, a panel per horizon.
+
+    A line goes through the solver's resolutions; a learned model is a mark; what costs nothing is a horizontal line.
+
+    Args:
+        panels: by title, then by family ``solver``, ``learned`` and ``trivial``: name, cost and error; infinite errors are left out.
+        x_label: of the costs.
+        y_label: of the errors.
+    """
+    figure = new_figure(TEXT_WIDTH, 2.8)
+    figure.set_layout_engine("constrained")
+    all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, (title, families) in zip(all_axes, panels.items(), strict=True):
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        solver = sorted((c, e) for _, c, e in families.get("solver", ()) if np.isfinite(e))
+        axes.plot(
+            [c for c, _ in solver],
+            [e for _, e in solver],
+            "s-",
+            markersize=4,
+            linewidth=1,
+            color="0.3",
+            label="solver, coarser to the left",
+        )
+        for k, (name, cost, error) in enumerate(families.get("learned", ())):
+            if np.isfinite(error):
+                axes.plot([cost], [error], "o", markersize=5, color=PALETTE[k % len(PALETTE)], label=name)
+        for style, (name, _, error) in zip((":", "--"), families.get("trivial", ()), strict=False):
+            axes.axhline(error, linestyle=style, linewidth=1, color="0.6", label=name)
+        axes.set_title(title, fontsize=8)
+        axes.set_xlabel(x_label, fontsize=7)
+        axes.tick_params(which="both", labelsize=7)
+        axes.spines[["top", "right"]].set_visible(False)
+    all_axes[0].set_ylabel(y_label, fontsize=8)
+    handles, labels = all_axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=7, frameon=False, ncols=4, loc="outside upper center")
+    return figure

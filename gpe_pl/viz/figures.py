@@ -147,3 +147,33 @@ def _set_log_limits(axes: Axes, values: np.ndarray) -> float:
     low, high = (positive.min(), positive.max()) if positive.size else (1e-1, 1.0)
     axes.set_ylim(low / 1.5, high * 1.5)
     return float(high * 10)
+
+
+def scaling_figure(
+    left: Mapping[str, Mapping[int, float]], left_label: str, right: Mapping[str, Mapping[int, float]], right_label: str
+) -> Figure:
+    """Two quantities against the number of nodes on logarithmic axes, a curve per name, beside a line of slope one.
+
+    Args:
+        left: of the left axes, by name and number of nodes.
+        left_label: with the unit.
+        right: of the right axes.
+        right_label: with the unit.
+    """
+    figure = new_figure(2 * COLUMN_WIDTH, 2.6)
+    figure.set_layout_engine("constrained")
+    for axes, curves, label in zip(figure.subplots(1, 2), (left, right), (left_label, right_label), strict=True):
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        for k, (name, values) in enumerate(curves.items()):
+            axes.plot([*values], [*values.values()], "o-", markersize=3, linewidth=1, color=PALETTE[k], label=name)
+        if curves:
+            first = next(iter(curves.values()))
+            ends = np.array([min(first), max(first)], dtype=float)
+            axes.plot(ends, first[min(first)] * ends / ends[0], ":", linewidth=1, color="0.5", label="∝ N")
+        axes.set_xlabel("nodes", fontsize=8)
+        axes.set_ylabel(label, fontsize=8)
+        axes.tick_params(which="both", labelsize=7)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(fontsize=7, frameon=False)
+    return figure

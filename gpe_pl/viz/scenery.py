@@ -121,7 +121,7 @@ def _draw_3d(axes: Any, camera: Camera, trajectory: Trajectory, points_per_metre
             grey = str(_brightness(camera, side * np.eye(3)[axis]))
             axes.add_patch(Polygon(outline, facecolor=grey, edgecolor=grey, zorder=1, **style))
     # Discs that overlap look like a surface; its shape shows by the light that falls on it. They end where the solid does.
-    pos, normal, gap = _surface_points(boundary, spacing)
+    pos, normal, gap = surface_points(boundary, spacing)
     seen = (normal @ camera.toward >= 0) & (signed_distance(walls, pos) > 1e-6 * spacing)
     pos, normal, radius = pos[seen], normal[seen], 0.85 * gap[seen]
     on_paper, depth = camera.project(pos - radius[:, None] * normal)
@@ -138,7 +138,7 @@ def _draw_3d(axes: Any, camera: Camera, trajectory: Trajectory, points_per_metre
     return Cover(camera, boundary.pos[hiding], spacing)
 
 
-def _surface_points(boundary: Boundary, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def surface_points(boundary: Boundary, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Positions and normals [point, 3] of all that is not flat, and distances between neighbours [point] in m."""
     flat_or_round: tuple[Any, ...] = tuple(s for s in boundary.shapes if s.kind in ("box", "sphere", "bowl"))
     rest = np.abs(signed_distance(flat_or_round, boundary.pos)) > 1e-6 * spacing

@@ -54,6 +54,48 @@ def test_data_can_be_read_and_made_without_torch() -> None:
     assert {"torch", "torch_geometric", "lightning", "hydra", "matplotlib", "wandb"} & loaded_by(*without, *solvers) == set()
 
 
+HEAVY = {"torch", "torch_geometric", "lightning", "torchmetrics", "numba", "scipy", "h5py", "matplotlib", "pandas", "wandb"}
+
+
+@pytest.mark.parametrize("command", ["fit", "evaluate"])
+def test_help_of_a_command_loads_nothing_heavy(command: str) -> None:
+    """Which is why it comes within a second."""
+    child = subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", f"gpe_pl.{command}", "--help"], capture_output=True, text=True, cwd=ROOT
+    )
+    assert child.returncode == 0 and "hydra" in child.stdout.lower()
+    loaded = {line.rpartition("|")[2].strip().partition(".")[0] for line in child.stderr.splitlines()}
+    assert "hydra" in loaded and loaded & HEAVY == set()
+
+
+def test_commands_load_nothing_heavy_before_they_run() -> None:
+    assert HEAVY & loaded_by(*(f"gpe_pl.{command}" for command in ("fit", "simulate", "evaluate", "benchmark"))) == set()
+
+
+def test_the_package_alone_loads_only_the_standard_library() -> None:
+    assert loaded_by("gpe_pl") - set(sys.stdlib_module_names) <= loaded_by("json") | {"gpe_pl"}
+
+
+def test_every_public_name_is_there_and_known_to_type_checkers() -> None:
+    import gpe_pl
+
+    tree = ast.parse((ROOT / "gpe_pl" / "__init__.py").read_text())
+    imported = {
+        str(alias.asname): f"{node.module}.{alias.name}"
+        for block in tree.body
+        if isinstance(block, ast.If)
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert set(imported) == set(gpe_pl.__all__) <= set(dir(gpe_pl))
+    for name, place in imported.items():
+        value = getattr(gpe_pl, name)
+        assert f"{value.__module__}.{value.__qualname__}" == place
+    with pytest.raises(AttributeError, match="has no attribute 'Simulator'; it has Contained, "):
+        _ = gpe_pl.Simulator
+
+
 def test_schema_imports_only_the_standard_library() -> None:
     tree = ast.parse((ROOT / "gpe_pl" / "schema.py").read_text())
     assert top_level_imports(tree) <= set(sys.stdlib_module_names)

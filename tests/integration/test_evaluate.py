@@ -5,7 +5,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import jaxtyping
 import pytest
+import torch
 
 from gpe_pl import pretrained
 from gpe_pl.config import ConfigError
@@ -34,10 +36,13 @@ def test_a_run_that_was_moved_gives_the_same_numbers(
     fit(tiny(tiny_data, tmp_path / "runs", f"model={model}"))
     known = {key(r): r.value for r in read_rows(tmp_path / "runs" / "fit" / "metrics.csv") if r.split == "test_unseen"}
     shutil.move(tmp_path / "runs" / "fit", tmp_path / "elsewhere")
-    rows = evaluate(tiny_data, tmp_path / "new", tmp_path / "elsewhere" / "checkpoints" / "best.ckpt", "evaluation.num_pictures=1")
+    checkpoint = tmp_path / "elsewhere" / "checkpoints" / "best.ckpt"
+    rows = evaluate(tiny_data, tmp_path / "new", checkpoint, "evaluation.num_pictures=1", "evaluation.export=[vtk,npz]")
     assert {key(r): r.value for r in rows} == pytest.approx(known, rel=1e-9)
     written = {path.name for path in (tmp_path / "new" / "evaluation_test_unseen").iterdir()}
-    assert {"rollout_test_unseen_00.png", "rollout_test_unseen_00.gif", "error_curve_test_unseen.png"} <= written
+    assert {f"rollout_test_unseen_00.{suffix}" for suffix in ("png", "gif", "html", "pvd", "npz")} <= written
+    assert {"error_curve_test_unseen.png", "ground_truth_test_unseen_00.pvd", "ground_truth_test_unseen_00.npz"} <= written
+    assert "model.pt2" not in written
     assert "rollout_mse            learned" in capsys.readouterr().out
 
 
@@ -49,6 +54,26 @@ def test_a_shipped_model_is_named(tiny_data: Path, tmp_path: Path, monkeypatch: 
     assert {r.model for r in rows} == {"learned", "ballistic", "constant_velocity"}
     with pytest.raises(ConfigError, match=r"checkpoint=None: name a checkpoint of a run.*, or a shipped model: sand"):
         evaluate(tiny_data, tmp_path, "null")
+
+
+@pytest.mark.slow
+def test_film_and_model_are_exported_on_request(tiny_data: Path, tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg", reason="MP4 needs imageio-ffmpeg")
+    fit(tiny(tiny_data, tmp_path))
+    exports = ("evaluation.num_pictures=1", "evaluation.export=[mp4,model]")
+    without_checks = jaxtyping.config.jaxtyping_disable
+    jaxtyping.config.update("jaxtyping_disable", True)  # lengths are symbols while a program is made
+    try:
+        evaluate(tiny_data, tmp_path, tmp_path / "fit" / "checkpoints" / "best.ckpt", *exports)
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", without_checks)
+    folder = tmp_path / "evaluation_test_unseen"
+    assert (folder / "rollout_test_unseen_00.mp4").stat().st_size > 1000 and torch.export.load(folder / "model.pt2")
+
+
+def test_an_unknown_format_is_refused(tiny_data: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"evaluation\.export\.0='vtu': input should be 'vtk', 'npz', 'mp4' or 'model'"):
+        evaluate(tiny_data, tmp_path, "x.ckpt", "evaluation.export=[vtu]")
 
 
 def test_a_summary_has_a_line_per_metric_and_a_column_per_horizon() -> None:

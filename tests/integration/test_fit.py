@@ -250,7 +250,7 @@ def test_metrics_hold_the_model_and_the_baselines(tiny_data: Path, tmp_path: Pat
         assert {r.parameter_group for r in mse} == groups
         assert all(np.isfinite(r.value) and r.value >= 0 and np.isfinite(r.parameter) for r in mse)
         assert (tmp_path / "fit" / f"error_curve_{split}.png").stat().st_size > 1000
-        for suffix in ("png", "gif"):
+        for suffix in ("png", "gif", "html"):
             assert (tmp_path / "fit" / f"rollout_{split}_00.{suffix}").stat().st_size > 1000
     extra = {r.metric for r in rows if r.model == "learned"}
     assert {"one_step_nmse", "share_outside_uncontained", "share_corrected", "momentum_error"} <= extra

@@ -239,10 +239,10 @@ def call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, task: Callable[[DictCo
 @pytest.mark.parametrize(
     ("task", "arguments", "line"),
     [
-        (lambda cfg: None, ["suit=speed"], "error: suit: unknown key 'suit'; valid keys: paths, suite"),
+        (lambda cfg: None, ["suit=speed"], "error: suit: unknown key 'suit'; valid keys: paths, suite, trainer"),
         (lambda cfg: None, ["suite=3"], "error: Config group override must be a string or a list. Got int"),
         (lambda cfg: None, ["paths.data=null"], "error: paths.data=None: input should be a valid string"),
-        (lambda cfg: None, ["+foo=1"], "error: foo: unknown or missing key; valid keys: paths, suite"),
+        (lambda cfg: None, ["+foo=1"], "error: foo: unknown or missing key; valid keys: paths, suite, trainer"),
         (benchmark, ["suite.name=nope"], "error: suite.name='nope': must be one of "),
         (lambda cfg: None, ["suite.name=${nothing}"], "error: Interpolation key 'nothing' not found"),
         (lambda cfg: construct(Inner, {"size": cfg.suite.num_nodes}, "suite"), ["suite.num_nodes=0"], "error: suite.size=0: input should"),
@@ -316,3 +316,9 @@ def test_commands_fail_in_one_line(tmp_path: Path, command: str, arguments: list
     assert len(errors) == 1
     assert errors[0].startswith(line)
     assert "Traceback" not in child.stdout + child.stderr
+
+
+def test_a_table_by_model_has_a_default() -> None:
+    table = ["+comparison=equal_steps", "data.comparison.noise_std.default=0.5", "+data.comparison.noise_std.GNS=2.0"]
+    assert compose("fit", *table).training.noise_std == 0.5
+    assert compose("fit", *table, "model=gns").training.noise_std == 2.0

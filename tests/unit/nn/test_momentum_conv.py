@@ -16,14 +16,14 @@ def problem(interaction: str, num_source: int = 7, num_target: int = 5, num_edge
     g = torch.Generator().manual_seed(0)
     edges = torch.stack([torch.randint(num_source, (num_edges,), generator=g), torch.randint(num_target, (num_edges,), generator=g)])
     rows = 2 * num_edges if interaction == "directed" else num_edges
-    shapes = ((num_source, 8), (num_target, 8), (rows, 6), (num_edges, 3))
+    shapes = ((num_source, 8), (num_target, 8), (rows, 8), (num_edges, 3))
     hs, ht, e, s = (torch.randn(shape, generator=g, dtype=DOUBLE) for shape in shapes)
     return hs, ht, edges, e, s
 
 
 def make(interaction: str, implementation: str = "factored") -> MomentumConv:
     torch.manual_seed(0)
-    return MomentumConv(8, 6, 3, interaction, implementation).double()  # type: ignore[arg-type]
+    return MomentumConv(8, 8, 3, interaction, implementation).double()  # type: ignore[arg-type]
 
 
 def test_is_a_message_passing_layer() -> None:
@@ -35,7 +35,7 @@ def test_is_a_message_passing_layer() -> None:
 def test_sums_equal_a_loop_over_edges(interaction: str, implementation: str) -> None:
     conv = make(interaction, implementation)
     hs, ht, edges, e, s = problem(interaction)
-    at_target, at_source, messages = conv(hs, ht, edges, e, s)
+    at_target, at_source, state = conv(hs, ht, edges, e, s)
     want_target, want_source = torch.zeros_like(ht), torch.zeros_like(hs)
     num_edges = edges.shape[1]
 
@@ -56,7 +56,7 @@ def test_sums_equal_a_loop_over_edges(interaction: str, implementation: str) -> 
             m = conv.lin_out(forward - reverse)
         else:
             m = conv.lin_out(forward)
-        torch.testing.assert_close(messages[n], m)
+        torch.testing.assert_close(state[n], e[n] + m)
         want_target[i] += m
         want_source[j] -= m
         if conv.lin_even is not None:
@@ -69,10 +69,10 @@ def test_sums_equal_a_loop_over_edges(interaction: str, implementation: str) -> 
 @pytest.mark.parametrize("interaction", KINDS)
 def test_last_linear_map_commutes_with_the_sum(interaction: str) -> None:
     conv = make(interaction)
-    with_messages = conv(*problem(interaction))
-    without = conv(*problem(interaction), with_messages=False)
+    updated = conv(*problem(interaction))
+    without = conv(*problem(interaction), update_edges=False)
     assert without[2] is None
-    for a, b in zip(with_messages[:2], without[:2], strict=True):
+    for a, b in zip(updated[:2], without[:2], strict=True):
         torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-13)
 
 

@@ -74,6 +74,10 @@ def block(dim: int, side: int = 2) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture
 def mesh(dim) -> Trajectory:
+    return falling_mesh(dim)
+
+
+def falling_mesh(dim: int) -> Trajectory:
     """A block that falls, with stress that grows, beside two particles of no cell."""
     base = falling(dim)
     rest, cells = block(dim)

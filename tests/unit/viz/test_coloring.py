@@ -26,6 +26,13 @@ def test_every_material_has_a_colour_of_its_own():
     assert set(MATERIAL_COLORS) == set(MATERIALS) and len(set(MATERIAL_COLORS.values())) == len(MATERIALS)
 
 
+def test_speed_is_the_length_of_the_velocity(ground_truth):
+    moving = replace(ground_truth, vel=np.random.default_rng(0).normal(size=ground_truth.vel.shape))
+    coloring = Coloring("speed", [moving], range(moving.num_frames))
+    np.testing.assert_allclose(coloring.values(moving, 3)[0], np.sqrt((moving.vel[3] ** 2).sum(-1)))
+    assert coloring.scale.vmin == 0 and coloring.bar_label == "speed [m/s]"
+
+
 def test_stress_has_one_scale_for_all_rows(mesh):
     stiff = replace(mesh, stress=type(mesh.stress)(4 * mesh.stress.node, 4 * mesh.stress.cell))
     coloring = Coloring("von_mises", [mesh, stiff], range(mesh.num_frames))

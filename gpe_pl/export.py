@@ -1,0 +1,187 @@
+"""Trajectories in other programs' formats: VTK series for ParaView, and NumPy archives.
+
+A series is ``NAME.pvd``, which one opens, and a folder ``NAME`` with an unstructured grid per frame (``.vtu``, zlib-compressed, base64). Format: VTK file
+formats, XML part [Kitware, docs.vtk.org]. Nodes of meshes belong to their cells; every other node is a cell of its own, so particles show as points.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from jaxtyping import Float
+
+from gpe_pl.metrics import displacement
+from gpe_pl.trajectory import Trajectory, stored_arrays, stored_attributes, von_mises
+
+VERTEX = 1
+CELL_TYPES = {(2, 3): 5, (2, 4): 9, (3, 3): 5, (3, 4): 10}
+"""VTK's numbers of triangle, quadrilateral and tetrahedron, by dimension and corners."""
+
+SYMMETRIC = {4: (0, 2, 3, 1), 6: (0, 3, 5, 1, 4, 2)}
+"""Where VTK's components XX, YY, ZZ, XY, YZ, XZ stand in a stress of so many components; in plane strain the last two are zero."""
+
+VTK_TYPES = {"float32": "Float32", "float64": "Float64", "int32": "Int32", "int64": "Int64", "uint8": "UInt8"}
+
+
+def write_npz(path: Path | str, trajectory: Trajectory) -> None:
+    """Write a trajectory as arrays that ``numpy.load`` reads, in the precision of the store; the file appears complete or not at all.
+
+    Names, shapes and units are those of ``schema.FIELDS``; ``metadata``, ``shapes`` and ``node_types`` are JSON.
+
+    Raises:
+        ValueError: ``path`` does not end in ``.npz``.
+    """
+    path = Path(path)
+    if path.suffix != ".npz":
+        raise ValueError(f"{path}: a NumPy archive ends in .npz")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part.npz")
+    texts = {key: np.array(text) for key, text in stored_attributes(trajectory).items()}
+    try:
+        np.savez_compressed(temporary, allow_pickle=False, **stored_arrays(trajectory), **texts)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory | None = None, stride: int = 1) -> None:
+    """Write a series for ParaView: ``path`` (``.pvd``), a folder of the same name with a file per frame, and the boundary in it.
+
+    Points carry ``velocity`` [m/s], ``material`` (index into ``schema.NODE_TYPES``), ``mass`` [kg], the material parameters by their names and, where
+    they are known, ``displacement`` from rest [m], ``error`` (distance from the ground truth [m]), and ``stress`` and ``von_mises`` [Pa]; cells carry the
+    last two as well, NaN on particles. ``boundary.vtu`` has the boundary nodes with ``normal``, ``friction`` and ``restitution``.
+
+    Args:
+        path: ends in ``.pvd``.
+        trajectory: a ground truth or a prediction.
+        ground_truth: of the same frames and nodes, for ``error``; its later frames are ignored.
+        stride: every so many frames.
+
+    Raises:
+        ValueError: another file type, a stride that is not positive, or a ground truth with other nodes.
+    """
+    path = Path(path)
+    if path.suffix != ".pvd":
+        raise ValueError(f"{path}: a VTK series ends in .pvd")
+    if stride < 1:
+        raise ValueError(f"stride must be positive, got {stride}")
+    if ground_truth is not None and (ground_truth.num_nodes != trajectory.num_nodes or ground_truth.num_frames < trajectory.num_frames):
+        raise ValueError(
+            f"{path}: the ground truth has {ground_truth.pos.shape[:2]} frames and nodes, the trajectory {trajectory.pos.shape[:2]}"
+        )
+    folder = path.with_suffix("")
+    folder.mkdir(parents=True, exist_ok=True)
+    cells, types, is_vertex = _cells(trajectory)
+    entries = []
+    for frame in range(0, trajectory.num_frames, stride):
+        name = f"frame_{frame:05d}.vtu"
+        points, in_cells = _point_data(trajectory, frame, ground_truth), _cell_data(trajectory, frame, int(is_vertex.sum()))
+        _write(folder / name, _grid(trajectory.pos[frame], cells, types, points, in_cells))
+        time = frame * trajectory.metadata.frame_dt
+        entries.append(f'<DataSet timestep="{time:.9g}" part="0" file={quoteattr(f"{folder.name}/{name}")}/>')
+    boundary = trajectory.boundary
+    if len(boundary.pos):
+        data = {"normal": _in_3d(boundary.normal), "friction": boundary.friction, "restitution": boundary.restitution}
+        vertices = [np.arange(len(boundary.pos))[:, None]]
+        _write(folder / "boundary.vtu", _grid(boundary.pos, vertices, np.full(len(boundary.pos), VERTEX), data, {}))
+    _write(path, _document("Collection", "<Collection>\n" + "\n".join(entries) + "\n</Collection>"))
+
+
+def _cells(trajectory: Trajectory) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """Nodes of all cells, by number of corners, with their VTK types and whether they are particles; cells of the mesh come first."""
+    mesh = trajectory.cells
+    if mesh is None or len(mesh) == 0:
+        mesh = np.empty((0, 3), int)
+    loose = np.setdiff1d(np.arange(trajectory.num_nodes), mesh)[:, None]
+    is_vertex = np.repeat([False, True], [len(mesh), len(loose)])
+    types = np.where(is_vertex, VERTEX, CELL_TYPES[trajectory.metadata.dim, mesh.shape[1]])
+    return [mesh, loose], types, is_vertex
+
+
+def _point_data(trajectory: Trajectory, frame: int, ground_truth: Trajectory | None) -> dict[str, np.ndarray]:
+    data = {
+        "velocity": _in_3d(trajectory.vel[frame]),
+        "material": trajectory.node_type,
+        "mass": trajectory.mass,
+        **{name: trajectory.material_params[:, k] for k, name in enumerate(trajectory.metadata.param_names)},
+    }
+    if trajectory.rest_pos is not None:
+        data["displacement"] = _in_3d(trajectory.pos[frame] - trajectory.rest_pos)
+    if ground_truth is not None:
+        data["error"] = np.linalg.norm(displacement(trajectory.pos[frame], ground_truth.pos[frame], trajectory.metadata), axis=-1)
+    if trajectory.stress is not None:
+        data |= _stress(trajectory.stress.node[frame])
+    return data
+
+
+def _cell_data(trajectory: Trajectory, frame: int, num_particles: int) -> dict[str, np.ndarray]:
+    if trajectory.stress is None:
+        return {}
+    stress = trajectory.stress.cell[frame]
+    return _stress(np.concatenate([stress, np.full((num_particles, stress.shape[1]), np.nan, stress.dtype)]))
+
+
+def _stress(stress: Float[np.ndarray, "item component"]) -> dict[str, np.ndarray]:
+    ordered = np.zeros((len(stress), 6), stress.dtype)
+    order = SYMMETRIC[stress.shape[1]]
+    ordered[:, : len(order)] = stress[:, order]
+    return {"stress": ordered, "von_mises": von_mises(stress)}
+
+
+def _in_3d(values: Float[np.ndarray, "row dim"]) -> Float[np.ndarray, "row 3"]:
+    return np.pad(values, ((0, 0), (0, 3 - values.shape[1])))
+
+
+def _grid(
+    pos: np.ndarray, cells: list[np.ndarray], types: np.ndarray, points: Mapping[str, np.ndarray], in_cells: Mapping[str, np.ndarray]
+) -> str:
+    """A ``.vtu`` document."""
+    corners = np.concatenate([np.full(len(group), group.shape[1]) for group in cells])
+    parts = [
+        _array("Points", _in_3d(pos)).join(("<Points>", "</Points>")),
+        "<Cells>",
+        _array("connectivity", np.concatenate([group.ravel() for group in cells]).astype(np.int64)),
+        _array("offsets", np.cumsum(corners).astype(np.int64)),
+        _array("types", types.astype(np.uint8)),
+        "</Cells>",
+        "<PointData>",
+        *(_array(name, values) for name, values in points.items()),
+        "</PointData>",
+        "<CellData>",
+        *(_array(name, values) for name, values in in_cells.items()),
+        "</CellData>",
+    ]
+    piece = f'<Piece NumberOfPoints="{len(pos)}" NumberOfCells="{len(types)}">\n' + "\n".join(parts) + "\n</Piece>"
+    return _document("UnstructuredGrid", f"<UnstructuredGrid>\n{piece}\n</UnstructuredGrid>")
+
+
+def _array(name: str, values: np.ndarray) -> str:
+    """Values as one compressed block, after a header of four numbers: blocks, block size, size of a last partial block, compressed size."""
+    values = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+    data = zlib.compress(values.tobytes(), 1)
+    header = np.array([1, values.nbytes, 0, len(data)] if values.nbytes else [0, 0, 0], "<u8").tobytes()
+    text = base64.b64encode(header).decode() + (base64.b64encode(data).decode() if values.nbytes else "")
+    components = f' NumberOfComponents="{values.shape[1]}"' if values.ndim == 2 else ""
+    labels = {"stress": ("XX", "YY", "ZZ", "XY", "YZ", "XZ")}.get(name, ())
+    components += "".join(f' ComponentName{k}="{label}"' for k, label in enumerate(labels))
+    return f'<DataArray type="{VTK_TYPES[values.dtype.name]}" Name={quoteattr(name)}{components} format="binary">{text}</DataArray>'
+
+
+def _document(kind: str, content: str) -> str:
+    attributes = 'version="1.0" byte_order="LittleEndian" header_type="UInt64" compressor="vtkZLibDataCompressor"'
+    return f'<?xml version="1.0"?>\n<VTKFile type="{kind}" {attributes}>\n{content}\n</VTKFile>\n'
+
+
+def _write(path: Path, text: str) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        temporary.write_text(text)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

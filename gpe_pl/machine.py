@@ -1,0 +1,104 @@
+"""What the machine can do at best: rates of matrix products and copies, from which floors of run times follow, and the memory that a function needs."""
+
+from __future__ import annotations
+
+import multiprocessing
+import resource
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+BYTES_PER_UNIT = 1 if sys.platform == "darwin" else 1024
+"""Of ``ru_maxrss``."""
+CLEAR_REFS = Path("/proc/self/clear_refs")
+
+
+def synchronized(function: Callable[[], Any], device: str) -> Callable[[], Any]:
+    """The function, which then also waits until a GPU has finished what it started."""
+    if not device.startswith("cuda"):
+        return function
+
+    def call() -> Any:
+        result = function()
+        torch.cuda.synchronize()
+        return result
+
+    return call
+
+
+def best_time(function: Callable[[], Any], device: str, num_rounds: int = 10) -> float:
+    """Seconds of the fastest of several calls, after one that does not count."""
+    call = synchronized(function, device)
+    call()
+    times = []
+    for _ in range(num_rounds):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def gemm_rate(rows: int, channels: int, device: str) -> float:
+    """FLOP/s of the product of a matrix [rows × channels] with a square one, in one piece or in blocks that fit the cache, whichever is faster."""
+    square = torch.randn(channels, channels, device=device)
+    rates = []
+    for height in (rows, min(rows, 1024)):
+        matrix, result = torch.randn(2, height, channels, device=device)
+        seconds = best_time(partial(torch.mm, matrix, square, out=result), device, 50)
+        rates.append(2 * height * channels**2 / seconds)
+    return max(rates)
+
+
+def copy_rate(device: str, num_bytes: int = 2**28) -> float:
+    """Bytes/s read and written in copying an array that no cache holds."""
+    source = torch.zeros(num_bytes // 4, device=device)
+    target = torch.empty_like(source)
+    return 2 * num_bytes / best_time(lambda: target.copy_(source), device, 5)
+
+
+def peak_memory(function: Callable[..., Callable[[], Any]], *arguments: Any) -> int:
+    """Bytes that the function which ``function(*arguments)`` returns needs beyond what was there when it was called, in a process of its own.
+
+    On a GPU use ``torch.cuda.max_memory_allocated`` instead.
+    """
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_peak_memory, args=(sender, function, arguments))
+    process.start()
+    sender.close()
+    try:
+        return int(receiver.recv())
+    except EOFError:
+        raise MemoryError(f"the process that was to measure the memory of {function.__name__} ended without an answer") from None
+    finally:
+        process.join()
+
+
+def _peak_memory(sender: Any, function: Callable[..., Callable[[], Any]], arguments: tuple[Any, ...]) -> None:
+    torch.set_num_threads(1)
+    call = function(*arguments)
+    before = _resident()
+    call()
+    sender.send(_peak() - before)
+
+
+def _resident() -> int:
+    """Bytes in use; forgets an earlier peak where the system can (Linux), else the peak so far, against which a smaller need cannot be seen."""
+    if not CLEAR_REFS.exists():
+        return _peak()
+    CLEAR_REFS.write_text("5")
+    return _status("VmRSS")
+
+
+def _peak() -> int:
+    return _status("VmHWM") if CLEAR_REFS.exists() else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_UNIT
+
+
+def _status(key: str) -> int:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return 1024 * int(next(line for line in lines if line.startswith(f"{key}:")).split()[1])

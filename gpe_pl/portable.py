@@ -1,0 +1,298 @@
+"""A trained model without this package: one frame as a ``torch.export`` program, which PyTorch alone loads and runs.
+
+The program takes a scene as a dictionary of tensors and returns what changes; everything but the search for neighbours is inside. In Python::
+
+    program = torch.export.load("model.pt2").module()
+    scene["edges.sand.radius.sand"] = …           pairs within the radius, each once; row 0 source, row 1 target
+    moved, predicted = program(scene)             positions and velocity history; accelerations [m/s²] and stress [Pa]
+    scene |= moved
+
+``description.json`` in the file says which tensors there are, with their shapes and units (``torch.export.load`` reads it with ``extra_files``). Numbers of
+nodes, edges and islands may change from call to call.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import re
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.export import Dim
+from torch_geometric.data import HeteroData
+
+from gpe_pl import integrators
+from gpe_pl.errors import GpeError
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import boundary_features, edge_features, history_of, material_features, mesh_features, virtual_features
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, RADIUS, EdgeType, grid, level_of
+from gpe_pl.trajectory import Boundary, State
+
+Scene = dict[str, Tensor]
+"""Tensors by the names of ``describe``."""
+
+DESCRIPTION = "description.json"
+BOUNDARY_FIELDS = ("pos", "vel", "normal", "friction", "restitution")
+
+
+class PortableError(GpeError, ValueError):
+    """A simulator that cannot leave this package, or a file that cannot be written."""
+
+
+@dataclass(frozen=True)
+class Input:
+    """One tensor of a scene.
+
+    Attributes:
+        shape: lengths, or names of those that may differ from call to call.
+        dtype: ``float64`` or ``int64`` or ``bool``.
+        unit: of its values.
+        doc: what it is.
+    """
+
+    shape: tuple[int | str, ...]
+    dtype: str
+    unit: str
+    doc: str
+
+
+class PortableStep(nn.Module):
+    """A learned simulator's step on plain tensors.
+
+    Args:
+        simulator: with any model of this package.
+
+    Raises:
+        PortableError: the data set is periodic.
+    """
+
+    def __init__(self, simulator: LearnedSimulator) -> None:
+        super().__init__()
+        metadata = simulator.builder.metadata
+        if any(metadata.periodic):
+            raise PortableError(f"the data set {metadata.dataset!r} has periodic axes, which an exported model does not support")
+        self.simulator, self.spec, self.scales = simulator, simulator.builder.spec, simulator.builder.scales
+        self.frame_dt, self.features = metadata.frame_dt, simulator.builder.config.features
+
+    def forward(self, scene: Scene) -> tuple[Scene, Scene]:
+        """The next positions and velocity history; acceleration [m/s²], gravity included, and stress [Pa] at nodes where the model has one."""
+        predicted = self.simulator(self.graph(scene))
+        moved: Scene = {}
+        further: Scene = {}
+        for material, values in predicted.acceleration.items():
+            history = scene[f"velocity_history.{material}"]
+            acc = scene["gravity"].expand_as(history[:, -1]) + values.double() * self.simulator.acceleration_std
+            pos, vel = integrators.advance(scene[f"pos.{material}"], history[:, -1], acc, self.frame_dt)
+            moved[f"pos.{material}"] = pos
+            moved[f"velocity_history.{material}"] = torch.cat([history[:, 1:], vel[:, None]], dim=1)
+            further[f"acceleration.{material}"] = acc
+        for material, values in predicted.stress.items():
+            further[f"stress.{material}"] = values.double() * self.simulator.stress_std
+        return moved, further
+
+    def graph(self, scene: Scene) -> HeteroData:
+        """The graph that the builder makes of the same state."""
+        data = HeteroData()
+        for material in self.spec.materials:
+            store = data[material]
+            store.x = material_features(scene[f"velocity_history.{material}"], scene["gravity"], self.scales)
+            store.material_params, store.mass = scene[f"material_params.{material}"].float(), scene[f"mass.{material}"].float()
+            if self.spec.islands:
+                store.pos, store.island = scene[f"pos.{material}"].float(), scene[f"island.{material}"]
+        if self.spec.islands:
+            data.island_is_free = scene["island_is_free"]
+            data.num_islands = torch.full((1,), scene["island_is_free"].shape[0])
+        pos, vel, normal, friction, restitution = (scene[f"boundary.{name}"] for name in BOUNDARY_FIELDS)
+        boundary = Boundary(pos, vel, normal, friction, restitution)
+        data[BOUNDARY].x = boundary_features(boundary, self.scales)
+        self._add_radius_edges(data, scene, boundary)
+        self._add_mesh(data, scene)
+        return data
+
+    def _edges(self, scene: Scene, relation: EdgeType) -> Tensor:
+        return scene[f"edges.{'.'.join(relation)}"]
+
+    def _add_radius_edges(self, data: HeteroData, scene: Scene, boundary: Boundary) -> None:
+        pos = {m: scene[f"pos.{m}"] for m in self.spec.materials} | {BOUNDARY: boundary.pos}
+        vel = {m: scene[f"velocity_history.{m}"][:, -1] for m in self.spec.materials} | {BOUNDARY: boundary.vel}
+        for relation in self.spec.relations:
+            source, name, target = relation
+            if name != RADIUS:
+                continue
+            store = data[relation]
+            j, i = store.edge_index = self._edges(scene, relation)
+            displacement, relative_velocity = pos[target][i] - pos[source][j], vel[target][i] - vel[source][j]
+            normal = boundary.normal[j] if source == BOUNDARY else None
+            store.odd, store.even = edge_features(self.features, displacement, relative_velocity, normal, self.scales)
+            store.offset = store.odd[:, : self.spec.dim]
+
+    def _add_mesh(self, data: HeteroData, scene: Scene) -> None:
+        """Virtual nodes, each moving as the mean of its children, and the edges of meshes."""
+        relations = [r for r in self.spec.relations if r[1] != RADIUS]
+        if not relations:
+            return
+        dim, values, mass = self.spec.dim, dict[str, Tensor](), dict[str, Tensor]()
+        for m in dict.fromkeys(target for _, name, target in relations if name == CELL):
+            values[m] = torch.cat([scene[f"pos.{m}"], scene[f"rest_pos.{m}"], scene[f"velocity_history.{m}"].flatten(1)], dim=1)
+            mass[m] = scene[f"mass.{m}"][:, None]
+        width = next(iter(values.values())).shape[1]
+        for level in range(1, self.spec.num_levels + 1):
+            name = grid(level)
+            size = scene[f"num_nodes.{name}"]
+            total, weighted = size.new_zeros(size.shape[0], 1), size.new_zeros(size.shape[0], width)
+            for relation in relations:
+                if relation[:2] == (name, DOWN):
+                    (j, i), child = self._edges(scene, relation), relation[2]
+                    total = total.index_add(0, j, mass[child][i])
+                    weighted = weighted.index_add(0, j, mass[child][i] * values[child][i])
+            mass[name], values[name] = total, weighted / total
+            motion = values[name][:, 2 * dim :].unflatten(1, (-1, dim))
+            data[name].x = virtual_features(motion, torch.full((size.shape[0],), level), scene["gravity"], self.scales)
+        for relation in relations:
+            source, name, target = relation
+            store = data[relation]
+            j, i = store.edge_index = self._edges(scene, relation)
+            difference = values[target][i] - values[source][j]
+            level_of_source = None if name == CELL else torch.full((j.shape[0],), level_of(source))
+            store.odd, store.even = mesh_features(
+                self.features, difference[:, :dim], difference[:, dim : 2 * dim], difference[:, -dim:], level_of_source, self.scales
+            )
+
+
+def describe(simulator: LearnedSimulator) -> dict[str, Input]:
+    """The tensors that a program of this simulator takes, by name."""
+    builder, spec, dim = simulator.builder, simulator.builder.spec, simulator.builder.spec.dim
+    history = builder.config.history
+    inputs = {"gravity": Input((dim,), "float64", "m/s^2", "external acceleration")}
+    meshes = {r[2] for r in spec.relations if r[1] == CELL}
+    for m in spec.materials:
+        parameter = MATERIALS[m]
+        inputs |= {
+            f"pos.{m}": Input((m, dim), "float64", "m", "positions"),
+            f"velocity_history.{m}": Input(
+                (m, history, dim), "float64", "m/s", "differences of the last positions by frame_dt, oldest first"
+            ),
+            f"material_params.{m}": Input((m, 1), "float64", parameter.unit, parameter.name),
+            f"mass.{m}": Input((m,), "float64", "kg", "mass (per metre of depth in 2D)"),
+        }
+        if m in meshes:
+            inputs[f"rest_pos.{m}"] = Input((m, dim), "float64", "m", "undeformed positions")
+        if spec.islands:
+            doc = "number of the connected group, within the data set's radius or a mesh"
+            inputs[f"island.{m}"] = Input((m,), "int64", "1", doc)
+    if spec.islands:
+        doc = "whether nothing of a group is tied to the boundary, now and in the frame before"
+        inputs["island_is_free"] = Input(("island",), "bool", "1", doc)
+    vector: tuple[int | str, ...] = (BOUNDARY, dim)
+    inputs |= {
+        "boundary.pos": Input(vector, "float64", "m", "points of walls and obstacles, about one spacing apart"),
+        "boundary.vel": Input(vector, "float64", "m/s", "their velocities"),
+        "boundary.normal": Input(vector, "float64", "1", "unit normals into free space"),
+        "boundary.friction": Input((BOUNDARY,), "float64", "1", "Coulomb coefficient; 1e6 or more is no-slip"),
+        "boundary.restitution": Input((BOUNDARY,), "float64", "1", "part of the normal velocity that a bounce returns"),
+    }
+    for level in range(1, spec.num_levels + 1):
+        name = grid(level)
+        inputs[f"num_nodes.{name}"] = Input(
+            (name, 0), "float64", "1", f"no values: its length is the number of virtual nodes of level {level}"
+        )
+    for relation in spec.relations:
+        source, name, target = relation
+        doc = f"rows of {source} (row 0) and {target} (row 1)"
+        inputs[f"edges.{'.'.join(relation)}"] = Input((2, f"edge.{'.'.join(relation)}"), "int64", "1", doc)
+    return inputs
+
+
+def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
+    """The tensors that a program of this simulator takes, for a state with velocity history."""
+    builder, spec = simulator.builder, simulator.builder.spec
+    graph = GraphBuilder(replace(builder.config, trim_boundary=False), builder.metadata)(state)
+    rest_pos = state.pos if state.rest_pos is None else state.rest_pos
+    scene: Scene = {"gravity": state.gravity} | {f"boundary.{name}": getattr(state.boundary, name) for name in BOUNDARY_FIELDS}
+    for m in spec.materials:
+        rows, column = graph[m].node_id, builder.metadata.param_names.index(MATERIALS[m].name)
+        values = {
+            "pos": state.pos[rows],
+            "velocity_history": history_of(state)[rows],
+            "material_params": state.material_params[rows, column : column + 1],
+            "mass": state.mass[rows],
+            "rest_pos": rest_pos[rows],
+        }
+        if spec.islands:
+            values["island"] = graph[m].island
+        scene |= {f"{name}.{m}": value for name, value in values.items()}
+    if spec.islands:
+        scene["island_is_free"] = graph.island_is_free
+    scene |= {f"num_nodes.{t}": state.pos.new_empty(graph[t].num_nodes, 0) for t in spec.node_types if t.startswith("grid_")}
+    scene |= {f"edges.{'.'.join(r)}": graph[r].edge_index for r in spec.relations}
+    return {name: scene[name] for name in describe(simulator)}
+
+
+def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
+    """Write a simulator's step as a ``torch.export`` program, atomically; ``path`` ends in ``.pt2``.
+
+    Raises:
+        PortableError: the data set is periodic.
+        ValueError: another file type.
+    """
+    path = Path(path)
+    if path.suffix != ".pt2":
+        raise ValueError(f"{path}: an exported program ends in .pt2")
+    step = PortableStep(copy.deepcopy(simulator).cpu().eval())
+    inputs = describe(simulator)
+    example, sizes = _example(inputs)
+    dims = {name: Dim(re.sub(r"\W", "_", name)) for name in sizes}
+    shapes = {name: {k: dims[n] for k, n in enumerate(i.shape) if isinstance(n, str)} for name, i in inputs.items()}
+    with torch.no_grad():
+        program = torch.export.export(step, (example,), dynamic_shapes=(shapes,))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part.pt2")
+    try:
+        torch.export.save(program, temporary, extra_files={DESCRIPTION: json.dumps(_description(simulator, inputs), indent=1)})
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _description(simulator: LearnedSimulator, inputs: dict[str, Input]) -> dict[str, Any]:
+    """What one has to know to use a program, as plain values."""
+    builder = simulator.builder
+    return {
+        "model": type(simulator.model).__name__,
+        "dataset": builder.metadata.dataset,
+        "frame_dt": builder.metadata.frame_dt,
+        "spacing": builder.metadata.spacing,
+        "connectivity_radius": builder.scales.radius,
+        "island_radius": builder.metadata.connectivity_radius if builder.spec.islands else None,
+        "inputs": {name: asdict(about) for name, about in inputs.items()},
+    }
+
+
+def _example(inputs: dict[str, Input]) -> tuple[Scene, dict[str, int]]:
+    """Some scene, from which ``torch.export`` learns the operations, and its sizes: all different, so that none seems to depend on another."""
+    names = dict.fromkeys(n for i in inputs.values() for n in i.shape if isinstance(n, str))
+    sizes = {name: 5 + 2 * k for k, name in enumerate(names)}
+    random = torch.Generator().manual_seed(0)
+
+    def integers(high: int, *shape: int) -> Tensor:
+        return torch.randint(high, shape, generator=random)
+
+    scene: Scene = {}
+    for name, about in inputs.items():
+        shape = tuple(sizes[n] if isinstance(n, str) else n for n in about.shape)
+        if name.startswith("edges."):
+            _, source, _, target = name.split(".")
+            scene[name] = torch.cat([integers(sizes[source], 1, shape[1]), integers(sizes[target], 1, shape[1])])
+        elif name == "island_is_free":
+            scene[name] = integers(2, *shape) > 0
+        elif about.dtype == "int64":
+            scene[name] = integers(sizes["island"], *shape)
+        else:
+            scene[name] = 1 + torch.rand(shape, dtype=torch.float64, generator=random)
+    return scene, sizes

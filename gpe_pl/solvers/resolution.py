@@ -1,0 +1,200 @@
+"""The same scene at another resolution, and where its nodes were: what a study of a solver's convergence needs.
+
+Particles are divided into 2^dim children or merged in groups as large, with their mass; meshes have their cells divided, or their outline meshed anew with
+longer edges. ``Resolved.restrict`` gives the positions of the nodes that the scene had before.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+from gpe_pl.meshing import triangulate
+from gpe_pl.trajectory import State, Stress
+
+Positions = Float[np.ndarray, "node dim"]
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """A scene at another resolution.
+
+    Attributes:
+        state: initial state.
+        restrict: from positions of its nodes [m] to those of the nodes of the scene that it came from.
+    """
+
+    state: State
+    restrict: Callable[[np.ndarray], np.ndarray]
+
+
+def finer(state: State, spacing: float) -> Resolved:
+    """Half the spacing [m] between nodes.
+
+    Raises:
+        ValueError: the mesh is of cells that are not triangles.
+    """
+    return _divided_particles(state, spacing) if state.cells is None or not len(state.cells) else _divided_triangles(state)
+
+
+def coarser(state: State, spacing: float, factor: float = 2.0) -> Resolved:
+    """So many times the spacing [m] between nodes.
+
+    Raises:
+        ValueError: the mesh is of cells that are not triangles, or too coarse a mesh would be left.
+    """
+    if state.cells is None or not len(state.cells):
+        return _merged_particles(state, factor * spacing)
+    return _remeshed(state, factor * spacing)
+
+
+# --- particles --------------------------------------------------------------------------------------------------------------------------------
+
+
+def _divided_particles(state: State, spacing: float) -> Resolved:
+    dim, count = state.dim, state.num_nodes
+    shifts = spacing / 4 * np.array(list(itertools.product((-1, 1), repeat=dim)))
+    children = len(shifts)
+    pos = (state.pos[:, None] + shifts).reshape(-1, dim)
+    rows = np.repeat(np.arange(count), children)
+    return Resolved(_rows(state, rows, pos, state.mass[rows] / children), lambda pos: pos.reshape(count, children, dim).mean(axis=1))
+
+
+def _merged_particles(state: State, size: float) -> Resolved:
+    """Particles of one type and parameters in one cell of a lattice become one at their centre of mass; each keeps its place beside it."""
+    cell = np.floor(state.pos / size).astype(np.int64)
+    kind = np.column_stack([cell, state.node_type, np.nan_to_num(state.material_params, nan=-1.0)])
+    _, first, group = np.unique(kind, axis=0, return_index=True, return_inverse=True)
+    group = group.ravel()
+    mass = np.bincount(group, state.mass)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(group, state.mass * column) / mass for column in values.T], axis=1)
+
+    pos = mean(state.pos)
+    beside = state.pos - pos[group]
+    merged = replace(_rows(state, first, pos, mass), vel=mean(state.vel))
+    return Resolved(merged, lambda pos: pos[group] + beside)
+
+
+def _rows(state: State, rows: np.ndarray, pos: np.ndarray, mass: np.ndarray) -> State:
+    """A state of particles made of these rows."""
+    return replace(
+        state,
+        pos=pos,
+        vel=state.vel[rows],
+        node_type=state.node_type[rows],
+        mass=mass,
+        material_params=state.material_params[rows],
+        velocity_history=None,
+        rest_pos=None,
+        cells=None,
+        internal=None,
+    )
+
+
+# --- triangles --------------------------------------------------------------------------------------------------------------------------------
+
+
+def _check_triangles(state: State) -> None:
+    if state.dim != 2 or state.cells is None or state.cells.shape[1] != 3:
+        raise ValueError("only meshes of triangles can be divided or meshed anew")
+
+
+def _divided_triangles(state: State) -> Resolved:
+    """Every triangle becomes four; the old nodes come first and keep their numbers."""
+    _check_triangles(state)
+    count, cells = state.num_nodes, state.cells
+    assert cells is not None
+    sides = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, number = np.unique(sides, axis=0, return_inverse=True)
+    ab, bc, ca = (count + number.reshape(-1, 3)).T
+    a, b, c = cells.T
+    divided = np.concatenate([np.stack(corners, axis=1) for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+
+    def with_middles(values: np.ndarray) -> np.ndarray:
+        return np.concatenate([values, values[edges].mean(axis=1)])
+
+    return Resolved(
+        _mesh_state(state, with_middles(state.pos), divided, with_middles(state.vel), with_middles(state.material_params)),
+        lambda pos: pos[:count],
+    )
+
+
+def _remeshed(state: State, spacing: float) -> Resolved:
+    """The outline of the mesh filled with new triangles; old nodes move with the triangle that is nearest to them."""
+    _check_triangles(state)
+    assert state.cells is not None
+    loops = [state.pos[loop] for loop in outline(state.cells)]
+    points, cells = triangulate(loops, spacing, np.random.default_rng(0))
+    nodes, weights = _locate(points, cells, state.pos)
+    near = cKDTree(state.pos).query(points)[1]
+    # a velocity field that is linear in space, translation and spin, is taken over exactly
+    linear = np.column_stack([np.ones(state.num_nodes), state.pos])
+    field = np.linalg.lstsq(linear, state.vel, rcond=None)[0]
+    rest = state.vel - linear @ field
+    vel = np.column_stack([np.ones(len(points)), points]) @ field + rest[near]
+    state = _mesh_state(state, points, cells, vel, state.material_params[near])
+    return Resolved(state, lambda pos: np.einsum("nc,ncd->nd", weights, pos[nodes]))
+
+
+def _mesh_state(state: State, pos: np.ndarray, cells: np.ndarray, vel: np.ndarray, params: np.ndarray) -> State:
+    """A state of another mesh of the same body, as heavy as before."""
+    corners = pos[cells]
+    area = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 2
+    share = np.bincount(cells.ravel(), np.repeat(area / 3, 3), minlength=len(pos))
+    stress = None if state.stress is None else Stress(np.zeros((len(pos), 4)), np.zeros((len(cells), 4)))
+    return replace(
+        state,
+        pos=pos,
+        vel=vel,
+        node_type=np.full(len(pos), state.node_type[0]),
+        mass=share / share.sum() * state.mass.sum(),
+        material_params=params,
+        velocity_history=None,
+        rest_pos=pos.copy(),
+        cells=cells,
+        stress=stress,
+        internal=None,
+    )
+
+
+def outline(cells: Int[np.ndarray, "cell 3"]) -> list[list[int]]:
+    """The closed loops of nodes along the edges that only one triangle has.
+
+    Raises:
+        ValueError: loops touch in a node.
+    """
+    sides = cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+    _, number, count = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True)
+    once = sides[count[number.ravel()] == 1]
+    following = dict(once.tolist())
+    if len(following) != len(once):
+        raise ValueError("two outlines of the mesh touch in a node")
+    loops = []
+    while following:
+        first, node = following.popitem()
+        loop = [first]
+        while node != first:
+            loop.append(node)
+            node = following.pop(node)
+        loops.append(loop)
+    return loops
+
+
+def _locate(points: np.ndarray, cells: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The triangle [node, 3] that holds each wanted point, or of the nearest ones that from which it is least far outside, and its barycentric weights."""
+    a = points[cells[:, 0]]
+    inverse = np.linalg.inv(np.stack([points[cells[:, 1]] - a, points[cells[:, 2]] - a], axis=2))
+    num_near = min(12, len(cells))
+    near = cKDTree(points[cells].mean(axis=1)).query(wanted, num_near)[1].reshape(len(wanted), num_near)
+    local = np.einsum("nkij,nkj->nki", inverse[near], wanted[:, None] - a[near])
+    weights = np.concatenate([1 - local.sum(axis=2, keepdims=True), local], axis=2)
+    best = np.argmax(weights.min(axis=2), axis=1)
+    rows = np.arange(len(wanted))
+    return cells[near[rows, best]], weights[rows, best]

@@ -1,0 +1,417 @@
+"""Run time against error for solvers and learned models on the same axes: who is more accurate at equal cost, and cheaper at equal accuracy.
+
+The reference is the solver at half the spacing between nodes, and thereby at a substep at most half as long, with its observed order of convergence.
+Everything is compared with it, the solver that made the training data too: its error is the floor of what can be learned from them. Protocol after McGreivy
+and Hakim 2024 (arXiv 2407.07218): a solver always has a resolution to turn down, and only equal cost or equal accuracy may be compared.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from gpe_pl.baselines import Ballistic, ConstantVelocity
+from gpe_pl.containment import Contained
+from gpe_pl.errors import GpeError
+from gpe_pl.generation import DatasetSpec, generate_trajectory, initial_state
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.metrics import bootstrap_interval, energy_distance
+from gpe_pl.report import Run, finished_runs, table_row
+from gpe_pl.rollout import SimulationError, Simulator
+from gpe_pl.schema import Split
+from gpe_pl.solvers.resolution import Resolved, coarser, finer
+from gpe_pl.trajectory import State, Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+log = logging.getLogger(__name__)
+
+Family = Literal["solver", "learned", "trivial"]
+DATA = "solver, as for the data"
+BALLISTIC = "ballistic"
+
+
+class ComparisonError(GpeError, ValueError):
+    """Nothing can be compared; the message says what is missing."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A data set: what ``python -m gpe_pl.simulate`` would be given."""
+
+    overrides: list[str]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is compared.
+
+    Attributes:
+        cases: data sets, by name.
+        runs: folders of finished runs; the models among them that were trained on a case's data set take part.
+        factors: how many times coarser than the data the solver is also run.
+        split, num_trajectories: scenes.
+        horizons: frames over which errors are averaged; the full length is always added.
+        num_threads: of PyTorch; the solvers use one.
+    """
+
+    cases: dict[str, Case]
+    runs: list[str]
+    factors: list[Annotated[float, Field(gt=1)]] = field(default_factory=lambda: [1.5, 2.0, 3.0])
+    split: Split = "test_unseen"
+    num_trajectories: Annotated[int, Field(ge=1)] = 5
+    horizons: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [20, 50, 100])
+    num_threads: Annotated[int, Field(ge=1)] = 1
+
+
+@dataclass
+class Point:
+    """A simulator on the two axes.
+
+    Attributes:
+        name: of the simulator.
+        family: what kind it is.
+        seconds: wall time over simulated time, of each scene.
+        mse: [m²] over the frames up to each horizon, of each scene; infinite where it failed.
+        distance: energy distance [m] to the reference in the last frame, of each scene: a difference of distributions, for when the error of single nodes
+            says nothing any more.
+        overhead: seconds of training and of generating its data.
+    """
+
+    name: str
+    family: Family
+    seconds: list[float] = field(default_factory=list)
+    mse: dict[str, list[float]] = field(default_factory=dict)
+    distance: list[float] = field(default_factory=list)
+    overhead: float = 0.0
+
+    def error(self, horizon: str) -> float:
+        return float(np.mean(self.mse[horizon]))
+
+    @property
+    def cost(self) -> float:
+        return float(np.median(self.seconds))
+
+
+def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
+    """Records of every simulator in every case, and a Markdown table per case with a section on where learning loses."""
+    torch.set_num_threads(settings.num_threads)
+    records: list[dict[str, Any]] = []
+    parts = []
+    finished = [run for folder in settings.runs for run in finished_runs(Path(folder))]
+    for name, spec in specs.items():
+        models = _models(finished, spec)
+        if not models:
+            raise ComparisonError(
+                f"{' and '.join(settings.runs)}: no finished run that was trained on the data set {spec.name!r} of size {spec.size!r}; train with "
+                f"`python -m gpe_pl.fit experiment=table1 size={spec.size}` or set suite.runs"
+            )
+        log.info("%s: %d models", name, len(models))
+        points, order = compare(spec, models, settings)
+        records += list(_records(name, points, order))
+        parts.append(_section(name, points, order, settings.num_trajectories))
+    return records, "\n\n".join(parts)
+
+
+def _models(runs: Sequence[Run], spec: DatasetSpec) -> dict[str, tuple[LearnedSimulator, float]]:
+    """Trained simulators and the seconds of their training, by model and width; the first seed of each."""
+    models: dict[str, tuple[LearnedSimulator, float]] = {}
+    for run in runs:
+        if (run.config["data.name"], run.config["size.name"]) == (spec.name, spec.size):
+            depth = run.config.get("model.num_message_passing_steps", run.config.get("model.num_propagation_steps"))
+            size = f"{depth or run.config.get('model.num_convolutions')} × {run.config['model.hidden_channels']}"
+            label = f"{str(run.config['model._target_']).rpartition('.')[2]} {size}"
+            if label not in models:
+                minutes = run.config.get("size.comparison.budget_minutes")
+                simulator = LearnedSimulator.from_checkpoint(run.folder / "checkpoints" / "best.ckpt")
+                models[label] = simulator, 60 * float(cast(float, minutes)) if minutes is not None else float("nan")
+    return models
+
+
+def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]], settings: Settings) -> tuple[list[Point], float]:
+    """All simulators on the same scenes, and the solver's observed order of convergence."""
+    history = max(simulator.builder.config.history for simulator, _ in models.values())
+    points: dict[str, Point] = {}
+    orders = []
+    for index in range(settings.num_trajectories):
+        data = generate_trajectory(spec, settings.split, index)
+        start = initial_state(spec, settings.split, index)
+        reference = _reference(spec, start, data)
+        orders.append(_order(spec, start, data, reference))
+        truth = reference.frames(history)
+        for name, family, simulator, at in _simulators(spec, start, data, models, history, settings):
+            point = points.setdefault(name, Point(name, family))
+            prediction, seconds = _timed(simulator, at, data, history)
+            point.seconds.append(seconds)
+            error = _squared_error(prediction, truth)[1:]
+            for horizon in (*(h for h in settings.horizons if h <= len(error)), None):
+                point.mse.setdefault("full" if horizon is None else str(horizon), []).append(float(np.mean(error[:horizon])))
+            point.distance.append(_distance(prediction, truth))
+    generation = points[DATA].cost * spec.num_train * (spec.num_frames - 1) * spec.solver.frame_dt
+    for label, (_, training) in models.items():
+        points[label].overhead = training + generation
+    return [*points.values()], float(np.nanmedian(orders))
+
+
+# --- simulators -------------------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Restricted:
+    """Where a simulator starts, and how the positions of its nodes become those of the scene's."""
+
+    resolved: Resolved
+    from_start: bool
+
+
+def _simulators(
+    spec: DatasetSpec,
+    start: State,
+    data: Trajectory,
+    models: dict[str, tuple[LearnedSimulator, float]],
+    history: int,
+    settings: Settings,
+) -> Iterator[tuple[str, Family, Simulator, _Restricted]]:
+    """Solvers start with the scene, the others where learned models have the history they need."""
+    same = Resolved(start, lambda pos: pos)
+    yield DATA, "solver", spec.solver, _Restricted(same, True)
+    for factor in settings.factors:
+        solver = _solver(spec, factor)
+        try:
+            resolved = coarser(start, spec.scene.spacing, factor)
+        except ValueError as error:
+            log.info("%s: no scene %g times coarser (%s)", spec.name, factor, error)
+            continue
+        if solver is not None:
+            yield f"solver, spacing × {factor:g}", "solver", solver, _Restricted(resolved, True)
+    dt = spec.solver.frame_dt
+    for label, (simulator, _) in models.items():
+        state = simulator.initial_state(data, history)
+        yield label, "learned", Contained(simulator, dt), _Restricted(Resolved(state, lambda pos: pos), False)
+    for name, baseline in ((BALLISTIC, Ballistic(dt)), ("constant velocity", ConstantVelocity(dt))):
+        state = data.state(history, history)
+        yield name, "trivial", baseline, _Restricted(Resolved(state, lambda pos: pos), False)
+
+
+def _solver(spec: DatasetSpec, factor: float) -> Any | None:
+    """The solver for nodes so many times farther apart: on a grid as much coarser, if it has one; None where that does not fit the domain."""
+    solver: Any = spec.solver
+    spacing = getattr(solver, "grid_spacing", None)
+    if spacing is None:
+        return solver
+    cells = [max(1, round((high - low) / (factor * spacing))) for low, high in solver.bounds]
+    wanted = (solver.bounds[0][1] - solver.bounds[0][0]) / cells[0]
+    try:
+        return replace(solver, grid_spacing=wanted)
+    except ValueError as error:
+        log.info("%s: no grid %g times coarser (%s)", spec.name, factor, error)
+        return None
+
+
+def _reference(spec: DatasetSpec, start: State, data: Trajectory) -> Trajectory:
+    """The solver at half the spacing, seen at the nodes of the scene."""
+    resolved = finer(start, spec.scene.spacing)
+    prediction, _ = _timed(_solver(spec, 0.5), _Restricted(resolved, True), data, 0)
+    if prediction.num_frames < data.num_frames:
+        raise ComparisonError(f"{spec.name}: the reference solution failed after {prediction.num_frames - 1} frames")
+    return prediction
+
+
+def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Trajectory, num_frames: int = 20) -> float:
+    """P = log₂ |u_h − u_{h/2}| / |u_2h − u_h| over the first frames, while solutions still are close to each other; NaN where 2h does not fit."""
+    solver = _solver(spec, 2.0)
+    try:
+        resolved = coarser(start, spec.scene.spacing, 2.0)
+    except ValueError:
+        return float("nan")
+    if solver is None:
+        return float("nan")
+    few = data.frames(0, min(num_frames, data.num_frames - 1) + 1)
+    coarse, _ = _timed(solver, _Restricted(resolved, True), few, 0)
+    if coarse.num_frames < few.num_frames:
+        return float("nan")
+    first = np.sqrt(np.mean(np.square(few.pos.astype(np.float64) - reference.pos[: few.num_frames])))
+    second = np.sqrt(np.mean(np.square(coarse.pos - few.pos)))
+    return float(np.log2(second / first))
+
+
+def _timed(simulator: Any, at: _Restricted, data: Trajectory, history: int) -> tuple[Trajectory, float]:
+    """A rollout from frame ``history`` to the end of the data, at the nodes of the scene, and its wall time over its simulated time.
+
+    The first step is taken twice and timed once: compilation and first use of memory are not part of it. A rollout that fails ends there.
+    """
+    state: Any = at.resolved.state
+    dt = data.metadata.frame_dt
+    first = 0 if at.from_start else history
+    frames, seconds, steps = [_numpy(state)], 0.0, 0
+    try:
+        simulator.step(state)
+        for _ in range(data.num_frames - 1 - first):
+            begun = time.perf_counter()
+            state = simulator.step(state)
+            seconds += time.perf_counter() - begun
+            steps += 1
+            pos, vel = _numpy(state)
+            if not np.isfinite(pos).all():
+                break
+            frames.append((pos, vel))
+    except SimulationError as error:
+        log.info("%s stopped: %s", type(simulator).__name__, error)
+    pos = np.stack([at.resolved.restrict(p) for p, _ in frames])
+    vel = np.stack([(at.resolved.restrict(p + dt * v) - at.resolved.restrict(p)) / dt for p, v in frames])
+    trajectory = replace(data, pos=pos, vel=vel, stress=None).frames(history - first)
+    return trajectory, seconds / max(1, steps) / dt
+
+
+def _numpy(state: State) -> tuple[np.ndarray, np.ndarray]:
+    pos, vel = (x.detach().cpu().numpy() if isinstance(x, torch.Tensor) else x for x in (state.pos, state.vel))
+    return np.array(pos, dtype=np.float64), np.array(vel, dtype=np.float64)
+
+
+def _squared_error(prediction: Trajectory, truth: Trajectory) -> np.ndarray:
+    """Mean over nodes and axes [m²] of every frame; infinite in those that the prediction lacks. Frame 0 need not be the same: another resolution made it."""
+    error = np.full(truth.num_frames, np.inf)
+    count = prediction.num_frames
+    error[:count] = np.square(prediction.pos.astype(np.float64) - truth.pos[:count]).mean(axis=(1, 2))
+    return error
+
+
+def _distance(prediction: Trajectory, truth: Trajectory) -> float:
+    if prediction.num_frames < truth.num_frames:
+        return float("inf")
+    return energy_distance(prediction.pos[-1], truth.pos[-1], prediction.mass, truth.mass)
+
+
+# --- what follows from the points -------------------------------------------------------------------------------------------------------------
+
+
+def front(points: Sequence[Point], horizon: str) -> list[Point]:
+    """Those that no other one beats in both cost and error, from the cheapest on."""
+    best: list[Point] = []
+    for point in sorted(points, key=lambda p: (p.cost, p.error(horizon))):
+        if np.isfinite(point.error(horizon)) and (not best or point.error(horizon) < best[-1].error(horizon)):
+            best.append(point)
+    return best
+
+
+def hypervolume(points: Sequence[Point], horizon: str, worst: tuple[float, float]) -> float:
+    """Area in decades² that the points dominate, up to the worst cost and error: larger is better."""
+    area, limit = 0.0, worst[1]
+    for point in front(points, horizon):
+        if point.cost < worst[0] and point.error(horizon) < limit:
+            area += float(np.log10(worst[0] / point.cost) * np.log10(limit / point.error(horizon)))
+            limit = point.error(horizon)
+    return area
+
+
+def cost_at_error(points: Sequence[Point], error: float, horizon: str) -> float:
+    """Cost of a solver of that error: interpolated along the front on logarithmic axes; that of the cheapest for larger errors, infinite for smaller ones."""
+    best = front(points, horizon)
+    if not best or error < best[-1].error(horizon):
+        return float("inf")
+    if error >= best[0].error(horizon):
+        return best[0].cost
+    errors = np.log([p.error(horizon) for p in best[::-1]])
+    costs = np.log([p.cost for p in best[::-1]])
+    return float(np.exp(np.interp(np.log(error), errors, costs)))
+
+
+def break_even(point: Point, solvers: Sequence[Point], horizon: str, duration: float) -> float:
+    """Rollouts of a duration [s] after which training has paid off against an error-equivalent solver; infinite if never."""
+    saved = (cost_at_error(solvers, point.error(horizon), horizon) - point.cost) * duration
+    if saved <= 0:
+        return float("inf")
+    return 0.0 if np.isinf(saved) else point.overhead / saved
+
+
+def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[str, Any]]:
+    yield {"metric": "observed_order", "case": case, "value": order, "unit": "1"}
+    for point in points:
+        about = {"case": case, "simulator": point.name, "family": point.family}
+        yield {"metric": "time_per_simulated_second", **about, "value": point.cost, "values": point.seconds, "unit": "1"}
+        yield {"metric": "energy_distance", **about, "value": float(np.mean(point.distance)), "values": point.distance, "unit": "m"}
+        for horizon, values in point.mse.items():
+            yield {"metric": "rollout_mse", **about, "horizon": horizon, "value": float(np.mean(values)), "values": values, "unit": "m²"}
+        yield {"metric": "overhead", **about, "value": point.overhead, "unit": "s"}
+    for horizon in points[0].mse:
+        worst = max(p.cost for p in points), max(p.error(horizon) for p in points if p.name == BALLISTIC)
+        for family in ("solver", "learned"):
+            value = hypervolume([p for p in points if p.family == family], horizon, worst)
+            yield {"metric": "hypervolume", "case": case, "family": family, "horizon": horizon, "value": value, "unit": "decade²"}
+
+
+def _points(records: Sequence[dict[str, Any]], case: str) -> list[Point]:
+    """The points that ``_records`` wrote."""
+    points: dict[str, Point] = {}
+    for r in records:
+        if r["case"] == case and "simulator" in r:
+            point = points.setdefault(r["simulator"], Point(r["simulator"], r["family"]))
+            if r["metric"] == "time_per_simulated_second":
+                point.seconds = r["values"]
+            elif r["metric"] == "rollout_mse":
+                point.mse[r["horizon"]] = r["values"]
+    return [*points.values()]
+
+
+def _section(case: str, points: Sequence[Point], order: float, num_trajectories: int) -> str:
+    horizons = [*points[0].mse]
+    solvers = [p for p in points if p.family == "solver"]
+    header = ["", "time per simulated second", *(f"MSE @{h}" for h in horizons), "energy distance [mm]"]
+    lines = [table_row(header), "|" + "---|" * len(header)]
+    for point in sorted(points, key=lambda p: (("solver", "learned", "trivial").index(p.family), -p.cost)):
+        cells = [_interval(point.mse[h], 1e3) for h in horizons]
+        lines.append(table_row([point.name, f"{point.cost:.3g}", *cells, f"{1e3 * np.mean(point.distance):.3g}"]))
+    note = (
+        f"{num_trajectories} scenes. MSE ×1e-3 [m²] to the solver at half the spacing between nodes, whose observed order of convergence is "
+        f"{order:.1f} (positions, first 20 frames): mean and 95 % interval over scenes. `{DATA}` is the error in the "
+        "training data. Times: one core, warm, neighbour search and features included."
+    )
+    duration = 1.0
+    lost = ["", "**Where the learned models lose**", ""]
+    for point in (p for p in points if p.family == "learned"):
+        for horizon in horizons:
+            needed = cost_at_error(solvers, point.error(horizon), horizon)
+            after = break_even(point, solvers, horizon, duration)
+            if needed <= point.cost:
+                lost.append(f"- {point.name} @{horizon}: a solver of the same error takes {needed / point.cost:.2g} times its time.")
+            elif np.isinf(needed):
+                lost.append(f"- {point.name} @{horizon}: more accurate than every solver that was run.")
+            else:
+                lost.append(
+                    f"- {point.name} @{horizon}: wins, {needed / point.cost:.2g} times as fast as a solver of the same error; its training has paid off after "
+                    f"{after:.3g} simulated seconds."
+                )
+    return "\n".join([f"### {case}", "", *lines, "", note, *lost])
+
+
+def _interval(values: list[float], scale: float) -> str:
+    if not np.isfinite(values).all():
+        return f"{int((~np.isfinite(values)).sum())} of {len(values)} failed"
+    i = bootstrap_interval(np.array([values]) * scale, statistic=np.mean)
+    return f"{i.estimate:.3g} [{i.low:.3g}, {i.high:.3g}]"
+
+
+def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
+    """Cost against error, a figure per case."""
+    from gpe_pl.viz.comparison import cost_error_figure
+
+    found = {}
+    for case in dict.fromkeys(r["case"] for r in records):
+        points = _points(records, case)
+        panels = {}
+        for horizon in points[0].mse:
+            panels[f"frames 1 – {horizon}" if horizon != "full" else "all frames"] = {
+                family: [(p.name, p.cost, p.error(horizon)) for p in points if p.family == family]
+                for family in ("solver", "learned", "trivial")
+            }
+        found[f"cost_error_{case}".replace(" ", "_")] = cost_error_figure(panels, "wall time per simulated second", "rollout MSE [m²]")
+    return found

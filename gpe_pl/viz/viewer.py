@@ -1,0 +1,388 @@
+"""One HTML file that plays a rollout beside the ground truth: no server, no network, nothing to install.
+
+The page draws with WebGL 2; its parts are in ``page/``. Arrays are stored in it as base64 of zlib. Positions are rounded to 16 bits per axis,
+
+    x = low + step q,   q = 0 … 65534,   |rounding| ≤ step / 2
+
+over the region where nodes are shown, so by 8 µm in a domain of 1 m; the page says by how much. Speed and stress have 16 bits as well. The colours
+of errors follow from the positions.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import os
+import re
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt16
+from matplotlib.colors import to_rgb
+
+from gpe_pl.errors import GpeError
+from gpe_pl.geometry import Bowl, signed_distance
+from gpe_pl.schema import MATERIALS
+from gpe_pl.trajectory import Trajectory
+from gpe_pl.viz.camera import AZIMUTH, ELEVATION, vertical_axis
+from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, ColorBy, Coloring, position_error
+from gpe_pl.viz.contact_sheet import telling_color
+from gpe_pl.viz.panel import DOT, drawn_faces, outline
+from gpe_pl.viz.scenery import BACKDROP, surface_points
+
+PAGE = Path(__file__).parent / "page"
+
+LEVELS = 65535
+"""Values that 16 bits hold besides the one that means none."""
+
+FASTEST = 50.0
+"""Speeds and stresses are stored up to this many times the end of their colours: one that exploded must not take all levels."""
+
+UNITS: dict[ColorBy, tuple[str, str]] = {
+    "error": ("position error", "m"),
+    "height": ("height at the start", "m"),
+    "material": ("material", ""),
+    "speed": ("speed", "m/s"),
+    "von_mises": ("von Mises stress", "Pa"),
+}
+"""Name and unit of what colours mean."""
+
+SOLID_GRID = 512
+"""Points along the longer side of a 2D scene at which obstacles are asked for their signed distance, …"""
+SOLID_CELLS = 4
+"""… which is stored up to this many of its cells."""
+
+
+class ViewerError(GpeError, ValueError):
+    """Trajectories that do not show the same scene."""
+
+
+def write_viewer(
+    path: Path | str,
+    ground_truth: Trajectory,
+    predictions: Mapping[str, Trajectory] | None = None,
+    stride: int = 1,
+    title: str | None = None,
+) -> float:
+    """Write a page with ground truth, prediction and error side by side; the file appears complete or not at all.
+
+    Args:
+        path: ends in ``.html``.
+        ground_truth: sets the length.
+        predictions: of the same frames, by name; one of them is shown at a time. Without any, the ground truth stands alone.
+        stride: every so many frames.
+        title: of the page; by default data set and split.
+
+    Returns:
+        The largest rounding of a position that is shown [m]. Nodes more than the domain's size outside of it are not shown.
+
+    Raises:
+        ViewerError: a prediction has other nodes than the ground truth.
+        ValueError: another file type, or a stride that is not positive.
+    """
+    path = Path(path)
+    if path.suffix != ".html":
+        raise ValueError(f"{path}: a viewer ends in .html")
+    if stride < 1:
+        raise ValueError(f"stride must be positive, got {stride}")
+    trajectories = {"ground truth": ground_truth, **(predictions or {})}
+    for name, trajectory in trajectories.items():
+        if not np.array_equal(trajectory.node_type, ground_truth.node_type):
+            raise ViewerError(
+                f"{name!r} has {trajectory.num_nodes} nodes, or their materials, unlike the ground truth's {ground_truth.num_nodes}"
+            )
+    about = ground_truth.metadata
+    title = title or " ".join(word for word in (about.dataset, about.split) if word)
+    scene, arrays = _scene(trajectories, stride)
+    parts = {
+        "title": html.escape(title),
+        "style": (PAGE / "viewer.css").read_text(),
+        "arrays": "\n".join(_element(name, *value) for name, value in arrays.items()),
+        "scene": json.dumps(scene, allow_nan=False).replace("<", "\\u003c"),
+        "script": "\n".join((PAGE / name).read_text() for name in ("data.js", "render.js", "viewer.js")),
+    }
+    page = re.sub(r"\{\{(\w+)\}\}", lambda slot: parts[slot[1]], (PAGE / "viewer.html").read_text())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        temporary.write_text(page)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return float(scene["rounding"])
+
+
+Arrays = dict[str, tuple[str, np.ndarray]]
+"""Arrays of a page: kind (``frames`` of 16 bits, or a NumPy type) and values, by name."""
+
+
+def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, Any], Arrays]:
+    """What the page knows, as plain values and arrays."""
+    truth, about = trajectories["ground truth"], trajectories["ground truth"].metadata
+    frames = range(0, truth.num_frames, stride)
+    shown = {name: _inside(t.frames(0, truth.num_frames)) for name, t in trajectories.items()}
+    raster = Raster.of([t.pos[::stride] for t in shown.values()], np.asarray(about.bounds, float))
+    colorings = {by: Coloring(by, [*shown.values()], frames, shown["ground truth"]) for by in _colors(shown)}
+    steps = {by: _step(by, colorings[by], shown, frames) for by in ("speed", "von_mises") if by in colorings}
+    codes = np.unique(truth.node_type).tolist()
+    names = list(MATERIALS)
+    vertical = vertical_axis(truth)
+    scene = {
+        "dim": about.dim,
+        "nodes": truth.num_nodes,
+        "stride": stride,
+        "frameInterval": stride * about.frame_dt,
+        "decimals": max(2, int(np.ceil(-np.log10(stride * about.frame_dt)))),
+        "spacing": about.spacing,
+        "diameter": DOT * about.spacing,
+        "periods": [high - low if periodic else 0.0 for (low, high), periodic in zip(about.bounds, about.periodic, strict=True)],
+        "position": {"low": _in_3d(raster.low), "extent": _in_3d(LEVELS * raster.step)},
+        "rounding": float(raster.step.max() / 2),
+        "order": np.roll(np.arange(3), 2 - vertical).tolist(),  # as ``Camera``: right-handed, with the vertical last
+        "azimuth": AZIMUTH,
+        "elevation": ELEVATION,
+        "neutral": to_rgb(REFERENCE),
+        "materials": [{"name": names[code], "color": MATERIAL_COLORS[names[code]]} for code in codes],
+        "nodeMaterials": names,
+        "colors": [_color(by, coloring) for by, coloring in colorings.items()],
+        "steps": steps,
+        "trajectories": [],
+        **_focus(truth),
+    }
+    arrays: Arrays = {f"map_{by}": ("uint8", _color_map(coloring)) for by, coloring in colorings.items()}
+    for by in ("height", "material"):
+        arrays[f"all_{by}"] = ("float32", colorings[by].values(shown["ground truth"], 0)[0])  # type: ignore[index]
+    for number, (name, trajectory) in enumerate(shown.items()):
+        kept = [frame for frame in frames if frame < trajectory.num_frames]
+        fields = {"pos": raster(trajectory.pos[kept])}
+        for by, step in steps.items():
+            if by != "von_mises" or trajectory.stress is not None:
+                fields[by] = _levels(np.stack([colorings[by].values(trajectory, frame)[0] for frame in kept]), step)
+        arrays |= {f"t{number}_{field}": ("frames", values) for field, values in fields.items()}
+        stop = trajectory.termination
+        scene["trajectories"].append(
+            {
+                "id": f"t{number}",
+                "name": name,
+                "frames": len(kept),
+                "fields": [*fields],
+                "stopped": "not simulated" if stop is None else f"stopped at {stop.frame * about.frame_dt:.2f} s ({stop.reason})",
+                "rmse": None if number == 0 else _rmse(trajectory, shown["ground truth"], frames),
+            }
+        )
+    arrays |= {name: ("uint32", values) for name, values in _mesh(truth).items()}
+    if about.dim == 2:
+        solid, scenery = _scenery_2d(truth)
+        scene |= solid
+    else:
+        scenery = _scenery_3d(truth)
+    return scene, arrays | scenery
+
+
+def _inside(trajectory: Trajectory) -> Trajectory:
+    """The same with all nodes inside the domain along its periodic axes."""
+    pos = np.array(trajectory.pos)
+    for axis, ((low, high), periodic) in enumerate(zip(trajectory.metadata.bounds, trajectory.metadata.periodic, strict=True)):
+        if periodic:
+            pos[..., axis] = low + np.mod(pos[..., axis] - low, high - low)
+    return replace(trajectory, pos=pos)
+
+
+def _colors(trajectories: Mapping[str, Trajectory]) -> list[ColorBy]:
+    """What nodes can be coloured by, the most telling first."""
+    shown = [*trajectories.values()]
+    colors: list[ColorBy] = ["height", "speed", "material"]
+    if any(trajectory.stress is not None for trajectory in shown):
+        colors.append("von_mises")
+    if len(shown) > 1:
+        colors.append("error")
+    return sorted(colors, key=lambda by: by != telling_color(shown))
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Positions as 16-bit integers.
+
+    Attributes:
+        low: of the region that is shown [dim] in m.
+        step: between neighbouring values [dim] in m.
+    """
+
+    low: Float[np.ndarray, " dim"]
+    step: Float[np.ndarray, " dim"]
+
+    @classmethod
+    def of(cls, positions: Sequence[Float[np.ndarray, "_ node dim"]], bounds: Float[np.ndarray, "dim 2"]) -> Raster:
+        """The smallest region with the domain and all nodes that are less than the domain's size outside of it."""
+        low, high = bounds.T.copy()
+        size = float(np.max(high - low))
+        for pos in positions:
+            for axis, values in enumerate(np.moveaxis(pos, -1, 0)):
+                near = values[(values >= bounds[axis, 0] - size) & (values <= bounds[axis, 1] + size)]  # a NaN is not
+                if near.size:
+                    low[axis], high[axis] = min(low[axis], float(near.min())), max(high[axis], float(near.max()))
+        return cls(low, (high - low) / (LEVELS - 1))
+
+    def __call__(self, pos: Float[np.ndarray, "frame node dim"]) -> UInt16[np.ndarray, "frame node dim"]:
+        """Rounded positions; all axes of a node outside of the region have the value 65535."""
+        with np.errstate(invalid="ignore"):
+            level = np.round((pos - self.low) / self.step)
+            outside = ~((level >= 0) & (level < LEVELS)).all(axis=-1)
+        return np.where(outside[..., None], LEVELS, np.nan_to_num(level)).astype(np.uint16)
+
+
+def _step(by: ColorBy, coloring: Coloring, trajectories: Mapping[str, Trajectory], frames: Sequence[int]) -> float:
+    """Difference of neighbouring 16-bit values of a quantity."""
+    values = [coloring.values(t, f)[0] for t in trajectories.values() for f in frames if f < t.num_frames]
+    finite = [v[np.isfinite(v)].max(initial=0.0) for v in values]
+    top = min(max(finite), FASTEST * coloring.scale.vmax)  # type: ignore[operator]
+    return float(top if top > 0 else 1.0) / (LEVELS - 1)
+
+
+def _levels(values: Float[np.ndarray, "frame node"], step: float) -> UInt16[np.ndarray, "frame node"]:
+    """A quantity in 16 bits; 65535 where there is none."""
+    known = np.isfinite(values)
+    return np.where(known, np.clip(np.round(np.where(known, values, 0.0) / step), 0, LEVELS - 1), LEVELS).astype(np.uint16)
+
+
+def _rmse(prediction: Trajectory, truth: Trajectory, frames: Sequence[int]) -> list[float | None]:
+    """Root mean square of the position error [m] in each frame, or None where there is no prediction."""
+    errors = [np.sqrt(np.mean(position_error(prediction, truth, f) ** 2)) if f < prediction.num_frames else np.nan for f in frames]
+    return [float(e) if np.isfinite(e) else None for e in errors]
+
+
+def _color(by: ColorBy, coloring: Coloring) -> dict[str, Any]:
+    name, unit = UNITS[by]
+    return {"by": by, "name": name, "label": name, "unit": unit, "low": coloring.scale.vmin, "high": coloring.scale.vmax}
+
+
+def _color_map(coloring: Coloring) -> np.ndarray:
+    return np.round(255 * coloring.color_map(np.linspace(0, 1, 256))[:, :3]).astype(np.uint8)
+
+
+def _in_3d(values: np.ndarray) -> list[float]:
+    return [*map(float, values), *[0.0] * (3 - len(values))]
+
+
+def _focus(trajectory: Trajectory) -> dict[str, Any]:
+    """The part of the scene that fills a panel, whether it is a bowl, and how far anything in it lies from its middle at most [m]."""
+    low, high = np.asarray(trajectory.metadata.bounds, float).T
+    bowls = [shape for shape in trajectory.boundary.shapes if isinstance(shape, Bowl)]
+    if bowls:
+        center, radius = np.asarray(bowls[0].center, float), bowls[0].radius
+        low, high = np.maximum(low, center - radius), np.minimum(high, center + radius)
+    bounds = np.asarray(trajectory.metadata.bounds, float)
+    return {
+        "focus": {"low": _in_3d(low), "high": _in_3d(high)},
+        "round": bool(bowls),
+        "depth": 4.0 * float(np.linalg.norm(np.ptp(bounds, axis=1))),
+    }
+
+
+def _mesh(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    """Triangles and edges of meshes, outlines of 2D meshes, and the nodes that stand for themselves."""
+    faces, _ = drawn_faces(trajectory)
+    pairs = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
+    meshed = np.empty(0, int) if trajectory.cells is None or len(faces) == 0 else trajectory.cells
+    fans = [faces[:, [0, k, k + 1]] for k in range(1, faces.shape[1] - 1)]
+    return {
+        "triangles": np.concatenate([np.empty((0, 3), int), *fans]),
+        "edges": np.unique(np.sort(pairs, axis=1), axis=0),
+        "outline": outline(trajectory),
+        "loose": np.setdiff1d(np.arange(trajectory.num_nodes), meshed),
+    }
+
+
+INK_RGB = (0.15, 0.15, 0.15)
+
+
+def _scenery_2d(trajectory: Trajectory) -> tuple[dict[str, Any], Arrays]:
+    """Walls as lines, and all solids as one picture of their signed distance."""
+    shapes: tuple[Any, ...] = trajectory.boundary.shapes
+    walls, solids = [s for s in shapes if s.kind == "wall"], tuple(s for s in shapes if s.kind != "wall")
+    lines = []
+    for wall in walls:
+        axis = int(np.argmax(np.abs(wall.normal)))
+        ends = np.array([wall.low, wall.high], float)
+        ends[:, axis] = wall.offset * wall.normal[axis]
+        lines += [(*end, 0.0, 0.0, 0.0, 0.0, *INK_RGB) for end in ends]
+    if not shapes:  # imported data knows its boundary by nodes only: a cross each
+        arm = 0.25 * trajectory.metadata.spacing
+        for x, y in trajectory.boundary.pos:
+            for dx, dy in ((arm, 0.0), (0.0, arm)):
+                lines += [(x + sign * dx, y + sign * dy, 0.0, 0.0, 0.0, 0.0, *INK_RGB) for sign in (-1, 1)]
+    arrays: Arrays = {"lines": ("float32", np.array(lines))}
+    if not solids:
+        return {}, arrays
+    bounds = np.asarray(trajectory.metadata.bounds, float)
+    cell = np.ptp(bounds, axis=1).max() / (SOLID_GRID - 1)
+    x, y = (np.linspace(low, high, max(2, round((high - low) / cell) + 1)) for low, high in bounds)
+    distance = signed_distance(solids, np.stack(np.meshgrid(x, y), axis=-1))
+    unit = 2 * SOLID_CELLS * cell
+    arrays["solid"] = ("uint8", np.clip(np.round(distance / unit * 255) + 128, 0, 255))
+    low, high = bounds.T.tolist()
+    return {"solid": {"width": len(x), "height": len(y), "low": low, "high": high, "unit": unit}}, arrays
+
+
+def _scenery_3d(trajectory: Trajectory) -> Arrays:
+    """Walls and boxes as triangles, every other surface as discs on it; each visible from its free side."""
+    bounds, spacing = np.asarray(trajectory.metadata.bounds, float), trajectory.metadata.spacing
+    shapes: tuple[Any, ...] = trajectory.boundary.shapes
+    bowls = [s for s in shapes if s.kind == "bowl"]
+    flats, lines = [], []
+    for wall in [] if bowls else [s for s in shapes if s.kind == "wall"]:  # around a bowl they would be mere packaging
+        axis = int(np.argmax(np.abs(wall.normal)))
+        corners = _face(wall.low, wall.high, axis, wall.offset * wall.normal[axis])
+        flats += _facet(corners, wall.normal, float(BACKDROP))
+        lines += [(*p, *wall.normal, 0.6, 0.6, 0.6) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True) for p in (a, b)]
+    for box in (s for s in shapes if s.kind == "box"):
+        for axis in range(3):
+            for side, value in ((-1.0, box.low[axis]), (1.0, box.high[axis])):
+                grey = 0.72 + 0.18 * (axis == vertical_axis(trajectory)) + 0.08 * (axis == 1)
+                flats += _facet(_face(box.low, box.high, axis, value), side * np.eye(3)[axis], grey)
+    pos, normal, gap = surface_points(trajectory.boundary, spacing)
+    kept = signed_distance(tuple(s for s in shapes if s.kind == "wall"), pos) > 1e-6 * spacing
+    length = np.linalg.norm(normal, axis=1)
+    kept &= length > 0
+    surface = np.column_stack([pos, normal / np.maximum(length, 1e-12)[:, None], 0.85 * gap])[kept]
+    if not shapes:
+        low, high = bounds.T
+        for axis in range(3):
+            for value in bounds[axis]:
+                corners = _face(low.tolist(), high.tolist(), axis, float(value))
+                lines += [(*p, 0, 0, 0, 0.8, 0.8, 0.8) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True) for p in (a, b)]
+    return {name: ("float32", np.array(values, float)) for name, values in (("flats", flats), ("lines", lines), ("surface", surface))}
+
+
+def _face(low: Sequence[float], high: Sequence[float], axis: int, value: float) -> Float[np.ndarray, "4 3"]:
+    """Corners of the face of a box on which a coordinate has this value, in order."""
+    first, second = (k for k in range(3) if k != axis)
+    corners = np.full((4, 3), value)
+    corners[:, first] = np.take([low[first], high[first]], [0, 1, 1, 0])
+    corners[:, second] = np.take([low[second], high[second]], [0, 0, 1, 1])
+    return corners
+
+
+def _facet(corners: Float[np.ndarray, "4 3"], normal: Any, grey: float) -> list[tuple[float, ...]]:
+    """Two triangles, as vertices with normal and colour."""
+    return [(*corners[k], *normal, grey, grey, grey) for k in (0, 1, 2, 0, 2, 3)]
+
+
+def _element(name: str, kind: str, values: np.ndarray) -> str:
+    """An array as an element of the page: little-endian, compressed, as base64."""
+    width = 0
+    if kind == "frames":
+        # Differences from frame to frame are small; all their low bytes before all high bytes compress best.
+        width = int(np.prod(values.shape[1:]))
+        flat = values.reshape(len(values), width)
+        change = np.concatenate([flat[:1], np.diff(flat, axis=0)])  # modulo 2^16
+        data = change.astype("<u2").reshape(-1, 1).view(np.uint8).T.tobytes()
+    else:
+        data = np.ascontiguousarray(values, np.dtype(kind).newbyteorder("<")).tobytes()
+    text = base64.b64encode(zlib.compress(data, 6)).decode("ascii")
+    return f'<script type="application/octet-stream" data-name="{name}" data-kind="{kind}" data-width="{width}">{text}</script>'

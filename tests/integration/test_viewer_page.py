@@ -1,0 +1,163 @@
+"""The viewer in a browser: it plays, it reacts, it asks the network for nothing. Skipped where there is no browser."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gpe_pl.schema import node_code
+from gpe_pl.trajectory import Stress, Termination, Trajectory
+from gpe_pl.viz.coloring import MATERIAL_COLORS
+from gpe_pl.viz.viewer import write_viewer
+from tests.unit.viz.conftest import falling, falling_mesh
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+SOFTWARE = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # WebGL without a graphics card
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = next((found for name in BROWSERS if (found := shutil.which(name))), None)
+    with playwright.sync_playwright() as p:
+        if path is None and not Path(p.chromium.executable_path).exists():
+            pytest.skip(f"no browser is installed: none of {', '.join(BROWSERS)}, and none of playwright's own")
+        chromium = p.chromium.launch(executable_path=path, args=SOFTWARE)
+        yield chromium
+        chromium.close()
+
+
+class Viewer:
+    """An open page, and what went wrong in it."""
+
+    def __init__(self, browser: Any, path: Path) -> None:
+        self.page = browser.new_page(viewport={"width": 900, "height": 420})
+        self.problems: list[str] = []
+        self.requests: list[str] = []
+        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
+        self.page.on("console", lambda message: self.problems.append(message.text) if message.type in ("error", "warning") else None)
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(path.as_uri())
+        self.page.wait_for_selector("#message", state="hidden", timeout=30_000)
+
+    def picture(self) -> np.ndarray:
+        """The panels as RGB [height, width, 3]."""
+        with Image.open(BytesIO(self.page.locator("#stage").screenshot())) as image:
+            return np.asarray(image.convert("RGB")).astype(int)
+
+    def colored(self, panel: int) -> np.ndarray:
+        """Rows and columns of the coloured pixels of one of three panels, its colour bar aside."""
+        picture = self.picture()[:-40]
+        width = picture.shape[1] // 3
+        return np.argwhere(np.ptp(picture[:, panel * width : (panel + 1) * width], axis=-1) > 25)
+
+
+@pytest.fixture
+def opened(browser: Any, tmp_path: Path) -> Iterator[Any]:
+    viewers: list[Viewer] = []
+
+    def open_page(truth: Trajectory, **predictions: Trajectory) -> Viewer:
+        write_viewer(tmp_path / "viewer.html", truth, predictions)
+        viewers.append(Viewer(browser, tmp_path / "viewer.html"))
+        return viewers[-1]
+
+    yield open_page
+    for viewer in viewers:
+        assert viewer.problems == []
+        assert [url.partition(":")[0] for url in viewer.requests] == ["file"]  # the page itself
+        viewer.page.close()
+
+
+def test_particles_fall_as_time_passes(opened: Any) -> None:
+    viewer = opened(falling(2), GPE=falling(2, noise=0.3))
+    first = [viewer.colored(panel)[:, 0].mean() for panel in range(3)]
+    viewer.page.locator("#frame").fill("11")
+    last = [viewer.colored(panel)[:, 0].mean() for panel in range(3)]
+    assert all(after > before + 20 for before, after in zip(first, last, strict=True))
+    assert viewer.page.locator("#time").inner_text().startswith("0.22 s   frame 11\nerror ")
+
+
+def test_it_plays_to_the_end_and_stops(opened: Any) -> None:
+    viewer = opened(falling(3), GPE=falling(3, noise=0.3))
+    viewer.page.locator("#stage").focus()
+    viewer.page.keyboard.press("ArrowRight")
+    assert "frame 1" in viewer.page.locator("#time").inner_text()
+    viewer.page.click("#play")
+    viewer.page.wait_for_selector('#play[aria-label="play"]', timeout=20_000)
+    assert "frame 11" in viewer.page.locator("#time").inner_text()
+
+
+def test_colours_mean_what_is_chosen(opened: Any) -> None:
+    truth = falling(2)
+    viewer = opened(replace(truth, node_type=np.full(truth.num_nodes, node_code("snow"), np.uint8)))
+    viewer.page.select_option("#color", "material")
+    wanted = np.array([int(MATERIAL_COLORS["snow"][k : k + 2], 16) for k in (1, 3, 5)])
+    assert (np.abs(viewer.picture() - wanted).max(axis=-1) <= 2).sum() > 200
+    viewer.page.select_option("#color", "speed")
+    assert (np.abs(viewer.picture() - wanted).max(axis=-1) <= 2).sum() == 0
+    assert viewer.page.locator(".bar").inner_text().split("\n")[:2] == ["0 m/s", "speed"]
+
+
+def test_a_mesh_is_coloured_by_its_stress(opened: Any, mesh: Trajectory) -> None:
+    assert mesh.stress is not None
+    node = np.zeros_like(mesh.stress.node)
+    node[..., 0] = np.linspace(0, 1e5, mesh.num_frames)[:, None]
+    viewer = opened(replace(mesh, stress=Stress(node, mesh.stress.cell)))
+    counts = []
+    for frame in (0, 11):
+        viewer.page.locator("#frame").fill(str(frame))
+        red, green, _ = np.moveaxis(viewer.picture()[:-40], -1, 0)
+        counts.append(int((red - green > 60).sum()))
+    assert counts[0] == 0 and counts[1] > 500
+    assert viewer.page.locator(".bar").inner_text().split("\n")[1] == "von Mises stress"
+
+
+def test_cells_do_not_stretch_across_a_periodic_domain(opened: Any) -> None:
+    mesh = falling_mesh(2)
+    metadata = replace(mesh.metadata, periodic=(True, False))
+    viewer = opened(replace(mesh, metadata=metadata, pos=mesh.pos + np.array([0.5, 0.0])))
+    viewer.page.select_option("#color", "material")
+    picture = viewer.picture()[:-40]
+    between = picture[:, 450:530]  # of the cells at both sides, and right of the loose particles
+    assert (np.ptp(picture, axis=-1) > 40).sum() > 500 and (np.ptp(between, axis=-1) > 40).sum() == 0
+
+
+def test_predictions_take_turns_and_one_that_stopped_says_why(opened: Any) -> None:
+    truth, other = falling(2), falling(2, noise=0.3)
+    stopped = replace(other.frames(0, 7), termination=Termination("explosion", 7, 0, "frame 7: too fast"))
+    viewer = opened(truth, GPE=other, GNS=stopped)
+    viewer.page.locator("#frame").fill("9")
+    assert viewer.page.locator("h2").all_inner_texts() == ["ground truth", "GPE", "error"]
+    viewer.page.select_option("#prediction", label="GNS")
+    assert viewer.page.locator("h2").all_inner_texts() == ["ground truth", "GNS", "error"]
+    notes = viewer.page.locator(".stopped:visible").all_inner_texts()
+    assert notes == ["stopped at 0.14 s (explosion)"] * 2
+    assert len(viewer.colored(0)) > 100 and len(viewer.colored(1)) == 0
+
+
+def test_the_mouse_finds_a_node_in_every_panel_and_turns_a_scene(opened: Any) -> None:
+    viewer = opened(falling(3), GPE=falling(3, noise=0.3))
+    row, column = viewer.colored(0).mean(axis=0)
+    viewer.page.mouse.move(column, row + viewer.page.locator("#stage").bounding_box()["y"])
+    assert "node" in viewer.page.locator("#tooltip").inner_text()
+    assert viewer.page.locator(".ring:visible").count() == 3
+    before = viewer.picture()
+    viewer.page.mouse.down()
+    viewer.page.mouse.move(column + 120, row + 100, steps=3)
+    viewer.page.mouse.up()
+    assert (viewer.picture() != before).any(axis=-1).mean() > 0.02
+    viewer.page.mouse.move(1, 1)
+    viewer.page.click("#reset")
+
+
+@pytest.fixture(params=[2, 3], ids=["2d", "3d"])
+def mesh(request: pytest.FixtureRequest) -> Trajectory:
+    return falling_mesh(request.param)

@@ -1,0 +1,112 @@
+"""Cost against error: what follows from points on the two axes, and that all simulators get there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
+from gpe_pl.simulate import dataset_spec
+from gpe_pl.suites import runtime_vs_error as module
+from gpe_pl.suites.runtime_vs_error import (
+    DATA,
+    Case,
+    ComparisonError,
+    Family,
+    Point,
+    Settings,
+    break_even,
+    compare,
+    cost_at_error,
+    figures,
+    front,
+    hypervolume,
+    run,
+)
+from tests.runs import compose
+
+OVERRIDES = ["data=sand", "size=tiny", "data.sizes.tiny.num_frames=24"]
+
+
+def point(name: str, cost: float, error: float, family: Family = "solver") -> Point:
+    return Point(name, family, [cost], {"full": [error]})
+
+
+LADDER = [point("fine", 8.0, 1e-4), point("medium", 2.0, 1e-3), point("worse", 3.0, 5e-3), point("coarse", 0.5, 1e-2)]
+
+
+def test_the_front_is_what_nothing_beats() -> None:
+    assert [p.name for p in front(LADDER, "full")] == ["coarse", "medium", "fine"]
+    assert [p.name for p in front([*LADDER, point("broken", 0.1, float("inf"))], "full")] == ["coarse", "medium", "fine"]
+
+
+def test_equal_error_costs_what_lies_between_two_resolutions() -> None:
+    assert cost_at_error(LADDER, 1e-3, "full") == pytest.approx(2.0)
+    assert cost_at_error(LADDER, 10**-3.5, "full") == pytest.approx(4.0)
+    assert cost_at_error(LADDER, 1.0, "full") == 0.5
+    assert cost_at_error(LADDER, 1e-5, "full") == float("inf")
+
+
+def test_training_pays_off_after_what_it_saves() -> None:
+    model = point("model", 1.0, 1e-3, "learned")
+    model.overhead = 600.0
+    assert break_even(model, LADDER, "full", duration=2.0) == pytest.approx(300.0)
+    model.seconds = [3.0]
+    assert break_even(model, LADDER, "full", duration=2.0) == float("inf")
+
+
+def test_hypervolume_is_the_area_of_steps() -> None:
+    assert hypervolume([point("a", 1.0, 1e-2)], "full", (10.0, 1.0)) == pytest.approx(2.0)
+    two = [point("a", 1.0, 1e-1), point("b", 10**0.5, 1e-2)]
+    assert hypervolume(two, "full", (10.0, 1.0)) == pytest.approx(1.0 + 0.5)
+    assert hypervolume([point("slow", 20.0, 1e-2)], "full", (10.0, 1.0)) == 0
+
+
+def untrained() -> LearnedSimulator:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    from gpe_pl.generation import trajectory_metadata
+
+    builder = GraphBuilder(GraphConfig(history=2), trajectory_metadata(spec, "test", 0))
+    return LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder)
+
+
+def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    settings = Settings({}, [], factors=[2.0], num_trajectories=1, horizons=[10])
+    points, order = compare(spec, {"GPE 1 × 8": (untrained(), 60.0)}, settings)
+    by_name = {p.name: p for p in points}
+    assert {DATA, "GPE 1 × 8", "ballistic", "constant velocity"} < set(by_name)
+    assert by_name[DATA].error("10") < by_name["solver, spacing × 2"].error("10") < by_name["constant velocity"].error("10")
+    assert all(p.cost > 0 and set(p.mse) == {"10", "full"} for p in points)
+    assert by_name["GPE 1 × 8"].overhead > 60.0
+    assert np.isfinite(order)
+
+
+def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    points = [
+        *LADDER,
+        point("model", 1.0, 2e-3, "learned"),
+        point("slow model", 9.0, 2e-3, "learned"),
+        point("ballistic", 0.01, 0.1, "trivial"),
+    ]
+    for p in points:
+        p.distance = [1e-3]
+    monkeypatch.setattr(module, "_models", lambda *_: {"model": None})
+    monkeypatch.setattr(module, "compare", lambda *_: (points, 1.3))
+    records, table = run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec})
+    assert "model @full: wins, 1.3 times as fast" in table and "slow model @full: a solver of the same error takes 0.15 times" in table
+    assert "order of convergence is 1.3" in table
+    axes = figures(records)["cost_error_sand"].axes[0]
+    assert axes.get_title() == "all frames" and len(axes.lines) == 4
+
+
+def test_nothing_to_compare_says_so(tmp_path: Path) -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    with pytest.raises(ComparisonError, match=": no finished run that was trained on the data set 'sand' of size 'tiny'"):
+        run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec})

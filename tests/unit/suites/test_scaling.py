@@ -1,0 +1,32 @@
+"""The benchmark of scaling fits what it measured."""
+
+from __future__ import annotations
+
+import pytest
+
+from gpe_pl.suites import scaling
+from gpe_pl.suites.scaling import Settings, figures, run
+
+
+def test_a_power_law_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scaling, "peak_memory", lambda *_: 1000)
+    sizes = iter([30, 60, 120] * 2)
+    times = iter(t for n in sizes for t in (1e-4 * n**1.5 / 4, 3e-4 * n**1.5 / 4))  # graph and forward
+    monkeypatch.setattr(scaling, "_fastest", lambda *_: next(times))
+    settings = Settings(num_nodes=[30, 60, 120], fitted=(30, 120), num_message_passing_steps=2, hidden_channels=8, budget=0.0)
+    records, table = run(settings)
+    found = {(r["metric"], r["case"]): r["value"] for r in records}
+    for dim in (2, 3):
+        assert found["scaling_exponent", f"{dim}d"] == pytest.approx(1.5)
+        edges = found["num_edges", f"{dim}d, 120"] / found["num_edges", f"{dim}d, 30"]
+        assert found["edge_layer_time_ratio", f"{dim}d"] == pytest.approx(8 / edges)
+    assert "N^1.500" in table and table.count("| 3D |") == 3
+    assert figures(records)["scaling"].axes[0].get_ylabel() == "time of a step [s]"
+
+
+def test_steps_of_a_scene_are_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scaling, "peak_memory", lambda *_: 1000)
+    records, _ = run(Settings(num_nodes=[40], dimensions=[3], num_message_passing_steps=1, hidden_channels=8, budget=0.0))
+    found = {r["metric"]: r["value"] for r in records}
+    assert found["step_time"] == found["graph_time"] + found["forward_time"] and found["graph_time"] > 0
+    assert "scaling_exponent" not in found

@@ -1,0 +1,64 @@
+"""The benchmark of speed runs, counts the products it claims to count, and times what it says."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.lattice import lattice_graph
+from gpe_pl.suites.speed import REFERENCE, Case, Settings, cases, flop, run, training_step
+
+SMALL = Settings(num_nodes=40, num_edges=100, num_message_passing_steps=2, hidden_channels=8, num_rounds=1, compile=False)
+
+
+@pytest.mark.parametrize(("dim", "num_nodes", "num_edges"), [(2, 400, 2000), (2, 400, 4000), (3, 1000, 7000)])
+def test_the_lattice_has_about_the_wanted_edges(dim: int, num_nodes: int, num_edges: int) -> None:
+    builder, graph = lattice_graph(num_nodes, num_edges, GraphConfig(), dim)
+    found = sum(graph[r].edge_index.shape[1] for r in builder.spec.relations)
+    assert abs(found - num_edges) < 0.02 * num_edges
+    assert graph["sand"].x.shape[0] == num_nodes and builder.spec.dim == dim
+
+
+def test_a_scene_larger_than_the_sample_that_its_radius_comes_from() -> None:
+    builder, graph = lattice_graph(50_000, 250_000, GraphConfig(history=1))
+    assert abs(sum(graph[r].edge_index.shape[1] for r in builder.spec.relations) - 250_000) < 0.02 * 250_000
+
+
+def test_products_are_counted_as_by_hand() -> None:
+    builder, graph = lattice_graph(50, 120, GraphConfig())
+    spec, hidden, steps = builder.spec, 8, 3
+    relation = ("sand", "radius", "sand")
+    edges = graph[relation].edge_index.shape[1]
+    features = spec.odd_channels[relation] + spec.even_channels[relation]
+    counted = flop(Case().build(spec, steps, hidden), graph)
+    square = 2 * hidden * hidden
+    nodes = 50 * (2 * hidden * (1 + spec.node_channels["sand"] + hidden) + square)  # material embedding and encoder
+    nodes += 50 * (steps * 4 * square + 2 * square)  # two factors, two layers of the update; the last product after the sums, at both ends
+    nodes += 50 * (square + 2 * hidden * 2)  # decoder
+    per_edge = 2 * features * hidden + square + steps * square + (steps - 1) * square
+    assert counted == nodes + edges * per_edge
+
+
+def test_a_training_step_has_gradients_and_changes_nothing() -> None:
+    builder, graph = lattice_graph(40, 100, GraphConfig())
+    model = Case().build(builder.spec, 2, 8)
+    before = {k: v.clone() for k, v in model.state_dict().items()}
+    loss = training_step(model, graph)()
+    assert loss > 0 and any(p.grad is not None and p.grad.abs().max() > 0 for p in model.parameters())
+    assert all(torch.equal(v, before[k]) for k, v in model.state_dict().items())
+
+
+def test_every_case_has_its_records_and_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gpe_pl.suites.speed.peak_memory", lambda *_: 1_000_000)
+    monkeypatch.setattr("gpe_pl.suites.speed.copy_rate", lambda *_: 1e9)
+    records, table = run(SMALL)
+    found = {(r["metric"], r["case"]): r["value"] for r in records}
+    for name, case in cases(compiled=False).items():
+        wanted = {"forward_time", "training_time", "forward_speedup", "forward_speedup_vs_gns", "training_speedup", "peak_memory"}
+        wanted |= {"forward_time_saved", "flop_floor", "byte_floor", "floor_ratio"} if case.model == "GPE" else set()
+        assert all(found[metric, name] >= 0 or metric == "forward_time_saved" for metric in wanted)
+        assert f"| {name} |" in table
+    assert found["forward_speedup", REFERENCE] == 1 and found["forward_speedup_vs_gns", "GNS"] == 1
+    assert found["neighbor_time", "cpu"] > 0
+    assert found["flop", "negated, geometry"] < found["flop", "negated"] < found["flop", REFERENCE]

@@ -1,0 +1,188 @@
+"""A step on plain tensors is the simulator's step, and its program runs where this package is not."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jaxtyping
+import numpy as np
+import pytest
+import torch
+
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.models.cconv import ContinuousConvNet
+from gpe_pl.models.dpinet import DPINet
+from gpe_pl.models.gns import GNS
+from gpe_pl.models.gpe import GPE
+from gpe_pl.portable import DESCRIPTION, PortableError, PortableStep, export_model, scene_of
+from gpe_pl.rollout import rollout
+from gpe_pl.trajectory import State
+from tests import scenes
+
+SMALL: dict[Any, dict[str, Any]] = {
+    GPE: {"num_message_passing_steps": 2, "hidden_channels": 8},
+    GNS: {"num_message_passing_steps": 2, "hidden_channels": 8},
+    DPINet: {"hidden_channels": 8},
+    ContinuousConvNet: {"hidden_channels": 8},
+}
+
+
+def simulator(
+    model: Any = GPE, materials: tuple[str, ...] = ("sand",), dim: int = 2, config: dict[str, Any] | None = None, **settings: Any
+):
+    """A simulator with random weights whose accelerations are of the order of gravity."""
+    build = scenes.builder(materials, dim, **{"islands": False, **(config or {})})
+    torch.manual_seed(0)
+    made = LearnedSimulator(model(build.spec, **{**SMALL[model], **settings}), build).eval()
+    made.acceleration_std.fill_(30.0)
+    made.stress_std.fill_(1e5)
+    return made
+
+
+def assert_same_step(step: Any, learned: LearnedSimulator, state: State, atol: float = 1e-9) -> None:
+    expected, scene = learned.step(state), scene_of(learned, state)
+    with torch.inference_mode():
+        result, further = step(scene)
+    for material, rows in {m: learned.builder(state)[m].node_id for m in learned.builder.spec.materials}.items():
+        if len(rows):
+            torch.testing.assert_close(result[f"pos.{material}"], expected.pos[rows], rtol=0, atol=atol)
+            assert expected.velocity_history is not None
+            torch.testing.assert_close(result[f"velocity_history.{material}"], expected.velocity_history[rows], rtol=0, atol=200 * atol)
+            if f"stress.{material}" in further:
+                assert expected.stress is not None
+                torch.testing.assert_close(further[f"stress.{material}"], expected.stress.node[rows], rtol=1e-5, atol=1.0)
+    assert float((expected.pos - state.pos).abs().max()) > 1e4 * atol
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("features", ["paper", "contact"])
+@pytest.mark.parametrize("model", SMALL)
+def test_particles(model: Any, features: str, dim: int) -> None:
+    learned = simulator(model, ("sand", "snow"), dim, {"features": features, "history": 3})
+    assert_same_step(PortableStep(learned), learned, scenes.state(materials=("sand", "snow"), history=3, dim=dim).to_torch())
+
+
+@pytest.mark.parametrize("kind", ["triangles", "lattice", "tetrahedra"])
+@pytest.mark.parametrize("model", [GPE, GNS, DPINet])
+def test_meshes(model: Any, kind: Any) -> None:
+    materials, dim = ("sand", "solid", "elastomer"), 3 if kind == "tetrahedra" else 2
+    settings = {"stress": True, "level_weights": "separate"} if model is GPE else {}
+    learned = simulator(model, materials, dim, {"mesh": True, "num_levels": 3}, **settings)
+    assert_same_step(PortableStep(learned), learned, scenes.mesh_state(kind, materials, num_bodies=3).to_torch())
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_islands_keep_their_momentum(dim: int) -> None:
+    learned = simulator(dim=dim, config={"islands": True}, island_momentum="angular")
+    assert_same_step(PortableStep(learned), learned, scenes.state(materials=("sand",), dim=dim, low=0.1, high=0.9).to_torch())
+
+
+def test_what_a_file_cannot_be_is_refused(tmp_path: Path) -> None:
+    learned = simulator()
+    with pytest.raises(ValueError, match=r"an exported program ends in \.pt2"):
+        export_model(learned, tmp_path / "model.pt")
+    periodic = LearnedSimulator(learned.model, learned.builder)
+    object.__setattr__(periodic.builder, "metadata", replace(learned.builder.metadata, periodic=(True, False)))
+    with pytest.raises(PortableError, match="data set 'test' has periodic axes"):
+        export_model(periodic, tmp_path / "model.pt2")
+    assert not [*tmp_path.iterdir()]
+
+
+def exported(learned: LearnedSimulator, path: Path) -> Path:
+    """Lengths are symbols while a program is made, which the tests' checks of types do not take for numbers."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        export_model(learned, path)
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+    return path
+
+
+ELSEWHERE = """
+import json, sys
+import numpy as np, torch
+from scipy.spatial import cKDTree
+
+path, start, stop, num_steps = *sys.argv[1:4], int(sys.argv[4])
+files = {"description.json": ""}
+program = torch.export.load(path, extra_files=files).module()
+radius = json.loads(files["description.json"])["connectivity_radius"]
+scene = {name: torch.from_numpy(values) for name, values in np.load(start).items()}
+for _ in range(num_steps):
+    pos, boundary = scene["pos.sand"].numpy(), scene["boundary.pos"].numpy()
+    tree = cKDTree(pos)
+    scene["edges.sand.radius.sand"] = torch.from_numpy(tree.query_pairs(radius, output_type="ndarray").T.astype(np.int64))
+    near = cKDTree(boundary).sparse_distance_matrix(tree, radius, output_type="ndarray")
+    scene["edges.boundary.radius.sand"] = torch.from_numpy(np.stack([near["i"], near["j"]]).astype(np.int64))
+    with torch.inference_mode():
+        moved, predicted = program(scene)
+    scene |= moved
+np.savez(stop, **{name: values.numpy() for name, values in (scene | predicted).items()})
+assert not {"gpe_pl", "torch_geometric", "numba", "lightning"} & {name.partition(".")[0] for name in sys.modules}
+"""
+
+
+def test_a_rollout_in_a_process_without_this_package(tmp_path: Path) -> None:
+    """More nodes and edges than in the example from which the program was made, and other numbers of edges in every frame."""
+    learned, num_steps = simulator(config={"history": 2}), 6
+    state = scenes.state(history=2).to_torch()
+    exported(learned, tmp_path / "model.pt2")
+    start: dict[str, Any] = {name: values.numpy() for name, values in scene_of(learned, state).items()}
+    np.savez(tmp_path / "start.npz", **start)
+    files = [str(tmp_path / name) for name in ("model.pt2", "start.npz", "stop.npz")]
+    child = subprocess.run(
+        [sys.executable, "-I", "-W", "ignore", "-c", ELSEWHERE, *files, str(num_steps)],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        check=False,
+    )
+    assert child.returncode == 0, child.stderr
+    expected = rollout(learned, state, num_steps, learned.builder.metadata)
+    np.testing.assert_allclose(np.load(tmp_path / "stop.npz")["pos.sand"], expected.pos[-1], rtol=0, atol=1e-7)
+    assert np.abs(expected.pos[-1] - expected.pos[0]).max() > 0.01
+
+
+@pytest.mark.slow
+def test_a_program_serves_any_numbers_of_nodes_and_edges(tmp_path: Path) -> None:
+    learned = simulator(materials=("sand", "snow"), config={"islands": True}, island_momentum="angular")
+    files = {DESCRIPTION: ""}
+    program = torch.export.load(exported(learned, tmp_path / "model.pt2"), extra_files=files).module()
+    two = scenes.state(2, ("sand", "snow"), walls=False)
+    for state in (scenes.state(60, ("sand", "snow")), two, scenes.permuted(two, np.array([1]))):  # the last one has no sand and no edges
+        assert_same_step(program, learned, state.to_torch())
+    description = json.loads(files[DESCRIPTION])
+    assert description["connectivity_radius"] == learned.builder.scales.radius
+    assert description["inputs"]["velocity_history.sand"]["shape"] == ["sand", 1, 2]
+    assert set(description["inputs"]) == set(scene_of(learned, state.to_torch()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", SMALL)
+@pytest.mark.parametrize("kind", ["particles", "mesh"])
+def test_every_model_becomes_a_program(model: Any, kind: str, tmp_path: Path) -> None:
+    if kind == "mesh" and model is ContinuousConvNet:
+        pytest.skip("continuous convolutions know no meshes")
+    config = {"mesh": True, "num_levels": 2, "islands": model is GPE} if kind == "mesh" else {}
+    settings = {"stress": True, "island_momentum": "angular"} if config and model is GPE else {}
+    materials, dim = (("sand", "solid"), 3) if config else (("sand",), 2)
+    learned = simulator(model, materials, dim, config, **settings)
+    program = torch.export.load(exported(learned, tmp_path / "model.pt2")).module()
+    for seed in (0, 1):
+        state = scenes.mesh_state("tetrahedra", materials, seed=seed) if config else scenes.state(seed=seed, num_nodes=30 + seed)
+        assert_same_step(program, learned, state.to_torch())
+
+
+def test_the_configuration_of_graphs_is_that_of_the_simulator() -> None:
+    """Boundary nodes without edges change nothing: programs take all of them."""
+    learned = simulator()
+    assert learned.builder.config == GraphConfig(history=1) and isinstance(learned.builder, GraphBuilder)
+    scene = scene_of(learned, scenes.state().to_torch())
+    assert scene["boundary.pos"].shape == scenes.state().boundary.pos.shape
