@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 
 from gpe_pl.data.importers.source import ImportFailure, Refusal
+from gpe_pl.errors import GpeError
 from gpe_pl.trajectory import LARGEST_DEFLATE_RATIO
 
 
@@ -21,7 +22,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             yield file
-    except (ImportFailure, Refusal):
+    except GpeError:
         raise
     except (
         OSError,

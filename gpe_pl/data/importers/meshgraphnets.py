@@ -14,7 +14,6 @@ Source: Pfaff et al. 2021, and the layout of github.com/google-deepmind/deepmind
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -75,17 +74,14 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         raise ImportFailure(f"{described}: dt = {meta.get('dt')!r} does not say how much time passes between frames; pass frame_dt=… [s]")
     facts = Facts(frame_dt or None, notes=tuple(notes)).overridden(settings)
 
-    def load(fields: Mapping[str, Any], facts: Facts) -> Loaded:
-        return _loaded({name: fields[name] for name in NEEDED}, length, settings, facts)
-
     def from_record(record: tfrecord.Record, facts: Facts) -> Loaded:
         stored = tfrecord.example(record.read())
-        return load({name: _decoded(stored.get(name), name, features[name], length) for name in NEEDED}, facts)
+        return _loaded({name: _decoded(stored.get(name), name, features[name], length) for name in NEEDED}, length, settings, facts)
 
     def from_group(file: Path, name: str, facts: Facts) -> Loaded:
         with hdf5.opened(file) as opened:
-            group = opened[name]
-            return load({key: hdf5.array(group, key, "frame, row, component") for key in NEEDED}, facts)
+            fields = {key: hdf5.array(opened[name], key, "frame, row, component") for key in NEEDED}
+        return _loaded(fields, length, settings, facts)
 
     splits = {}
     for split, file in files.items():
@@ -116,8 +112,8 @@ def _decoded(stored: tfrecord.Feature | None, name: str, feature: Mapping[str, A
         raise Refusal(
             f"{name} has {len(data)} bytes, which is no whole number of rows of {frames} frames × {shape[-1]} × {dtype.itemsize} bytes"
         )
-    rows = math.prod(shape[1:-1])
-    if len(shape) == 3 and rows > 0 and len(data) != row_bytes * rows:
+    rows = shape[1] if len(shape) == 3 and type(shape[1]) is int else -1
+    if rows > 0 and len(data) != row_bytes * rows:
         raise Refusal(f"{name} has {len(data)} bytes, meta.json says {kind}{[frames, *shape[1:]]}")
     return np.frombuffer(data, dtype).reshape(frames, -1, shape[-1])
 

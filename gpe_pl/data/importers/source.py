@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from gpe_pl.arrays import estimated_normals
+from gpe_pl.arrays import estimated_normals, numbers
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import domain_walls
 from gpe_pl.periodicity import NOWHERE, Periodicity
@@ -32,8 +32,8 @@ ASSUMED_PARAMETERS = {"sand": 30.0, "snow": 8.0, "fluid": 1e-3, "elastomer": 1e5
 
 ASSUMED_FRICTION = 0.5
 
-STILL = 1e-3
-"""Boundary nodes that move by less than this share of the spacing are still."""
+STILL = 1e-2
+"""Boundary nodes that never get farther than this share of the spacing from where they should be are still, or slide steadily."""
 
 MAX_JSON_BYTES = 2**24
 
@@ -209,6 +209,7 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
     for name, axes in (("bounds", facts.bounds), ("periodic", facts.periodic)):
         if axes is not None and len(axes) != nodes.pos.shape[2]:
             raise ImportFailure(f"{name} = {axes}: has {len(axes)} axes, the data have {nodes.pos.shape[2]}")
+    numbers("pos", nodes.pos, {"frame": None, "node": None, "dim": None})
     moving = np.flatnonzero(nodes.kind != BOUNDARY)
     if not len(moving):
         raise Refusal("has no nodes but boundary nodes")
@@ -309,12 +310,11 @@ def joined(dim: int, *parts: Boundary) -> Boundary:
 def _sliding_velocity(pos: np.ndarray, nodes: np.ndarray, facts: Facts, repairs: list[Repair]) -> Any:
     """Velocity of boundary nodes [frame, boundary_node, dim] that are still, or slide steadily along periodic axes as a lid does."""
     assert facts.frame_dt is not None
-    steps = facts.periodicity.shortest(np.diff(pos.astype(np.float64), axis=0))
+    path = np.cumsum(facts.periodicity.shortest(np.diff(pos.astype(np.float64), axis=0)), axis=0)
+    mean = path[-1] / len(path)
+    mean[:, [axis for axis in range(pos.shape[2]) if axis not in facts.periodicity.axes]] = 0.0
     tolerance = STILL * (facts.spacing or float(np.ptp(pos[0], axis=0).max()) / 50)
-    mean = steps.mean(axis=0)
-    unsteady = np.abs(steps - mean).max(axis=2) > tolerance
-    across = [axis for axis in range(pos.shape[2]) if axis not in facts.periodicity.axes]
-    unsteady |= np.abs(steps[..., across]).max(axis=2, initial=0.0) > tolerance
+    unsteady = np.abs(path - mean * np.arange(1, len(path) + 1)[:, None, None]).max(axis=2) > tolerance
     if unsteady.any():
         frame, node = np.argwhere(unsteady)[0]
         raise Refusal(
@@ -322,11 +322,13 @@ def _sliding_velocity(pos: np.ndarray, nodes: np.ndarray, facts: Facts, repairs:
             "what is simulated, name their material with materials={type: material}",
             int(frame) + 1,
         )
-    if np.abs(mean).max(initial=0.0) <= tolerance:
+    slides = np.abs(mean).max(axis=1) * len(path) > tolerance
+    if not slides.any():
         return 0.0
-    moving = int((np.abs(mean).max(axis=1) > tolerance).sum())
-    repairs.append(Repair(f"{moving} boundary nodes slide along a periodic axis: stored where they are in frame 0, with their velocity"))
-    return mean / facts.frame_dt
+    repairs.append(
+        Repair(f"{int(slides.sum())} boundary nodes slide along a periodic axis: stored where they are in frame 0, with their velocity")
+    )
+    return np.where(slides[:, None], mean / facts.frame_dt, 0.0)
 
 
 def typed(pos: np.ndarray, types: np.ndarray, table: Mapping[int, str], settings: ImportSettings, **arrays: Any) -> Nodes:

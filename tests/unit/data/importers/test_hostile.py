@@ -177,6 +177,23 @@ def test_nan_is_refused_with_frame_and_node(tmp_path: Path, records: list[bytes]
     assert "record 3, frame 4" in (tmp_path / "data" / "set" / "imported" / "report.md").read_text()
 
 
+@pytest.mark.parametrize("node", [2, 15])
+def test_nan_beside_a_boundary(tmp_path: Path, records: list[bytes], node: int) -> None:
+    pos, types = motion(seed=9), np.where(np.arange(20) < 4, 3, 5)
+    pos[:, :4] = pos[0, :4]
+    pos[4, node] = np.inf
+    write(tmp_path, *records[:3], sources.record(sources.gns_record(pos, types)))
+    assert unreadable(tmp_path, "gns") == f"train, record 3, frame 4: pos: frame 4, node {node} is inf"
+
+
+def test_a_wall_that_creeps_is_refused(tmp_path: Path, records: list[bytes]) -> None:
+    pos, types = motion(seed=9), np.where(np.arange(20) < 4, 3, 5)
+    pos[:, :4] = pos[0, :4] + np.float32(3e-5) * np.arange(10, dtype=np.float32)[:, None, None]
+    write(tmp_path, *records[:3], sources.record(sources.gns_record(pos, types)))
+    assert "boundary node 0 moves" in unreadable(tmp_path, "gns")
+    assert "frame 1: " not in unreadable(tmp_path, "gns")
+
+
 def test_boundary_nodes_that_move_are_refused(tmp_path: Path, records: list[bytes]) -> None:
     types = np.where(np.arange(20) < 4, 3, 5)
     write(tmp_path, *records[:3], sources.record(sources.gns_record(motion(seed=5), types)))
@@ -447,6 +464,10 @@ def test_own_arrays_that_do_not_fit(tmp_path: Path, changes: dict[str, Any], mes
         ({"trajectory_length": "long"}, "trajectory_length = 'long', expected an integer"),
         ({"dt": None}, "dt = None does not say how much time passes between frames; pass frame_dt="),
         ({"dt": 0}, "dt = 0 does not say"),
+        (
+            {"features": {name: {"type": "static", "dtype": "float32", "shape": None} for name in sources.sheet()}},
+            "meta.json says dtype 'float32' and shape None",
+        ),
     ],
 )
 def test_a_wrong_description_of_meshes(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
@@ -484,6 +505,7 @@ def test_a_mesh_that_cannot_be_used(tmp_path: Path, container: str, changes: dic
     getattr(sources, f"mgn_{container}")(tmp_path / "raw" / f"train.{container}", [*good, {**sources.sheet(seed=9), **changes}])
     text = unreadable(tmp_path, "meshgraphnets")
     assert re.search(message, text), text
+    assert "not a readable" not in text
 
 
 # --- DPI-Net -------------------------------------------------------------------------------------------------------------------------------
