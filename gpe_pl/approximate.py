@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gpe_pl import integrators
@@ -19,7 +18,7 @@ from gpe_pl.graphs.islands import islands_within
 from gpe_pl.graphs.multiscale import cell_edges
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.rollout import SimulationError, Simulator, step_all
-from gpe_pl.trajectory import State, Stress
+from gpe_pl.trajectory import State, Stress, search_tree
 
 
 def approximate(simulator: LearnedSimulator) -> Simulator:
@@ -87,12 +86,14 @@ class Sleeping(_Batched):
             return everything, everything
         pos = np.ascontiguousarray(state.pos.cpu().numpy())
         cells = np.empty((0, 2), np.int64) if state.cells is None else state.cells.cpu().numpy()
-        islands = islands_within(self.radius, pos, state.boundary.tree, cell_edges(cells, len(pos)))
+        edges, space = cell_edges(cells, len(pos)), state.periodicity
+        islands = islands_within(self.radius, pos, state.boundary.tree(space), edges, space)
         awake = _in_the_same_island(~is_calm, islands.label)
         seen = awake.copy()
         if awake.any() and not awake.all():
             reach = self.simulator.num_hops * self.radius
-            distance, _ = cKDTree(pos[awake]).query(pos[~awake], distance_upper_bound=reach)
+            others = space.from_corner(pos[~awake]) if space else pos[~awake]
+            distance, _ = search_tree(pos[awake], space).query(others, distance_upper_bound=reach)
             seen[~awake] = np.isfinite(distance)
             if len(cells):  # a mesh is seen as a whole
                 seen = _in_the_same_island(seen, islands.label)
@@ -193,7 +194,7 @@ class Holding(_Batched):
         pos, vel = integrators.advance(state.pos, state.vel, held.acceleration, self.dt)
         return replace(
             state,
-            pos=pos,
+            pos=state.periodicity.wrapped(pos),
             vel=vel,
             velocity_history=torch.cat([history_of(state)[:, 1:], vel[:, None]], dim=1),
             time=state.time + self.dt,

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
     from gpe_pl.generation import DatasetSpec
 
+IMPORTED = "imported"
+"""Where data that are generated have their size, those that ``convert`` made have this."""
+
 AUTOMATIC_BYTES = 2**30
 """``fit`` generates data sets smaller than this by itself; larger ones are asked for with ``simulate``."""
 
@@ -42,10 +45,26 @@ def dataset(*overrides: str) -> DatasetSpec:
     return dataset_spec(compose("simulate", overrides))
 
 
+def imported_data(cfg: DictConfig) -> Path:
+    """Folder of an imported data set; raises ``ConfigError`` where there is none."""
+    if not isinstance(cfg.data.name, str):
+        raise ConfigError("data.name=null: name the imported data set, as `python -m gpe_pl.convert name=…` did")
+    folder = Path(cfg.paths.data) / cfg.data.name / IMPORTED
+    if not (folder / "statistics.json").is_file():
+        there = ", ".join(sorted(path.parent.parent.name for path in Path(cfg.paths.data).glob(f"*/{IMPORTED}/statistics.json"))) or "none"
+        raise ConfigError(
+            f"data.name={cfg.data.name}: no imported data in {folder}; make them with `python -m gpe_pl.convert name={cfg.data.name} format=… source=…` "
+            f"(imported are: {there})"
+        )
+    return folder
+
+
 def ensure_data(cfg: DictConfig) -> Path:
     """Folder of the config's data set; generates what is missing if the data set is small."""
     from gpe_pl.generation import dataset_bytes, generate, progress_bar
 
+    if cfg.data.size == IMPORTED:  # used as they are
+        return imported_data(cfg)
     spec = dataset_spec(cfg)
     folder = Path(cfg.paths.data) / spec.name / spec.size
     if dataset_bytes(spec) > AUTOMATIC_BYTES and not (folder / "statistics.json").exists():

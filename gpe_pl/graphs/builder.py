@@ -28,7 +28,7 @@ from gpe_pl.graphs.features import (
     scales_of,
     virtual_features,
 )
-from gpe_pl.graphs.islands import find_islands
+from gpe_pl.graphs.islands import find_islands, unwrapped
 from gpe_pl.graphs.multiscale import MultiscaleGraph, multiscale_graph
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of, node_code
@@ -49,11 +49,15 @@ class GraphBuilder:
     ``offset``: the displacement over the radius, which standardisation leaves as it is.
 
     With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph ``island_is_free`` [island] and ``num_islands`` [1].
+    In periodic domains ``pos`` keeps an island together; one that goes around the period has no lever arms, and all its nodes the same ``pos``.
 
     Attributes:
         config: what the graphs are like.
         metadata: of the data set.
         skips: what is left out in building them, which changes no graph.
+
+    Raises:
+        PeriodicityError: the neighbour radius is half a period or more.
     """
 
     config: GraphConfig
@@ -61,8 +65,8 @@ class GraphBuilder:
     skips: Skips = field(default_factory=Skips)
 
     def __post_init__(self) -> None:
-        if any(self.metadata.periodic):
-            raise GraphError(f"data set {self.metadata.dataset!r} has periodic axes, which the graph builder does not support")
+        for radius in (self.scales.radius, self.metadata.connectivity_radius):
+            self.metadata.periodicity.check_radius(radius)
 
     @cached_property
     def scales(self) -> Scales:
@@ -76,8 +80,12 @@ class GraphBuilder:
         """Build the graph of a state of float64 tensors.
 
         Raises:
-            GraphError: the state holds a node type that the data set does not have, lacks velocity history, or has cells that do not fit its nodes.
+            GraphError: the state holds a node type that the data set does not have, lacks velocity history, repeats along other axes, or has cells that
+                do not fit its nodes.
         """
+        if state.periodicity.axes != self.metadata.periodicity.axes:
+            own, other = (", ".join("xyz"[a] for a in p.axes) or "no axis" for p in (self.metadata.periodicity, state.periodicity))
+            raise GraphError(f"state is periodic along {other}, the data set {self.metadata.dataset!r} along {own}")
         history = history_of(state)
         if history.shape[1] != self.config.history:
             raise GraphError(f"state has a history of {history.shape[1]} velocities, the graph needs {self.config.history}")
@@ -121,7 +129,7 @@ class GraphBuilder:
         """Boundary nodes, and the edges that the radius decides."""
         device = state.pos.device
         pos, vel = {m: state.pos[r] for m, r in rows.items()}, {m: state.vel[r] for m, r in rows.items()}
-        points = {m: _array(p) for m, p in pos.items()} | {BOUNDARY: self._points(state.boundary)}
+        points = {m: _array(p) for m, p in pos.items()} | {BOUNDARY: self._points(state)}
         present = {m for m, r in rows.items() if len(r)} | ({BOUNDARY} if len(state.boundary.pos) else set())
         relations = [r for r in self.spec.relations if r[1] == RADIUS]
         edges: dict[EdgeType, Tensor] = {}
@@ -130,9 +138,9 @@ class GraphBuilder:
             if self.skips.absent_types and not {source, target} <= present:
                 continue
             if source != target:
-                pairs = radius_between(points[source], points[target], self.scales.radius)
+                pairs = radius_between(points[source], points[target], self.scales.radius, state.periodicity)
             else:
-                pairs = radius_pairs(points[source], self.scales.radius)
+                pairs = radius_pairs(points[source], self.scales.radius, state.periodicity)
                 if mesh is not None and source in self._meshes:
                     pairs = pairs[:, mesh.are_in_contact(rows[source].cpu().numpy()[pairs], self.scales.radius)]
             edges[relation] = torch.from_numpy(pairs).to(device)
@@ -150,7 +158,7 @@ class GraphBuilder:
             parts = [
                 edge_features(
                     self.config.features,
-                    pos[target][i] - pos[source][j],
+                    state.periodicity.shortest(pos[target][i] - pos[source][j]),
                     vel[target][i] - vel[source][j],
                     boundary.normal[j] if source == BOUNDARY else None,
                     self.scales,
@@ -162,9 +170,9 @@ class GraphBuilder:
             store.odd, store.even = (part[0] if len(part) == 1 else torch.cat(part) for part in zip(*parts, strict=True))
             store.offset = store.odd[:, : self.spec.dim]
 
-    def _points(self, boundary: Boundary) -> Any:
+    def _points(self, state: State) -> Any:
         """Where the boundary nodes are, as ``radius_between`` takes it."""
-        return boundary.tree if self.skips.static_boundary else _array(boundary.pos)
+        return state.boundary.tree(state.periodicity) if self.skips.static_boundary else _array(state.boundary.pos)
 
     def _add_no_edges(self, data: HeteroData, relation: EdgeType, device: torch.device) -> None:
         store = data[relation]
@@ -186,13 +194,21 @@ class GraphBuilder:
             elif source in rows and target in rows:
                 j, i = data[source, name, target].edge_index
                 between.append(torch.stack([rows[source][j], rows[target][i]]))
-        islands = find_islands(state.num_nodes, torch.cat(between, dim=1).cpu().numpy(), touches.cpu().numpy())
+        edges = torch.cat(between, dim=1).cpu().numpy()
+        islands = find_islands(state.num_nodes, edges, touches.cpu().numpy())
         label = torch.from_numpy(islands.label).to(state.pos.device)
+        pos = self._kept_together(state, edges) if state.periodicity else state.pos
         for material, r in rows.items():
-            data[material].pos = state.pos[r].float()
+            data[material].pos = pos[r].float()
             data[material].island = label[r]
         data.island_is_free = torch.from_numpy(islands.is_free).to(state.pos.device)
         data.num_islands = torch.tensor([len(islands.is_free)], device=state.pos.device)
+
+    @staticmethod
+    def _kept_together(state: State, edges: np.ndarray) -> Tensor:
+        """Positions that do not tear islands apart at the seams of a periodic domain; all zero where an island goes around it."""
+        images, goes_around = unwrapped(_array(state.pos), edges, state.periodicity)
+        return torch.from_numpy(np.where(goes_around[:, None], 0.0, images)).to(state.pos.device)
 
     # --- meshes ---------------------------------------------------------------------------------------------------------------------------
 
@@ -227,7 +243,7 @@ class GraphBuilder:
             row[r] = torch.arange(len(r), device=device)
         row[n:] = torch.cat([torch.arange(size, device=device) for size in sizes]) if sizes else row[n:]
 
-        values = torch.cat([state.pos, cast(Tensor, state.rest_pos), history_of(state).flatten(1)], dim=1)
+        values = torch.cat([self._kept_whole(state, mesh), cast(Tensor, state.rest_pos), history_of(state).flatten(1)], dim=1)
         above, below = torch.tensor(mesh.descent, device=device)
         above, mass = above - n, state.mass[below][:, None]
         total = mass.new_zeros(sum(sizes), 1).index_add_(0, above, mass)
@@ -260,6 +276,15 @@ class GraphBuilder:
                     chosen = torch.arange(len(i), device=device)[chosen][is_target]
                 store = data[relation]
                 store.edge_index, store.odd, store.even = row[edges[:, chosen]], odd[chosen], even[chosen]
+
+    def _kept_whole(self, state: State, mesh: MultiscaleGraph) -> Tensor:
+        """Positions that do not tear meshes apart at the seams of a periodic domain."""
+        if not state.periodicity:
+            return state.pos
+        pos, goes_around = unwrapped(np.ascontiguousarray(state.pos.cpu().numpy()), mesh.cell_edges, state.periodicity)
+        if goes_around.any():
+            raise GraphError(f"the mesh of node {int(goes_around.argmax())} goes around the periodic domain, so it has no rest shape")
+        return torch.from_numpy(pos).to(state.pos.device)
 
     def _add_empty_mesh(self, data: HeteroData, state: State) -> None:
         """The stores of a mesh for a state without one."""
