@@ -13,6 +13,7 @@ import torch
 from gpe_pl.approximate import Holding, Sleeping, approximate
 from gpe_pl.containment import Contained
 from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
@@ -200,3 +201,17 @@ def test_scenes_side_by_side_are_as_alone_and_containment_works_around() -> None
     together = rollouts(runner, [Start(s, 5, build.metadata, Guard(bounds=build.metadata.bounds, margin=1.0)) for s in states])
     for s, t in zip(states, together, strict=True):
         np.testing.assert_allclose(rollout(runner, s, 5, build.metadata).pos, t.pos, rtol=0, atol=1e-6 * scenes.SPACING)
+
+
+@pytest.mark.parametrize("hold", [1, 2])
+def test_periodic_scenes_sleep_and_are_held_across_the_seam(hold: int) -> None:
+    space = replace(scenes.metadata(), periodic=(True, False))
+    simulated = simulator(GraphBuilder(GraphConfig(history=1, islands=True), space), hold=hold)
+    simulated.acceleration_std.fill_(1e4)
+    s = two_heaps()
+    shifted = (s.pos + [0.8, 0.0]) % [1.0, 10.0]  # one heap lies across the seam
+    start = after_rest(Sleeping(simulated), replace(s, pos=shifted, periodicity=space.periodicity).to_torch())
+    after, full = approximate(simulated).step(start), simulated.step(start)
+    assert after.num_asleep == 20
+    torch.testing.assert_close(after.vel[20:], full.vel[20:], rtol=0, atol=1e-6 * float(full.vel.abs().max()))
+    assert float(approximate(simulated).step(after).pos[:, 0].max()) < 1.0
