@@ -87,47 +87,65 @@ def run(
     folder.mkdir(parents=True, exist_ok=True)
     metadata = replace(describe(scene, simulator.builder.metadata.frame_dt, seed=settings.seed), dataset="showcase")
     state = simulator.standing(scene.sample(settings.values, settings.seed), metadata)
-    total = settings.num_steps + settings.num_uncontained_steps
-    runner = approximate(simulator)
-    film = _Film(state, metadata, settings.num_steps)
-    limit = MAX_SPEED_FACTOR * _fall_speed(state, metadata)
-    seconds, num_corrected, num_too_fast, top_speed, end, stop = [], 0, 0, 0.0, state, None
-    started = time.perf_counter()
+    runner, total = approximate(simulator), settings.num_steps + settings.num_uncontained_steps
+    film, tally, stop, outside = _Film(state, metadata, settings.num_steps), _Tally(state, metadata), None, []
     for frame, item in _frames(Contained(runner, metadata.frame_dt), state, settings.num_steps, metadata):
         if isinstance(item, Termination):
-            stop = item
+            stop = item.message
             break
-        seconds.append(time.perf_counter() - started)
-        end, num_corrected = item, num_corrected + item.num_corrected
-        speed = item.vel.norm(dim=1)
-        num_too_fast, top_speed = num_too_fast + int((speed > limit).sum()), max(top_speed, float(speed.max()))
+        tally.add(item)
         film.add(frame, item)
         if on_progress is not None:
             on_progress(frame, total)
-        started = time.perf_counter()
-    outside = []
+        tally.resume()
     for frame, item in _frames(runner, state, settings.num_uncontained_steps, metadata):
         outside.append(1.0 if isinstance(item, Termination) else _share_deeper(item, DEPTH * metadata.spacing))
         if on_progress is not None:
             on_progress(settings.num_steps + frame, total)
-    num_steps, size = len(seconds), state.num_nodes
-    found: dict[str, tuple[float, str]] = {
-        "num_nodes": (size, "1"),
-        "num_boundary_nodes": (len(state.boundary.pos), "1"),
-        "num_steps": (num_steps, "1"),
-        "seconds_per_step": (float(np.median(seconds)) if seconds else math.nan, "s"),
-        "peak_memory": (peak_resident(), "B"),
-        "share_corrected": (num_corrected / (num_steps * size) if seconds else math.nan, "1"),
-        "share_too_fast": (num_too_fast / (num_steps * size) if seconds else math.nan, "1"),
-        "share_outside_at_end": (_share_deeper(end, TOLERANCE), "1"),
-        "max_speed": (top_speed, "m/s"),
-    }
+    records = tally.records()
     if outside:
-        found["share_outside_uncontained"] = float(np.mean(outside)), "1"
-    records = [Record(metric, float(value), unit) for metric, (value, unit) in found.items()]
-    _write(folder / "showcase.json", {"records": [vars(r) for r in records], "stopped": None if stop is None else stop.message})
+        records.append(Record("share_outside_uncontained", float(np.mean(outside)), "1"))
+    _write(folder / "showcase.json", {"records": [vars(r) for r in records], "stopped": stop})
     film.write(folder / "showcase")
     return records
+
+
+class _Tally:
+    """What happens in a rollout, counted."""
+
+    def __init__(self, state: State, metadata: Metadata) -> None:
+        self.end, self.limit = state, MAX_SPEED_FACTOR * _fall_speed(state, metadata)
+        self.num_corrected, self.num_too_fast, self.top_speed = 0, 0, 0.0
+        self.seconds: list[float] = []
+        self.resume()
+
+    def resume(self) -> None:
+        """The next step begins."""
+        self.started = time.perf_counter()
+
+    def add(self, state: State) -> None:
+        """A step ends."""
+        self.seconds.append(time.perf_counter() - self.started)
+        speed = state.vel.norm(dim=1)
+        self.end, self.top_speed = state, max(self.top_speed, float(speed.max()))
+        self.num_corrected += state.num_corrected
+        self.num_too_fast += int((speed > self.limit).sum())
+
+    def records(self) -> list[Record]:
+        num_steps, size = len(self.seconds), self.end.num_nodes
+        particle_steps = num_steps * size if num_steps else math.nan
+        found: dict[str, tuple[float, str]] = {
+            "num_nodes": (size, "1"),
+            "num_boundary_nodes": (len(self.end.boundary.pos), "1"),
+            "num_steps": (num_steps, "1"),
+            "seconds_per_step": (float(np.median(self.seconds)) if num_steps else math.nan, "s"),
+            "peak_memory": (peak_resident(), "B"),
+            "share_corrected": (self.num_corrected / particle_steps, "1"),
+            "share_too_fast": (self.num_too_fast / particle_steps, "1"),
+            "share_outside_at_end": (_share_deeper(self.end, TOLERANCE), "1"),
+            "max_speed": (self.top_speed, "m/s"),
+        }
+        return [Record(metric, float(value), unit) for metric, (value, unit) in found.items()]
 
 
 def _frames(simulator: Simulator, state: State, num_steps: int, metadata: Metadata) -> Any:

@@ -209,7 +209,7 @@ def test_periodic_scenes_sleep_and_are_held_across_the_seam(hold: int) -> None:
     simulated = simulator(GraphBuilder(GraphConfig(history=1, islands=True), space), hold=hold)
     simulated.acceleration_std.fill_(1e4)
     s = two_heaps()
-    shifted = (s.pos + [0.8, 0.0]) % [1.0, 10.0]  # one heap lies across the seam
+    shifted = (s.pos + np.array([0.8, 0.0])) % [1.0, 10.0]  # one heap lies across the seam
     start = after_rest(Sleeping(simulated), replace(s, pos=shifted, periodicity=space.periodicity).to_torch())
     after, full = approximate(simulated).step(start), simulated.step(start)
     assert after.num_asleep == 20
