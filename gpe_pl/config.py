@@ -36,6 +36,7 @@ WITHOUT_KEY = {"comparison", "experiment", "scene", "solver"}
 """Config groups that fill other keys than one of their own."""
 
 launcher.register()  # conf/ names it
+OmegaConf.register_new_resolver("times", lambda a, b: a * b, replace=True)  # ${times:a,b} in conf/
 
 
 def _for_model(values: Mapping[str, Any], target: str) -> Any:

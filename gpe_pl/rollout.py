@@ -15,7 +15,7 @@ from array_api_compat import array_namespace
 
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import signed_distance
-from gpe_pl.trajectory import Boundary, Metadata, State, Stress, Termination, Trajectory
+from gpe_pl.trajectory import Metadata, State, Stress, Termination, Trajectory
 
 
 @runtime_checkable
@@ -97,6 +97,8 @@ class Guard:
 
 def step_all(simulator: Simulator, states: list[State]) -> list[State | SimulationError]:
     """One step of every state, together if the simulator can; errors of single scenes are returned, so that the others go on."""
+    if not states:
+        return []
     if isinstance(simulator, BatchSimulator):
         return simulator.step_all(states)
     return [_step(simulator, state) for state in states]
@@ -189,8 +191,7 @@ class _Recording:
         self.stress.append(None if item.stress is None else Stress(_numpy(item.stress.node), _numpy(item.stress.cell)))
 
     def trajectory(self) -> Trajectory:
-        state, b = self.start.state, self.start.state.boundary
-        boundary = Boundary(_numpy(b.pos), _numpy(b.vel), _numpy(b.normal), _numpy(b.friction), _numpy(b.restitution), b.shapes)
+        state = self.start.state
         known = [stress for stress in self.stress if stress is not None]
         has_stress = len(known) == len(self.stress)
         return Trajectory(
@@ -200,7 +201,7 @@ class _Recording:
             _numpy(state.node_type),
             _numpy(state.mass),
             _numpy(state.material_params),
-            boundary,
+            state.boundary.to_numpy(),
             rest_pos=None if state.rest_pos is None else _numpy(state.rest_pos),
             cells=None if state.cells is None else _numpy(state.cells),
             stress=Stress(np.stack([s.node for s in known]), np.stack([s.cell for s in known])) if has_stress else None,

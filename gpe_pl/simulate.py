@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpe_pl.config import ConfigError, compose, construct, construct_target, entry_point
+from gpe_pl.schema import SPLITS
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -32,7 +33,7 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     if cfg.size.name not in cfg.data.sizes:
         raise ConfigError(f"size={cfg.size.name}: data={cfg.data.name} has the sizes {', '.join(cfg.data.sizes)}")
     values: dict[str, Any] = OmegaConf.to_container(cfg.data, resolve=True)  # type: ignore[assignment]
-    for table in ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds", "larger", "comparison"):
+    for table in ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds", "larger", "comparison", "showcase"):
         values.pop(table, None)
     scene = construct_target(values.pop("scene"), "data.scene", "gpe_pl.solvers.")
     solver = construct_target(values.pop("solver"), "data.solver", "gpe_pl.solvers.")
@@ -70,6 +71,19 @@ def ensure_data(cfg: DictConfig) -> Path:
         raise ConfigError(f"{folder}: no data; generate it first with `python -m gpe_pl.simulate data={spec.name} size={spec.size}`")
     with progress_bar(f"{spec.name} {spec.size}") as on_progress:
         return generate(cfg.paths.data, spec, os.cpu_count() or 1, on_progress)
+
+
+def ensure_split(cfg: DictConfig, split: str) -> Path:
+    """Folder of the config's data set; where it does not exist, of one that has nothing but this split and a single training trajectory."""
+    from omegaconf import OmegaConf
+
+    from gpe_pl.generation import SPEC_FILE
+
+    if not (Path(cfg.paths.data) / cfg.data.name / cfg.size.name / SPEC_FILE).exists():
+        counts = {f"num_{s}": cfg.data[f"num_{s}"] if s == split else int(s == "train") for s in SPLITS}
+        only: Any = OmegaConf.merge(cfg, {"data": {"name": f"{cfg.data.name}_{split}", **counts}})
+        return ensure_data(only)
+    return ensure_data(cfg)
 
 
 def evaluated_config(cfg: DictConfig) -> DictConfig:

@@ -126,6 +126,32 @@ class Boundary:
         )
         return cls(pos, vel, (normal / length[:, None]).astype(np.float32), friction, restitution, shapes)
 
+    def to_numpy(self) -> Boundary:
+        """The same with NumPy arrays of its own."""
+        pos, vel, normal, friction, restitution = (
+            np.array(_numpy(x)) for x in (self.pos, self.vel, self.normal, self.friction, self.restitution)
+        )
+        return Boundary(pos, vel, normal, friction, restitution, self.shapes)
+
+    @cached_property
+    def tree(self) -> Any:
+        """``search_tree`` of the positions, built once: a boundary stays where it is."""
+        return search_tree(self.pos)
+
+
+def search_tree(pos: Array, periodicity: Periodicity = NOWHERE) -> Any:
+    """A k-d tree of positions [node, dim] for neighbour search on the CPU: quick to build, so that moving nodes can have a new one in every step."""
+    from scipy.spatial import cKDTree
+
+    points = np.ascontiguousarray(_numpy(pos))
+    if not periodicity:
+        return cKDTree(points, balanced_tree=False, compact_nodes=False)
+    return cKDTree(periodicity.from_corner(points), balanced_tree=False, compact_nodes=False, boxsize=periodicity.period)
+
+
+def _numpy(x: Array) -> np.ndarray:
+    return x if isinstance(x, np.ndarray) else x.detach().cpu().numpy()
+
 
 @dataclass(frozen=True)
 class Stress:
@@ -179,6 +205,8 @@ class State:
         stress: of the mesh, where the solver computes it.
         num_substeps: that a solver took to come here from the frame before.
         num_corrected: nodes that containment put back in coming here from the frame before.
+        num_asleep: nodes that a simulator left alone in coming here from the frame before.
+        lost_impulse: momentum [kg m/s], in sum of magnitudes, that it took from them.
         internal: opaque part of a solver (deformation gradient, …), carried so that a restart equals a run-through.
         periodicity: axes along which space repeats.
     """
@@ -197,6 +225,8 @@ class State:
     stress: Stress | None = None
     num_substeps: int = 0
     num_corrected: int = 0
+    num_asleep: int = 0
+    lost_impulse: float = 0.0
     internal: Any = None
     periodicity: Periodicity = NOWHERE
 

@@ -6,7 +6,7 @@ is missing from some graphs. Each undirected edge is stored once. There are no e
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, cast
 
@@ -28,11 +28,12 @@ from gpe_pl.graphs.features import (
     scales_of,
     virtual_features,
 )
-from gpe_pl.graphs.islands import islands_within, unwrapped
+from gpe_pl.graphs.islands import find_islands, unwrapped
 from gpe_pl.graphs.multiscale import MultiscaleGraph, multiscale_graph
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of, node_code
-from gpe_pl.trajectory import Metadata, State
+from gpe_pl.skips import Skips
+from gpe_pl.trajectory import Boundary, Metadata, State
 
 
 class GraphError(GpeError, ValueError):
@@ -50,12 +51,18 @@ class GraphBuilder:
     With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph ``island_is_free`` [island] and ``num_islands`` [1].
     In periodic domains ``pos`` keeps an island together; one that goes around the period has no lever arms, and all its nodes the same ``pos``.
 
+    Attributes:
+        config: what the graphs are like.
+        metadata: of the data set.
+        skips: what is left out in building them, which changes no graph.
+
     Raises:
         PeriodicityError: the neighbour radius is half a period or more.
     """
 
     config: GraphConfig
     metadata: Metadata
+    skips: Skips = field(default_factory=Skips)
 
     def __post_init__(self) -> None:
         for radius in (self.scales.radius, self.metadata.connectivity_radius):
@@ -97,7 +104,7 @@ class GraphBuilder:
             store.material_params = state.material_params[r, column : column + 1].float()
             store.mass = state.mass[r].float()
             store.node_id = r
-        self._add_boundary(data, state, rows, mesh)
+        self._add_radius_edges(data, state, rows, mesh)
         if mesh is not None:
             self._add_mesh(data, state, rows, mesh)
         elif self._meshes:
@@ -118,70 +125,79 @@ class GraphBuilder:
 
     # --- edges within a radius ------------------------------------------------------------------------------------------------------------
 
-    def _add_boundary(self, data: HeteroData, state: State, rows: dict[str, Tensor], mesh: MultiscaleGraph | None) -> None:
+    def _add_radius_edges(self, data: HeteroData, state: State, rows: dict[str, Tensor], mesh: MultiscaleGraph | None) -> None:
         """Boundary nodes, and the edges that the radius decides."""
-        pos = {m: state.pos[r] for m, r in rows.items()} | {BOUNDARY: state.boundary.pos}
-        vel = {m: state.vel[r] for m, r in rows.items()} | {BOUNDARY: state.boundary.vel}
-        numpy_pos = {t: np.ascontiguousarray(p.detach().cpu().numpy()) for t, p in pos.items()}
+        device = state.pos.device
+        pos, vel = {m: state.pos[r] for m, r in rows.items()}, {m: state.vel[r] for m, r in rows.items()}
+        points = {m: _array(p) for m, p in pos.items()} | {BOUNDARY: self._points(state)}
+        present = {m for m, r in rows.items() if len(r)} | ({BOUNDARY} if len(state.boundary.pos) else set())
+        relations = [r for r in self.spec.relations if r[1] == RADIUS]
         edges: dict[EdgeType, Tensor] = {}
-        for relation in self.spec.relations:
-            source, name, target = relation
-            if name != RADIUS:
+        for relation in relations:
+            source, _, target = relation
+            if self.skips.absent_types and not {source, target} <= present:
                 continue
             if source != target:
-                pairs = radius_between(numpy_pos[source], numpy_pos[target], self.scales.radius, state.periodicity)
+                pairs = radius_between(points[source], points[target], self.scales.radius, state.periodicity)
             else:
-                pairs = radius_pairs(numpy_pos[source], self.scales.radius, state.periodicity)
+                pairs = radius_pairs(points[source], self.scales.radius, state.periodicity)
                 if mesh is not None and source in self._meshes:
                     pairs = pairs[:, mesh.are_in_contact(rows[source].cpu().numpy()[pairs], self.scales.radius)]
-            edges[relation] = torch.from_numpy(pairs).to(state.pos.device)
+            edges[relation] = torch.from_numpy(pairs).to(device)
 
-        boundary_x, normal = boundary_features(state.boundary, self.scales), state.boundary.normal
-        if self.config.trim_boundary:
-            kept = self._trim(edges, boundary_x.shape[0])
-            boundary_x, normal = boundary_x[kept], normal[kept]
-            pos[BOUNDARY], vel[BOUNDARY] = pos[BOUNDARY][kept], vel[BOUNDARY][kept]
-        data[BOUNDARY].x = boundary_x
-        for relation, edge_index in edges.items():
+        boundary = _trim(state.boundary, edges) if self.config.trim_boundary else state.boundary
+        data[BOUNDARY].x = boundary_features(boundary, self.scales)
+        pos[BOUNDARY], vel[BOUNDARY] = boundary.pos, boundary.vel
+        for relation in relations:
+            if relation not in edges:
+                self._add_no_edges(data, relation, device)
+                continue
             source, _, target = relation
-            j, i = edge_index
+            edge_index = edges[relation]
+            chunk = max(1, edge_index.shape[1]) if self.skips.edges_at_once is None else self.skips.edges_at_once
+            parts = [
+                edge_features(
+                    self.config.features,
+                    state.periodicity.shortest(pos[target][i] - pos[source][j]),
+                    vel[target][i] - vel[source][j],
+                    boundary.normal[j] if source == BOUNDARY else None,
+                    self.scales,
+                )
+                for j, i in edge_index.split(chunk, dim=1)
+            ]
             store = data[relation]
             store.edge_index = edge_index
-            store.odd, store.even = edge_features(
-                self.config.features,
-                state.periodicity.shortest(pos[target][i] - pos[source][j]),
-                vel[target][i] - vel[source][j],
-                normal[j] if source == BOUNDARY else None,
-                self.scales,
-            )
+            store.odd, store.even = (part[0] if len(part) == 1 else torch.cat(part) for part in zip(*parts, strict=True))
             store.offset = store.odd[:, : self.spec.dim]
 
-    @staticmethod
-    def _trim(edges: dict[tuple[str, str, str], Tensor], num_boundary: int) -> Tensor:
-        """Keep the boundary nodes that have an edge, in order, and renumber the edges in place; returns the kept rows."""
-        sources = [e[0] for (s, _, _), e in edges.items() if s == BOUNDARY]
-        device = sources[0].device
-        used = torch.zeros(num_boundary, dtype=torch.bool, device=device)
-        for s in sources:
-            used[s] = True
-        kept = torch.nonzero(used).flatten()
-        new_row = torch.cumsum(used, dim=0) - 1
-        for relation, edge_index in edges.items():
-            if relation[0] == BOUNDARY:
-                edges[relation] = torch.stack([new_row[edge_index[0]], edge_index[1]])
-        return kept
+    def _points(self, state: State) -> Any:
+        """Where the boundary nodes are, as ``radius_between`` takes it."""
+        return state.boundary.tree if self.skips.static_boundary and not state.periodicity else _array(state.boundary.pos)
+
+    def _add_no_edges(self, data: HeteroData, relation: EdgeType, device: torch.device) -> None:
+        store = data[relation]
+        store.edge_index = torch.empty(2, 0, dtype=torch.int64, device=device)
+        store.odd = torch.empty(0, self.spec.odd_channels[relation], device=device)
+        store.even = torch.empty(0, self.spec.even_channels[relation], device=device)
+        if relation[1] == RADIUS:
+            store.offset = store.odd[:, : self.spec.dim]
 
     def _add_islands(self, data: HeteroData, state: State, rows: dict[str, Tensor]) -> None:
         """Groups of nodes that the graph connects, and which of them no edge ties to the boundary.
 
         What pushes a body from beyond the radius no model can see; held to free fall, it stays stable (docs/results/trials).
         """
-        cells = [torch.empty(2, 0, dtype=torch.int64), *(rows[m][data[m, CELL, m].edge_index].cpu() for m in self._meshes)]
-        mesh, radius = torch.cat(cells, dim=1).numpy(), self.scales.radius
-        points, boundary = (np.ascontiguousarray(p.cpu().numpy()) for p in (state.pos, state.boundary.pos))
-        islands = islands_within(radius, points, boundary, mesh, state.periodicity)
+        between, touches = [], torch.zeros(state.num_nodes, dtype=torch.bool, device=state.pos.device)
+        for source, name, target in self.spec.relations:
+            if source == BOUNDARY:
+                touches[rows[target][data[source, name, target].edge_index[1]]] = True
+            elif source in rows and target in rows:
+                j, i = data[source, name, target].edge_index
+                between.append(torch.stack([rows[source][j], rows[target][i]]))
+        edges = torch.cat(between, dim=1).cpu().numpy()
+        islands = find_islands(state.num_nodes, edges, touches.cpu().numpy())
         label = torch.from_numpy(islands.label).to(state.pos.device)
-        pos = self._kept_together(state, radius, mesh) if state.periodicity else state.pos
+        pos = self._kept_together(state, edges) if state.periodicity else state.pos
         for material, r in rows.items():
             data[material].pos = pos[r].float()
             data[material].island = label[r]
@@ -189,12 +205,9 @@ class GraphBuilder:
         data.num_islands = torch.tensor([len(islands.is_free)], device=state.pos.device)
 
     @staticmethod
-    def _kept_together(state: State, radius: float, mesh: np.ndarray) -> Tensor:
+    def _kept_together(state: State, edges: np.ndarray) -> Tensor:
         """Positions that do not tear islands apart at the seams of a periodic domain; all zero where an island goes around it."""
-        pos = np.ascontiguousarray(state.pos.cpu().numpy())
-        images, goes_around = unwrapped(
-            pos, np.concatenate([radius_pairs(pos, radius, state.periodicity), mesh], axis=1), state.periodicity
-        )
+        images, goes_around = unwrapped(_array(state.pos), edges, state.periodicity)
         return torch.from_numpy(np.where(goes_around[:, None], 0.0, images)).to(state.pos.device)
 
     # --- meshes ---------------------------------------------------------------------------------------------------------------------------
@@ -280,7 +293,23 @@ class GraphBuilder:
             data[grid(k)].x = torch.empty(0, self.spec.node_channels[grid(k)], device=device)
         for relation in self.spec.relations:
             if relation[1] != RADIUS:
-                store = data[relation]
-                store.edge_index = torch.empty(2, 0, dtype=torch.int64, device=device)
-                store.odd = torch.empty(0, self.spec.odd_channels[relation], device=device)
-                store.even = torch.empty(0, self.spec.even_channels[relation], device=device)
+                self._add_no_edges(data, relation, device)
+
+
+def _array(x: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(x.detach().cpu().numpy())
+
+
+def _trim(boundary: Boundary, edges: dict[EdgeType, Tensor]) -> Boundary:
+    """The boundary nodes that have an edge, in order; renumbers the edges in place."""
+    used = torch.zeros(len(boundary.pos), dtype=torch.bool, device=boundary.pos.device)
+    for (source, _, _), edge_index in edges.items():
+        if source == BOUNDARY:
+            used[edge_index[0]] = True
+    kept = torch.nonzero(used).flatten()
+    new_row = torch.cumsum(used, dim=0) - 1
+    for relation, edge_index in edges.items():
+        if relation[0] == BOUNDARY:
+            edges[relation] = torch.stack([new_row[edge_index[0]], edge_index[1]])
+    rows = {name: getattr(boundary, name)[kept] for name in ("pos", "vel", "normal", "friction", "restitution")}
+    return Boundary(**rows, shapes=boundary.shapes)

@@ -8,6 +8,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numba import njit
+from scipy.spatial import cKDTree
 
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.periodicity import NOWHERE, Periodicity
@@ -77,13 +78,13 @@ def _components(num_nodes, edge_index):
 def islands_within(
     radius: float,
     pos: Float64[np.ndarray, "node dim"],
-    boundary_pos: Float64[np.ndarray, "boundary dim"],
+    boundary: Float64[np.ndarray, "boundary dim"] | cKDTree,
     mesh_edges: Int64[np.ndarray, "2 edge"],
     periodicity: Periodicity = NOWHERE,
 ) -> Islands:
-    """Islands of nodes that a radius [m] or a mesh connects; free where no boundary node lies within the radius."""
+    """Islands of nodes that a radius [m] or a mesh connects; free where no boundary node, given by position or search tree, lies within the radius."""
     touches = np.zeros(len(pos), dtype=bool)
-    touches[radius_between(boundary_pos, pos, radius, periodicity)[1]] = True
+    touches[radius_between(boundary, pos, radius, periodicity)[1]] = True
     return find_islands(len(pos), np.concatenate([radius_pairs(pos, radius, periodicity), mesh_edges], axis=1), touches)
 
 

@@ -9,6 +9,7 @@ from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 
 from gpe_pl.periodicity import NOWHERE, Periodicity
+from gpe_pl.trajectory import search_tree
 
 
 def radius_pairs(pos: Float64[np.ndarray, "node dim"], radius: float, periodicity: Periodicity = NOWHERE) -> Int64[np.ndarray, "2 edge"]:
@@ -16,25 +17,27 @@ def radius_pairs(pos: Float64[np.ndarray, "node dim"], radius: float, periodicit
     if len(pos) < 2:
         return np.empty((2, 0), dtype=np.int64)
     periodicity.check_radius(radius)
-    pairs = _tree(pos, periodicity).query_pairs(radius, output_type="ndarray")
+    pairs = search_tree(pos, periodicity).query_pairs(radius, output_type="ndarray")
     return np.ascontiguousarray(pairs.T, dtype=np.int64)
 
 
 def radius_between(
-    source_pos: Float64[np.ndarray, "source dim"],
-    target_pos: Float64[np.ndarray, "target dim"],
+    source: Float64[np.ndarray, "source dim"] | cKDTree,
+    target: Float64[np.ndarray, "target dim"],
     radius: float,
     periodicity: Periodicity = NOWHERE,
 ) -> Int64[np.ndarray, "2 edge"]:
-    """Pairs of a source node and a target node of two different sets at most ``radius`` [m] apart."""
-    if len(source_pos) == 0 or len(target_pos) == 0:
+    """Pairs of a source node and a target node of two different sets at most ``radius`` [m] apart.
+
+    Args:
+        source: positions [m], or ``search_tree`` of them.
+        target: positions [m].
+        radius: [m].
+        periodicity: where space repeats; a tree given as ``source`` must have been built for it.
+    """
+    tree = source if isinstance(source, cKDTree) else search_tree(source, periodicity)
+    if tree.n == 0 or len(target) == 0:
         return np.empty((2, 0), dtype=np.int64)
     periodicity.check_radius(radius)
-    found = _tree(source_pos, periodicity).sparse_distance_matrix(_tree(target_pos, periodicity), radius, output_type="ndarray")
+    found = tree.sparse_distance_matrix(search_tree(target, periodicity), radius, output_type="ndarray")
     return np.stack([found["i"], found["j"]]).astype(np.int64)
-
-
-def _tree(pos: np.ndarray, periodicity: Periodicity) -> cKDTree:
-    if not periodicity:
-        return cKDTree(pos, balanced_tree=False, compact_nodes=False)
-    return cKDTree(periodicity.from_corner(pos), balanced_tree=False, compact_nodes=False, boxsize=periodicity.period)
