@@ -53,9 +53,15 @@ def test_without_containment_what_enters_a_wall_is_counted(tmp_path: Path) -> No
 
 
 def test_a_rollout_that_explodes_says_so(tmp_path: Path) -> None:
-    records = run(simulator(1e6), CANYON, SETTINGS, tmp_path)
+    records = run(simulator(float("inf")), CANYON, SETTINGS, tmp_path)
     assert values(records)["num_steps"] == 0
-    assert "moves at" in json.loads((tmp_path / "showcase.json").read_text())["stopped"]
+    assert "not finite" in json.loads((tmp_path / "showcase.json").read_text())["stopped"]
+
+
+def test_nodes_faster_than_gravity_explains_are_counted(tmp_path: Path) -> None:
+    fast, slow = (values(run(simulator(a), CANYON, SETTINGS, tmp_path)) for a in (1e5, 1.0))
+    assert slow["share_too_fast"] == 0 and slow["max_speed"] < 1
+    assert fast["share_too_fast"] > 0.1 and fast["max_speed"] > 20
 
 
 def test_a_long_rollout_keeps_few_frames() -> None:
