@@ -79,7 +79,7 @@ def ensure_split(cfg: DictConfig, split: str) -> Path:
 
     from gpe_pl.generation import SPEC_FILE
 
-    if not (Path(cfg.paths.data) / cfg.data.name / cfg.size.name / SPEC_FILE).exists():
+    if cfg.data.size != IMPORTED and not (Path(cfg.paths.data) / cfg.data.name / cfg.size.name / SPEC_FILE).exists():
         counts = {f"num_{s}": cfg.data[f"num_{s}"] if s == split else int(s == "train") for s in SPLITS}
         only: Any = OmegaConf.merge(cfg, {"data": {"name": f"{cfg.data.name}_{split}", **counts}})
         return ensure_data(only)

@@ -142,16 +142,13 @@ class Boundary:
 
 
 def search_tree(pos: Array, periodicity: Periodicity = NOWHERE) -> Any:
-    """A k-d tree of positions [node, dim] for neighbour search on the CPU: quick to build, so that moving nodes can have a new one in every step.
-
-    Where space repeats, it holds and takes ``Periodicity.from_corner`` of them.
-    """
+    """A k-d tree of positions [node, dim] for neighbour search on the CPU: quick to build, so that moving nodes can have a new one in every step."""
     from scipy.spatial import cKDTree
 
-    pos = np.ascontiguousarray(_numpy(pos))
+    points = np.ascontiguousarray(_numpy(pos))
     if not periodicity:
-        return cKDTree(pos, balanced_tree=False, compact_nodes=False)
-    return cKDTree(periodicity.from_corner(pos), balanced_tree=False, compact_nodes=False, boxsize=periodicity.period)
+        return cKDTree(points, balanced_tree=False, compact_nodes=False)
+    return cKDTree(periodicity.from_corner(points), balanced_tree=False, compact_nodes=False, boxsize=periodicity.period)
 
 
 def _numpy(x: Array) -> np.ndarray:

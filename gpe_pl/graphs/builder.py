@@ -49,7 +49,8 @@ class GraphBuilder:
     ``offset``: the displacement over the radius, which standardisation leaves as it is.
 
     With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph ``island_is_free`` [island] and ``num_islands`` [1].
-    In periodic domains ``pos`` keeps an island together; one that goes around the period has no lever arms, and all its nodes the same ``pos``.
+    ``pos`` counts from the mean of the node's island, and in periodic domains keeps it together; an island that goes around the period has no lever arms, and
+    ``pos`` is zero there.
 
     Attributes:
         config: what the graphs are like.
@@ -198,8 +199,9 @@ class GraphBuilder:
         islands = find_islands(state.num_nodes, edges, touches.cpu().numpy())
         label = torch.from_numpy(islands.label).to(state.pos.device)
         pos = self._kept_together(state, edges) if state.periodicity else state.pos
+        arms = _from_centre(pos, label, len(islands.is_free)).float()  # the network's precision has no room for where the island is
         for material, r in rows.items():
-            data[material].pos = pos[r].float()
+            data[material].pos = arms[r]
             data[material].island = label[r]
         data.island_is_free = torch.from_numpy(islands.is_free).to(state.pos.device)
         data.num_islands = torch.tensor([len(islands.is_free)], device=state.pos.device)
@@ -298,6 +300,13 @@ class GraphBuilder:
 
 def _array(x: Tensor) -> np.ndarray:
     return np.ascontiguousarray(x.detach().cpu().numpy())
+
+
+def _from_centre(pos: Tensor, island: Tensor, num_islands: int) -> Tensor:
+    """Positions counted from the mean of their island."""
+    count = torch.bincount(island, minlength=num_islands)[:, None]
+    centre = pos.new_zeros(num_islands, pos.shape[1]).index_add_(0, island, pos) / count
+    return pos - centre[island]
 
 
 def _trim(boundary: Boundary, edges: dict[EdgeType, Tensor]) -> Boundary:

@@ -33,7 +33,7 @@ def radius_between(
         source: positions [m], or ``search_tree`` of them with the same periodicity.
         target: positions [m].
         radius: [m].
-        periodicity: where space repeats.
+        periodicity: where space repeats; a tree given as ``source`` must have been built for it.
     """
     tree = source if isinstance(source, cKDTree) else search_tree(source, periodicity)
     if tree.n == 0 or len(target) == 0:

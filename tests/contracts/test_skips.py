@@ -164,9 +164,9 @@ def test_the_boundary_is_sorted_once(static: bool, monkeypatch: pytest.MonkeyPat
     simulated, start = simulator(build), scattered(("sand",), ("sand",)).to_torch()
     sizes: list[int] = []
 
-    def counted(pos: Any, *space: Any) -> Any:
+    def counted(pos: Any, *others: Any) -> Any:
         sizes.append(len(pos))
-        return search_tree(pos, *space)
+        return search_tree(pos, *others)
 
     for module in ("trajectory", "graphs.neighbors"):
         monkeypatch.setattr(f"gpe_pl.{module}.search_tree", counted)

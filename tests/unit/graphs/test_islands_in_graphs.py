@@ -99,3 +99,11 @@ def test_islands_of_edges_are_those_of_the_radius(dim: int, trim: bool) -> None:
     np.testing.assert_array_equal(label, expected.label)
     np.testing.assert_array_equal(data.island_is_free, expected.is_free)
     assert 2 < len(expected.is_free) < 60 and 0 < expected.is_free.sum() < len(expected.is_free)
+
+
+def test_far_from_the_origin_lever_arms_keep_their_precision() -> None:
+    build = scenes.builder(("sand",), 2)
+    near = scenes.state(60, ("sand",), high=0.8)
+    shift = np.array([2.0**20, -(2.0**19)])
+    far = replace(near, pos=near.pos + shift, boundary=replace(near.boundary, pos=near.boundary.pos + shift))
+    np.testing.assert_allclose(build(far.to_torch())["sand"].pos, build(near.to_torch())["sand"].pos, rtol=0, atol=1e-7)
