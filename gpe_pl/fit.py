@@ -21,6 +21,7 @@ def fit(cfg: DictConfig) -> float:
     from omegaconf import OmegaConf
 
     from gpe_pl.data.datamodule import TrajectoryDataModule
+    from gpe_pl.data.dataset import BatchSize
     from gpe_pl.data.noise import Noise
     from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, read_rows
     from gpe_pl.graphs.features import GraphConfig
@@ -41,6 +42,7 @@ def fit(cfg: DictConfig) -> float:
     logger = construct(LoggerSettings, cfg.logger, "logger")
     new_model = bind(model_class(cfg.model._target_), {k: v for k, v in cfg.model.items() if k != "_target_"}, "model", "spec")
     noise = Noise(training.noise, training.noise_std, training.noise_correction)
+    batch_size = construct(BatchSize, cfg.batching, "batching", num_graphs=training.batch_size)
 
     run_dir = output_dir(cfg)
     Path(cfg.paths.data).mkdir(parents=True, exist_ok=True)
@@ -53,7 +55,7 @@ def fit(cfg: DictConfig) -> float:
     @cache
     def data() -> TrajectoryDataModule:
         stress = bool(cfg.model.get("stress", False))
-        return TrajectoryDataModule(root, graph, noise, training.batch_size, cfg.seed, trainer.num_workers, stress=stress)
+        return TrajectoryDataModule(root, graph, noise, batch_size, cfg.seed, trainer.num_workers, stress=stress)
 
     def new_module(training: TrainingSettings) -> TrainingModule:
         L.seed_everything(cfg.seed, verbose=False)
@@ -63,16 +65,21 @@ def fit(cfg: DictConfig) -> float:
         return TrainingModule(simulator, **{n: getattr(training, n) for n in names})
 
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    unusual = {"batching": settings["batching"]} if batch_size.max_nodes is not None else {}  # as runs had it before there was a choice
     if training.budget_minutes is not None:
         dataset = {k: v for k, v in settings["data"].items() if k != "comparison"}
         parts = {k: settings[k] for k in ("graph", "model")} | {"data": dataset, "batch_size": training.batch_size, "device": device}
+        parts |= unusual
         key = f"{cfg.data.name} {cfg.size.name} {cfg.model._target_.rpartition('.')[2]} {digest(parts)}"
         times = Path(cfg.paths.runs) / (cfg.reuse or cfg.name) / "step_times.json"
         training = within_budget(
-            training, times, key, lambda settings: step_time(new_module(settings).to(device), data().train_set, settings)
+            training,
+            times,
+            key,
+            lambda settings: step_time(new_module(settings).to(device), data().train_set, batch_size, settings.gradient_clip),
         )
     settings["training"] = asdict(training)
-    trained = {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training")}
+    trained = {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training")} | unusual
     claim(run_dir, trained | {"evaluation": settings["evaluation"]})
     if not (run_dir / "metrics.csv").exists():
         best = None if cfg.reuse is None else adopt(Path(cfg.paths.runs) / cfg.reuse, trained, run_dir)

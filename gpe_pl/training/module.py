@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 from torch_geometric.data import HeteroData
 
+from gpe_pl import ranks
 from gpe_pl.errors import GpeError
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE
@@ -135,22 +136,30 @@ class TrainingModule(L.LightningModule):
             del model.compute  # back to the class's own
 
     def loss(self, batch: HeteroData) -> Tensor:
-        """Mean squared error of the normalised accelerations, and of the normalised stress where there is one."""
+        """Mean squared error of the normalised accelerations, and of the normalised stress where there is one; of several ranks, the part of this one."""
         predicted = self.simulator(batch)
-        loss = torch.cat([(a - self._normalized(batch[m].target)).square() for m, a in predicted.acceleration.items()]).mean()
-        if predicted.stress:
-            std = self.simulator.stress_std.float()
-            loss = (
-                loss
-                + self.stress_weight * torch.cat([(s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]).mean()
-            )
+        std = self.simulator.stress_std.float()
+        acceleration = [(a - self._normalized(batch[m].target)).square() for m, a in predicted.acceleration.items()]
+        stress = [(s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]
+        shares = self._shares(acceleration, stress)
+        loss = torch.cat(acceleration).mean() * shares[0]
+        if stress:
+            loss = loss + self.stress_weight * torch.cat(stress).mean() * shares[1]
         return loss
+
+    def _shares(self, *errors: list[Tensor]) -> list[float]:
+        """How many of all ranks' errors of each kind are on this one. The ranks exchange it also where this one has none of a kind."""
+        if ranks.num_ranks() == 1:
+            return [1.0] * len(errors)
+        here = torch.tensor([sum(e.numel() for e in kind) for kind in errors], device=self.device)
+        return [n / max(1, total) for n, total in zip(here.tolist(), ranks.summed(here).tolist(), strict=True)]
 
     def training_step(self, batch: HeteroData, batch_idx: int) -> Tensor:
         loss = self.loss(batch)
         self._windows = list(zip(batch.trajectory.tolist(), batch.frame.tolist(), strict=True))
-        self._stop_unless_finite("loss", loss)
-        self.log("train/loss", loss, batch_size=1)
+        total = ranks.summed(loss.detach())
+        self._stop_unless_finite("loss", total)
+        self.log("train/loss", total, batch_size=1)
         return loss
 
     def configure_gradient_clipping(
@@ -161,9 +170,10 @@ class TrainingModule(L.LightningModule):
         self._stop_unless_finite("gradient norm", norm)
 
     def _stop_unless_finite(self, name: str, value: Tensor) -> None:
-        if not torch.isfinite(value):
+        if not torch.isfinite(value):  # on all ranks, as it is a sum over them
+            windows = [window for part in ranks.gathered(self._windows) for window in part]
             raise TrainingError(
-                f"step {self.global_step}: the {name} is {value.item()} for (trajectory, frame) = {', '.join(map(str, self._windows))}; "
+                f"step {self.global_step}: the {name} is {value.item()} for (trajectory, frame) = {', '.join(map(str, windows))}; "
                 "the last good checkpoint is kept. Lower training.learning_rate, or validate the data with `python -m gpe_pl.data.validate`"
             )
 

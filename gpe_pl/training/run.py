@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import shutil
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,6 +23,7 @@ from gpe_pl.data.noise import NoiseKind
 from gpe_pl.errors import GpeError
 from gpe_pl.training.callbacks import RolloutValidation, WarmAverage
 from gpe_pl.training.module import Compile, Schedule, TrainingModule
+from gpe_pl.training.parallel import SummedGradients
 
 log = logging.getLogger(__name__)
 
@@ -64,13 +66,21 @@ class TrainingSettings:
 
 @dataclass(frozen=True)
 class TrainerSettings:
-    """Where the training runs."""
+    """Where the training runs: in one process per device, each of which takes a part of every batch (see ``training.parallel``).
+
+    ``devices`` are those of one of ``num_nodes`` machines.
+    """
 
     accelerator: Literal["cpu", "gpu", "auto"] = "cpu"
     devices: Annotated[int, Field(ge=1)] = 1
+    num_nodes: Annotated[int, Field(ge=1)] = 1
     num_threads: Annotated[int, Field(ge=1)] | None = None
     num_workers: Annotated[int, Field(ge=0)] = 0
     progress: bool = True
+
+    @property
+    def num_processes(self) -> int:
+        return self.devices * self.num_nodes
 
 
 @dataclass(frozen=True)
@@ -116,18 +126,18 @@ def claim(run_dir: Path, config: dict[str, Any]) -> None:
                 f"{run_dir} holds a run with another configuration ({'; '.join(different[:3])}); choose another name=… or delete the folder"
             )
         return
-    temporary = path.with_suffix(".part")
+    temporary = path.with_suffix(f".{os.getpid()}.part")
     temporary.write_text(json.dumps(config, indent=1, sort_keys=True))
     os.replace(temporary, path)
 
 
 def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
-    """Copy the checkpoint of a finished run below ``folder`` whose configuration has all values of ``config``; None if there is no such run."""
+    """Copy the checkpoint of a finished run below ``folder`` that was trained with the configuration ``config``; None if there is no such run."""
     for path in sorted(folder.rglob("config.json")):
         trained = path.parent / "checkpoints" / "best.ckpt"
         if (path.parent / "metrics.csv").exists() and trained.exists():
             there = _config_in(path)
-            if not _differences({key: there.get(key) for key in config}, config):
+            if not _differences({key: value for key, value in there.items() if key != "evaluation"}, config):
                 log.info("taking the model that was trained in %s", path.parent)
                 own = run_dir / "checkpoints" / "best.ckpt"
                 own.parent.mkdir(parents=True, exist_ok=True)
@@ -158,7 +168,11 @@ def train(
     loggers: list[Logger],
     run_dir: Path,
 ) -> Path:
-    """Train to ``num_steps``, resuming from ``checkpoints/last.ckpt`` if there is one; returns the checkpoint with the best validation rollout."""
+    """Train to ``num_steps``, resuming from ``checkpoints/last.ckpt`` if there is one; returns the checkpoint with the best validation rollout.
+
+    Of several processes only the first returns, the others end. Unless something else starts them (``torchrun``, Slurm), each runs the command that is
+    running.
+    """
     folder = run_dir / "checkpoints"
     last = folder / "last.ckpt"
     options: dict[str, Any] = {"save_top_k": 1, "save_on_train_epoch_end": False, "enable_version_counter": False}
@@ -175,10 +189,16 @@ def train(
     ]
     if trainer_settings.progress:
         callbacks.append(TQDMProgressBar(refresh_rate=50))
+    is_parallel = trainer_settings.num_processes > 1
+    if is_parallel:
+        os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # else Lightning shares out all cores
     try:
         trainer = L.Trainer(
             accelerator=trainer_settings.accelerator,
             devices=trainer_settings.devices,
+            num_nodes=trainer_settings.num_nodes,
+            strategy=SummedGradients() if is_parallel else "auto",
+            use_distributed_sampler=False,  # the data module's samplers know the ranks
             max_steps=training.num_steps,
             max_epochs=-1,
             val_check_interval=min(training.val_interval, training.num_steps),
@@ -200,6 +220,10 @@ def train(
         trainer.fit(module, datamodule, ckpt_path=str(last) if last.exists() else None, weights_only=True)
     except SystemExit:  # Lightning's answer to Ctrl-C
         raise RunError(f"interrupted; run the same command again to resume from {last}") from None
+    if is_parallel:
+        if trainer.global_rank > 0:
+            sys.exit()  # what comes after training is for one process
+        torch.distributed.destroy_process_group()
     return folder / "best.ckpt"
 
 
