@@ -23,13 +23,14 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.data.datamodule import TrajectoryDataModule
     from gpe_pl.data.dataset import BatchSize
     from gpe_pl.data.noise import Noise
-    from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, read_rows
+    from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
     from gpe_pl.simulate import ensure_data, evaluated_config
     from gpe_pl.training.budget import digest, step_time, within_budget
     from gpe_pl.training.module import TrainingModule
-    from gpe_pl.training.run import LoggerSettings, TrainerSettings, TrainingSettings, adopt, claim, set_threads, train
+    from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, claim, set_threads, train
+    from gpe_pl.training.tracking import LoggerSettings, publish
 
     if type(cfg.seed) is not int or cfg.seed < 0:
         raise ConfigError(f"seed={cfg.seed!r}: must be an integer of at least 0")
@@ -80,11 +81,14 @@ def fit(cfg: DictConfig) -> float:
         )
     settings["training"] = asdict(training)
     trained = {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training")} | unusual
-    claim(run_dir, trained | {"evaluation": settings["evaluation"]})
+    config = trained | {"evaluation": settings["evaluation"]}
+    claim(run_dir, config)
     if not (run_dir / "metrics.csv").exists():
         best = None if cfg.reuse is None else adopt(Path(cfg.paths.runs) / cfg.reuse, trained, run_dir)
-        best = best or train(new_module(training), data(), training, trainer, logger.loggers(run_dir), run_dir)
-        evaluate(LearnedSimulator.from_checkpoint(best, device), evaluated, evaluation, run_dir)
+        loggers = logger.loggers(run_dir, cfg.name, config)
+        best = best or train(new_module(training), data(), training, trainer, loggers, run_dir)
+        rows = evaluate(LearnedSimulator.from_checkpoint(best, device), evaluated, evaluation, run_dir)
+        publish(loggers, run_dir, means(rows))
 
     values = [
         r.value

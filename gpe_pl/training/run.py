@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint, TQDMProgressBar
-from lightning.pytorch.loggers import CSVLogger, Logger
+from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
@@ -81,34 +81,6 @@ class TrainerSettings:
     @property
     def num_processes(self) -> int:
         return self.devices * self.num_nodes
-
-
-@dataclass(frozen=True)
-class LoggerSettings:
-    """Where the metrics go; files in the run's folder are always written."""
-
-    kind: Literal["csv", "wandb"] = "csv"
-    project: str = "gpe_pl"
-    mode: Literal["online", "offline", "disabled"] | None = None
-
-    def loggers(self, run_dir: Path) -> list[Logger]:
-        """CSV under ``run_dir/log``, one version per start of the run, and W&B if asked for (offline without an API key)."""
-        loggers: list[Logger] = [CSVLogger(run_dir, name="log", flush_logs_every_n_steps=1)]
-        if self.kind == "wandb":
-            from lightning.pytorch.loggers import WandbLogger
-
-            has_key = bool(os.environ.get("WANDB_API_KEY"))
-            mode = self.mode or ("online" if has_key else "offline")
-            loggers.append(WandbLogger(project=self.project, save_dir=run_dir, id=run_id(run_dir), resume="allow", mode=mode))
-        return loggers
-
-
-def run_id(run_dir: Path) -> str:
-    """An identifier that a resumed run finds again; written once."""
-    path = run_dir / "run_id"
-    if not path.exists():
-        path.write_text(os.urandom(6).hex())
-    return path.read_text().strip()
 
 
 def claim(run_dir: Path, config: dict[str, Any]) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from lightning.pytorch.loggers import CSVLogger
 from torch import nn
 from torch_geometric.data import Batch, HeteroData
 
@@ -150,9 +151,10 @@ def trained(root: Path, run: Path, rank: int, num_ranks: int, size: BatchSize, n
     simulator.fit_statistics(data.statistics_sample())
     module = Recorded(simulator, SETTINGS.num_steps, warmup_steps=SETTINGS.warmup_steps, compile="off")
     settings = replace(SETTINGS, num_steps=num_steps)
+    run.mkdir(exist_ok=True)
     seen: dict[str, Any] = {"steps": module.steps, "losses": module.losses}
     try:
-        train(module, data, settings, TrainerSettings(devices=num_ranks, progress=False), [], run)
+        train(module, data, settings, TrainerSettings(devices=num_ranks, progress=False), [CSVLogger(run, name="log")], run)
     finally:
         seen["weights"] = {k: v.numpy() for k, v in module.simulator.state_dict().items()}
         (run / f"seen_{rank}.pickle").write_bytes(pickle.dumps(seen))
@@ -168,7 +170,7 @@ def checkpoint(run: Path, name: str) -> dict[str, Any]:
     return torch.load(run / "checkpoints" / f"{name}.ckpt", weights_only=True)
 
 
-@pytest.mark.parametrize("size", [BatchSize(3), BatchSize(3, max_nodes=64)])
+@pytest.mark.parametrize("size", [BatchSize(3), pytest.param(BatchSize(3, max_nodes=64), marks=pytest.mark.slow)])
 def test_two_processes_train_like_one(mixed: Path, tmp_path: Path, size: BatchSize) -> None:
     one = trained(mixed, tmp_path / "one", 0, 1, size)
     two = trained_on_ranks(mixed, tmp_path / "two", size)
@@ -192,6 +194,7 @@ def test_two_processes_train_like_one(mixed: Path, tmp_path: Path, size: BatchSi
     assert values[0] and values[1] == pytest.approx(values[0], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_two_processes_resume_where_they_stopped(mixed: Path, tmp_path: Path) -> None:
     whole = trained_on_ranks(mixed, tmp_path / "whole", BatchSize(3))
     trained_on_ranks(mixed, tmp_path / "parts", BatchSize(3), num_steps=10)
