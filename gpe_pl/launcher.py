@@ -150,7 +150,7 @@ class ProcessLauncher(CommandLauncher):
     """Runs jobs side by side on this machine.
 
     Args:
-        num_processes: jobs at once; None: as many as there are cores, at ``trainer.num_threads`` each (one job if that is None).
+        num_processes: jobs at once; None: as many as there are cores, at ``trainer.num_threads`` (None: all) for each of ``trainer.devices``.
     """
 
     def __init__(self, num_processes: int | None = None) -> None:
@@ -171,13 +171,14 @@ class ProcessLauncher(CommandLauncher):
             pool.shutdown(wait=True, cancel_futures=True)  # a Ctrl-C reaches the runs too: they save, nothing new starts
 
     def _number(self, jobs: Sequence[Job]) -> int:
-        return min(len(jobs), self.num_processes or default_processes(OmegaConf.select(self.config, "trainer.num_threads")))
+        num_threads, devices = (OmegaConf.select(self.config, f"trainer.{key}") for key in ("num_threads", "devices"))
+        return min(len(jobs), self.num_processes or default_processes(num_threads, devices or 1))
 
 
-def default_processes(num_threads: int | None) -> int:
+def default_processes(num_threads: int | None, devices: int = 1) -> int:
     """Jobs that this machine has cores for."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // (num_threads or cores))
+    return max(1, cores // ((num_threads or cores) * devices))
 
 
 class RayLauncher(CommandLauncher):

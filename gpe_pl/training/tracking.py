@@ -56,9 +56,10 @@ def has_key() -> bool:
         return True
     host = urlparse(os.environ.get("WANDB_BASE_URL", WANDB_URL)).hostname or ""
     try:
-        return netrc.netrc(os.environ.get("NETRC")).authenticators(host) is not None
+        found = netrc.netrc(os.environ.get("NETRC")).authenticators(host)
     except (OSError, netrc.NetrcParseError):
         return False
+    return found is not None and bool(found[2])
 
 
 def run_id(run_dir: Path) -> str:

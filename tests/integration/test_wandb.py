@@ -25,7 +25,7 @@ def test_a_key_is_found_where_wandb_looks_for_it(tmp_path: Path, monkeypatch: py
     assert has_key()
     monkeypatch.setenv("WANDB_BASE_URL", "https://wandb.example.org")
     assert not has_key()
-    (tmp_path / "netrc").write_text("machine wandb.example.org login user")
+    (tmp_path / "netrc").write_text("machine wandb.example.org login user password secret and more")
     assert not has_key()  # damaged
     monkeypatch.setenv("WANDB_API_KEY", "secret")
     assert has_key()
@@ -37,6 +37,7 @@ def test_the_identifier_of_a_run_stays(tmp_path: Path) -> None:
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["run_id"]
 
 
+@pytest.mark.slow
 def test_a_run_without_a_key_is_kept_offline_and_resumes(tiny_data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     steps = ("training.num_steps=4", "training.val_interval=2", "training.warmup_steps=2")
     cfg = tiny(tiny_data, tmp_path, "logger=wandb", "name='group/model=a'", "evaluation.num_pictures=1", *steps)
