@@ -19,6 +19,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -204,7 +205,7 @@ class RayLauncher(CommandLauncher):
             while waiting:
                 (reference, *_), _ = ray.wait([*waiting], num_returns=1)
                 k = waiting.pop(reference)
-                yield k, jobs[k].outcome(lambda reference=reference: ray.get(reference))
+                yield k, jobs[k].outcome(partial(ray.get, reference))
         finally:
             ray.shutdown()  # ends the jobs that are left
 

@@ -60,15 +60,16 @@ class OptunaSweeper(Sweeper):
             raise UsageError("hydra/sweeper=optuna needs optuna: `pip install optuna`, or gpe_pl with its extra [optuna]") from None
         State = optuna.trial.TrialState
         optuna.logging.set_verbosity(optuna.logging.WARNING)
+        assert self.config is not None and self.launcher is not None
         fixed, space = self._split(arguments)
         folder = Path(str(self.config.hydra.sweep.dir))
         folder.mkdir(parents=True, exist_ok=True)
         study = optuna.create_study(
             storage=JournalStorage(JournalFileBackend(str(folder / JOURNAL))), study_name="sweep", load_if_exists=True
         )
-        for trial in study.get_trials(states=[State.RUNNING]):  # of a sweep that was killed: their folders know how far they are
-            study.enqueue_trial(trial.params)
-            study.tell(trial.number, state=State.FAIL)
+        for left_over in study.get_trials(states=[State.RUNNING]):  # of a sweep that was killed: their folders know how far they are
+            study.enqueue_trial(left_over.params)
+            study.tell(left_over.number, state=State.FAIL)
         error = "no trial has succeeded"
         while (left := self.num_trials - len(study.get_trials(states=[State.COMPLETE, State.PRUNED]))) > 0:
             study.sampler = optuna.samplers.TPESampler(seed=self.seed + len(study.trials))

@@ -16,6 +16,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger
 log = logging.getLogger(__name__)
 
 WANDB_URL = "https://api.wandb.ai"
+FILMS: tuple[Literal["gif", "mp4"], ...] = ("gif", "mp4")
 RUN_ID = "run_id"
 """File in a run's folder: the identifier under which W&B knows the run."""
 
@@ -83,14 +84,12 @@ def publish(loggers: Iterable[Logger], run_dir: Path, results: Mapping[str, floa
 
             run: Any = logger.experiment
             pictures = {path.stem: wandb.Image(str(path)) for path in sorted(run_dir.glob("*.png"))}
-            films = {f"{path.stem} ({path.suffix[1:]})": wandb.Video(str(path), format=path.suffix[1:]) for path in _films(run_dir)}
+            films = {
+                f"{path.stem} ({kind})": wandb.Video(str(path), format=kind) for kind in FILMS for path in sorted(run_dir.glob(f"*.{kind}"))
+            }
             run.log({**pictures, **films})
             run.summary.update(dict(results))
             folder, is_offline = Path(run.dir).parent, run.settings.mode == "offline"
             run.finish()
             if is_offline:
                 log.warning("W&B: kept offline%s; upload it with `wandb sync %s`", "" if has_key() else ", as there is no API key", folder)
-
-
-def _films(run_dir: Path) -> list[Path]:
-    return sorted(path for suffix in ("gif", "mp4") for path in run_dir.glob(f"*.{suffix}"))
