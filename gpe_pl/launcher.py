@@ -198,7 +198,12 @@ class RayLauncher(CommandLauncher):
 
     def run(self, jobs: Sequence[Job], module: str) -> Iterator[tuple[int, JobReturn]]:
         ray = _imported("ray", "ray")
-        ray.init(address=self.address, log_to_driver=False)
+        try:
+            ray.init(address=self.address, log_to_driver=False)
+        except Exception as error:  # bare ones too
+            raise UsageError(
+                f"hydra/launcher=ray: the cluster does not start or cannot be reached ({' '.join(str(error).split())})"
+            ) from None
         try:
             task = ray.remote(num_cpus=self.num_cpus, num_gpus=self.num_gpus)(Job.run)
             waiting = {task.remote(job, module): k for k, job in enumerate(jobs)}

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -90,7 +92,7 @@ class Fixed(CommandLauncher):
 def launched(launcher: Fixed, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     launcher.config = OmegaConf.create({"hydra": {"sweep": {"dir": "sweep"}}})
     monkeypatch.setattr("gpe_pl.launcher.setup_globals", lambda: None)
-    monkeypatch.setattr("sys.modules", {**__import__("sys").modules, "__main__": pytest})
+    monkeypatch.setattr("sys.modules", {**sys.modules, "__main__": pytest})
     return launcher.launch([[name] for name in launcher.ends], 0)
 
 
@@ -118,9 +120,18 @@ def test_a_wrong_configuration_ends_a_sweep(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize(("make", "module", "extra"), [(RayLauncher, "ray", "ray"), (SlurmLauncher, "submitit", "slurm")])
 def test_what_a_launcher_needs_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch, make: Any, module: str, extra: str) -> None:
-    monkeypatch.setitem(__import__("sys").modules, module, None)
+    monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(UsageError, match=rf"hydra/launcher={extra} needs {module}: `pip install {module}`"):
         outcomes(make(), folder, "1")
+
+
+def test_a_cluster_that_cannot_be_reached_is_named(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def init(**_: Any) -> None:
+        raise ConnectionError("nobody answers\nat host:6379")
+
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=init))
+    with pytest.raises(UsageError, match=r"hydra/launcher=ray: .* cannot be reached \(nobody answers at host:6379\)"):
+        outcomes(RayLauncher("host:6379"), folder, "1")
 
 
 def test_wrong_settings_are_named(folder: Path) -> None:
