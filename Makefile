@@ -62,7 +62,7 @@ notebooks: install ## execute every notebook from start to end
 	$(BIN)/python -m pytest -m notebook $(PYTEST_ARGS)
 
 docs: install ## user guide and reference in docs/_build/html; warnings and broken links within are errors
-	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going docs docs/_build/html
+	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going --jobs auto docs docs/_build/html
 	$(BIN)/python docs/check_links.py docs/_build/html
 
 links: install ## links of the documentation that lead elsewhere (needs the network)

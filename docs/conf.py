@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from collections import _tuplegetter  # type: ignore[attr-defined]
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +29,12 @@ python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 100
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
-napoleon_use_ivar = True  # attributes of a NamedTuple are also members
 napoleon_use_rtype = False
 
 html_theme = "furo"
 html_title = "gpe_pl"
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
 html_show_sphinx = False
 html_show_copyright = False
 copybutton_exclude = ".linenos, .gp"
@@ -45,6 +47,12 @@ def escape_bars(app: Any, what: str, name: str, obj: Any, options: Any, lines: l
         lines[k] = "``".join(part if inside % 2 else re.sub(r"\|(?=\S)", r"\\|", part) for inside, part in enumerate(parts))
 
 
+def skip_described_fields(app: Any, what: str, name: str, obj: Any, skip: bool, options: Any) -> bool | None:
+    """Fields of a NamedTuple stand in its docstring."""
+    return True if isinstance(obj, _tuplegetter) else None
+
+
 def setup(app: Any) -> None:
     """Called by Sphinx."""
+    app.connect("autodoc-skip-member", skip_described_fields)
     app.connect("autodoc-process-docstring", escape_bars, priority=400)  # before napoleon makes reStructuredText of it
