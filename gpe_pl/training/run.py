@@ -175,6 +175,7 @@ def train(
     ]
     if trainer_settings.progress:
         callbacks.append(TQDMProgressBar(refresh_rate=50))
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     try:
         trainer = L.Trainer(
             accelerator=trainer_settings.accelerator,
@@ -195,7 +196,6 @@ def train(
         raise RunError(f"trainer.accelerator={trainer_settings.accelerator}, trainer.devices={trainer_settings.devices}: {error}") from None
     if last.exists():
         log.info("resuming from %s", last)
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     try:
         trainer.fit(module, datamodule, ckpt_path=str(last) if last.exists() else None, weights_only=True)
     except SystemExit:  # Lightning's answer to Ctrl-C

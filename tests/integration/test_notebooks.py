@@ -69,7 +69,13 @@ def _execute(path: Path, folder: Path, runs: Path, data: Path) -> Any:
     write_kernel_spec(folder / "jupyter" / "kernels" / "python3")  # one that a user has installed may be another interpreter
     copy = Path(shutil.copy(path, folder))
     notebook = nbformat.read(copy, as_version=4)
-    own = {"JUPYTER_PATH": folder / "jupyter", "IPYTHONDIR": folder / "ipython", "GPE_RUNS": runs, "GPE_DATA": data, "GPE_WORK": folder / "work"}
+    own = {
+        "JUPYTER_PATH": folder / "jupyter",
+        "IPYTHONDIR": folder / "ipython",
+        "GPE_RUNS": runs,
+        "GPE_DATA": data,
+        "GPE_WORK": folder / "work",
+    }
     with pytest.MonkeyPatch.context() as monkeypatch:
         for key, value in {**_environment(), **SETTINGS, **own}.items():
             monkeypatch.setenv(key, str(value))
