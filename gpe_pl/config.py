@@ -294,6 +294,7 @@ class Report(Callback):
                 report_domains(folder)
             else:
                 report_sweep(folder)
+            print(folder)
         except GpeError as error:
             _fail(error)
         except Exception:

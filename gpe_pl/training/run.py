@@ -164,6 +164,7 @@ def train(
     is_parallel = trainer_settings.num_processes > 1
     if is_parallel:
         os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # else Lightning shares out all cores
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     try:
         trainer = L.Trainer(
             accelerator=trainer_settings.accelerator,
@@ -187,7 +188,6 @@ def train(
         raise RunError(f"trainer.accelerator={trainer_settings.accelerator}, trainer.devices={trainer_settings.devices}: {error}") from None
     if last.exists():
         log.info("resuming from %s", last)
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     try:
         trainer.fit(module, datamodule, ckpt_path=str(last) if last.exists() else None, weights_only=True)
     except SystemExit:  # Lightning's answer to Ctrl-C
