@@ -36,7 +36,7 @@ def commands() -> dict[str, tuple[str, list[str]]]:
 @pytest.mark.parametrize(("name", "overrides"), commands().values(), ids=commands())
 def test_commands_compose(name: str, overrides: list[str]) -> None:
     GlobalHydra.instance().clear()
-    compose(name, [word for word in overrides if not word.startswith("hydra/")])
+    compose(name, [word for word in overrides if not word.startswith(("hydra/", "hydra."))])
 
 
 def named(page: str, key: str) -> set[str]:
