@@ -21,6 +21,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     from gpe_pl.report import summary
     from gpe_pl.simulate import ensure_split, evaluated_config
     from gpe_pl.skips import Skips
+    from gpe_pl.training.run import TrainerSettings, set_up
 
     if not isinstance(cfg.checkpoint, str):
         shipped = f", or a shipped model: {', '.join(names())}" if names() else ""
@@ -28,7 +29,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     settings = construct(
         EvaluationSettings, {**{k: v for k, v in cfg.evaluation.items() if k != "data"}, "splits": [cfg.split]}, "evaluation"
     )
-    simulator = LearnedSimulator.from_checkpoint(checkpoint_path(cfg.checkpoint))
+    device = set_up(construct(TrainerSettings, cfg.trainer, "trainer"))
+    simulator = LearnedSimulator.from_checkpoint(checkpoint_path(cfg.checkpoint), device)
     simulator.skips = construct(Skips, cfg.rollout, "rollout")
     root = ensure_split(evaluated_config(cfg), cfg.split)
     folder = Path(cfg.paths.runs) / cfg.name

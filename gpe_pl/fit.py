@@ -29,7 +29,7 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.simulate import ensure_data, evaluated_config
     from gpe_pl.training.budget import digest, step_time, within_budget
     from gpe_pl.training.module import TrainingModule
-    from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, claim, set_threads, train
+    from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, claim, set_up, train
     from gpe_pl.training.tracking import LoggerSettings, publish
 
     if type(cfg.seed) is not int or cfg.seed < 0:
@@ -50,8 +50,7 @@ def fit(cfg: DictConfig) -> float:
     with FileLock(Path(cfg.paths.data) / f".{cfg.data.name}.lock"):  # runs of a sweep start at the same time
         root = ensure_data(cfg)
         evaluated = ensure_data(evaluated_config(cfg)) if cfg.evaluation.data else root
-    device = "cuda" if trainer.accelerator == "gpu" else "cpu"
-    set_threads(trainer)
+    device = set_up(trainer)
 
     @cache
     def data() -> TrajectoryDataModule:

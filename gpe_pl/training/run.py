@@ -68,7 +68,8 @@ class TrainingSettings:
 class TrainerSettings:
     """Where the training runs: in one process per device, each of which takes a part of every batch (see ``training.parallel``).
 
-    ``devices`` are those of one of ``num_nodes`` machines.
+    ``devices`` are those of one of ``num_nodes`` machines. ``matmul_precision`` is PyTorch's for products of single precision: ``high`` and ``medium`` may use
+    TensorFloat-32 or bfloat16 inside, where the processor or GPU is faster with them.
     """
 
     accelerator: Literal["cpu", "gpu", "auto"] = "cpu"
@@ -76,7 +77,13 @@ class TrainerSettings:
     num_nodes: Annotated[int, Field(ge=1)] = 1
     num_threads: Annotated[int, Field(ge=1)] | None = None
     num_workers: Annotated[int, Field(ge=0)] = 0
+    matmul_precision: Literal["highest", "high", "medium"] = "highest"
     progress: bool = True
+
+    @property
+    def device(self) -> str:
+        """Where tensors go."""
+        return "cuda" if self.accelerator == "gpu" or (self.accelerator == "auto" and torch.cuda.is_available()) else "cpu"
 
     @property
     def num_processes(self) -> int:
@@ -199,7 +206,15 @@ def train(
     return folder / "best.ckpt"
 
 
-def set_threads(settings: TrainerSettings) -> None:
-    """PyTorch's threads in this process."""
+def set_up(settings: TrainerSettings) -> str:
+    """Threads and precision of PyTorch in this process; the device to compute on.
+
+    Raises:
+        RunError: there is no such device.
+    """
+    if settings.device == "cuda" and not torch.cuda.is_available():
+        raise RunError(f"trainer.accelerator={settings.accelerator}: PyTorch finds no GPU here; choose trainer=cpu")
     if settings.num_threads is not None:
         torch.set_num_threads(settings.num_threads)
+    torch.set_float32_matmul_precision(settings.matmul_precision)
+    return settings.device

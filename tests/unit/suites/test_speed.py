@@ -7,7 +7,7 @@ import torch
 
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.lattice import lattice_graph
-from gpe_pl.suites.speed import REFERENCE, Case, Settings, cases, flop, run, training_step
+from gpe_pl.suites.speed import REFERENCE, Case, Settings, cases, flop, run, training_step, with_precision
 
 SMALL = Settings(num_nodes=40, num_edges=100, num_message_passing_steps=2, hidden_channels=8, num_rounds=1, compile=False)
 
@@ -55,10 +55,22 @@ def test_every_case_has_its_records_and_its_row(monkeypatch: pytest.MonkeyPatch)
     records, table = run(SMALL)
     found = {(r["metric"], r["case"]): r["value"] for r in records}
     for name, case in cases(compiled=False).items():
-        wanted = {"forward_time", "training_time", "forward_speedup", "forward_speedup_vs_gns", "training_speedup", "peak_memory"}
-        wanted |= {"forward_time_saved", "flop_floor", "byte_floor", "floor_ratio"} if case.model == "GPE" else set()
+        wanted = {"forward_time", "training_time", "forward_speedup", "forward_speedup_vs_gns", "training_speedup"}
+        if case.precision != "highest":
+            wanted |= {"forward_difference"}
+        else:
+            wanted |= {"peak_memory"} | (
+                {"forward_time_saved", "flop_floor", "byte_floor", "floor_ratio"} if case.model == "GPE" else set()
+            )
         assert all(found[metric, name] >= 0 or metric == "forward_time_saved" for metric in wanted)
         assert f"| {name} |" in table
     assert found["forward_speedup", REFERENCE] == 1 and found["forward_speedup_vs_gns", "GNS"] == 1
     assert found["neighbor_time", "cpu"] > 0
     assert found["flop", "negated, geometry"] < found["flop", "negated"] < found["flop", REFERENCE]
+
+
+def test_precision_holds_within_a_pass_alone() -> None:
+    seen: list[str] = []
+    before = torch.get_float32_matmul_precision()
+    with_precision(lambda: seen.append(torch.get_float32_matmul_precision()), "medium")()
+    assert seen == ["medium"] and torch.get_float32_matmul_precision() == before == "highest"

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
-from gpe_pl.training.run import RunError, adopt, claim
+from gpe_pl.training.run import RunError, TrainerSettings, adopt, claim, set_up
 
 CONFIG: dict[str, Any] = {"seed": 0, "model": {"depth": 3}, "training": {"batch_size": 2}}
 BY_NODES = {**CONFIG, "batching": {"max_nodes": 500}}
@@ -36,3 +37,18 @@ def test_the_same_configuration_is_the_same_run(tmp_path: Path, config: dict[str
     claim(folder, {**config, "evaluation": {"splits": ["test"]}})
     taken = adopt(tmp_path / "there", config, tmp_path / "now")
     assert taken is not None and taken.read_bytes() == b"weights"
+
+
+def test_a_gpu_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert TrainerSettings(accelerator="auto").device == "cpu"
+    with pytest.raises(RunError, match="trainer.accelerator=gpu: PyTorch finds no GPU here; choose trainer=cpu"):
+        set_up(TrainerSettings(accelerator="gpu"))
+
+
+def test_the_precision_of_products_is_set() -> None:
+    try:
+        assert set_up(TrainerSettings(matmul_precision="medium")) == "cpu"
+        assert torch.get_float32_matmul_precision() == "medium"
+    finally:
+        torch.set_float32_matmul_precision("highest")
