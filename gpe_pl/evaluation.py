@@ -168,7 +168,7 @@ def _start(simulator: LearnedSimulator, trajectory: Trajectory, truth: Trajector
     bounds = truth.metadata.bounds
     size = max(high - low for low, high in bounds)
     speed = float(np.linalg.norm(trajectory.vel, axis=-1).max(initial=0.0))
-    guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, size), bounds=bounds, margin=size)
+    guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, size), bounds=bounds, margin=size, spacing=truth.metadata.spacing)
     return Start(simulator.initial_state(trajectory, simulator.builder.config.history), truth.num_frames - 1, truth.metadata, guard)
 
 

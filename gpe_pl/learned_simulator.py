@@ -198,15 +198,26 @@ class LearnedSimulator(nn.Module):
 
     @torch.inference_mode()
     def step(self, state: State) -> State:
-        return self._advance_all([state])[0]
+        return self._advance_all([state], [self.builder(state)])[0]
 
     @torch.inference_mode()
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        """``step`` of several scenes in one pass of the model."""
-        return [*self._advance_all(states)]
+        """``step`` of several scenes in one pass of the model; a scene that has no graph any more is answered with the reason."""
+        graphs = [self._graph(state) for state in states]
+        sound = [k for k, graph in enumerate(graphs) if not isinstance(graph, SimulationError)]
+        new: list[Any] = list(graphs)
+        if sound:
+            for k, state in zip(sound, self._advance_all([states[k] for k in sound], [new[k] for k in sound]), strict=True):
+                new[k] = state
+        return new
 
-    def _advance_all(self, states: list[State]) -> list[State]:
-        graphs = [self.builder(state) for state in states]
+    def _graph(self, state: State) -> HeteroData | SimulationError:
+        try:
+            return self.builder(state)
+        except SimulationError as error:
+            return error
+
+    def _advance_all(self, states: list[State], graphs: list[HeteroData]) -> list[State]:
         data = graphs[0] if len(graphs) == 1 else Batch.from_data_list(graphs)
         predicted = self(data)
         acc = [state.gravity.expand_as(state.pos).clone() for state in states]

@@ -30,7 +30,8 @@ from gpe_pl.graphs.features import (
 )
 from gpe_pl.graphs.islands import islands_within
 from gpe_pl.graphs.multiscale import MultiscaleGraph, multiscale_graph
-from gpe_pl.graphs.neighbors import radius_between, radius_pairs
+from gpe_pl.graphs.neighbors import check_crowding, radius_between, radius_pairs
+from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of, node_code
 from gpe_pl.trajectory import Metadata, State
 
@@ -70,10 +71,18 @@ class GraphBuilder:
 
         Raises:
             GraphError: the state holds a node type that the data set does not have, lacks velocity history, or has cells that do not fit its nodes.
+            SimulationError: a position or velocity is not finite, or so many nodes lie within each other's radius that the material has collapsed.
         """
+        if state.pos.dtype != torch.float64:
+            raise GraphError(f"positions are {state.pos.dtype}; convert the state with State.to_torch, which makes them float64")
         history = history_of(state)
         if history.shape[1] != self.config.history:
             raise GraphError(f"state has a history of {history.shape[1]} velocities, the graph needs {self.config.history}")
+        bad = ~torch.isfinite(torch.cat([state.pos, history.flatten(1)], dim=1)).all(dim=1)
+        if bad.any():
+            node = int(bad.nonzero()[0])
+            raise SimulationError(f"node {node} has a position or velocity that is not finite", reason="nan", node=node)
+        check_crowding(state.pos.cpu().numpy(), self.scales.radius, self.scales.spacing)
         rows = {m: self._rows(state, m) for m in self.spec.materials}
         if sum(len(r) for r in rows.values()) != state.num_nodes:
             present = {NODE_TYPES[code] for code in state.node_type.unique().tolist()}
