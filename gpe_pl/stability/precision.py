@@ -145,7 +145,7 @@ def trained(subject: Subject, graphs: list[HeteroData], learning_rate: float) ->
         loss.backward()
         torch.nn.utils.clip_grad_norm_(simulator.parameters(), 1.0)
         optimizer.step()
-        losses.append(float(loss))
+        losses.append(loss.item())
     return losses
 
 

@@ -80,10 +80,20 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
     """A record per test and model, and a Markdown table per domain."""
     torch.set_num_threads(settings.num_threads)
     records: list[dict[str, Any]] = []
+    untested = []
     for name, spec in specs.items():
-        for subject in subjects(name, spec, settings):
+        models = dict(_models(spec, settings))
+        if not models:
+            untested.append(name)
+        for subject in subjects(name, spec, models, settings) if models else ():
             records += test(subject, settings.tests)
-    return records, _report(records)
+    if not records:
+        raise NothingToTestError(
+            f"{', '.join([*settings.runs, *settings.checkpoints]) or 'suite.runs and suite.checkpoints are empty'}: no model that was trained on one of "
+            f"{', '.join(f'{s.name} {s.size}' for s in specs.values())}; train with `python -m gpe_pl.fit data={untested[0]} model=gpe_tuned` or set "
+            "suite.runs or suite.checkpoints"
+        )
+    return records, _report(records, untested)
 
 
 def test(subject: Subject, numbers: Sequence[int] = ()) -> Iterator[dict[str, Any]]:
@@ -122,18 +132,8 @@ def _outcome(stress_test: StressTest, subject: Subject) -> Outcome:
 # --- what is tested -------------------------------------------------------------------------------------------------------------------------
 
 
-def subjects(domain: str, spec: DatasetSpec, settings: Settings) -> list[Subject]:
-    """The models of a data set, the gating ones first.
-
-    Raises:
-        NothingToTestError: there are none.
-    """
-    models = dict(_models(spec, settings))
-    if not models:
-        raise NothingToTestError(
-            f"{', '.join([*settings.runs, *settings.checkpoints])}: no model that was trained on the data set {spec.name!r} of size {spec.size!r}; "
-            f"train with `python -m gpe_pl.fit data={domain} model=gpe_tuned size={spec.size}` or set suite.runs or suite.checkpoints"
-        )
+def subjects(domain: str, spec: DatasetSpec, models: dict[str, LearnedSimulator], settings: Settings) -> list[Subject]:
+    """The models of a data set with what they are tested on, the gating ones first."""
     scenes = [generate_trajectory(spec, "test", k) for k in range(settings.num_scenes)]
     speed = horizon.max_speed(spec, generate_trajectory, settings.num_scenes)
     found = [
@@ -192,7 +192,7 @@ def _label(simulator: LearnedSimulator) -> str:
 MARKS = {"passed": "passed", "failed": "**failed**", "not_applicable": "–"}
 
 
-def _report(records: Sequence[dict[str, Any]]) -> str:
+def _report(records: Sequence[dict[str, Any]], untested: Sequence[str] = ()) -> str:
     """Counts, and a table per domain: a row per test, a column per model."""
     gating = [r for r in records if r["gating"]]
     failed = [r for r in gating if r["status"] == "failed"]
@@ -200,6 +200,8 @@ def _report(records: Sequence[dict[str, Any]]) -> str:
         f"Gating configurations: {sum(r['status'] == 'passed' for r in gating)} passed, {len(failed)} failed, "
         f"{sum(r['status'] == 'not_applicable' for r in gating)} do not apply. Criteria were fixed before they were measured.",
     ]
+    if untested:
+        lines += ["", f"Not tested, for want of a model: {', '.join(untested)}."]
     for domain in dict.fromkeys(r["domain"] for r in records):
         own = [r for r in records if r["domain"] == domain]
         models = {r["model"]: r["gating"] for r in own}
