@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 
-from gpe_pl.rollout import CROWDING_LIMIT, SimulationError
+from gpe_pl.rollout import CROWDING_LIMIT, SimulationError, crowding
 
 
 def pairs_at_rest(num_nodes: int, radius: float, spacing: float, dim: int) -> float:
@@ -27,10 +27,7 @@ def check_crowding(pos: Float64[np.ndarray, "node dim"], radius: float, spacing:
     if num_nodes < 2:
         return
     limit = CROWDING_LIMIT * pairs_at_rest(num_nodes, radius, spacing, dim)
-    _, in_box = np.unique(np.floor(pos / radius), axis=0, return_counts=True)
-    if (
-        3**dim / 2 * float(np.sum(in_box.astype(np.float64) ** 2)) <= limit
-    ):  # no fewer than there are: a node's neighbours lie in 3^dim boxes
+    if 3**dim / 2 * float(crowding(pos, radius).sum()) <= limit:  # no fewer than there are: a node's neighbours lie in 3^dim boxes
         return
     tree = cKDTree(pos)
     num_pairs = (int(tree.count_neighbors(tree, radius)) - num_nodes) // 2

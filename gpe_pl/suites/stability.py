@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import logging
 import math
+import multiprocessing
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
@@ -62,7 +64,8 @@ class Settings:
         horizon_factors: lengths of long rollouts over the trained horizon.
         num_rest_steps: frames that a pile at rest is watched.
         tests: numbers of the tests to run; none runs all.
-        num_threads: of PyTorch; the solvers use one.
+        num_workers: processes, each with data sets of its own.
+        num_threads: of PyTorch in each; the solvers use one.
     """
 
     cases: dict[str, Case]
@@ -73,20 +76,22 @@ class Settings:
     horizon_factors: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=1)] = field(default_factory=lambda: [1.0, 3.0, 10.0])
     num_rest_steps: Annotated[int, Field(ge=1)] = 1000
     tests: list[Annotated[int, Field(ge=1, le=30)]] = field(default_factory=list)
+    num_workers: Annotated[int, Field(ge=1)] = 2
     num_threads: Annotated[int, Field(ge=1)] = 1
 
 
 def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
     """A record per test and model, and a Markdown table per domain."""
-    torch.set_num_threads(settings.num_threads)
     records: list[dict[str, Any]] = []
-    untested = []
-    for name, spec in specs.items():
-        models = dict(_models(spec, settings))
-        if not models:
-            untested.append(name)
-        for subject in subjects(name, spec, models, settings) if models else ():
-            records += test(subject, settings.tests)
+    untested = [name for name, spec in specs.items() if not any(_models(spec, settings))]
+    tested = {name: spec for name, spec in specs.items() if name not in untested}
+    if min(settings.num_workers, len(tested)) > 1:
+        with ProcessPoolExecutor(settings.num_workers, multiprocessing.get_context("spawn")) as pool:
+            for found in pool.map(_test_domain, tested, tested.values(), [settings] * len(tested)):
+                records += found
+    else:
+        for name, spec in tested.items():
+            records += _test_domain(name, spec, settings)
     if not records:
         raise NothingToTestError(
             f"{', '.join([*settings.runs, *settings.checkpoints]) or 'suite.runs and suite.checkpoints are empty'}: no model that was trained on one of "
@@ -94,6 +99,12 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
             "suite.runs or suite.checkpoints"
         )
     return records, _report(records, untested)
+
+
+def _test_domain(name: str, spec: DatasetSpec, settings: Settings) -> list[dict[str, Any]]:
+    """Records of all models of a data set."""
+    torch.set_num_threads(settings.num_threads)
+    return [record for subject in subjects(name, spec, dict(_models(spec, settings)), settings) for record in test(subject, settings.tests)]
 
 
 def test(subject: Subject, numbers: Sequence[int] = ()) -> Iterator[dict[str, Any]]:
