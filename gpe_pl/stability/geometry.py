@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -101,7 +102,8 @@ def cutoff(subject: Subject) -> Outcome:
 
 def _with_visitor(state: State, visitor: State) -> State:
     names = ("pos", "vel", "node_type", "mass", "material_params", "velocity_history")
-    return replace(state, **{n: torch.cat([getattr(state, n), getattr(visitor, n)]) for n in names}, cells=None, rest_pos=None)
+    values: dict[str, Any] = {n: torch.cat([getattr(state, n), getattr(visitor, n)]) for n in names}
+    return replace(state, **values, cells=None, rest_pos=None)
 
 
 @stress_test(16, "neighbour list", "equal to brute force for 1,000 random moves; pairs are unordered")

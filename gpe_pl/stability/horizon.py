@@ -14,6 +14,7 @@ import torch
 
 from gpe_pl.containment import Contained
 from gpe_pl.generation import initial_state
+from gpe_pl.graphs.features import history_of
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import displacement
 from gpe_pl.rollout import Simulator, Start, rollout, rollouts
@@ -195,7 +196,7 @@ def resuming(subject: Subject) -> Outcome:
     half = _advanced(simulator, start, 100)
     with tempfile.TemporaryDirectory() as folder:
         subject.simulator.save(Path(folder) / "model.ckpt")
-        np.savez(Path(folder) / "state.npz", pos=half.pos, vel=half.vel, history=half.velocity_history)
+        np.savez(Path(folder) / "state.npz", pos=half.pos, vel=half.vel, history=history_of(half))
         loaded = np.load(Path(folder) / "state.npz")
         pos, vel, history = (torch.from_numpy(loaded[name]) for name in ("pos", "vel", "history"))
         resumed = Contained(LearnedSimulator.from_checkpoint(Path(folder) / "model.ckpt"), subject.dt)

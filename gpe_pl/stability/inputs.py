@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,7 @@ def materials(subject: Subject) -> Outcome:
         truth = subject.scenes[0]
         params = truth.material_params.copy()
         params[3] = value
-        refused += _raises(lambda p=params, t=truth: simulator.initial_state(replace(t, material_params=p), subject.history), "node 3 ")
+        refused += _raises(partial(simulator.initial_state, replace(truth, material_params=params), subject.history), "node 3 ")
     return Outcome(all(found) and refused == 3, f"{sum(found)} of 2 finite and flagged, {refused} of 3 refused")
 
 
@@ -133,7 +134,7 @@ def large_steps(subject: Subject) -> Outcome:
     assert state.velocity_history is not None
     for factor in (2.0, 5.0, 10.0):
         other = replace(truth, metadata=replace(truth.metadata, frame_dt=factor * truth.metadata.frame_dt))
-        refused += _raises(lambda t=other: simulator.initial_state(t, subject.history))
+        refused += _raises(partial(simulator.initial_state, other, subject.history))
         fast = replace(state, vel=factor * state.vel, velocity_history=factor * state.velocity_history, boundary=no_boundary(state))
         cfl = float(fast.vel.norm(dim=1).max()) * subject.dt / simulator.builder.scales.radius
         result = rollouts(simulator, [Start(fast, NUM_STEPS, truth.metadata, Guard())])[0]

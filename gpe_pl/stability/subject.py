@@ -247,6 +247,6 @@ def joined(a: State, b: State) -> State:
     """The nodes of two states in one, with the boundary of the first."""
     names = ["pos", "vel", "node_type", "mass", "material_params", "velocity_history"]
     values: dict[str, Any] = {name: torch.cat([getattr(a, name), getattr(b, name)]) for name in names}
-    if a.cells is not None and b.cells is not None:
+    if a.cells is not None and b.cells is not None and a.rest_pos is not None and b.rest_pos is not None:
         values |= {"rest_pos": torch.cat([a.rest_pos, b.rest_pos]), "cells": torch.cat([a.cells, b.cells + a.num_nodes])}
     return replace(a, **values, stress=None)

@@ -41,6 +41,7 @@ def losses(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[float]]:
 
     def training_step(self: TrainingModule, batch: Any, batch_idx: int) -> torch.Tensor:
         loss = plain(self, batch, batch_idx)
+        assert loss is not None
         seen.setdefault(self.global_step, []).append(loss.item())
         return loss
 
@@ -204,7 +205,7 @@ def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(
     cfg = tiny(tiny_data, tmp_path, *STEPS, "training.num_steps=60")
     plain = TrainingModule.training_step
 
-    def training_step(self: TrainingModule, batch: Any, batch_idx: int) -> torch.Tensor:
+    def training_step(self: TrainingModule, batch: Any, batch_idx: int) -> torch.Tensor | None:
         if self.global_step == 4:  # from now on
             data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
             stored = data.train_set.trajectories[1]
