@@ -15,6 +15,7 @@ from gpe_pl.generation import DatasetSpec, generate_trajectory
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.simulate import dataset
 from gpe_pl.stability import conservation, geometry, horizon, inputs, invariances, precision
@@ -106,6 +107,19 @@ def test_a_model_without_exact_momentum_says_so(spec: DatasetSpec, scenes: list[
     assert conservation.angular_momentum(own).passed is None
     assert conservation.node_head(own).passed is None
     assert geometry.isolated(own).passed is False  # a node alone does not fall freely
+
+
+def test_a_node_head_is_compared_with_gns(spec: DatasetSpec, scenes: list[Trajectory]) -> None:
+    exact = subject(spec, scenes, **SHIPPED)
+    build = exact.simulator.builder
+    gns = LearnedSimulator(GNS(build.spec, num_message_passing_steps=2, hidden_channels=8), build).eval()
+    peers = {"GPE": exact.simulator, "GNS": gns}
+    better, worse = (replace(s, peers=peers) for s in (exact, subject(spec, scenes)))
+    assert conservation.node_head(better).passed is True
+    theirs = conservation.momentum_residual(gns, worse.free_state())
+    own = conservation.momentum_residual(worse.simulator, worse.free_state())
+    assert conservation.node_head(worse).passed is (own <= theirs)
+    assert conservation.node_head(replace(worse, simulator=gns)).measured == f"this is GNS: {theirs:.2g}"
 
 
 def test_an_exploding_model_fails(spec: DatasetSpec, scenes: list[Trajectory]) -> None:
