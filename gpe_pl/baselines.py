@@ -20,7 +20,8 @@ class ConstantVelocity:
     dt: float
 
     def step(self, state: State) -> State:
-        return replace(state, pos=state.pos + state.vel * self.dt, velocity_history=None, time=state.time + self.dt, stress=None)
+        pos = state.periodicity.wrapped(state.pos + state.vel * self.dt)
+        return replace(state, pos=pos, velocity_history=None, time=state.time + self.dt, stress=None)
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Ballistic:
             pos = xp.where(hit[:, None], self._touchdown(state, pos), pos)
         pos = xp.where(stuck[:, None], state.pos, pos)
         vel = xp.where((hit | stuck)[:, None], xp.zeros_like(vel), vel)
-        return replace(state, pos=pos, vel=vel, velocity_history=None, time=state.time + self.dt, stress=None)
+        return replace(state, pos=state.periodicity.wrapped(pos), vel=vel, velocity_history=None, time=state.time + self.dt, stress=None)
 
     @staticmethod
     def _touchdown(state: State, end: Array) -> Array:

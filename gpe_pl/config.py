@@ -36,6 +36,7 @@ WITHOUT_KEY = {"comparison", "experiment", "scene", "solver"}
 """Config groups that fill other keys than one of their own."""
 
 launcher.register()  # conf/ names it
+OmegaConf.register_new_resolver("times", lambda a, b: a * b, replace=True)  # ${times:a,b} in conf/
 
 
 def _for_model(values: Mapping[str, Any], target: str) -> Any:
@@ -130,7 +131,7 @@ def bind(target: Callable[..., T], settings: Mapping[str, Any], path: str, *late
 def _one_line(error: ValidationError, path: str) -> str:
     parts = []
     for e in error.errors():
-        key = ".".join([path, *(str(k) for k in e["loc"] if isinstance(k, (str, int)))])
+        key = ".".join([*([path] if path else []), *(str(k) for k in e["loc"] if isinstance(k, (str, int)))])
         value = f"={e['input']!r}" if e["loc"] and e["type"] != "missing" and not isinstance(e["input"], dict) else ""
         message = e["msg"].removeprefix("Value error, ")
         message = message if message[:2].isupper() else message[0].lower() + message[1:]
@@ -214,6 +215,8 @@ def _fail(error: Exception) -> None:
 def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
     """One line for a composition error, with the valid keys or choices."""
     text = " ".join(str(error).split())
+    if "'data/imported'" in text:
+        return f"data=imported: {config_name} takes data that it simulates; fit and evaluate take imported ones"
     match = re.search(r"Could not override '([^']+)'", text)
     if match is None:
         override = getattr(error, "override", None)  # of a syntax error
@@ -241,11 +244,12 @@ def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
 
 
 def _check_top_level(cfg: DictConfig, config_name: str) -> None:
-    known = {*_groups(config_name), *(str(k) for k in OmegaConf.load(CONF / f"{config_name}.yaml"))} - {"defaults", "hydra"}
+    file = OmegaConf.load(CONF / f"{config_name}.yaml")
+    known = {*_groups(config_name), *map(str, file)} - {"defaults", "hydra"}
     wrong = {str(k) for k in cfg} ^ (known - WITHOUT_KEY)
     if wrong:
         raise ConfigError(f"{min(wrong)}: unknown or missing key; valid keys: {', '.join(sorted(known))}")
-    if "name" in cfg and not (isinstance(cfg.name, str) and cfg.name.strip()):
+    if "name" in cfg and OmegaConf.to_container(file)["name"] is not None and not (isinstance(cfg.name, str) and cfg.name.strip()):  # type: ignore[call-overload,index]
         raise ConfigError(f"name={cfg.name!r}: must be the name of a folder for the results")
 
 

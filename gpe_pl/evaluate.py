@@ -5,19 +5,22 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpe_pl.config import ConfigError, construct, entry_point
+from gpe_pl.config import ConfigError, construct, construct_target, entry_point
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
+    from gpe_pl.learned_simulator import LearnedSimulator
+
 
 def evaluate_checkpoint(cfg: DictConfig) -> None:
-    """Roll a trained model out on one split of a data set; numbers and pictures go to ``{paths.runs}/{name}``."""
+    """Roll a trained model out on one split of a data set, and in the scene's showcase if it has one; numbers and pictures go to ``{paths.runs}/{name}``."""
     from gpe_pl.evaluation import EvaluationSettings, evaluate
     from gpe_pl.learned_simulator import LearnedSimulator
     from gpe_pl.pretrained import checkpoint_path, names
     from gpe_pl.report import summary
-    from gpe_pl.simulate import ensure_data, evaluated_config
+    from gpe_pl.simulate import ensure_split, evaluated_config
+    from gpe_pl.skips import Skips
 
     if not isinstance(cfg.checkpoint, str):
         shipped = f", or a shipped model: {', '.join(names())}" if names() else ""
@@ -26,11 +29,25 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
         EvaluationSettings, {**{k: v for k, v in cfg.evaluation.items() if k != "data"}, "splits": [cfg.split]}, "evaluation"
     )
     simulator = LearnedSimulator.from_checkpoint(checkpoint_path(cfg.checkpoint))
-    root = ensure_data(evaluated_config(cfg))
+    simulator.skips = construct(Skips, cfg.rollout, "rollout")
+    root = ensure_split(evaluated_config(cfg), cfg.split)
     folder = Path(cfg.paths.runs) / cfg.name
     rows = evaluate(simulator, root, settings, folder)
     print(summary(rows))
+    if cfg.data.get("showcase") is not None:
+        _show(cfg, simulator, folder)
     print(folder)
+
+
+def _show(cfg: DictConfig, simulator: LearnedSimulator, folder: Path) -> None:
+    from gpe_pl import showcase
+    from gpe_pl.generation import progress_bar
+
+    settings = construct(showcase.ShowcaseSettings, {k: v for k, v in cfg.data.showcase.items() if k != "scene"}, "data.showcase")
+    scene = construct_target(cfg.data.showcase.scene, "data.showcase.scene", "gpe_pl.solvers.")
+    with progress_bar("showcase") as on_progress:
+        records = showcase.run(simulator, scene, settings, folder, on_progress)
+    print(showcase.summary(records))
 
 
 main = entry_point("evaluate")(evaluate_checkpoint)

@@ -17,6 +17,7 @@ import torch
 from pydantic import Field
 from torch_geometric.data import Batch
 
+from gpe_pl.approximate import approximate
 from gpe_pl.baselines import Ballistic, ConstantVelocity
 from gpe_pl.containment import TOLERANCE, Contained
 from gpe_pl.data.dataset import WindowDataset, open_split
@@ -24,13 +25,15 @@ from gpe_pl.errors import GpeError
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
 from gpe_pl.portable import export_model
-from gpe_pl.rollout import Guard, Start, rollout, rollouts, share_outside
+from gpe_pl.rollout import Guard, Simulator, Start, rollout, rollouts, share_outside
 from gpe_pl.schema import Split
 from gpe_pl.trajectory import State, Trajectory, iter_trajectories
 
 log = logging.getLogger(__name__)
 
 LEARNED = "learned"
+EXACT = "learned, exact"
+"""The same model without the approximate levels of ``Skips``, where a rollout has some."""
 Export = Literal["vtk", "npz", "mp4", "model"]
 MAX_SPEED_FACTOR = 20.0
 """A learned rollout faster than this many times the fastest particle of the ground truth has exploded."""
@@ -89,6 +92,10 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     All rollouts start at the first frame with enough history and run to the end of the ground truth. Share outside with containment off is reported as
     ``share_outside_uncontained``, where it was asked for, the share of corrected particle-steps as ``share_corrected``.
 
+    Where ``simulator.skips`` has approximate levels, the rollout without them is evaluated beside, and what they cost is reported: ``skipping_mse`` [m²] is
+    the distance between the two rollouts, ``share_asleep`` that of particle-steps that were not computed, ``lost_impulse`` [kg m/s] the momentum that
+    falling asleep took away.
+
     Raises:
         ExportError: a format in ``settings.export`` needs a package that is not installed.
     """
@@ -99,7 +106,7 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     run_dir.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     for split in settings.splits:
-        curves: dict[str, list[np.ndarray]] = {label: [], "ballistic": [], "constant_velocity": []}
+        curves: dict[str, list[np.ndarray]] = {}
         rows += [Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split))]
         trajectories = islice(iter_trajectories(root, split), settings.num_trajectories)
         number, truth = 0, None
@@ -114,7 +121,7 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
                     log.warning("%s %d stopped: %s, %s", split, number, stop.reason, stop.message)
                 about = (split, number, truth.metadata.parameter_group, parameter)
                 for model, prediction in predictions.items():
-                    curves[model].append(per_frame_mse(prediction, truth))
+                    curves.setdefault(model, []).append(per_frame_mse(prediction, truth))
                     for record in rollout_metrics(prediction, truth, [*settings.horizons, "full"]):
                         rows.append(Row(model, *about, record.metric, str(record.horizon), record.value))
                 rows += [Row(label, *about, metric, "full", value) for metric, value in extra.items()]
@@ -139,25 +146,35 @@ def _predict(
     starts = [_start(simulator, *pair) for pair in zip(trajectories, truths, strict=True)]
     for line in sorted({line for start in starts for line in simulator.untrained_parameters(start.state)}):
         log.warning("outside the training data: %s", line)
-    num_corrected = [0] * len(starts)
+    totals = [{"num_corrected": 0.0, "num_asleep": 0.0, "lost_impulse": 0.0} for _ in starts]
 
     def count(scene: int, _: int, state: State) -> None:
-        num_corrected[scene] += state.num_corrected
+        for name in totals[scene]:
+            totals[scene][name] += getattr(state, name)
 
-    free = rollouts(simulator, starts[:num_uncontained] if containment else starts)
-    contained = rollouts(Contained(simulator, truths[0].metadata.frame_dt), starts, count) if containment else free
+    runner = approximate(simulator)
+
+    def within_walls(inner: Simulator) -> Simulator:
+        return Contained(inner, truths[0].metadata.frame_dt) if containment else inner
+
+    predicted = rollouts(within_walls(runner), starts, count)
+    free = rollouts(runner, starts[:num_uncontained]) if containment else predicted
+    exact = None if runner is simulator else rollouts(within_walls(simulator), starts)
     for scene, (trajectory, truth) in enumerate(zip(trajectories, truths, strict=True)):
         dt, steps, spacing = truth.metadata.frame_dt, truth.num_frames - 1, truth.metadata.spacing
-        prediction = contained[scene]
-        predictions = {label: prediction}
+        prediction = predicted[scene]
+        predictions = {label: prediction} if exact is None else {label: prediction, EXACT: exact[scene]}
         for name, baseline in (("ballistic", Ballistic(dt)), ("constant_velocity", ConstantVelocity(dt))):
             predictions[name] = rollout(baseline, trajectory.state(history, history), steps, truth.metadata)
         num_steps = truth.num_nodes * max(1, prediction.num_frames - 1)
         extra = {
             "share_outside_at_end": _share_outside(prediction, steps, steps, tolerance=TOLERANCE),
             "num_good_frames": float(prediction.num_frames - 1),
-            "share_corrected": num_corrected[scene] / num_steps,
+            "share_corrected": totals[scene]["num_corrected"] / num_steps,
         }
+        if exact is not None:
+            extra["skipping_mse"] = float(per_frame_mse(prediction, exact[scene])[1:].mean())
+            extra["share_asleep"], extra["lost_impulse"] = totals[scene]["num_asleep"] / num_steps, totals[scene]["lost_impulse"]
         if scene < len(free):
             extra["share_outside_uncontained"] = _share_outside(free[scene], 1, steps, tolerance=1e-3 * spacing)
         yield predictions, extra

@@ -32,7 +32,7 @@ import numpy as np
 from pydantic import Field, InstanceOf
 from pydantic.dataclasses import dataclass
 
-from gpe_pl import integrators
+from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.errors import GpeError
 from gpe_pl.rollout import Guard, SimulationError, Simulator, rollout
 from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup
@@ -42,7 +42,6 @@ from gpe_pl.trajectory import Metadata, State, StoreError, Trajectory, read_traj
 log = logging.getLogger(__name__)
 
 SPEC_FILE = "dataset.json"
-STATISTICS_FILE = "statistics.json"
 CONTACT_SHEET_FILE = "contact_sheet.png"
 SHEET_ROWS = 5
 
@@ -440,8 +439,8 @@ def generate(
         train = [(split, k) for split, k in _shards(spec) if split == "train"]
         if not statistics.is_file() and all(_is_complete(spec, folder, *shard) for shard in train):
             paths = [shard_path(folder, *shard) for shard in train]
-            moments = {str(path): sums for path, sums in _run(pool, _moments, [(path,) for path in paths])}
-            _write_json(statistics, _statistics(spec, [moments[str(path)] for path in paths]))
+            moments = {str(path): sums for path, sums in _run(pool, shard_moments, [(path,) for path in paths])}
+            _write_json(statistics, combined([moments[str(path)] for path in paths]))
     return folder
 
 
@@ -590,55 +589,3 @@ def _run(pool: Executor | None, function: Callable[..., Any], arguments: list[tu
     finally:
         for future in futures:
             future.cancel()
-
-
-# --- statistics ----------------------------------------------------------------------------------------------------------------------------
-
-
-def _moments(path: Path) -> tuple[str, dict[str, Any]]:
-    """Sums over one shard from which the statistics follow."""
-    sums: dict[str, Any] = {"velocity": [0, 0.0], "acceleration": [0, 0.0], "params": None, "nodes": 0, "frames": 0, "trajectories": 0}
-    for name in trajectory_names(path):
-        trajectory = read_trajectory(path, name)
-        dt = trajectory.metadata.frame_dt
-        vel = integrators.velocities(trajectory.pos.astype(np.float64), dt)
-        acc = integrators.acceleration(vel[1:], vel[:-1], dt) - np.asarray(trajectory.metadata.gravity)
-        for key, values in (("velocity", vel), ("acceleration", acc)):
-            sums[key][0] += values.size
-            sums[key][1] += float(np.sum(values * values))
-        params = _scaled(trajectory)
-        finite = np.isfinite(params)
-        values = np.where(finite, params, 0.0)
-        triple = np.stack([finite.sum(axis=0), values.sum(axis=0), (values * values).sum(axis=0)])
-        sums["params"] = triple if sums["params"] is None else sums["params"] + triple
-        sums["nodes"] += trajectory.num_nodes
-        sums["frames"] += trajectory.num_frames
-        sums["trajectories"] += 1
-    return str(path), sums
-
-
-def _scaled(trajectory: Trajectory) -> np.ndarray:
-    """Material parameters [node, param], those on a logarithmic scale as natural logarithms."""
-    scale = {p.name: p.scale for p in MATERIALS.values()}
-    columns = trajectory.material_params.astype(np.float64).T
-    return np.stack([np.log(c) if scale[n] == "log" else c for n, c in zip(trajectory.metadata.param_names, columns, strict=True)], axis=-1)
-
-
-def _statistics(spec: DatasetSpec, moments: list[dict[str, Any]]) -> dict[str, Any]:
-    """Root mean squares per component, and mean and standard deviation of the material parameters on the scale that ``schema`` gives them."""
-    rms = {}
-    for key in ("velocity", "acceleration"):
-        rms[key] = math.sqrt(math.fsum(m[key][1] for m in moments) / sum(m[key][0] for m in moments))
-    count, total, square = np.sum([m["params"] for m in moments], axis=0)
-    mean = total / np.maximum(count, 1)
-    std = np.sqrt(np.maximum(square / np.maximum(count, 1) - mean * mean, 0.0))
-    parameters = {p.name: p for p in MATERIALS.values()}
-    names = trajectory_metadata(spec, "train", 0).param_names
-    return {
-        "velocity_std": rms["velocity"],
-        "acceleration_std": rms["acceleration"],
-        "material_params": {
-            n: {"mean": float(m), "std": float(s), "scale": parameters[n].scale} for n, m, s in zip(names, mean, std, strict=True)
-        },
-        **{f"num_{key}": sum(m[key] for m in moments) for key in ("trajectories", "frames", "nodes")},
-    }

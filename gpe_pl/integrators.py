@@ -7,17 +7,20 @@ Symplectic Euler at the frame interval ``dt`` [s] throughout::
     x[t+1] = x[t] + v[t+1] dt
 
 so ``acceleration`` of three stored frames, fed back through ``advance``, gives the third frame back. All functions take NumPy arrays or
-torch tensors; precision is that of the input, so pass float64 (float32 positions lose small accelerations).
+torch tensors; precision is that of the input, so pass float64 (float32 positions lose small accelerations). Across the seam of a periodic axis a
+position changes by the shortest way around.
 """
 
 from typing import Any
 
+from gpe_pl.periodicity import NOWHERE, Periodicity
+
 Array = Any
 
 
-def velocities(pos: Array, dt: float) -> Array:
+def velocities(pos: Array, dt: float, periodicity: Periodicity = NOWHERE) -> Array:
     """Velocities [frame-1, ...] in m/s between consecutive positions [frame, ...] in m."""
-    return (pos[1:] - pos[:-1]) / dt
+    return periodicity.shortest(pos[1:] - pos[:-1]) / dt
 
 
 def acceleration(vel_next: Array, vel: Array, dt: float) -> Array:

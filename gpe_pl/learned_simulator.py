@@ -27,6 +27,7 @@ from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import Standardize
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, EdgeType, FeatureSpec, node_code, role
+from gpe_pl.skips import Skips
 from gpe_pl.trajectory import Metadata, State, Stress, Trajectory
 
 CHECKPOINT_FORMAT = 3
@@ -87,17 +88,24 @@ class GraphStandardizer(nn.Module):
         if sum(len(x) for x in mass):
             self.mass.copy_(torch.cat(mass).double().mean())
 
-    def forward(self, data: HeteroData) -> HeteroData:
-        """A graph with standardised features; the input is left as it is."""
+    def forward(self, data: HeteroData, skip_absent: bool = True) -> HeteroData:
+        """A graph with standardised features, on request also those that it has no rows of; the input is left as it is."""
+
+        def wanted(values: Tensor) -> bool:
+            return not skip_absent or values.shape[0] > 0
+
         out = copy.copy(data)
         for t in self.spec.node_types:
-            out[t].x = self.node[role(t)](data[t].x)
+            if wanted(data[t].x):
+                out[t].x = self.node[role(t)](data[t].x)
         for m in self.spec.materials:
-            out[m].material_params = self.params[m](self._material_scale(m, data[m].material_params))
-            out[m].mass = data[m].mass / self.mass
+            if wanted(data[m].x):
+                out[m].material_params = self.params[m](self._material_scale(m, data[m].material_params))
+                out[m].mass = data[m].mass / self.mass
         for relation in self.spec.relations:
-            out[relation].odd = self.odd[self._key(relation)](data[relation].odd)
-            out[relation].even = self.even[self._key(relation)](data[relation].even)
+            if wanted(data[relation].odd):
+                out[relation].odd = self.odd[self._key(relation)](data[relation].odd)
+                out[relation].even = self.even[self._key(relation)](data[relation].even)
         return out
 
 
@@ -107,6 +115,9 @@ class LearnedSimulator(nn.Module):
     Args:
         model: any ``models.base.Model``; its ``settings`` rebuild it from a checkpoint.
         builder: makes the graphs.
+
+    Attributes:
+        skips: what steps leave out; may be changed at any time and is no part of a checkpoint.
     """
 
     acceleration_std: Tensor
@@ -122,6 +133,20 @@ class LearnedSimulator(nn.Module):
             self.register_buffer(
                 f"trained_{material}", torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).expand(2, count).clone()
             )
+
+    @property
+    def skips(self) -> Skips:
+        return self.builder.skips
+
+    @skips.setter
+    def skips(self, skips: Skips) -> None:
+        self.builder = replace(self.builder, skips=skips)
+        cast(Any, self.model).skips = skips
+
+    @property
+    def num_hops(self) -> int:
+        """How many edges away a node can still count."""
+        return int(cast(Any, self.model).num_hops)
 
     @torch.no_grad()
     def fit_statistics(self, graphs: Iterable[HeteroData]) -> None:
@@ -165,7 +190,7 @@ class LearnedSimulator(nn.Module):
 
     def forward(self, data: HeteroData) -> Prediction:
         """Accelerations without gravity per material, in units of ``acceleration_std``."""
-        return self.model(self.standardizer(data))
+        return self.model(self.standardizer(data, self.skips.absent_types))
 
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
         """The state at a frame with the velocity history that the graph needs, on this model's device.
@@ -174,7 +199,23 @@ class LearnedSimulator(nn.Module):
             IndexError: too few frames before ``frame``.
             SceneError: another frame interval, dimension or material than in training, or a value that is not finite; names the node.
         """
-        own, scene = self.builder.metadata, trajectory.metadata
+        self._check_scene(trajectory.metadata)
+        state = trajectory.state(frame, history=self.builder.config.history).to_torch(self.acceleration_std.device)
+        return self._checked(state, f"frame {frame}")
+
+    def standing(self, state: State, scene: Metadata) -> State:
+        """A scene's state as if it had never moved otherwise, on this model's device: what a rollout without frames before it starts from.
+
+        Raises:
+            SceneError: as ``initial_state``.
+        """
+        self._check_scene(scene)
+        state = state.to_torch(self.acceleration_std.device)
+        history = state.vel[:, None].expand(-1, self.builder.config.history, -1)
+        return self._checked(replace(state, velocity_history=history.clone()), "start")
+
+    def _check_scene(self, scene: Metadata) -> None:
+        own = self.builder.metadata
         same_scales = abs(scene.frame_dt / own.frame_dt - 1) < 1e-6 and abs(scene.spacing / own.spacing - 1) < 0.01
         if not same_scales or scene.dim != own.dim or scene.param_names != own.param_names:
             raise SceneError(
@@ -182,11 +223,12 @@ class LearnedSimulator(nn.Module):
                 f"the scene has frame_dt={scene.frame_dt:g} s and spacing={scene.spacing:g} m in {scene.dim}D and "
                 f"{', '.join(scene.materials)}; choose the data set with data=… size=…"
             )
-        state = trajectory.state(frame, history=self.builder.config.history).to_torch(self.acceleration_std.device)
+
+    def _checked(self, state: State, where: str) -> State:
         for name, values in (("pos", state.pos), ("velocity", history_of(state))):
             bad = ~torch.isfinite(values).flatten(1).all(dim=1)
             if bad.any():
-                raise SceneError(f"frame {frame}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
+                raise SceneError(f"{where}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
         for material, spec in MATERIALS.items():
             if material in self.builder.metadata.materials:
                 rows = torch.nonzero(state.node_type == node_code(material)).flatten()
@@ -241,7 +283,7 @@ class LearnedSimulator(nn.Module):
         dt = self.builder.metadata.frame_dt
         pos, vel = integrators.advance(state.pos, state.vel, acc, dt)
         history = torch.cat([history_of(state)[:, 1:], vel[:, None]], dim=1)
-        return replace(state, pos=pos, vel=vel, velocity_history=history, time=state.time + dt, stress=None)
+        return replace(state, pos=state.periodicity.wrapped(pos), vel=vel, velocity_history=history, time=state.time + dt, stress=None)
 
     # --- checkpoints ----------------------------------------------------------------------------------------------------------------------
 

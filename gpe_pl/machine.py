@@ -84,18 +84,19 @@ def _peak_memory(sender: Any, function: Callable[..., Callable[[], Any]], argume
     call = function(*arguments)
     before = _resident()
     call()
-    sender.send(_peak() - before)
+    sender.send(peak_resident() - before)
 
 
 def _resident() -> int:
     """Bytes in use; forgets an earlier peak where the system can (Linux), else the peak so far, against which a smaller need cannot be seen."""
     if not CLEAR_REFS.exists():
-        return _peak()
+        return peak_resident()
     CLEAR_REFS.write_text("5")
     return _status("VmRSS")
 
 
-def _peak() -> int:
+def peak_resident() -> int:
+    """Most bytes that this process has had in memory so far."""
     return _status("VmHWM") if CLEAR_REFS.exists() else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_UNIT
 
 

@@ -70,11 +70,7 @@ def displacement(
     pos: Float[np.ndarray, "*axes dim"], reference: Float[np.ndarray, "*axes dim"], metadata: Metadata
 ) -> Float[np.ndarray, "*axes dim"]:
     """``pos - reference`` [m] in float64; along periodic axes the shortest way around."""
-    difference = pos.astype(np.float64) - reference.astype(np.float64)
-    for axis, (low, high) in enumerate(metadata.bounds):
-        if metadata.periodic[axis]:
-            difference[..., axis] -= (high - low) * np.round(difference[..., axis] / (high - low))
-    return difference
+    return metadata.periodicity.shortest(pos.astype(np.float64) - reference.astype(np.float64))
 
 
 def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.ndarray, "frame"]:

@@ -32,12 +32,15 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import boundary_features, edge_features, history_of, material_features, mesh_features, virtual_features
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, RADIUS, EdgeType, grid, level_of
+from gpe_pl.skips import Skips
 from gpe_pl.trajectory import Boundary, State
 
 Scene = dict[str, Tensor]
 """Tensors by the names of ``describe``."""
 
 DESCRIPTION = "description.json"
+EVERYTHING = Skips(absent_types=False, isolated_nodes=False, edges_at_once=None)
+"""What a program computes cannot depend on the values in its scene."""
 BOUNDARY_FIELDS = ("pos", "vel", "normal", "friction", "restitution")
 
 
@@ -245,6 +248,7 @@ def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
     if path.suffix != ".pt2":
         raise ValueError(f"{path}: an exported program ends in .pt2")
     step = PortableStep(copy.deepcopy(simulator).cpu().eval())
+    step.simulator.skips = EVERYTHING
     inputs = describe(simulator)
     example, sizes = _example(inputs)
     dims = {name: Dim(re.sub(r"\W", "_", name)) for name in sizes}

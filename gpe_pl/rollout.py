@@ -16,7 +16,7 @@ from array_api_compat import array_namespace
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import signed_distance
 from gpe_pl.schema import MATERIALS, node_code
-from gpe_pl.trajectory import Boundary, Metadata, State, Stress, Termination, Trajectory
+from gpe_pl.trajectory import Metadata, State, Stress, Termination, Trajectory
 
 
 @runtime_checkable
@@ -125,7 +125,8 @@ class Guard:
 
     def _tunnelling(self, before: State, state: State, frame: int) -> Termination | None:
         """Nodes that were and are outside of all shapes, but not between the two frames."""
-        start, end = _numpy(before.pos), _numpy(state.pos)
+        start = _numpy(before.pos)
+        end = start + state.periodicity.shortest(_numpy(state.pos) - start)
         shapes, length = state.boundary.shapes, np.linalg.norm(end - start, axis=-1)
         fast = np.flatnonzero(length > 2 * TUNNEL_DEPTH * self.spacing)
         if not shapes or not len(fast):
@@ -168,6 +169,8 @@ def impossible_material(state: State, metadata: Metadata) -> Termination | None:
 
 def step_all(simulator: Simulator, states: list[State]) -> list[State | SimulationError]:
     """One step of every state, together if the simulator can; errors of single scenes are returned, so that the others go on."""
+    if not states:
+        return []
     if isinstance(simulator, BatchSimulator):
         return simulator.step_all(states)
     return [_step(simulator, state) for state in states]
@@ -266,8 +269,7 @@ class _Recording:
         self.stress.append(None if item.stress is None else Stress(_numpy(item.stress.node), _numpy(item.stress.cell)))
 
     def trajectory(self) -> Trajectory:
-        state, b = self.start.state, self.start.state.boundary
-        boundary = Boundary(_numpy(b.pos), _numpy(b.vel), _numpy(b.normal), _numpy(b.friction), _numpy(b.restitution), b.shapes)
+        state = self.start.state
         known = [stress for stress in self.stress if stress is not None]
         has_stress = len(known) == len(self.stress)
         return Trajectory(
@@ -277,7 +279,7 @@ class _Recording:
             _numpy(state.node_type),
             _numpy(state.mass),
             _numpy(state.material_params),
-            boundary,
+            state.boundary.to_numpy(),
             rest_pos=None if state.rest_pos is None else _numpy(state.rest_pos),
             cells=None if state.cells is None else _numpy(state.cells),
             stress=Stress(np.stack([s.node for s in known]), np.stack([s.cell for s in known])) if has_stress else None,

@@ -135,6 +135,29 @@ def read_terrain(
     return DistanceGrid.from_values(low, spacing, values, friction)
 
 
+def ground_of(points: np.ndarray, normals: np.ndarray, bounds: Bounds, spacing: float, friction: float = STICKY) -> DistanceGrid:
+    """What is solid below an open surface given by points [point, 3] in m with unit normals into free space, at grid nodes that cover the domain.
+
+    Near the surface the normals tell which side is free. Farther away, where the nearest normal may belong to the rim of a cliff, it is what lies above the
+    height field through the points.
+
+    Args:
+        points, normals: of the surface.
+        bounds: ``(low, high)`` of the domain along x, y and z [m].
+        spacing: of the grid [m].
+        friction: Coulomb coefficient of the surface.
+
+    Raises:
+        TerrainError: seen from above all points lie on one line.
+    """
+    low, counts = _lattice(bounds, spacing)
+    values = _cloud_distances(points, normals, low, spacing, counts)
+    heights = _heights_of(Path("points"), points, low, spacing, counts)
+    is_above = low[2] + spacing * np.arange(counts[2]) > heights[..., None]
+    values = np.where(np.abs(values) > spacing, np.where(is_above, 1.0, -1.0) * np.abs(values), values)
+    return DistanceGrid.from_values(low, spacing, values, friction)
+
+
 def _lattice(bounds: Bounds, spacing: float) -> tuple[np.ndarray, tuple[int, ...]]:
     """First node and number of nodes of the grid that covers the domain."""
     if len(bounds) != 3 or any(not -math.inf < low < high < math.inf for low, high in bounds):

@@ -10,9 +10,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,22 @@ from array_api_compat import array_namespace
 from pydantic import TypeAdapter, ValidationError
 
 from gpe_pl import integrators
+from gpe_pl.arrays import (
+    RADIUS_SPACINGS,
+    ArrayError,
+    checked_bounds,
+    checked_cells,
+    checked_materials,
+    numbers,
+    per_node,
+    positive,
+    typical_spacing,
+    velocities_of,
+)
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import Shape, shape_from_dict, shape_to_dict
-from gpe_pl.schema import FIELDS, NODE_TYPES, SCHEMA_VERSION, node_code
+from gpe_pl.periodicity import NOWHERE, Periodicity
+from gpe_pl.schema import FIELDS, NODE_TYPES, SCHEMA_VERSION, STICKY, node_code, param_names
 
 Array = Any
 """A NumPy array or a torch tensor."""
@@ -75,6 +89,70 @@ class Boundary:
     def empty(cls, dim: int) -> Boundary:
         """No boundary at all."""
         return cls.sample((), 1.0, dim)
+
+    @classmethod
+    def from_numpy(
+        cls,
+        pos: Array,
+        normal: Array,
+        *,
+        vel: Array = 0.0,
+        friction: Array = STICKY,
+        restitution: Array = 0.0,
+        shapes: tuple[Shape, ...] = (),
+    ) -> Boundary:
+        """Walls and obstacles that are known by points on them; see ``arrays.estimated_normals`` where normals are not known.
+
+        Args:
+            pos: positions [boundary_node, dim] in m, about as far apart as particles.
+            normal: directions into free space [boundary_node, dim]; of any length.
+            vel: velocity in m/s, one for all [dim] or one per node, for walls that slide along themselves.
+            friction: Coulomb coefficient, one for all or one per node; ``schema.STICKY`` is no-slip.
+            restitution: fraction of the normal velocity that a bounce returns, one for all or one per node.
+            shapes: the geometry behind the points, if it is known; containment and pictures use it.
+
+        Raises:
+            ArrayError: an array of another shape, a number that is not finite or out of range; names the node.
+        """
+        pos = numbers("boundary pos", pos, {"boundary_node": None, "dim": None})
+        normal = numbers("boundary normal", normal, dict(zip(("boundary_node", "dim"), pos.shape, strict=True)))
+        length = np.linalg.norm(normal.astype(np.float64), axis=1)
+        if (length == 0).any():
+            raise ArrayError(f"boundary normal: boundary_node {int(length.argmin())} has length 0; it must point into free space")
+        vel = per_node("boundary vel", vel, pos.shape, "boundary_node")
+        friction, restitution = (
+            per_node(f"boundary {name}", value, pos.shape[:1], "boundary_node", low=0.0, high=high)
+            for name, value, high in (("friction", friction, np.inf), ("restitution", restitution, 1.0))
+        )
+        return cls(pos, vel, (normal / length[:, None]).astype(np.float32), friction, restitution, shapes)
+
+    def to_numpy(self) -> Boundary:
+        """The same with NumPy arrays of its own."""
+        pos, vel, normal, friction, restitution = (
+            np.array(_numpy(x)) for x in (self.pos, self.vel, self.normal, self.friction, self.restitution)
+        )
+        return Boundary(pos, vel, normal, friction, restitution, self.shapes)
+
+    def tree(self, periodicity: Periodicity) -> Any:
+        """``search_tree`` of the positions, built once: a boundary stays where it is."""
+        kept: dict[Periodicity, Any] = self.__dict__.setdefault("_trees", {})  # no field: no part of equality or of what is stored
+        if periodicity not in kept:
+            kept[periodicity] = search_tree(self.pos, periodicity)
+        return kept[periodicity]
+
+
+def search_tree(pos: Array, periodicity: Periodicity = NOWHERE) -> Any:
+    """A k-d tree of positions [node, dim] for neighbour search on the CPU: quick to build, so that moving nodes can have a new one in every step."""
+    from scipy.spatial import cKDTree
+
+    points = np.ascontiguousarray(_numpy(pos))
+    if not periodicity:
+        return cKDTree(points, balanced_tree=False, compact_nodes=False)
+    return cKDTree(periodicity.from_corner(points), balanced_tree=False, compact_nodes=False, boxsize=periodicity.period)
+
+
+def _numpy(x: Array) -> np.ndarray:
+    return x if isinstance(x, np.ndarray) else x.detach().cpu().numpy()
 
 
 @dataclass(frozen=True)
@@ -129,7 +207,10 @@ class State:
         stress: of the mesh, where the solver computes it.
         num_substeps: that a solver took to come here from the frame before.
         num_corrected: nodes that containment put back in coming here from the frame before.
+        num_asleep: nodes that a simulator left alone in coming here from the frame before.
+        lost_impulse: momentum [kg m/s], in sum of magnitudes, that it took from them.
         internal: opaque part of a solver (deformation gradient, …), carried so that a restart equals a run-through.
+        periodicity: axes along which space repeats.
     """
 
     pos: Array
@@ -146,7 +227,10 @@ class State:
     stress: Stress | None = None
     num_substeps: int = 0
     num_corrected: int = 0
+    num_asleep: int = 0
+    lost_impulse: float = 0.0
     internal: Any = None
+    periodicity: Periodicity = NOWHERE
 
     @property
     def num_nodes(self) -> int:
@@ -224,6 +308,10 @@ class Metadata:
     def dim(self) -> int:
         return len(self.bounds)
 
+    @cached_property
+    def periodicity(self) -> Periodicity:
+        return Periodicity(self.bounds, self.periodic)
+
 
 @dataclass(frozen=True)
 class Termination:
@@ -262,6 +350,91 @@ class Trajectory:
     stress: Stress | None = None
     termination: Termination | None = field(default=None, compare=False)
 
+    @classmethod
+    def from_numpy(
+        cls,
+        pos: Array,
+        frame_dt: float | int,
+        materials: str | Sequence[str],
+        params: Mapping[str, Array],
+        *,
+        vel: Array | None = None,
+        mass: Array = 1.0,
+        bounds: Array | None = None,
+        periodic: Array | None = None,
+        gravity: Array | None = None,
+        spacing: float | int | None = None,
+        connectivity_radius: float | int | None = None,
+        boundary: Boundary | None = None,
+        cells: Array | None = None,
+        rest_pos: Array | None = None,
+        dataset: str = "arrays",
+        split: str = "train",
+    ) -> Trajectory:
+        """A trajectory of your own arrays, checked.
+
+        ``data.importers.save_dataset`` writes many of them as a data set that ``python -m gpe_pl.fit data=imported`` trains on.
+
+        Args:
+            pos: positions [frame, node, dim] in m of at least 3 frames. Along periodic axes they are folded into the domain.
+            frame_dt: time between frames [s].
+            materials: material of all nodes, or of each; names of ``schema.MATERIALS``.
+            params: the parameter of each material that occurs, in the unit that ``schema.MATERIALS`` gives it: one value, or one per node of the trajectory.
+            vel: velocities [frame, node, dim] in m/s; None takes the differences of positions. Models learn from positions only.
+            mass: of all nodes or of each [kg]; only ratios matter to a model.
+            bounds: ``(low, high)`` of the domain per axis [m]; None takes the extremes of all positions. Periodic axes need them.
+            periodic: per axis whether space repeats; None: nowhere.
+            gravity: external acceleration [dim] in m/s²; None: zero, and models learn it as any other force.
+            spacing: rest spacing of neighbours [m]; None takes the median distance to the nearest node in the first frame.
+            connectivity_radius: neighbour radius [m] that sees what acts on a node; None takes ``arrays.RADIUS_SPACINGS`` spacings.
+            boundary: walls and obstacles, for example ``Boundary.sample(domain_walls(bounds, friction), spacing, dim)`` or ``Boundary.from_numpy(…)``.
+            cells: nodes of each cell [cell, corner] of meshes of elastomers and solids.
+            rest_pos: undeformed positions [node, dim] of meshes in m; None takes those of the first frame.
+            dataset, split: where the trajectory belongs; ``save_dataset`` overrides both.
+
+        Raises:
+            ArrayError: an argument that does not fit; names it, and frame and node where there is one.
+        """
+        pos = numbers("pos", pos, {"frame": None, "node": None, "dim": None})
+        num_frames, num_nodes, dim = pos.shape
+        if num_frames < 3 or num_nodes < 1 or dim not in (2, 3):
+            raise ArrayError(f"pos [frame, node, dim] is {list(pos.shape)}: at least 3 frames, 1 node, and 2 or 3 dimensions are needed")
+        frame_dt = positive("frame_dt", frame_dt, "seconds")
+        boundary = Boundary.empty(dim) if boundary is None else boundary
+        if boundary.pos.shape[1:] != (dim,):
+            raise ArrayError(f"boundary: its positions are {list(boundary.pos.shape)}, expected [boundary_node, {dim}]")
+        bounds = checked_bounds(bounds, periodic, pos, boundary.pos)
+        periodicity = Periodicity(bounds, tuple(map(bool, periodic)) if periodic is not None else (False,) * dim)
+        if periodicity:
+            pos = np.stack([periodicity.wrapped(frame.astype(np.float64)).astype(np.float32) for frame in pos])
+        pos = pos.astype(np.float32, copy=False)
+        codes, columns, names = checked_materials(materials, params, num_nodes)
+        spacing = positive("spacing", typical_spacing(pos[0].astype(np.float64), periodicity) if spacing is None else spacing, "m")
+        radius = positive("connectivity_radius", RADIUS_SPACINGS * spacing if connectivity_radius is None else connectivity_radius, "m")
+        periodicity.check_radius(radius)
+        vel = velocities_of(pos, frame_dt, periodicity) if vel is None else vel
+        shape = {"frame": num_frames, "node": num_nodes, "dim": dim}
+        gravity = numbers("gravity", np.zeros(dim) if gravity is None else gravity, {"dim": dim})
+        if cells is not None:
+            cells = checked_cells(cells, codes)
+            rest_pos = numbers("rest_pos", pos[0] if rest_pos is None else rest_pos, {"node": num_nodes, "dim": dim}).astype(np.float32)
+        elif rest_pos is not None:
+            raise ArrayError("rest_pos: only meshes have rest positions; pass cells too, or leave it out")
+        return cls(
+            Metadata(
+                dataset, names, param_names(names), frame_dt, spacing, radius, bounds, tuple(map(float, gravity)),
+                periodicity.periodic, split=split, solver="import", solver_version="1",
+            ),
+            pos,
+            numbers("vel", vel, shape).astype(np.float32, copy=False),
+            codes,
+            per_node("mass", mass, (num_nodes,), low=float(np.finfo(np.float32).tiny)),
+            columns,
+            boundary,
+            rest_pos=rest_pos,
+            cells=cells,
+        )  # fmt: skip
+
     @property
     def num_frames(self) -> int:
         return self.pos.shape[0]
@@ -285,13 +458,13 @@ class Trajectory:
         pos, vel, past = self.pos[frame].astype(np.float64), self.vel[frame].astype(np.float64), None
         if history:
             window = self.pos[frame - history : frame + 1].astype(np.float64)
-            past = np.ascontiguousarray(integrators.velocities(window, self.metadata.frame_dt).swapaxes(0, 1))
+            past = np.ascontiguousarray(integrators.velocities(window, self.metadata.frame_dt, self.metadata.periodicity).swapaxes(0, 1))
             vel = past[:, -1]
         rest_pos = None if self.rest_pos is None else self.rest_pos.astype(np.float64)
         stress = None if self.stress is None else Stress(self.stress.node[frame], self.stress.cell[frame])
         return State(
             pos, vel, self.node_type, self.mass, self.material_params, self.boundary, gravity, past, frame * self.metadata.frame_dt,
-            rest_pos, self.cells, stress,
+            rest_pos, self.cells, stress, periodicity=self.metadata.periodicity,
         )  # fmt: skip
 
     def frames(self, start: int, stop: int | None = None) -> Trajectory:
@@ -596,7 +769,9 @@ def shards(root: Path | str, split: str) -> list[Path]:
     """Shard files of a split under a data set's folder, in order; raises ``StoreError`` when there is none."""
     found = sorted((Path(root) / split).glob("shard-*.h5"))
     if not found:
-        raise StoreError(f"{root}: no shards of split {split!r}; generate them with `python -m gpe_pl.simulate`")
+        raise StoreError(
+            f"{root}: no shards of split {split!r}; generate them with `python -m gpe_pl.simulate`, or import data that have it"
+        )
     return found
 
 

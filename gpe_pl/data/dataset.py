@@ -121,7 +121,7 @@ class WindowDataset(Dataset[HeteroData]):
         if self.noise is not None:
             rng = np.random.default_rng((self.seed, sample))
             pos = self.noise.apply(pos, self.velocity_unit, dt, rng)
-        velocities = integrators.velocities(pos, dt)
+        velocities = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
         gravity = np.asarray(trajectory.metadata.gravity)
         target = integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity
         past = np.ascontiguousarray(velocities[:-1].swapaxes(0, 1))
@@ -137,6 +137,7 @@ class WindowDataset(Dataset[HeteroData]):
             frame * dt,
             trajectory.rest_pos,
             trajectory.cells,
+            periodicity=trajectory.metadata.periodicity,
         )
         data = self.builder(state.to_torch())
         target_tensor = torch.from_numpy(target).float()

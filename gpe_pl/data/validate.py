@@ -26,6 +26,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from gpe_pl.geometry import Shape
 from gpe_pl.graphs.islands import Islands, free_since, islands_within
+from gpe_pl.periodicity import PeriodicityError
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup, param_names
 from gpe_pl.trajectory import (
     Metadata,
@@ -92,10 +93,9 @@ class Group:
         self.low, self.high = np.minimum(self.low, pos.min((0, 1))), np.maximum(self.high, pos.max((0, 1)))
         for name, column in zip(metadata.param_names, arrays["material_params"].T, strict=True):
             self.params.setdefault(name, set()).update(np.unique(column[~np.isnan(column)]).tolist())
-        if not any(metadata.periodic):
-            for islands, free, disturbed in disturbed_islands(metadata, arrays):
-                self.num_islands, self.num_free = self.num_islands + islands, self.num_free + free
-                self.num_disturbed += disturbed
+        for islands, free, disturbed in disturbed_islands(metadata, arrays):
+            self.num_islands, self.num_free = self.num_islands + islands, self.num_free + free
+            self.num_disturbed += disturbed
 
     def __str__(self) -> str:
         m = self.metadata
@@ -141,13 +141,16 @@ def disturbed_islands(metadata: Metadata, arrays: dict[str, np.ndarray]) -> Iter
     mesh = np.concatenate([np.stack([cells[:, 0], cells[:, k]]) for k in range(1, cells.shape[1])], axis=1)
 
     def islands_of(frame: int) -> Islands:
-        return islands_within(radius, pos[frame], boundary, mesh)
+        return islands_within(radius, pos[frame], boundary, mesh, metadata.periodicity)
 
     for frame in np.unique(np.linspace(1, len(pos) - 2, min(len(pos) - 2, ISLAND_FRAMES)).astype(int)).tolist():
         before, islands = islands_of(frame - 1), islands_of(frame)
         count = len(islands.is_free)
         free = free_since(before, islands)
-        acceleration = np.diff([islands.mean(x, mass) for x in pos[frame - 1 : frame + 2]], 2, axis=0)[0] / dt**2
+        window = pos[frame - 1 : frame + 2]
+        if metadata.periodicity:  # relative to the middle, so that crossing the seam is no jump
+            window = metadata.periodicity.shortest(window - pos[frame])
+        acceleration = np.diff([islands.mean(x, mass) for x in window], 2, axis=0)[0] / dt**2
         limit = np.maximum(tolerance, resolution / np.sqrt(np.bincount(islands.label, minlength=count)))
         yield count, int(free.sum()), int(np.sum(free & (np.linalg.norm(acceleration - gravity, axis=-1) > limit)))
 
@@ -275,6 +278,11 @@ def _check_metadata(m: Metadata, path: Path) -> Iterator[Finding]:
     for key in ("gravity", "periodic"):
         if len(getattr(m, key)) != m.dim:
             yield key, f"has {len(getattr(m, key))} components in {m.dim}D"
+    if len(m.periodic) == m.dim:
+        try:
+            m.periodicity.check_radius(m.connectivity_radius)
+        except PeriodicityError as error:
+            yield "connectivity_radius", str(error)
     if not all(map(math.isfinite, m.gravity)):
         yield "gravity", f"is {m.gravity}, must be finite"
     try:
@@ -370,7 +378,7 @@ def _check_boundary(m: Metadata, arrays: dict[str, np.ndarray], shapes: tuple[Sh
         if message := _bad_shape(shape, m.dim):
             sound = False
             yield "shapes", f"shape {k} ({shape.kind}): {message}"
-    if shapes and sound and m.spacing > 0:
+    if shapes and sound and m.spacing > 0 and not m.solver.startswith("import/"):  # of imported boundaries some may be known by points only
         distance = np.min([np.abs(shape.signed_distance(pos.astype(np.float64))) for shape in shapes], axis=0)
         if where := _offenders("boundary_pos", distance > 0.1 * m.spacing):
             yield "boundary_pos", f"{where}: {distance[distance > 0.1 * m.spacing][0]:.4g} m away from every shape that it could belong to"
@@ -425,7 +433,7 @@ def _documented_attributes(cls: type) -> dict[str, str]:
 _PAGE = """\
 # The trajectory store
 
-This page is generated: `python -m gpe_pl.data.validate --format-page > data/README.md`. Generated data sets go into this folder and are not
+This page is generated: `python -m gpe_pl.data.validate --format-page > data/README.md`. Generated and imported data sets go into this folder and are not
 kept in version control. Check any of them with `python -m gpe_pl.data.validate data`.
 
 Schema version {version}. One HDF5 file per shard, a group per trajectory, SI units, little-endian:
@@ -437,6 +445,8 @@ Schema version {version}. One HDF5 file per shard, a group per trajectory, SI un
         attributes: metadata (JSON), shapes (JSON), node_types (JSON), sha256
         pos  vel  …                        fields, each with its attribute unit
 ```
+
+Imported data sets have the size `imported`, and beside their splits a `report.md` of where they come from.
 
 Files are written under a temporary name and renamed, so a file that exists is complete. Equal content gives equal bytes. Every array has a
 fletcher32 checksum per chunk; arrays with frames are cut along them. `sha256` covers names, shapes, types and bytes of all arrays and the

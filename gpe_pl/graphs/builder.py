@@ -6,7 +6,7 @@ is missing from some graphs. Each undirected edge is stored once. There are no e
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, cast
 
@@ -28,12 +28,13 @@ from gpe_pl.graphs.features import (
     scales_of,
     virtual_features,
 )
-from gpe_pl.graphs.islands import islands_within
+from gpe_pl.graphs.islands import find_islands, unwrapped
 from gpe_pl.graphs.multiscale import MultiscaleGraph, multiscale_graph
 from gpe_pl.graphs.neighbors import check_crowding, radius_between, radius_pairs
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of, node_code
-from gpe_pl.trajectory import Metadata, State
+from gpe_pl.skips import Skips
+from gpe_pl.trajectory import Boundary, Metadata, State
 
 
 class GraphError(GpeError, ValueError):
@@ -49,14 +50,25 @@ class GraphBuilder:
     ``offset``: the displacement over the radius, which standardisation leaves as it is.
 
     With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph ``island_is_free`` [island] and ``num_islands`` [1].
+    ``pos`` counts from the mean of the node's island, and in periodic domains keeps it together; an island that goes around the period has no lever arms, and
+    ``pos`` is zero there.
+
+    Attributes:
+        config: what the graphs are like.
+        metadata: of the data set.
+        skips: what is left out in building them, which changes no graph.
+
+    Raises:
+        PeriodicityError: the neighbour radius is half a period or more.
     """
 
     config: GraphConfig
     metadata: Metadata
+    skips: Skips = field(default_factory=Skips)
 
     def __post_init__(self) -> None:
-        if any(self.metadata.periodic):
-            raise GraphError(f"data set {self.metadata.dataset!r} has periodic axes, which the graph builder does not support")
+        for radius in (self.scales.radius, self.metadata.connectivity_radius):
+            self.metadata.periodicity.check_radius(radius)
 
     @cached_property
     def scales(self) -> Scales:
@@ -70,11 +82,15 @@ class GraphBuilder:
         """Build the graph of a state of float64 tensors.
 
         Raises:
-            GraphError: the state holds a node type that the data set does not have, lacks velocity history, or has cells that do not fit its nodes.
+            GraphError: the state holds a node type that the data set does not have, lacks velocity history, repeats along other axes, or has cells that
+                do not fit its nodes.
             SimulationError: a position or velocity is not finite, or so many nodes lie within each other's radius that the material has collapsed.
         """
         if state.pos.dtype != torch.float64:
             raise GraphError(f"positions are {state.pos.dtype}; convert the state with State.to_torch, which makes them float64")
+        if state.periodicity.axes != self.metadata.periodicity.axes:
+            own, other = (", ".join("xyz"[a] for a in p.axes) or "no axis" for p in (self.metadata.periodicity, state.periodicity))
+            raise GraphError(f"state is periodic along {other}, the data set {self.metadata.dataset!r} along {own}")
         history = history_of(state)
         if history.shape[1] != self.config.history:
             raise GraphError(f"state has a history of {history.shape[1]} velocities, the graph needs {self.config.history}")
@@ -82,7 +98,7 @@ class GraphBuilder:
         if bad.any():
             node = int(bad.nonzero()[0])
             raise SimulationError(f"node {node} has a position or velocity that is not finite", reason="nan", node=node)
-        check_crowding(state.pos.cpu().numpy(), self.scales.radius, self.scales.spacing)
+        check_crowding(_array(state.pos), self.scales.radius, self.scales.spacing, state.periodicity)
         rows = {m: self._rows(state, m) for m in self.spec.materials}
         if sum(len(r) for r in rows.values()) != state.num_nodes:
             present = {NODE_TYPES[code] for code in state.node_type.unique().tolist()}
@@ -96,9 +112,9 @@ class GraphBuilder:
             store.x = material_features(history[r], state.gravity, self.scales)
             column = self.metadata.param_names.index(MATERIALS[material].name)
             store.material_params = state.material_params[r, column : column + 1].float()
-            store.mass = state.mass[r].float()
+            store.mass = self._rounded(state.mass[r])
             store.node_id = r
-        self._add_boundary(data, state, rows, mesh)
+        self._add_radius_edges(data, state, rows, mesh)
         if mesh is not None:
             self._add_mesh(data, state, rows, mesh)
         elif self._meshes:
@@ -119,73 +135,95 @@ class GraphBuilder:
 
     # --- edges within a radius ------------------------------------------------------------------------------------------------------------
 
-    def _add_boundary(self, data: HeteroData, state: State, rows: dict[str, Tensor], mesh: MultiscaleGraph | None) -> None:
+    def _add_radius_edges(self, data: HeteroData, state: State, rows: dict[str, Tensor], mesh: MultiscaleGraph | None) -> None:
         """Boundary nodes, and the edges that the radius decides."""
-        pos = {m: state.pos[r] for m, r in rows.items()} | {BOUNDARY: state.boundary.pos}
-        vel = {m: state.vel[r] for m, r in rows.items()} | {BOUNDARY: state.boundary.vel}
-        numpy_pos = {t: np.ascontiguousarray(p.detach().cpu().numpy()) for t, p in pos.items()}
+        device = state.pos.device
+        pos, vel = {m: state.pos[r] for m, r in rows.items()}, {m: state.vel[r] for m, r in rows.items()}
+        points = {m: _array(p) for m, p in pos.items()} | {BOUNDARY: self._points(state)}
+        present = {m for m, r in rows.items() if len(r)} | ({BOUNDARY} if len(state.boundary.pos) else set())
+        relations = [r for r in self.spec.relations if r[1] == RADIUS]
         edges: dict[EdgeType, Tensor] = {}
-        for relation in self.spec.relations:
-            source, name, target = relation
-            if name != RADIUS:
+        for relation in relations:
+            source, _, target = relation
+            if self.skips.absent_types and not {source, target} <= present:
                 continue
             if source != target:
-                pairs = radius_between(numpy_pos[source], numpy_pos[target], self.scales.radius)
+                pairs = radius_between(points[source], points[target], self.scales.radius, state.periodicity)
             else:
-                pairs = radius_pairs(numpy_pos[source], self.scales.radius)
+                pairs = radius_pairs(points[source], self.scales.radius, state.periodicity)
                 if mesh is not None and source in self._meshes:
                     pairs = pairs[:, mesh.are_in_contact(rows[source].cpu().numpy()[pairs], self.scales.radius)]
-            edges[relation] = torch.from_numpy(pairs).to(state.pos.device)
+            edges[relation] = torch.from_numpy(pairs).to(device)
 
-        boundary_x, normal = boundary_features(state.boundary, self.scales), state.boundary.normal
-        if self.config.trim_boundary:
-            kept = self._trim(edges, boundary_x.shape[0])
-            boundary_x, normal = boundary_x[kept], normal[kept]
-            pos[BOUNDARY], vel[BOUNDARY] = pos[BOUNDARY][kept], vel[BOUNDARY][kept]
-        data[BOUNDARY].x = boundary_x
-        for relation, edge_index in edges.items():
+        boundary = _trim(state.boundary, edges) if self.config.trim_boundary else state.boundary
+        data[BOUNDARY].x = boundary_features(boundary, self.scales)
+        pos[BOUNDARY], vel[BOUNDARY] = boundary.pos, boundary.vel
+        for relation in relations:
+            if relation not in edges:
+                self._add_no_edges(data, relation, device)
+                continue
             source, _, target = relation
-            j, i = edge_index
+            edge_index = edges[relation]
+            chunk = max(1, edge_index.shape[1]) if self.skips.edges_at_once is None else self.skips.edges_at_once
+            parts = [
+                edge_features(
+                    self.config.features,
+                    state.periodicity.shortest(pos[target][i] - pos[source][j]),
+                    vel[target][i] - vel[source][j],
+                    boundary.normal[j] if source == BOUNDARY else None,
+                    self.scales,
+                )
+                for j, i in edge_index.split(chunk, dim=1)
+            ]
             store = data[relation]
             store.edge_index = edge_index
-            store.odd, store.even = edge_features(
-                self.config.features,
-                pos[target][i] - pos[source][j],
-                vel[target][i] - vel[source][j],
-                normal[j] if source == BOUNDARY else None,
-                self.scales,
-            )
+            store.odd, store.even = (part[0] if len(part) == 1 else torch.cat(part) for part in zip(*parts, strict=True))
             store.offset = store.odd[:, : self.spec.dim]
 
-    @staticmethod
-    def _trim(edges: dict[tuple[str, str, str], Tensor], num_boundary: int) -> Tensor:
-        """Keep the boundary nodes that have an edge, in order, and renumber the edges in place; returns the kept rows."""
-        sources = [e[0] for (s, _, _), e in edges.items() if s == BOUNDARY]
-        device = sources[0].device
-        used = torch.zeros(num_boundary, dtype=torch.bool, device=device)
-        for s in sources:
-            used[s] = True
-        kept = torch.nonzero(used).flatten()
-        new_row = torch.cumsum(used, dim=0) - 1
-        for relation, edge_index in edges.items():
-            if relation[0] == BOUNDARY:
-                edges[relation] = torch.stack([new_row[edge_index[0]], edge_index[1]])
-        return kept
+    def _points(self, state: State) -> Any:
+        """Where the boundary nodes are, as ``radius_between`` takes it."""
+        return state.boundary.tree(state.periodicity) if self.skips.static_boundary else _array(state.boundary.pos)
+
+    def _add_no_edges(self, data: HeteroData, relation: EdgeType, device: torch.device) -> None:
+        store = data[relation]
+        store.edge_index = torch.empty(2, 0, dtype=torch.int64, device=device)
+        store.odd = torch.empty(0, self.spec.odd_channels[relation], device=device)
+        store.even = torch.empty(0, self.spec.even_channels[relation], device=device)
+        if relation[1] == RADIUS:
+            store.offset = store.odd[:, : self.spec.dim]
 
     def _add_islands(self, data: HeteroData, state: State, rows: dict[str, Tensor]) -> None:
         """Groups of nodes that the graph connects, and which of them no edge ties to the boundary.
 
         What pushes a body from beyond the radius no model can see; held to free fall, it stays stable (docs/results/trials).
         """
-        cells = [torch.empty(2, 0, dtype=torch.int64), *(rows[m][data[m, CELL, m].edge_index].cpu() for m in self._meshes)]
-        pos, boundary = (np.ascontiguousarray(p.cpu().numpy()) for p in (state.pos, state.boundary.pos))
-        islands = islands_within(self.scales.radius, pos, boundary, torch.cat(cells, dim=1).numpy())
+        between, touches = [], torch.zeros(state.num_nodes, dtype=torch.bool, device=state.pos.device)
+        for source, name, target in self.spec.relations:
+            if source == BOUNDARY:
+                touches[rows[target][data[source, name, target].edge_index[1]]] = True
+            elif source in rows and target in rows:
+                j, i = data[source, name, target].edge_index
+                between.append(torch.stack([rows[source][j], rows[target][i]]))
+        edges = torch.cat(between, dim=1).cpu().numpy()
+        islands = find_islands(state.num_nodes, edges, touches.cpu().numpy())
         label = torch.from_numpy(islands.label).to(state.pos.device)
+        pos = self._kept_together(state, edges) if state.periodicity else state.pos
+        arms = self._rounded(_from_centre(pos, label, len(islands.is_free)))  # single precision has no room for where the island is
         for material, r in rows.items():
-            data[material].pos = state.pos[r].float()
+            data[material].pos = arms[r]
             data[material].island = label[r]
         data.island_is_free = torch.from_numpy(islands.is_free).to(state.pos.device)
         data.num_islands = torch.tensor([len(islands.is_free)], device=state.pos.device)
+
+    def _rounded(self, values: Tensor) -> Tensor:
+        """Values in the network's precision."""
+        return values.float()
+
+    @staticmethod
+    def _kept_together(state: State, edges: np.ndarray) -> Tensor:
+        """Positions that do not tear islands apart at the seams of a periodic domain; all zero where an island goes around it."""
+        images, goes_around = unwrapped(_array(state.pos), edges, state.periodicity)
+        return torch.from_numpy(np.where(goes_around[:, None], 0.0, images)).to(state.pos.device)
 
     # --- meshes ---------------------------------------------------------------------------------------------------------------------------
 
@@ -220,7 +258,7 @@ class GraphBuilder:
             row[r] = torch.arange(len(r), device=device)
         row[n:] = torch.cat([torch.arange(size, device=device) for size in sizes]) if sizes else row[n:]
 
-        values = torch.cat([state.pos, cast(Tensor, state.rest_pos), history_of(state).flatten(1)], dim=1)
+        values = torch.cat([self._kept_whole(state, mesh), cast(Tensor, state.rest_pos), history_of(state).flatten(1)], dim=1)
         above, below = torch.tensor(mesh.descent, device=device)
         above, mass = above - n, state.mass[below][:, None]
         total = mass.new_zeros(sum(sizes), 1).index_add_(0, above, mass)
@@ -254,6 +292,15 @@ class GraphBuilder:
                 store = data[relation]
                 store.edge_index, store.odd, store.even = row[edges[:, chosen]], odd[chosen], even[chosen]
 
+    def _kept_whole(self, state: State, mesh: MultiscaleGraph) -> Tensor:
+        """Positions that do not tear meshes apart at the seams of a periodic domain."""
+        if not state.periodicity:
+            return state.pos
+        pos, goes_around = unwrapped(np.ascontiguousarray(state.pos.cpu().numpy()), mesh.cell_edges, state.periodicity)
+        if goes_around.any():
+            raise GraphError(f"the mesh of node {int(goes_around.argmax())} goes around the periodic domain, so it has no rest shape")
+        return torch.from_numpy(pos).to(state.pos.device)
+
     def _add_empty_mesh(self, data: HeteroData, state: State) -> None:
         """The stores of a mesh for a state without one."""
         device = state.pos.device
@@ -261,7 +308,30 @@ class GraphBuilder:
             data[grid(k)].x = torch.empty(0, self.spec.node_channels[grid(k)], device=device)
         for relation in self.spec.relations:
             if relation[1] != RADIUS:
-                store = data[relation]
-                store.edge_index = torch.empty(2, 0, dtype=torch.int64, device=device)
-                store.odd = torch.empty(0, self.spec.odd_channels[relation], device=device)
-                store.even = torch.empty(0, self.spec.even_channels[relation], device=device)
+                self._add_no_edges(data, relation, device)
+
+
+def _array(x: Tensor) -> np.ndarray:
+    return np.ascontiguousarray(x.detach().cpu().numpy())
+
+
+def _from_centre(pos: Tensor, island: Tensor, num_islands: int) -> Tensor:
+    """Positions counted from the mean of their island."""
+    count = torch.bincount(island, minlength=num_islands)[:, None]
+    centre = pos.new_zeros(num_islands, pos.shape[1]).index_add_(0, island, pos) / count
+    return pos - centre[island]
+
+
+def _trim(boundary: Boundary, edges: dict[EdgeType, Tensor]) -> Boundary:
+    """The boundary nodes that have an edge, in order; renumbers the edges in place."""
+    used = torch.zeros(len(boundary.pos), dtype=torch.bool, device=boundary.pos.device)
+    for (source, _, _), edge_index in edges.items():
+        if source == BOUNDARY:
+            used[edge_index[0]] = True
+    kept = torch.nonzero(used).flatten()
+    new_row = torch.cumsum(used, dim=0) - 1
+    for relation, edge_index in edges.items():
+        if relation[0] == BOUNDARY:
+            edges[relation] = torch.stack([new_row[edge_index[0]], edge_index[1]])
+    rows = {name: getattr(boundary, name)[kept] for name in ("pos", "vel", "normal", "friction", "restitution")}
+    return Boundary(**rows, shapes=boundary.shapes)

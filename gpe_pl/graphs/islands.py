@@ -8,8 +8,10 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numba import njit
+from scipy.spatial import cKDTree
 
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
+from gpe_pl.periodicity import NOWHERE, Periodicity
 
 
 @dataclass(frozen=True)
@@ -76,13 +78,80 @@ def _components(num_nodes, edge_index):
 def islands_within(
     radius: float,
     pos: Float64[np.ndarray, "node dim"],
-    boundary_pos: Float64[np.ndarray, "boundary dim"],
+    boundary: Float64[np.ndarray, "boundary dim"] | cKDTree,
     mesh_edges: Int64[np.ndarray, "2 edge"],
+    periodicity: Periodicity = NOWHERE,
 ) -> Islands:
-    """Islands of nodes that a radius [m] or a mesh connects; free where no boundary node lies within the radius."""
+    """Islands of nodes that a radius [m] or a mesh connects; free where no boundary node, given by position or search tree, lies within the radius."""
     touches = np.zeros(len(pos), dtype=bool)
-    touches[radius_between(boundary_pos, pos, radius)[1]] = True
-    return find_islands(len(pos), np.concatenate([radius_pairs(pos, radius), mesh_edges], axis=1), touches)
+    touches[radius_between(boundary, pos, radius, periodicity)[1]] = True
+    return find_islands(len(pos), np.concatenate([radius_pairs(pos, radius, periodicity), mesh_edges], axis=1), touches)
+
+
+def unwrapped(
+    pos: Float64[np.ndarray, "node dim"], edge_index: Int64[np.ndarray, "2 edge"], periodicity: Periodicity
+) -> tuple[Float64[np.ndarray, "node dim"], Bool[np.ndarray, "node"]]:
+    """Images of nodes that lie beside their neighbours, and whether a node's component goes around the period, so that no such images exist.
+
+    Args:
+        pos: positions [m].
+        edge_index: edges that are shorter than half the period.
+        periodicity: where space repeats.
+    """
+    if not periodicity:
+        return pos, np.zeros(len(pos), dtype=bool)
+    j, i = edge_index
+    difference = pos[i] - pos[j]
+    turns = np.round((periodicity.shortest(difference) - difference) / np.where(periodicity.period > 0, periodicity.period, 1.0))
+    image, goes_around = _images(len(pos), edge_index, turns.astype(np.int64))
+    return pos + image * periodicity.period, goes_around
+
+
+@njit(cache=True)
+@no_type_check
+def _images(num_nodes, edge_index, turns):
+    """Periods by which to move each node, so that edge k, moved by ``turns[k]`` at its target, is short; and whether its component contradicts that."""
+    num_edges, dim = turns.shape
+    first = np.zeros(num_nodes + 1, np.int64)  # of a node's entries in ``edge``
+    for k in range(num_edges):
+        first[edge_index[0, k] + 1] += 1
+        first[edge_index[1, k] + 1] += 1
+    first = np.cumsum(first)
+    filled = first[:-1].copy()
+    edge = np.empty(2 * num_edges, np.int64)
+    for k in range(num_edges):
+        for end in range(2):
+            node = edge_index[end, k]
+            edge[filled[node]] = k
+            filled[node] += 1
+    image = np.zeros((num_nodes, dim), np.int64)
+    component = np.full(num_nodes, -1)
+    goes_around = np.zeros(num_nodes, np.bool_)  # of components, by their first node
+    queue = np.empty(num_nodes, np.int64)
+    for start in range(num_nodes):
+        if component[start] >= 0:
+            continue
+        component[start] = start
+        queue[0], length, done = start, 1, 0
+        while done < length:
+            node = queue[done]
+            done += 1
+            for e in range(first[node], first[node + 1]):
+                k = edge[e]
+                is_source = edge_index[0, k] == node
+                other = edge_index[1, k] if is_source else edge_index[0, k]
+                sign = 1 if is_source else -1
+                if component[other] < 0:
+                    component[other] = start
+                    for d in range(dim):
+                        image[other, d] = image[node, d] + sign * turns[k, d]
+                    queue[length] = other
+                    length += 1
+                else:
+                    for d in range(dim):
+                        if image[other, d] != image[node, d] + sign * turns[k, d]:
+                            goes_around[start] = True
+    return image, goes_around[component]
 
 
 def free_since(before: Islands, now: Islands) -> Bool[np.ndarray, "island"]:

@@ -7,6 +7,7 @@ from torch import Tensor
 from torch_geometric.data import HeteroData
 
 from gpe_pl.schema import FeatureSpec
+from gpe_pl.skips import Skips
 
 
 @dataclass(frozen=True)
@@ -26,11 +27,17 @@ class Model(Protocol):
     """A network whose constructor takes a ``FeatureSpec`` first and keyword settings after it.
 
     ``forward`` gets a graph with standardised features. ``settings`` holds the constructor's keyword arguments as plain values, so a checkpoint can rebuild
-    the model. ``compute`` does the work of ``forward`` on tensors, in dictionaries and tuples: the part that ``torch.compile`` sees.
+    the model. ``compute`` does the work of ``forward`` on tensors, in dictionaries and tuples: the part that ``torch.compile`` sees. ``skips`` says what
+    ``forward`` may leave out in evaluation mode; a model need not know any of it. ``num_hops`` is how many ``radius`` edges lead to the farthest node that
+    an answer can depend on, apart from paths inside of meshes.
     """
 
     spec: FeatureSpec
     settings: dict[str, Any]
+    skips: Skips
+
+    @property
+    def num_hops(self) -> int: ...
 
     def forward(self, data: HeteroData) -> Prediction: ...
 

@@ -75,6 +75,10 @@ class ContinuousConvNet(nn.Module):
         self.convs = nn.ModuleList([ContinuousConv(a, b, spec.dim, kernel_size) for a, b in pairs])
         self.denses = nn.ModuleList([_dense(a, b) for a, b in pairs])
 
+    @property
+    def num_hops(self) -> int:
+        return 1 + len(self.convs)
+
     def forward(self, data: HeteroData) -> Prediction:
         """Accelerations without gravity per material, in units of the data set's acceleration scale."""
         x = {t: data[t].x for t in self.spec.node_types if data[t].x.shape[0]}

@@ -93,6 +93,10 @@ class DPINet(nn.Module):
         self.stages = nn.ModuleDict({name: Stage(node_channels, self.graph.edge_channels, hidden_channels) for name in names})
         self.predictor = ReluMLP(hidden_channels, hidden_channels, spec.dim, 2)
 
+    @property
+    def num_hops(self) -> int:
+        return self.num_propagation_steps
+
     def forward(self, data: HeteroData) -> Prediction:
         """Accelerations without gravity per material, in units of the data set's acceleration scale."""
         x, params, edges = present(data, self.spec)

@@ -83,6 +83,10 @@ class GNS(nn.Module):
         self.processor = nn.ModuleList([InteractionNetwork(hidden, layers) for _ in range(num_message_passing_steps)])
         self.decoder = ReluMLP(hidden, hidden, spec.dim, layers)
 
+    @property
+    def num_hops(self) -> int:
+        return len(self.processor)
+
     def forward(self, data: HeteroData) -> Prediction:
         """Accelerations without gravity per material, in units of the data set's acceleration scale."""
         x, params, edges = present(data, self.spec)

@@ -22,15 +22,15 @@ from torch_geometric.data import HeteroData
 from gpe_pl.errors import GpeError
 from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import MLP
+from gpe_pl.nn.connected import Edges, renumbered, touched
 from gpe_pl.nn.island_momentum import IslandMomentum, conserve
 from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction, MomentumConv, orient
 from gpe_pl.schema import CELL, DOWN, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
+from gpe_pl.skips import Skips
 
 Decoder = Literal["node", "pair"]
 LevelWeights = Literal["shared", "separate"]
 Schedule = Literal["simultaneous", "sweep"]
-Edges = dict[EdgeType, tuple[Tensor, Tensor, Tensor]]
-"""``edge_index``, ``odd`` and ``even`` of the relations that have edges."""
 MaterialEmbeddingKind = Literal["affine", "mlp"]
 NodeNorm = Literal["none", "layer"]
 
@@ -143,6 +143,8 @@ class GPE(nn.Module):
         IslandError: ``island_momentum`` with graphs that do not know their islands.
     """
 
+    skips = Skips()
+
     def __init__(
         self,
         spec: FeatureSpec,
@@ -221,6 +223,10 @@ class GPE(nn.Module):
             self.stress_decoder = nn.ModuleDict({m: MLP(hidden, hidden, c) for m, c in spec.stress_channels.items()})
 
     @property
+    def num_hops(self) -> int:
+        return self.num_message_passing_steps + (self.decoder == "pair")  # a pair force reads the state of the other end
+
+    @property
     def is_fused(self) -> bool:
         """Whether messages have code of their own for a CPU (see ``nn.fused_messages`` and ``nn.fused_latent``)."""
         return self.interaction in ("negated", "odd") and self.settings["implementation"] == "factored"
@@ -253,15 +259,17 @@ class GPE(nn.Module):
 
         Node types and relations that have no members, or cannot reach a material in so many steps, are skipped.
         """
-        x = {t: data[t].x for t in self.spec.node_types if self.type_key(t) in self.node_encoder and data[t].x.shape[0]}
+        keep_absent = not (self.training or self.skips.absent_types)
+        x = {t: data[t].x for t in self.spec.node_types if self.type_key(t) in self.node_encoder and (keep_absent or data[t].x.shape[0])}
         params = {m: data[m].material_params for m in self.material_embedding if m in x}
         mass = {m: data[m].mass for m in self.spec.materials if m in x}
         convs = cast(nn.ModuleDict, self.convs[0])
-        relations = [r for r in self.spec.relations if self.key(r) in convs and data[r].edge_index.shape[1]]
+        relations = [r for r in self.spec.relations if self.key(r) in convs and (keep_absent or data[r].edge_index.shape[1])]
         edges = {r: (data[r].edge_index, data[r].odd, data[r].even) for r in relations}
         if grid(1) in x and self.level_weights == "shared" and self.schedule == "simultaneous":
             x, edges = _merge_levels(x, edges)
-        acceleration, stress = self.compute(x, params, mass, edges)
+        apart = self.skips.isolated_nodes and not self.training
+        acceleration, stress = (self._compute_apart if apart else self.compute)(x, params, mass, edges)
         if acceleration and self.settings["island_momentum"] != "ignored":
             acceleration = self._conserve(data, acceleration)
         return Prediction(acceleration, stress)
@@ -276,6 +284,45 @@ class GPE(nn.Module):
         kept = conserve(torch.cat([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
         return dict(zip(acceleration, kept.split([a.shape[0] for a in acceleration.values()]), strict=True))
 
+    def _compute_apart(
+        self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """``compute``, but nodes without an edge pass no messages: what they would receive is nothing."""
+        has_edge = touched({t: values.shape[0] for t, values in x.items()}, edges)
+        if has_edge.keys() >= x.keys() and all(bool(mask.all()) for mask in has_edge.values()):
+            return self.compute(x, params, mass, edges)
+
+        def connected(values: dict[str, Tensor]) -> dict[str, Tensor]:
+            return {t: v[has_edge[t]] for t, v in values.items() if t in has_edge}
+
+        inner = self.compute(connected(x), connected(params), connected(mass), renumbered(edges, has_edge)) if edges else ({}, {})
+        acceleration: dict[str, Tensor] = {}
+        stress: dict[str, Tensor] = {}
+        for m in mass:
+            alone = ~has_edge[m] if m in has_edge else torch.ones(x[m].shape[0], dtype=torch.bool, device=x[m].device)
+            single = self._isolated(m, x[m][alone], params[m][alone] if m in params else None)
+            for whole, part, others in zip((acceleration, stress), single, inner, strict=True):
+                if part is not None:
+                    whole[m] = part.new_empty(alone.shape[0], part.shape[1])
+                    whole[m][alone] = part
+                    if m in others:
+                        whole[m][~alone] = others[m]
+        return acceleration, stress
+
+    def _isolated(self, material: str, x: Tensor, params: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """Accelerations, and stresses where they are decoded, of nodes without an edge: every step adds the same to all of them, an update by no message."""
+        falls_freely, with_stress = self.decoder == "pair", self._decodes_stress(material)
+        acceleration = x.new_zeros(x.shape[0], self.spec.dim)
+        if falls_freely and not with_stress:
+            return acceleration, None
+        h, key = self._encode_node(material, x, params), self.type_key(material)
+        for updates in self.updates:
+            h = h + cast(nn.ModuleDict, updates)[key](h.new_zeros(1, h.shape[1]))
+        return acceleration if falls_freely else self.node_decoder[material](h), self.stress_decoder[material](h) if with_stress else None
+
+    def _decodes_stress(self, material: str) -> bool:
+        return bool(self.settings["stress"]) and material in self.spec.stress_channels and (self.training or not self.skips.stress)
+
     def compute(
         self,
         x: dict[str, Tensor],
@@ -286,8 +333,9 @@ class GPE(nn.Module):
         """``forward`` on plain tensors: the part that ``torch.compile`` sees. Accelerations and stresses per material."""
         if self.interaction == "negated":
             edges = {r: (*orient(index, odd), even) if is_symmetric(r) else (index, odd, even) for r, (index, odd, even) in edges.items()}
+        chunk = None if torch.is_grad_enabled() else self.skips.edges_at_once
         h = {t: self._encode_node(t, x[t], params.get(t)) for t in x}
-        e = {r: self._encode_edge(r, odd, even) for r, (_, odd, even) in edges.items()}
+        e = {r: self._encode_edges(r, odd, even, chunk) for r, (_, odd, even) in edges.items()}
 
         phases = self._phases([*x], edges)
         for step in range(self.num_message_passing_steps):
@@ -301,7 +349,7 @@ class GPE(nn.Module):
                     source, _, target = relation
                     edge_index, _, even = edges[relation]
                     conv = convs[self.key(relation)]
-                    at_target, at_source, state = conv(h[source], h[target], edge_index, e[relation], even, update_edges)
+                    at_target, at_source, state = conv(h[source], h[target], edge_index, e[relation], even, update_edges, chunk)
                     if target in receivers:
                         total[target] = total[target] + at_target if target in total else at_target
                     if source in receivers and self.type_key(source) in updates:
@@ -315,7 +363,7 @@ class GPE(nn.Module):
                     incoming = total[node_type] if node_type in total else torch.zeros_like(state)
                     h[node_type] = state + update(incoming) if rows is None else state.index_add(0, rows, update(incoming[rows]))
 
-        stress = {m: self.stress_decoder[m](h[m]) for m in self.spec.stress_channels if m in h} if self.settings["stress"] else {}
+        stress = {m: self.stress_decoder[m](h[m]) for m in mass if self._decodes_stress(m)}
         if self.decoder == "node":
             return {m: self.node_decoder[m](h[m]) for m in mass}, stress
         return self._pair_accelerations(h, mass, edges), stress
@@ -336,6 +384,15 @@ class GPE(nn.Module):
         if params is not None:
             x = torch.cat([x, self.material_embedding[node_type](params)], dim=1)
         return self.node_encoder[self.type_key(node_type)](x)
+
+    def _encode_edges(self, relation: EdgeType, odd: Tensor, even: Tensor, chunk: int | None) -> Tensor:
+        """The edge states, computed for ``chunk`` edges at a time."""
+        if chunk is None or odd.shape[0] <= chunk:
+            return self._encode_edge(relation, odd, even)
+        parts = [self._encode_edge(relation, *part) for part in zip(odd.split(chunk), even.split(chunk), strict=True)]
+        if self._interaction(relation) == "directed":  # each part has both directions
+            return torch.cat([half for direction in range(2) for half in (part.chunk(2)[direction] for part in parts)])
+        return torch.cat(parts)
 
     def _encode_edge(self, relation: EdgeType, odd: Tensor, even: Tensor) -> Tensor:
         kind = self._interaction(relation)

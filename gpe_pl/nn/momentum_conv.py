@@ -12,7 +12,7 @@ The message is a two-layer MLP, whose first layer is linear in its parts, so tha
 A relation between two node types has a direction already, and is ``negated`` unless the layer is ``directed``.
 """
 
-from typing import Any, Literal, Optional
+from typing import Any, Literal, Optional, cast
 
 import torch
 from jaxtyping import Float, Int64
@@ -37,9 +37,10 @@ def orient(edge_index: Int64[Tensor, "2 edge"], odd: Float[Tensor, "edge odd"]) 
     The first odd channels are the displacement x_i − x_j, so the target is the end with the larger x, then y, then z; coincident nodes are told apart
     by their relative velocity where it is a feature. Pairs without any difference keep their order.
     """
-    nonzero = odd != 0
-    first = nonzero & (torch.cumsum(nonzero, dim=1) == 1)
-    negative = (odd * first).sum(dim=1) < 0
+    first = torch.zeros_like(odd[:, 0])
+    for channel in odd.unbind(dim=1):
+        first = torch.where(first == 0, channel, first)
+    negative = first < 0
     edge_index = torch.where(negative, edge_index.flip(0), edge_index)
     return edge_index, torch.where(negative[:, None], -odd, odd)
 
@@ -81,17 +82,21 @@ class MomentumConv(MessagePassing):
         e: Float[Tensor, "directed_edge state"],
         s: Float[Tensor, "edge even"],
         update_edges: bool = True,
+        edges_at_once: int | None = None,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Sums of messages at the target nodes, at the source nodes, and the new edge states e_ij + m_ij, which need as many channels as the messages.
 
         Without ``update_edges`` the last linear map is applied after the sum (it commutes), once per node instead of once per edge; the new states are
         then None. In a relation of one type with itself pass the same tensor twice and add the two sums.
+
+        With ``edges_at_once``, what is computed on the way exists for so many edges only; this is meant for inference.
         """
         size = (h_source.shape[0], h_target.shape[0])
         if self._is_fused(h_source, h_target, e):
             return self._fused(h_source, h_target, edge_index, e, s, update_edges)
+        w = None
         if self.implementation == "plain":
-            terms = {"a": (h_source, h_target), "b": (None, None), "e": e, "s": s}
+            terms = {"a": (h_source, h_target), "b": (None, None), "s": s}
         else:
             a, b, w, _ = self.lin_in.weight.split(self.widths, dim=1)
             both = self.interaction != "negated"  # also z_ji is needed
@@ -103,9 +108,11 @@ class MomentumConv(MessagePassing):
             terms = {
                 "a": (as_, at),
                 "b": (bs, bt),
-                "e": functional.linear(e, w),
                 "s": s if self.is_odd and self.widths[3] else None,
             }
+        if edges_at_once is not None and edges_at_once < edge_index.shape[1]:
+            return self._in_parts(edge_index, e, w, terms, size, update_edges, edges_at_once)
+        terms["e"] = e if w is None else functional.linear(e, w)
         at_target, at_source, messages = self.propagate(edge_index, size=size, with_messages=update_edges, **terms)
         return at_target, at_source, e + messages if update_edges else None
 
@@ -129,6 +136,39 @@ class MomentumConv(MessagePassing):
             return at_target, at_source, state
         j, i = edge_index
         return self._last_linear(at_target, i, 1), self._last_linear(at_source, j, -1), None
+
+    def _in_parts(
+        self, edge_index: Tensor, e: Tensor, w: MaybeTensor, terms: dict[str, Any], size: tuple[int, int], update_edges: bool, chunk: int
+    ) -> tuple[Tensor, Tensor, MaybeTensor]:
+        """What follows the products per node, for ``chunk`` edges after the other."""
+        count, width = edge_index.shape[1], self.lin_out.in_features
+        at_source, at_target = (e.new_zeros(n, width) for n in size)
+        even_source, even_target = (at_source, at_target) if self.lin_even is None else (e.new_zeros(n, width) for n in size)
+        directions, sign = e.split(count), 1  # of ``directed`` two
+        new = torch.empty_like(e) if update_edges else None
+        for first in range(0, count, chunk):
+            part = slice(first, first + chunk)
+            j, i = edge_index[:, part]
+            ends = {
+                f"{name}_{end}": None if h is None else h[k] for name in "ab" for end, k, h in zip("ji", (j, i), terms[name], strict=True)
+            }
+            edge = torch.cat([d[part] for d in directions])
+            s = None if terms["s"] is None else terms["s"][part]
+            forward, reverse = cast(Any, self.message(**ends, e=edge if w is None else functional.linear(edge, w), s=s))
+            x, y, sign = self._outgoing(forward, reverse, update_edges)
+            at_target.index_add_(0, i, x)
+            at_source.index_add_(0, j, y, alpha=sign)
+            if new is not None:
+                for updated, state, message in zip(new.split(count), directions, (x, y), strict=False):
+                    torch.add(state[part], message, out=updated[part])
+            if self.lin_even is not None:
+                even_target.index_add_(0, i, forward + reverse)
+                even_source.index_add_(0, j, forward + reverse)
+        if not update_edges:
+            at_target, at_source = self._last_linear(at_target, edge_index[1], 1), self._last_linear(at_source, edge_index[0], sign)
+        if self.lin_even is not None:
+            at_target, at_source = at_target + self.lin_even(even_target), at_source + self.lin_even(even_source)
+        return at_target, at_source, new
 
     def message(
         self, a_i: MaybeTensor, a_j: MaybeTensor, b_i: MaybeTensor, b_j: MaybeTensor, e: Tensor, s: MaybeTensor
@@ -174,16 +214,8 @@ class MomentumConv(MessagePassing):
     ) -> tuple[Tensor, Tensor, MaybeTensor]:
         """Sums at targets and sources: +m and −m, or for ``directed`` each its own."""
         forward, reverse = inputs
-        x = forward - reverse if self.is_odd else forward
-        messages: Any = None
-        if with_messages:
-            x = messages = self.lin_out(x)
-        if self.interaction == "directed":
-            y, sign = self.lin_out(reverse) if with_messages else reverse, 1
-            if with_messages:
-                messages = torch.cat([x, y])
-        else:
-            y, sign = x, -1
+        x, y, sign = self._outgoing(forward, reverse, with_messages)
+        messages = None if not with_messages else torch.cat([x, y]) if self.interaction == "directed" else x
         at_target = self._sum(x, edge_index_i, size_i, 1, with_messages)
         at_source = self._sum(y, edge_index_j, size_j, sign, with_messages)
         if self.lin_even is not None:
@@ -191,6 +223,15 @@ class MomentumConv(MessagePassing):
             at_target = at_target + self.lin_even(even.new_zeros(size_i, even.shape[1]).index_add(0, edge_index_i, even))
             at_source = at_source + self.lin_even(even.new_zeros(size_j, even.shape[1]).index_add(0, edge_index_j, even))
         return at_target, at_source, messages
+
+    def _outgoing(self, forward: Tensor, reverse: Any, with_messages: bool) -> tuple[Tensor, Tensor, int]:
+        """What targets get, and what sources get with a sign: messages, or the activations before the last linear map."""
+        x = forward - reverse if self.is_odd else forward
+        y, sign = (reverse, 1) if self.interaction == "directed" else (x, -1)
+        if not with_messages:
+            return x, y, sign
+        m = self.lin_out(x)
+        return m, self.lin_out(y) if self.interaction == "directed" else m, sign
 
     def _sum(self, x: Tensor, index: Tensor, size: int, sign: int, are_messages: bool) -> Tensor:
         """±Σ of messages, or of activations that the last linear map then turns into messages."""

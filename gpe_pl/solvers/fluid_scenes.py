@@ -16,15 +16,12 @@ from scipy.spatial import cKDTree
 
 from gpe_pl.geometry import Bowl, Box, DistanceGrid, Shape, domain_walls, signed_distance
 from gpe_pl.schema import STICKY, node_code
-from gpe_pl.solvers.scenes import JITTER, MAX_ATTEMPTS, check_domain, check_ranges, draw_velocity, floats, integer_lattice
+from gpe_pl.solvers.scenes import CLEARANCE, MAX_ATTEMPTS, check_domain, check_ranges, draw_velocity, filled_box, floats, jittered_lattice
 from gpe_pl.terrain import Bounds, Fit, Solid, Up, canyon, read_terrain
 from gpe_pl.trajectory import Boundary, State
 
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegativeFloat = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
-CLEARANCE = 0.25
-"""Smallest distance of a particle from a solid at the start, in spacings; a jittered lattice beside a wall just keeps it."""
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
@@ -211,25 +208,10 @@ def _body(count: int, config: FluidScene, rng: np.random.Generator) -> np.ndarra
             return np.max(np.abs(x) / stretch, axis=-1)
 
     reach = math.ceil(0.75 * longest * count ** (1 / dim)) + 2
-    points = _lattice(np.full(dim, -reach), np.full(dim, reach), rng) + rng.uniform(-0.5, 0.5, dim)
+    points = jittered_lattice(np.full(dim, -reach), np.full(dim, reach), rng) + rng.uniform(-0.5, 0.5, dim)
     kept = points[np.argsort(gauge(points), kind="stable")[:count]]
     rotation, upper = np.linalg.qr(rng.normal(size=(dim, dim)))
     return config.spacing * kept @ (rotation * np.sign(np.diag(upper))).T
-
-
-def _lattice(first: np.ndarray, last: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Jittered points [point, dim] around the integer points from ``first`` to ``last``."""
-    lattice = integer_lattice(first, last)
-    return lattice + rng.uniform(-JITTER, JITTER, lattice.shape)
-
-
-def _filling(config: FluidScene, region: Bounds, rng: np.random.Generator) -> np.ndarray:
-    """Jittered points of the rest spacing [point, dim] in a box, half a spacing away from its low sides."""
-    low, high = np.array(region, float).T
-    number = np.floor((high - low) / config.spacing + 1e-6)
-    if np.any(number < 1):
-        return np.empty((0, config.dim))
-    return low + config.spacing * (_lattice(np.zeros(config.dim), number - 1, rng) + 0.5)
 
 
 def _dam_break(config: FluidScene, rng: np.random.Generator) -> Sampled:
@@ -247,7 +229,7 @@ def _dam_break(config: FluidScene, rng: np.random.Generator) -> Sampled:
         )
     aspect, mirrored = math.exp(rng.uniform(math.log(least), math.log(most))), bool(rng.random() < 0.5)
     width = math.sqrt(face / aspect)
-    points = _filling(config, config.bounds, rng)
+    points = filled_box(config.bounds, config.spacing, rng)
     gauge = np.maximum((points[:, 0] - low[0]) / width, (points[:, -1] - low[-1]) / (aspect * width))
     if len(points) < config.num_particles:
         raise ValueError(
@@ -297,7 +279,8 @@ def _canyon(config: FluidScene, rng: np.random.Generator) -> Sampled:
         first, last = bounds[0]
         region = config.reservoir or ((first, first + (last - first) / 3), *bounds[1:])
     shapes: tuple[Shape, ...] = (*domain_walls(bounds, config.friction), terrain)
-    points = _filling(config, tuple((max(a, low), min(b, high)) for (a, b), (low, high) in zip(region, bounds, strict=True)), rng)
+    inside = [(max(a, low), min(b, high)) for (a, b), (low, high) in zip(region, bounds, strict=True)]
+    points = filled_box(inside, config.spacing, rng)
     points = points[signed_distance(shapes, points) > CLEARANCE * config.spacing * (1 - 1e-6)]
     if len(points) < config.num_particles:
         raise ValueError(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
@@ -26,6 +26,9 @@ ObstacleShapes = Literal["plain", "angular"]
 
 MAX_ATTEMPTS = 200
 """Layouts to try before a scene counts as impossible."""
+
+CLEARANCE = 0.25
+"""Smallest distance of a liquid's particle from a solid at the start, in spacings; a jittered lattice beside a wall just keeps it."""
 
 JITTER = 0.25
 """Largest displacement from the seeding lattice per axis, in spacings; a plain lattice would crack along its rows when it spreads."""
@@ -155,6 +158,21 @@ def integer_lattice(first: np.ndarray, last: np.ndarray) -> np.ndarray:
     """Points [point, dim] of whole coordinates from ``first`` to ``last`` [dim]."""
     axes = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+
+
+def jittered_lattice(first: np.ndarray, last: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Jittered points [point, dim] around the integer points from ``first`` to ``last``."""
+    lattice = integer_lattice(first, last)
+    return lattice + rng.uniform(-JITTER, JITTER, lattice.shape)
+
+
+def filled_box(region: Sequence[tuple[float, float]], spacing: float, rng: np.random.Generator) -> np.ndarray:
+    """Jittered points of a rest spacing [point, dim] in a box of ``(low, high)`` per axis, half a spacing away from its low sides."""
+    low, high = np.array(region, float).T
+    number = np.floor((high - low) / spacing + 1e-6)
+    if np.any(number < 1):
+        return np.empty((0, len(low)))
+    return low + spacing * (jittered_lattice(np.zeros(len(low)), number - 1, rng) + 0.5)
 
 
 def floats(values: np.ndarray) -> tuple[float, ...]:

@@ -169,16 +169,10 @@ def relative_change(new: Tensor, old: Tensor) -> float:
 
 
 class _DoubleBuilder(GraphBuilder):
-    """Positions and masses of islands in double precision too; features are dimensionless and stay as networks are given them."""
+    """Masses and lever arms in double precision too; features are dimensionless and stay as networks are given them."""
 
-    def __call__(self, state: State) -> HeteroData:
-        data = super().__call__(state)
-        for material in self.spec.materials:
-            rows = data[material].node_id
-            data[material].mass = state.mass[rows]
-            if self.config.islands:
-                data[material].pos = state.pos[rows]
-        return data
+    def _rounded(self, values: Tensor) -> Tensor:
+        return values
 
 
 class _DoubleSimulator(LearnedSimulator):

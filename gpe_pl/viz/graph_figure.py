@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
+from gpe_pl.graphs.islands import unwrapped
 from gpe_pl.graphs.multiscale import levels_of, multiscale_graph
 from gpe_pl.trajectory import Trajectory
 from gpe_pl.viz.coloring import PALETTE
@@ -31,7 +32,7 @@ def multiscale_figure(trajectory: Trajectory, frame: int = 0) -> Figure:
     mass = trajectory.mass[below].astype(np.float64)
     count = len(graph.level)
     total = np.bincount(above, mass, count)[graph.num_nodes :]
-    pos = trajectory.pos[frame].astype(np.float64)
+    pos, _ = unwrapped(trajectory.pos[frame].astype(np.float64), graph.cell_edges, trajectory.metadata.periodicity)
     mean = [np.bincount(above, mass * x[below], count)[graph.num_nodes :] / total for x in pos.T]
     points = np.concatenate([pos, np.stack(mean, axis=1)])[:, [0, -1]]
 

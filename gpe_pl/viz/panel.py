@@ -27,11 +27,11 @@ TETRAHEDRON = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 
 def drawn_faces(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Polygons that show a mesh, as nodes [face, corner], and the cell of each: in 2D the cells, in 3D the faces that only one cell has."""
+    """Polygons that show a mesh, as nodes [face, corner], and the cell of each: of surfaces the cells, of volumes the faces that only one cell has."""
     cells = trajectory.cells
     if cells is None or len(cells) == 0:
         return np.empty((0, 3), int), np.empty(0, int)
-    if trajectory.metadata.dim == 2:
+    if trajectory.metadata.dim == 2 or cells.shape[1] == 3:
         return cells, np.arange(len(cells))
     faces = cells[:, TETRAHEDRON].reshape(-1, 3)
     outer = _that_occur_once(faces)
@@ -105,7 +105,8 @@ class Panel:
     def show_frame(self, frame: int) -> None:
         """Show a frame of the trajectory, or why there is none."""
         if frame < self.trajectory.num_frames:
-            self._show(self.trajectory.pos[frame].astype(np.float64), *self.coloring(self.trajectory, frame))
+            pos = self.trajectory.metadata.periodicity.wrapped(self.trajectory.pos[frame].astype(np.float64))
+            self._show(pos, *self.coloring(self.trajectory, frame))
             self.note.set_text("")
             return
         self._show(np.full(self.trajectory.pos.shape[1:], np.nan), *self.coloring(self.trajectory, 0))
@@ -124,24 +125,41 @@ class Panel:
         on_paper, depth = self.camera.project(pos)
         whole = finite[self._faces].all(axis=1)
         faces, dots = self._faces[whole], self._loose[finite[self._loose]]
-        outlines, face_colors = list(on_paper[faces]), cell_colors[self._cell_of_face[whole]]
+        corners, shown = self._corners(pos, faces)
+        face_colors = cell_colors[self._cell_of_face[whole][shown]]
+        outlines = list(self.camera.project(corners)[0])
         if self._is_3d and len(faces):
             # Dots among faces become polygons, so that all together can be drawn from far to near.
             outlines += list(on_paper[dots, None] + self._radius * DISC)
-            face_colors[:, :3] *= self._shade(pos[faces])[:, None]
+            face_colors[:, :3] *= self._shade(corners)[:, None]
             face_colors = np.concatenate([face_colors, node_colors[dots]])
-            middle = np.concatenate([pos[faces].mean(axis=1), pos[dots]])
+            middle = np.concatenate([corners.mean(axis=1), pos[dots]])
             order = np.argsort(middle @ self.camera.toward, kind="stable")
             outlines = [outlines[k] for k in order]
             face_colors = self._seen_from_afar(face_colors, *self.camera.project(middle))[order]
             dots = dots[:0]
         self.mesh.set_verts(outlines)
         self._paint(self.mesh, face_colors, self._edge)
-        self.outline.set_segments(on_paper[self._outline[finite[self._outline].all(axis=1)]])
+        segments, _ = self._corners(pos, self._outline[finite[self._outline].all(axis=1)])
+        self.outline.set_segments(self.camera.project(segments)[0])
         dots = dots[np.argsort(depth[dots], kind="stable")]
         self.particles.set_offsets(on_paper[dots])
         # One colour per particle even where all are equal: a single one makes Agg round positions to whole pixels.
         self._paint(self.particles, self._seen_from_afar(node_colors[dots], on_paper[dots], depth[dots]), 0.7)
+
+    def _corners(self, pos: Float[np.ndarray, "node dim"], groups: np.ndarray) -> tuple[Float[np.ndarray, "drawn corner dim"], np.ndarray]:
+        """Positions of the nodes of faces or edges, and which of them each is: those at the seam of a periodic domain appear on both of its sides."""
+        corners, which = pos[groups], np.arange(len(groups))
+        periodicity = self.trajectory.metadata.periodicity
+        if periodicity:
+            corners = corners[:, :1] + periodicity.shortest(corners - corners[:, :1])
+        for axis in periodicity.axes:
+            low, high = periodicity.bounds[axis]
+            step = (high - low) * np.eye(pos.shape[1])[axis]
+            below, above = (corners[..., axis] < low).any(axis=1), (corners[..., axis] > high).any(axis=1)
+            corners = np.concatenate([corners, corners[below] + step, corners[above] - step])
+            which = np.concatenate([which, which[below], which[above]])
+        return corners, which
 
     def _paint(self, artist: Any, colors: Float[np.ndarray, "item 4"], edge: float) -> None:
         artist.set_facecolor(colors)

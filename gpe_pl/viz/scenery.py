@@ -68,8 +68,17 @@ def _draw_2d(axes: Any, trajectory: Trajectory) -> None:
             axes.add_patch(patch)
         else:
             _fill_solid(axes, shape, np.asarray(trajectory.metadata.bounds, float))
-    if not shapes:  # imported data knows its boundary by nodes only
-        axes.scatter(*trajectory.boundary.pos.T, s=1.0, color=INK, linewidths=0, zorder=2)
+    low, high = np.array(trajectory.metadata.bounds).T
+    for axis in trajectory.metadata.periodicity.axes:
+        for side in (low, high):
+            ends = np.array([low, high])
+            ends[:, axis] = side[axis]
+            axes.plot(*ends.T, color="0.6", linewidth=0.6, linestyle=":", zorder=1)
+    pos = trajectory.boundary.pos
+    distances = [np.abs(shape.signed_distance(pos)) for shape in shapes]
+    loose = pos[np.min(distances, axis=0) > 0.1 * trajectory.metadata.spacing] if shapes else pos
+    if len(loose):  # imported data know some boundaries by nodes only
+        axes.scatter(*loose.T, s=1.0, color=INK, linewidths=0, zorder=2)
 
 
 def _patch(shape: Any) -> Patch | None:

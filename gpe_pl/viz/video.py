@@ -17,7 +17,7 @@ from gpe_pl.viz.coloring import COLOR_MAPS, REFERENCE, ColorBy, Coloring
 from gpe_pl.viz.panel import Panel
 from gpe_pl.viz.scenery import INK
 
-PANEL_PIXELS = 360
+PANEL_PIXELS, FILM_PIXELS = 360, 960
 DPI = 100
 
 
@@ -45,15 +45,26 @@ def write_animation(
             second, or no trajectory has what ``color`` needs.
         ModuleNotFoundError: MP4 without imageio-ffmpeg.
     """
-    path = Path(path)
+    frames = range(0, ground_truth.num_frames, stride) if stride >= 1 else range(0)
+    _write(Path(path), {"ground truth": ground_truth, **predictions}, frames, fps, color, ground_truth, PANEL_PIXELS)
+
+
+def write_film(path: Path | str, name: str, trajectory: Trajectory, fps: int | float = 25, color: ColorBy = "height") -> None:
+    """``write_animation`` of a single trajectory, larger, under a name."""
+    _write(Path(path), {name: trajectory}, range(trajectory.num_frames), fps, color, None, FILM_PIXELS)
+
+
+def _write(
+    path: Path, rows: dict[str, Trajectory], frames: range, fps: int | float, color: ColorBy, truth: Trajectory | None, panel_pixels: int
+) -> None:
     if path.suffix not in (".gif", ".mp4"):
         raise ValueError(f"{path}: an animation ends in .gif or .mp4")
-    if stride < 1 or fps <= 0:
-        raise ValueError(f"stride and fps must be positive, got {stride} and {fps}")
+    if len(frames) == 0 or fps <= 0:
+        raise ValueError(f"{path}: stride and fps must be positive, and there must be a frame to show")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
-        images = _images(ground_truth, dict(predictions), stride, color)
+        images = _images(rows, frames, Coloring(color, list(rows.values()), frames, truth), panel_pixels)
         if path.suffix == ".gif":
             _write_gif(temporary, images, fps, _palette(color))
         else:
@@ -63,25 +74,23 @@ def write_animation(
         temporary.unlink(missing_ok=True)
 
 
-def _images(ground_truth: Trajectory, predictions: dict[str, Trajectory], stride: int, color: ColorBy) -> Iterator[np.ndarray]:
+def _images(rows: dict[str, Trajectory], frames: range, coloring: Coloring, panel_pixels: int) -> Iterator[np.ndarray]:
     """RGB images [height, width, 3], one per shown frame. Boundaries and titles are drawn once and restored below the particles."""
-    frames = range(0, ground_truth.num_frames, stride)
-    rows = {"ground truth": ground_truth, **predictions}
-    coloring = Coloring(color, list(rows.values()), frames, ground_truth)
-    aspect = Camera(ground_truth).aspect
+    first = next(iter(rows.values()))
+    aspect = Camera(first).aspect
 
     title, gap = 28, 8
-    width = len(rows) * PANEL_PIXELS + (len(rows) + 1) * gap
-    height = round(PANEL_PIXELS * aspect) + title + gap
+    width = len(rows) * panel_pixels + (len(rows) + 1) * gap
+    height = round(panel_pixels * aspect) + title + gap
     width, height = width + width % 2, height + height % 2  # H.264 wants even sizes
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
     canvas = FigureCanvasAgg(figure)
     panels = []
     for k, (name, trajectory) in enumerate(rows.items()):
-        left = gap + k * (PANEL_PIXELS + gap)
-        box = (left / width, gap / height, PANEL_PIXELS / width, PANEL_PIXELS * aspect / height)
+        left = gap + k * (panel_pixels + gap)
+        box = (left / width, gap / height, panel_pixels / width, panel_pixels * aspect / height)
         panels.append(Panel(figure, box, trajectory, coloring))
-        figure.text((left + PANEL_PIXELS / 2) / width, 1 - title / 2 / height, name, ha="center", va="center", fontsize=10, color=INK)
+        figure.text((left + panel_pixels / 2) / width, 1 - title / 2 / height, name, ha="center", va="center", fontsize=10, color=INK)
     clock = figure.text(gap / width, 1 - title / 2 / height, "", ha="left", va="center", fontsize=9, color=INK)
 
     moving = [*(artist for panel in panels for artist in panel.artists), clock]
@@ -93,7 +102,7 @@ def _images(ground_truth: Trajectory, predictions: dict[str, Trajectory], stride
         canvas.restore_region(background)
         for panel in panels:
             panel.show_frame(frame)
-        clock.set_text(f"{frame * ground_truth.metadata.frame_dt:.2f} s")
+        clock.set_text(f"{frame * first.metadata.frame_dt:.2f} s")
         for artist in moving:
             figure.draw_artist(artist)
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()

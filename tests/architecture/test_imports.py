@@ -42,7 +42,15 @@ def test_import_contracts() -> None:
 
 def test_data_can_be_read_and_made_without_torch() -> None:
     solvers = [dotted(path) for path in MODULES if "solvers" in path.parts]
-    without = ("gpe_pl.schema", "gpe_pl.geometry", "gpe_pl.trajectory", "gpe_pl.rollout", "gpe_pl.containment", "gpe_pl.data.validate")
+    without = (
+        "gpe_pl.schema",
+        "gpe_pl.geometry",
+        "gpe_pl.trajectory",
+        "gpe_pl.rollout",
+        "gpe_pl.containment",
+        "gpe_pl.data.validate",
+        "gpe_pl.data.importers",
+    )
     assert {"torch", "torch_geometric", "lightning", "hydra", "matplotlib", "wandb"} & loaded_by(*without, *solvers) == set()
 
 

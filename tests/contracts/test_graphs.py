@@ -222,12 +222,6 @@ def test_a_wrong_history_is_named() -> None:
         builder(history=3)(scenes.state(5, history=2).to_torch())
 
 
-def test_periodic_domains_are_refused() -> None:
-    build = builder()
-    with pytest.raises(GraphError, match="periodic"):
-        GraphBuilder(build.config, replace(build.metadata, periodic=(True, False)))
-
-
 def test_a_batch_numbers_nodes_as_its_graphs_do() -> None:
     build = builder(TWO)
     states = [

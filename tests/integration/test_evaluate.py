@@ -14,8 +14,13 @@ from gpe_pl.config import ConfigError
 from gpe_pl.evaluate import evaluate_checkpoint
 from gpe_pl.evaluation import Row, read_rows
 from gpe_pl.fit import fit
+from gpe_pl.generation import trajectory_metadata
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
 from gpe_pl.report import summary
+from gpe_pl.simulate import dataset_spec
 from tests.runs import DATA, compose, tiny
 
 
@@ -92,3 +97,50 @@ def test_a_summary_has_a_line_per_metric_and_a_column_per_horizon() -> None:
         ["test", "rollout_mse", "ballistic", "7"],
         ["test", "rollout_mse", "learned", "2", "3", "5"],
     ]
+
+
+def of_rollouts(rows: list[Row], model: str = "learned") -> dict[tuple[int, str, str], float]:
+    return {(r.trajectory, r.metric, r.horizon): r.value for r in rows if r.model == model and r.trajectory >= 0}
+
+
+def test_levels_of_skipping_change_nothing_or_are_reported_with_what_they_cost(tiny_data: Path, tmp_path: Path) -> None:
+    fit(tiny(tiny_data, tmp_path))
+    checkpoint = tmp_path / "fit" / "checkpoints" / "best.ckpt"
+
+    def rows(name: str, *levels: str) -> list[Row]:
+        return evaluate(tiny_data, tmp_path / name, checkpoint, "evaluation.num_pictures=0", *(f"rollout.{level}" for level in levels))
+
+    usual = of_rollouts(rows("usual"))
+    everything = rows("all", "absent_types=false", "static_boundary=false", "isolated_nodes=false", "edges_at_once=null")
+    assert of_rollouts(everything) == pytest.approx(usual, rel=1e-3, abs=1e-9)
+    approximate = rows("approximate", "hold=2", "sleep_after=1", "rest_speed=100", "rest_acceleration=1e6")
+    shared = of_rollouts(approximate, "learned, exact")
+    assert shared == pytest.approx({k: usual[k] for k in shared}, rel=1e-6, abs=1e-12) and len(shared) > 10
+    costs = {k: v for k, v in of_rollouts(approximate).items() if k[1] in ("skipping_mse", "share_asleep", "lost_impulse")}
+    assert len(costs) == 6 and all(v > 0 for v in costs.values())
+    assert not any(metric in ("skipping_mse", "share_asleep", "lost_impulse") for _, metric, _ in usual)
+
+
+def test_only_the_split_that_is_asked_for_is_generated(tiny_data: Path, tmp_path: Path) -> None:
+    fit(tiny(tiny_data, tmp_path))
+    checkpoint = tmp_path / "fit" / "checkpoints" / "best.ckpt"
+    known = evaluate(tiny_data, tmp_path / "known", checkpoint, "evaluation.num_pictures=0")
+    rows = evaluate(tmp_path / "new", tmp_path / "runs", checkpoint, "evaluation.num_pictures=0")
+    assert of_rollouts(rows) == pytest.approx(of_rollouts(known), rel=1e-6, abs=1e-12)
+    (folder,) = (tmp_path / "new").glob("*/*")
+    assert folder.parent.name == "sand_test_unseen"
+    assert {path.parent.name for path in folder.glob("*/shard-*.h5")} == {"train", "test_unseen"}
+
+
+@pytest.mark.slow
+def test_the_canyon_is_compared_with_the_solver_and_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spec = dataset_spec(compose("simulate", *DATA, "data=fluid"))
+    builder = GraphBuilder(GraphConfig(history=2), trajectory_metadata(spec, "train", 0))
+    LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder).save(tmp_path / "water.ckpt")
+    show = [f"data.showcase.{key}" for key in ("num_steps=2", "scene.num_particles=50", "scene.bounds=[[0,3],[0,1.5],[0,1.5]]")]
+    smaller = ["data.sizes.tiny.d3.num_particles=50", "data.showcase.scene.reservoir=null", "evaluation.num_pictures=0", *show]
+    rows = evaluate(tmp_path, tmp_path, tmp_path / "water.ckpt", "data=fluid", "scene=canyon", *smaller)
+    assert {r.model for r in rows} == {"learned", "ballistic", "constant_velocity"}
+    assert (tmp_path / "evaluation_test_unseen" / "showcase.json").exists()
+    printed = capsys.readouterr().out
+    assert "rollout_mse            learned" in printed and "showcase  share_corrected" in printed

@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch_geometric.data import Batch
 
+from gpe_pl.graphs.islands import islands_within
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE, IslandError
 from gpe_pl.trajectory import State
@@ -83,3 +84,26 @@ def test_islands_are_those_that_the_graphs_own_radius_shows() -> None:
     s = two_clouds(0.4).to_torch()
     wide, narrow = scenes.builder(TWO, history=2)(s), scenes.builder(TWO, history=2, connectivity_spacings=0.5)(s)
     assert int(narrow.num_islands) > int(wide.num_islands)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("trim", [True, False])
+def test_islands_of_edges_are_those_of_the_radius(dim: int, trim: bool) -> None:
+    build = scenes.builder(("sand", "snow"), dim, trim_boundary=trim)
+    s = scenes.state(60, ("sand", "snow"), dim=dim, high=0.8)
+    data = build(s.to_torch())
+    expected = islands_within(build.scales.radius, s.pos, s.boundary.pos, np.empty((2, 0), dtype=np.int64))
+    label = np.empty(60, dtype=np.int64)
+    for m in ("sand", "snow"):
+        label[data[m].node_id] = data[m].island
+    np.testing.assert_array_equal(label, expected.label)
+    np.testing.assert_array_equal(data.island_is_free, expected.is_free)
+    assert 2 < len(expected.is_free) < 60 and 0 < expected.is_free.sum() < len(expected.is_free)
+
+
+def test_far_from_the_origin_lever_arms_keep_their_precision() -> None:
+    build = scenes.builder(("sand",), 2)
+    near = scenes.state(60, ("sand",), high=0.8)
+    shift = np.array([2.0**20, -(2.0**19)])
+    far = replace(near, pos=near.pos + shift, boundary=replace(near.boundary, pos=near.boundary.pos + shift))
+    np.testing.assert_allclose(build(far.to_torch())["sand"].pos, build(near.to_torch())["sand"].pos, rtol=0, atol=1e-7)

@@ -1,0 +1,37 @@
+"""Import data of other projects, or your own arrays: ``python -m gpe_pl.convert format=lagrangebench source=FOLDER name=NAME``.
+
+What comes out is a data set of the project's own store, which ``python -m gpe_pl.fit data=imported data.name=NAME`` trains on. The modules of
+``gpe_pl.data.importers`` describe the formats; ``--help`` lists the settings. Trajectories that cannot be used are refused one by one, with the reason and
+the frame, and the others imported: read the report.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gpe_pl.config import construct, entry_point
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+
+def convert(cfg: DictConfig) -> None:
+    """Import one data set and print the report."""
+    from gpe_pl.data.importers import PAGE_FILE, ImportSettings, draw_contact_sheet, import_dataset
+    from gpe_pl.generation import progress_bar
+
+    settings = construct(ImportSettings, {str(key): value for key, value in cfg.items() if key != "paths"}, "")
+    with progress_bar(f"{settings.format} {settings.name or ''}") as on_progress:
+        report = import_dataset(cfg.paths.data, settings, on_progress)
+    print(report.text())
+    if {"train", "val", "test"} <= set(report.splits):
+        print(f"train on it: python -m gpe_pl.fit data=imported data.name={report.name}")
+    print(draw_contact_sheet(report))
+    print(Path(report.folder) / PAGE_FILE)
+
+
+main = entry_point("convert")(convert)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""Your own arrays, as archives that NumPy writes.
+
+``source`` is a folder with ``train/``, ``val/`` and ``test/``, or a folder of files, which are ``.npz`` archives with one trajectory each::
+
+    np.savez("train/00.npz", pos=pos, frame_dt=0.01, materials="fluid", params_fluid=1e-3, bounds=bounds, periodic=[True, False])
+
+Keys are the arguments of ``Trajectory.from_numpy``, which documents them; ``params_{material}`` stands for ``params[material]``, and ``boundary_pos``,
+``boundary_normal``, ``boundary_vel``, ``boundary_friction`` and ``boundary_restitution`` for those of ``Boundary.from_numpy``. Without ``boundary_normal``
+normals are estimated. Needed are ``pos``, ``frame_dt``, ``materials`` and ``params_…``; the settings of the command override what the files say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpe_pl.arrays import estimated_normals, numbers
+from gpe_pl.data.importers import npz
+from gpe_pl.data.importers.source import (
+    SPLIT_NAMES,
+    Facts,
+    ImportFailure,
+    ImportSettings,
+    Item,
+    Loaded,
+    Refusal,
+    Source,
+    joined,
+    walls_at_bounds,
+)
+from gpe_pl.trajectory import Boundary, Trajectory
+
+KEYS = (
+    *(
+        "pos",
+        "frame_dt",
+        "materials",
+        "vel",
+        "mass",
+        "bounds",
+        "periodic",
+        "gravity",
+        "spacing",
+        "connectivity_radius",
+        "cells",
+        "rest_pos",
+    ),
+    *(f"boundary_{name}" for name in ("pos", "normal", "vel", "friction", "restitution")),
+)
+SCALARS = ("frame_dt", "spacing", "connectivity_radius")
+
+
+def open_source(path: Path, settings: ImportSettings) -> Source:
+    """A data set in this format; raises ``ImportFailure``."""
+    folders = {split: path / name for name, split in SPLIT_NAMES.items() if (path / name).is_dir()} or {"train": path}
+    splits = {split: [Item(f.name, partial(_load, f)) for f in sorted(folder.glob("*.npz"))] for split, folder in folders.items()}
+    splits = {split: items for split, items in splits.items() if items}
+    if not splits:
+        raise ImportFailure(f"{path}: {'no such folder' if not path.is_dir() else 'holds no *.npz'}")
+    return Source(Facts().overridden(settings), splits)
+
+
+def _load(path: Path, facts: Facts) -> Loaded:
+    try:
+        names = npz.names(path)
+    except ImportFailure as failure:
+        raise Refusal(str(failure)) from None
+    wrong = [name for name in names if name not in KEYS and not name.startswith("params_")]
+    missing = [name for name in ("pos", "frame_dt", "materials") if name not in names]
+    if wrong or missing:
+        raise Refusal(
+            f"has {f'an unknown key {wrong[0]!r}' if wrong else f'no {missing[0]!r}'}; keys are params_MATERIAL, {', '.join(KEYS)}"
+        )
+    values: dict[str, Any] = {name: npz.read(path, name) for name in names}
+    for name in SCALARS:
+        if name in values:
+            if values[name].size != 1:
+                raise Refusal(f"{name} has shape {list(values[name].shape)}, expected one number")
+            values[name] = values[name].item()
+    materials = values["materials"]
+    if materials.dtype.kind != "U":
+        raise Refusal(f"materials is {materials.dtype}, expected text")
+    values["materials"] = materials.item() if materials.ndim == 0 else materials.tolist()
+    values["params"] = {name.removeprefix("params_"): values.pop(name) for name in names if name.startswith("params_")}
+    given = {"frame_dt", "bounds", "periodic", "gravity", "spacing", "connectivity_radius"}
+    values |= {name: value for name in given if (value := getattr(facts, name)) is not None}
+    values["params"] = {**{m: v for m, v in facts.parameters.items() if m in np.unique(values["materials"])}, **values["params"]}
+    wall = {name.removeprefix("boundary_"): values.pop(name) for name in names if name.startswith("boundary_")}
+    notes: list[str] = []
+    if wall:
+        if "pos" not in wall:
+            raise Refusal("has boundary arrays but no 'boundary_pos'")
+        if "normal" not in wall:
+            wall["normal"] = estimated_normals(wall["pos"], values["pos"], facts.periodicity)
+            notes.append("normals of boundary nodes are estimated: they point to where the other nodes have been")
+        values["boundary"] = Boundary.from_numpy(wall.pop("pos"), wall.pop("normal"), **wall)
+    if facts.walls:
+        dim = numbers("pos", values["pos"], {"frame": None, "node": None, "dim": None}).shape[2]
+        bounds = None
+        if "bounds" in values:
+            rows = numbers("bounds", values["bounds"], {"axis": dim, "low and high": 2})
+            bounds = tuple((float(low), float(high)) for low, high in rows)
+        values["boundary"] = joined(dim, values.get("boundary", Boundary.empty(dim)), walls_at_bounds(replace(facts, bounds=bounds), dim))
+    return Loaded(Trajectory.from_numpy(**values), notes=tuple(notes))

@@ -1,0 +1,383 @@
+"""From a source to a data set of the store: two passes, checks between trajectories, statistics and the report."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpe_pl import integrators
+from gpe_pl.arrays import ArrayError
+from gpe_pl.data.importers.report import Event, Report, SplitCounts
+from gpe_pl.data.importers.source import NAME, Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
+from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
+from gpe_pl.graphs.neighbors import radius_between, radius_pairs
+from gpe_pl.periodicity import PeriodicityError
+from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup, node_code, param_names
+from gpe_pl.trajectory import Trajectory, iter_trajectories, write_shard
+
+FOLDER = "imported"
+"""Folder of imported data in that of a data set, where generated data have their size."""
+
+VERSION = "1"
+TRAJECTORIES_PER_SHARD = 8
+NUM_SAMPLED = 8
+"""Training trajectories from which spacing and neighbours are taken, …"""
+FRAMES_SAMPLED = 3
+"""… and frames of each, evenly spread, in which neighbours are counted."""
+NUM_SHOWN = 4
+"""Rows of the contact sheet."""
+
+FEWEST_NEIGHBOURS, MOST_NEIGHBOURS = 3.0, 60.0
+VELOCITY_RATIO = 1.25
+"""Positions and velocities of a source disagree about time beyond this ratio, …"""
+FRAMES_COMPARED = 200
+"""… in these first frames."""
+TYPED = ("gns", "lagrangebench", "meshgraphnets")
+"""Formats with types of nodes."""
+
+
+Progress = Callable[[int, int], Any]
+"""Called with the number of trajectories that were read, and how often one will be."""
+
+
+def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Progress | None = None) -> Report:
+    """Convert a source into ``{root}/{name}/imported``.
+
+    Args:
+        root: folder of all data sets.
+        settings: what to read, and what to take instead of what it says.
+        on_progress: called after each trajectory that was read.
+
+    Raises:
+        ImportFailure: the source cannot be read, none of its training trajectories can be used, or the data set exists already.
+    """
+    path = Path(settings.source).expanduser()
+    name = settings.name or path.name.partition(".")[0]
+    folder = _free_folder(Path(root), name)
+    if settings.materials and settings.format not in TYPED:
+        raise ImportFailure(f"materials={settings.materials}: {settings.format} has no node types; {', '.join(TYPED)} have")
+    module = importlib.import_module(f"gpe_pl.data.importers.{settings.format}")
+    source = module.open_source(path, settings)
+    if settings.max_trajectories is not None:
+        source = replace(source, splits={split: items[: settings.max_trajectories] for split, items in source.splits.items()})
+    about = {
+        "format": settings.format,
+        "source": str(path.absolute()),
+        "settings": {k: v for k, v in asdict(settings).items() if v is not None},
+    }
+    return _Conversion(name, folder, source, settings.holdout, about, on_progress).run()
+
+
+def save_dataset(root: Path | str, name: str, holdout: float = 0.1, **splits: Iterable[Trajectory]) -> Report:
+    """Write trajectories of your own as ``{root}/{name}/imported``, which ``python -m gpe_pl.fit data=imported data.name={name}`` trains on.
+
+    Args:
+        root: folder of all data sets, ``data`` unless the command gets another ``paths.data``.
+        name: of the data set.
+        holdout: share of ``train`` that becomes ``val`` and ``test`` where these are not given.
+        splits: ``train=[…]``, ``val=[…]``, ``test=[…]`` and ``test_unseen=[…]``; see ``Trajectory.from_numpy``.
+
+    Raises:
+        ImportFailure: nothing to train on, or the data set exists already.
+    """
+    given = {split: list(trajectories) for split, trajectories in splits.items()}
+    unknown = sorted(set(given) - {"train", "val", "test", "test_unseen"})
+    if unknown or not given.get("train"):
+        raise ImportFailure(
+            f"splits: {unknown[0] if unknown else 'train'} {'is none of' if unknown else 'is missing; of'} train, val, test, test_unseen"
+        )
+    items = {split: [_held(f"{split}[{k}]", t) for k, t in enumerate(trajectories)] for split, trajectories in given.items()}
+    about = {"format": "arrays", "source": "memory", "settings": {}}
+    return _Conversion(name, _free_folder(Path(root), name), Source(Facts(), items), holdout, about).run()
+
+
+def draw_contact_sheet(report: Report) -> Path:
+    """Some scenes of an imported data set, to look at; returns the picture's path."""
+    from gpe_pl.viz.contact_sheet import contact_sheet
+
+    folder, split = Path(report.folder), next(iter(report.splits))
+    shown = islice(iter_trajectories(folder, split), NUM_SHOWN)
+    figure = contact_sheet({f"{split} {k}": trajectory for k, trajectory in enumerate(shown)})
+    temporary, path = folder / ".contact_sheet.part.png", folder / "contact_sheet.png"
+    figure.savefig(temporary)
+    os.replace(temporary, path)
+    return path
+
+
+def _held(name: str, trajectory: Trajectory) -> Item:
+    return Item(name, lambda _: Loaded(trajectory))
+
+
+def _free_folder(root: Path, name: str) -> Path:
+    if not re.fullmatch(NAME, name):
+        raise ImportFailure(f"name={name!r}: must be a folder's name of letters, digits, '_', '-' and '.'")
+    folder = root / name / FOLDER
+    if folder.exists():
+        raise ImportFailure(f"{folder}: exists already, and imported data are never overwritten; delete it, or choose another name=…")
+    for leftover in folder.parent.glob(f".{FOLDER}.*.part"):
+        shutil.rmtree(leftover, ignore_errors=True)
+    return folder
+
+
+@dataclass
+class _Survey:
+    """What the first pass learns."""
+
+    good: dict[str, list[Item]] = field(default_factory=dict)
+    materials: set[str] = field(default_factory=set)
+    bounds: list[tuple[tuple[float, float], ...]] = field(default_factory=list)
+    spacings: list[float] = field(default_factory=list)
+    radii: list[float] = field(default_factory=list)
+    velocity_ratios: list[float] = field(default_factory=list)
+    scenes: dict[bytes, str] = field(default_factory=dict)
+    common: tuple[float, int, tuple[bool, ...]] | None = None
+
+
+class _Conversion:
+    """One data set on its way into the store."""
+
+    def __init__(
+        self, name: str, folder: Path, source: Source, holdout: float, about: dict[str, Any], on_progress: Progress | None = None
+    ) -> None:
+        self.source, self.facts, self.holdout, self.folder, self.about = source, source.facts, holdout, folder, about
+        self.report = Report(name, about["format"], about["source"], str(folder))
+        self.survey = _Survey()
+        self.trained: dict[str, tuple[float, float]] = {}
+        self.on_progress, self.num_read = on_progress, 0
+
+    def run(self) -> Report:
+        """Look, decide, write."""
+        self._look()
+        self._decide()
+        part = self.folder.with_name(f".{FOLDER}.{os.getpid()}.part")
+        shutil.rmtree(part, ignore_errors=True)
+        try:
+            for split in SPLITS:  # train first: what is unseen is told by it
+                if split in self.survey.good:
+                    self._write(part, split, self.survey.good[split])
+            self._summarize(part)
+            self.report.write(part)
+            os.replace(part, self.folder)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
+        return self.report
+
+    # --- first pass ------------------------------------------------------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        """Read every trajectory once: refuse what cannot be used, and see what the others have in common."""
+        for split, items in self.source.splits.items():
+            for item in items:
+                try:
+                    loaded = self._load(item)
+                    self._accept(f"{split}, {item.name}", loaded.trajectory)
+                except (Refusal, ArrayError) as refusal:
+                    self.report.refusals.append(Event(split, item.name, getattr(refusal, "frame", -1), str(refusal)))
+                    continue
+                except PeriodicityError as error:  # not the fault of one trajectory
+                    raise ImportFailure(f"{error} (connectivity_radius=…)") from None
+                self.survey.good.setdefault(split, []).append(item)
+                self.report.repairs += [Event(split, item.name, repair.frame, repair.what) for repair in loaded.repairs]
+                self.report.notes += [note for note in loaded.notes if note not in self.report.notes]
+        self.report.notes = [*self.facts.notes, *self.report.notes]
+
+    def _load(self, item: Item) -> Loaded:
+        if self.on_progress is not None:
+            self.num_read += 1
+            self.on_progress(self.num_read, 2 * sum(map(len, self.source.splits.values())))
+        return item.load(self.facts)
+
+    def _accept(self, where: str, trajectory: Trajectory) -> None:
+        """Add a trajectory to what is known; raises ``Refusal`` where it does not fit the others."""
+        survey, m = self.survey, trajectory.metadata
+        common = (m.frame_dt, m.dim, m.periodic)
+        if survey.common is None:
+            survey.common = common
+        if common != survey.common:
+            raise Refusal(
+                f"frame_dt, dimension and periodic axes are {common}, of the trajectories before {survey.common}; a data set has the same in all of them"
+            )
+        if not np.any(trajectory.pos != trajectory.pos[:1]):
+            raise Refusal("nothing moves")
+        digest = hashlib.sha256(trajectory.pos.tobytes()).digest()
+        if survey.scenes.setdefault(digest, where) != where:
+            raise Refusal(f"has exactly the positions of {survey.scenes[digest]}: the same scene twice")
+        survey.materials |= set(m.materials)
+        survey.bounds.append(m.bounds)
+        if len(survey.spacings) < NUM_SAMPLED:
+            survey.spacings.append(m.spacing)
+            survey.radii.append(m.connectivity_radius)
+            first = trajectory.frames(0, FRAMES_COMPARED)
+            step = np.linalg.norm(m.periodicity.shortest(np.diff(first.pos.astype(np.float64), axis=0)), axis=-1).mean()
+            speed = np.linalg.norm(first.vel.astype(np.float64), axis=-1)
+            speed = (0.5 * (speed[1:] + speed[:-1])).mean()
+            if speed > 0:
+                survey.velocity_ratios.append(float(step / (speed * m.frame_dt)))
+
+    def _decide(self) -> None:
+        """Fill in what the source does not say, and the splits that it does not have."""
+        survey, report = self.survey, self.report
+        if not survey.good:
+            refused = "; ".join(str(event) for event in report.refusals[:5]) or "it holds none"
+            raise ImportFailure(f"{report.source}: no trajectory can be used: {refused}")
+        assert survey.common is not None
+        facts, (frame_dt, dim, periodic) = self.facts, survey.common
+        spacing = facts.spacing or float(np.median(survey.spacings))
+        radius = facts.connectivity_radius or float(np.median(survey.radii))
+        bounds = facts.bounds
+        if facts.spacing is None:
+            report.notes.append(
+                f"spacing {spacing:.4g} m is the median distance of nodes to the nearest one, unless they say otherwise (spacing=…)"
+            )
+        if facts.connectivity_radius is None:
+            report.notes.append(
+                f"connectivity_radius is {radius / spacing:.3g} spacings (connectivity_radius=…, or later graph.connectivity_spacings=…)"
+            )
+        if bounds is None and not any(periodic):
+            every = np.array(survey.bounds)
+            bounds = tuple(zip(every[..., 0].min(axis=0).tolist(), every[..., 1].max(axis=0).tolist(), strict=True))
+            report.notes.append("bounds are the extremes of all positions, unless trajectories say otherwise (bounds=…)")
+        self.facts = replace(facts, frame_dt=frame_dt, periodic=periodic, spacing=spacing, connectivity_radius=radius, bounds=bounds)
+        self._hold_out()
+        report.dim, report.frame_dt, report.periodic = dim, frame_dt, list(periodic)
+        report.spacing, report.connectivity_radius = spacing, radius
+        ratio = float(np.median(survey.velocity_ratios)) if survey.velocity_ratios else 1.0
+        if not 1 / VELOCITY_RATIO < ratio < VELOCITY_RATIO:
+            report.warnings.append(
+                f"nodes move {ratio:.3g} times as far per frame as their velocities say: frame_dt may be {frame_dt * ratio:.3g} s rather than {frame_dt:g} s"
+            )
+
+    def _hold_out(self) -> None:
+        """Take ``val`` and ``test`` from the end of the training trajectories where the source has none."""
+        good, report = self.survey.good, self.report
+        train = good.get("train", [])
+        missing = [split for split in ("val", "test") if not good.get(split)]
+        count = max(1, round(self.holdout * len(train)))
+        if missing and self.holdout > 0 and len(train) > count * len(missing):
+            for split in missing:
+                good["train"], good[split] = good["train"][:-count], good["train"][-count:]
+                moved = {item.name for item in good[split]}
+                report.repairs = [replace(e, split=split) if e.split == "train" and e.trajectory in moved else e for e in report.repairs]
+                report.notes.append(f"the source has no usable {split}: the last {count} training trajectories were taken")
+        elif missing:
+            report.warnings.append(f"there is no split {' and no split '.join(missing)}; fit needs train, val and test")
+
+    # --- second pass -----------------------------------------------------------------------------------------------------------------------
+
+    def _write(self, folder: Path, split: str, items: Sequence[Item]) -> None:
+        counts = self.report.splits.setdefault(split, SplitCounts())
+
+        def stored(part: Sequence[Item]) -> Iterator[Trajectory]:
+            for item in part:
+                trajectory = self._unified(self._load(item).trajectory, split)
+                counts.add(trajectory.num_frames, trajectory.num_nodes, len(trajectory.boundary.pos))
+                self._count(trajectory, split)
+                yield trajectory
+
+        for k, start in enumerate(range(0, len(items), TRAJECTORIES_PER_SHARD)):
+            part = items[start : start + TRAJECTORIES_PER_SHARD]
+            write_shard(folder / split / f"shard-{k:05d}.h5", stored(part), (f"{start + i:05d}" for i in range(len(part))))
+
+    def _unified(self, trajectory: Trajectory, split: str) -> Trajectory:
+        """With the metadata and material columns of the whole data set."""
+        facts, m = self.facts, trajectory.metadata
+        assert facts.spacing is not None and facts.connectivity_radius is not None
+        materials = tuple(name for name in MATERIALS if name in self.survey.materials)
+        names = param_names(materials)
+        columns = np.full((trajectory.num_nodes, len(names)), np.nan, np.float32)
+        for old, name in enumerate(m.param_names):
+            columns[:, names.index(name)] = trajectory.material_params[:, old]
+        metadata = replace(
+            m, dataset=self.report.name, materials=materials, param_names=names, spacing=facts.spacing, connectivity_radius=facts.connectivity_radius,
+            split=split, parameter_group=self._parameter_group(columns, names) if split == "test_unseen" else "seen",
+            solver=f"import/{self.about['format']}", solver_version=VERSION, config=json.dumps(self.about, sort_keys=True, default=str),
+        )  # fmt: skip
+        return replace(trajectory, metadata=metadata, material_params=columns)
+
+    def _parameter_group(self, columns: np.ndarray, names: tuple[str, ...]) -> ParameterGroup:
+        """Whether parameters of ``test_unseen`` lie inside or outside the range of the trained ones."""
+        for column, name in zip(columns.T, names, strict=True):
+            low, high = self.trained.get(name, (np.inf, -np.inf))
+            if (column < low).any() or (column > high).any():
+                return "extrapolated"
+        return "interpolated"
+
+    def _count(self, trajectory: Trajectory, split: str) -> None:
+        """Add one stored trajectory to the report."""
+        report, m = self.report, trajectory.metadata
+        so_far = report.bounds or m.bounds
+        report.bounds = [[min(a[0], b[0]), max(a[1], b[1])] for a, b in zip(so_far, m.bounds, strict=True)]
+        report.gravity = list(m.gravity)
+        for material in m.materials:
+            rows = trajectory.node_type == node_code(material)
+            if rows.any():
+                values = trajectory.material_params[rows, m.param_names.index(MATERIALS[material].name)]
+                entry = report.materials.setdefault(material, {"nodes": 0, "low": np.inf, "high": -np.inf})
+                if split == "train":
+                    low, high = self.trained.get(MATERIALS[material].name, (np.inf, -np.inf))
+                    self.trained[MATERIALS[material].name] = min(low, float(values.min())), max(high, float(values.max()))
+                elif MATERIALS[material].name not in self.trained and "train" in self.survey.good:
+                    warning = f"{material} occurs in {split} but not in train: no model will know it"
+                    report.warnings += [warning] if warning not in report.warnings else []
+                entry["nodes"] += int(rows.sum())
+                entry["low"], entry["high"] = min(entry["low"], float(values.min())), max(entry["high"], float(values.max()))
+
+    def _summarize(self, folder: Path) -> None:
+        """Statistics and neighbours of the training trajectories."""
+        split = "train" if "train" in self.survey.good else next(iter(self.survey.good))
+        shards = sorted((folder / split).glob("shard-*.h5"))
+        statistics = combined([shard_moments(path)[1] for path in shards])
+        (folder / STATISTICS_FILE).write_text(json.dumps(statistics, indent=2, sort_keys=True) + "\n")
+        report = self.report
+        report.velocity_std, report.acceleration_std = statistics["velocity_std"], statistics["acceleration_std"]
+        if report.acceleration_std == 0:
+            raise ImportFailure(f"{report.source}: nothing accelerates other than by gravity, so there is nothing to learn")
+        sample = list(islice(iter_trajectories(folder, split), NUM_SAMPLED))
+        degrees = [degree for trajectory in sample for degree in _degrees(trajectory)]
+        among, boundary = (np.concatenate(part) for part in zip(*degrees, strict=True))
+        report.neighbours = {
+            "mean": float(among.mean()),
+            "min": int(among.min()),
+            "max": int(among.max()),
+            "boundary": float(boundary.mean()),
+        }
+        self._look_at_motion(sample)
+        if not FEWEST_NEIGHBOURS <= among.mean() <= MOST_NEIGHBOURS:
+            report.warnings.append(
+                f"{among.mean():.1f} neighbours within the radius are {'few' if among.mean() < FEWEST_NEIGHBOURS else 'many'}; choose connectivity_radius=…"
+            )
+
+    def _look_at_motion(self, sample: Sequence[Trajectory]) -> None:
+        report = self.report
+        means = []
+        for trajectory in sample:
+            m, last = trajectory.metadata, trajectory.num_frames - 1
+            first, final = (
+                integrators.velocities(trajectory.pos[k : k + 2].astype(np.float64), m.frame_dt, m.periodicity)[0] for k in (0, last - 1)
+            )
+            means.append((final - first).mean(axis=0) / ((last - 1) * m.frame_dt))
+            report.max_speed = max(report.max_speed, float(np.linalg.norm(trajectory.vel, axis=-1).max()))
+        report.mean_acceleration = np.mean(means, axis=0).tolist()
+        report.step_in_spacings = report.max_speed * report.frame_dt / report.spacing
+
+
+def _degrees(trajectory: Trajectory) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Neighbours of each dynamic node among dynamic nodes and among boundary nodes, in some frames."""
+    m, count = trajectory.metadata, trajectory.num_nodes
+    walls = np.ascontiguousarray(trajectory.boundary.pos, dtype=np.float64)
+    for frame in np.unique(np.linspace(0, trajectory.num_frames - 1, FRAMES_SAMPLED).astype(int)):
+        pos = trajectory.pos[frame].astype(np.float64)
+        pairs = radius_pairs(pos, m.connectivity_radius, m.periodicity)
+        touching = radius_between(walls, pos, m.connectivity_radius, m.periodicity)[1]
+        yield np.bincount(pairs.ravel(), minlength=count), np.bincount(touching, minlength=count)

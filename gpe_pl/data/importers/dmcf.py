@@ -1,0 +1,175 @@
+"""Fluids of DeepLagrangianFluids (Continuous Convolutions) and DMCF.
+
+``source`` is a folder with ``train/``, ``valid/`` and ``test/``, a folder of files, or one file. Files are ``sim_{seed}_{part}.msgpack.zst``, where the parts
+of a scene follow each other in time, or have any other name and a whole scene. A file is a list of frames, each with ``pos`` and ``vel`` [node, 3], ``m`` and
+``viscosity`` [node], ``frame_id`` and ``scene_id``; the first frame of a scene also has ``box`` and ``box_normals`` [boundary_node, 3], and some have ``grav``.
+Two-dimensional scenes have a third coordinate that never changes, which is dropped.
+
+The time between frames is not in these files: 0.02 s unless ``frame_dt`` says otherwise (DMCF's WBC-SPH has 2.5e-3). The report compares it with how far
+particles move at the velocities of the source. Needs ``msgpack`` and ``zstandard`` (``pip install 'gpe_pl[import]'``).
+
+Sources: Ummenhofer et al. 2020, Prantl et al. 2022, and the layout of github.com/isl-org/DeepLagrangianFluids; msgpack-numpy for how arrays are stored.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpe_pl.data.importers.source import (
+    SPLIT_NAMES,
+    Facts,
+    ImportFailure,
+    ImportSettings,
+    Item,
+    Loaded,
+    Nodes,
+    Refusal,
+    Repair,
+    Source,
+    build,
+)
+
+ENDING = ".msgpack.zst"
+FRAME_DT = 0.02
+GRAVITY = -9.81
+MAX_BYTES = 2**32
+"""Of one file, unpacked."""
+
+
+def open_source(path: Path, settings: ImportSettings) -> Source:
+    """A data set in this format; raises ``ImportFailure``."""
+    _libraries()
+    if path.is_file():
+        scenes = {"train": [[path]]}
+    else:
+        folders = {split: path / name for name, split in SPLIT_NAMES.items() if (path / name).is_dir()} or {"train": path}
+        scenes = {split: found for split, folder in folders.items() if (found := _scenes(folder))}
+    if not scenes:
+        raise ImportFailure(f"{path}: {'no such file or folder' if not path.exists() else f'holds no *{ENDING}'}")
+    notes = () if settings.frame_dt else (f"frame_dt is not in the source; {FRAME_DT:g} s is the format's usual one (frame_dt=…)",)
+    facts = Facts(FRAME_DT, notes=notes).overridden(settings)
+    return Source(facts, {split: [Item(_scene_of(parts[0]), partial(_load, parts)) for parts in found] for split, found in scenes.items()})
+
+
+def _libraries() -> tuple[Any, Any]:
+    try:
+        import msgpack
+        import zstandard
+    except ImportError:
+        raise ImportFailure(f"*{ENDING} needs msgpack and zstandard: `pip install msgpack zstandard`") from None
+    return msgpack, zstandard
+
+
+def _scene_of(path: Path) -> str:
+    return re.sub(r"(_\d+)_\d+$", r"\1", path.name.removesuffix(ENDING))
+
+
+def _scenes(folder: Path) -> list[list[Path]]:
+    """Files of each scene, in order of their parts."""
+    scenes: dict[str, list[Path]] = {}
+    for path in sorted(folder.glob(f"*{ENDING}")):
+        scenes.setdefault(_scene_of(path), []).append(path)
+    return list(scenes.values())
+
+
+def _load(parts: list[Path], facts: Facts) -> Loaded:
+    frames = [frame for part in parts for frame in _frames(part)]
+    columns: dict[str, list[np.ndarray]] = {name: [] for name in ("pos", "vel")}
+    for k, frame in enumerate(frames):
+        if not isinstance(frame, dict):
+            raise Refusal(f"is {type(frame).__name__}, expected a map", k)
+        if "frame_id" in frame and int(_array(frame, "frame_id", k)) != int(_array(frames[0], "frame_id", 0)) + k:
+            raise Refusal("frame_id does not follow that of the frame before: a part is missing, or parts are of several scenes", k)
+        for name, arrays in columns.items():
+            arrays.append(_array(frame, name, k))
+            if arrays[-1].shape != (len(columns["pos"][0]), 3):
+                raise Refusal(
+                    f"{name} is {list(arrays[-1].shape)}, expected [{len(columns['pos'][0])}, 3]; the number of nodes must not change", k
+                )
+    if not frames:
+        raise Refusal("has no frames")
+    pos, vel = (np.stack(arrays) for arrays in columns.values())
+    first, count = frames[0], pos.shape[1]
+    walls = None
+    if "box" in first:
+        walls = _array(first, "box", 0), _array(first, "box_normals", 0)
+        if walls[0].shape != walls[1].shape or walls[0].ndim != 2 or walls[0].shape[1] != 3:
+            raise Refusal(f"box and box_normals are {list(walls[0].shape)} and {list(walls[1].shape)}, expected [boundary_node, 3] both", 0)
+    nodes = Nodes(pos, np.full(count, "fluid", dtype="U16"), vel=vel, walls=walls, friction=0.0)
+    for name in ("m", "viscosity"):
+        if name in first:
+            values = _array(first, name, 0)
+            if values.shape not in ((count,), ()):
+                raise Refusal(f"{name} is {list(values.shape)}, expected [{count}]", 0)
+            if name == "m":
+                nodes.mass = values
+            else:
+                nodes.parameters = {"fluid": values}
+    gravity = np.array([0.0, GRAVITY, 0.0])
+    if "grav" in first:
+        gravity = _array(first, "grav", 0).astype(np.float64).ravel()
+        if any("grav" in frame and not np.allclose(_array(frame, "grav", k).ravel(), gravity) for k, frame in enumerate(frames)):
+            raise Refusal("grav changes with time; the store keeps one gravity per trajectory")
+        if gravity.shape != (3,):
+            raise Refusal(f"grav has {gravity.size} components, expected 3", 0)
+    elif facts.gravity is None:
+        nodes.notes.append(f"gravity is not in the source; {GRAVITY:g} m/s² along y is the format's usual one (gravity=[…])")
+    if (pos[..., 2] == pos[0, 0, 2]).all():
+        nodes.repairs.append(Repair("the third coordinate never changes and was dropped: the scene is two-dimensional"))
+        nodes.pos, nodes.vel, gravity = pos[..., :2], vel[..., :2], gravity[:2]
+        if walls is not None:
+            flat = np.linalg.norm(walls[1][:, :2], axis=1) > 0.5  # the others close the third dimension
+            nodes.walls = walls[0][flat, :2], walls[1][flat, :2]
+    return build(nodes, facts if facts.gravity is not None else replace(facts, gravity=tuple(gravity.tolist())))
+
+
+# --- msgpack -------------------------------------------------------------------------------------------------------------------------------
+
+
+def _frames(path: Path) -> list[Any]:
+    msgpack, zstandard = _libraries()
+    try:
+        with (
+            open(path, "rb") as file,
+            zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(file, read_across_frames=True) as stream,
+        ):
+            data = stream.read(MAX_BYTES + 1)
+        if len(data) > MAX_BYTES:
+            raise Refusal(f"{path.name}: unpacks to more than {MAX_BYTES} bytes")
+        frames = msgpack.unpackb(data)
+    except Refusal:
+        raise
+    except (OSError, ValueError, MemoryError, RecursionError, zstandard.ZstdError, msgpack.UnpackException) as error:
+        raise Refusal(f"{path.name}: damaged or truncated ({type(error).__name__}: {error})") from None
+    if not isinstance(frames, list):
+        raise Refusal(f"{path.name}: holds {type(frames).__name__}, expected a list of frames")
+    return frames
+
+
+def _array(frame: dict[str, Any], name: str, number: int) -> np.ndarray:
+    """An array as msgpack-numpy stores it, a map of ``nd``, ``type``, ``kind``, ``shape`` and ``data``; those of Python objects are refused."""
+    stored = frame.get(name)
+    if isinstance(stored, (int, float)) and not isinstance(stored, bool):
+        return np.asarray(stored)
+    if not isinstance(stored, dict):
+        found = "missing" if name not in frame else type(stored).__name__
+        raise Refusal(f"{name} is {found}, expected an array; there are {', '.join(sorted(map(str, frame)))}", number)
+    entries = {key.decode() if isinstance(key, bytes) else key: value for key, value in stored.items()}
+    kind, shape, data = entries.get("type"), entries.get("shape", []), entries.get("data")
+    if entries.get("kind") not in (None, b"", "") or not isinstance(kind, str) or not isinstance(data, bytes):
+        raise Refusal(f"{name} is an array of Python objects or structures, expected numbers", number)
+    try:
+        dtype = np.dtype(kind)
+    except TypeError:
+        raise Refusal(f"{name} has type {kind!r}, expected numbers", number) from None
+    sound = isinstance(shape, list) and all(type(n) is int and n >= 0 for n in shape)
+    if dtype.kind not in "fiu" or not sound or math.prod(shape) * dtype.itemsize != len(data):
+        raise Refusal(f"{name} claims {kind}{shape} and has {len(data)} bytes", number)
+    return np.frombuffer(data, dtype).reshape(shape)

@@ -1,0 +1,94 @@
+"""Particles of DPI-Net: fluid that falls, and a rigid box in a bath.
+
+``source`` is a folder ``data_{Environment}`` with ``train/`` and ``valid/``; each holds a folder per rollout with a file ``{frame}.h5`` per frame, which has
+``positions`` [node, 3] and ``velocities`` [node, 3] in m/s, 1/60 s apart. BoxBath files also have ``clusters``: there the first 64 nodes are the rigid box,
+which becomes a ``solid``; all other nodes are ``fluid``. The y axis points up, the ground is at y = 0, and the bath's walls are where particles end.
+
+FluidShake and RiceGrip also store moving walls and grippers as the poses of bodies (``shape_quats``), without their shape: they are refused.
+
+Source: Li et al. 2019, and the layout of the data of github.com/YunzhuLi/DPI-Net.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.data.importers import hdf5
+from gpe_pl.data.importers.source import SPLIT_NAMES, Facts, ImportFailure, ImportSettings, Item, Loaded, Nodes, Refusal, Source, build
+
+FRAME_DT = 1 / 60
+NUM_RIGID = 64
+"""Nodes of the box in BoxBath; they come first."""
+GROUND_FRICTION = 0.5
+
+
+def open_source(path: Path, settings: ImportSettings) -> Source:
+    """A data set in this format; raises ``ImportFailure``."""
+    folders = {split: path / name for name, split in SPLIT_NAMES.items() if (path / name).is_dir()}
+    if not folders:
+        raise ImportFailure(f"{path}: {'no such folder' if not path.exists() else 'holds no folder train or valid'}")
+    rollouts = {split: _numbered(folder, "") for split, folder in folders.items()}
+    first = next((rollout for found in rollouts.values() for rollout in found), None)
+    if first is None:
+        raise ImportFailure(f"{path}: train and valid hold no rollouts, which are folders with numbers as names")
+    has_bath = _has_clusters(first)
+    sides = ("x_low", "x_high", "y_low", "z_low", "z_high") if has_bath else ("y_low",)
+    notes = [
+        f"walls {', '.join(sides)} at the extremes of all positions, with friction {GROUND_FRICTION:g}: neither is in the source",
+        "frame_dt = 1/60 s is the format's, not in the files",
+    ]
+    gravity = (0.0, -9.8, 0.0)
+    notes.append("gravity 9.8 m/s² along −y is the format's, not in the files")
+    facts = Facts(FRAME_DT, gravity=gravity, walls=dict.fromkeys(sides, GROUND_FRICTION), notes=tuple(notes)).overridden(settings)
+    return Source(
+        facts, {split: [Item(f"{r.parent.name}/{r.name}", partial(_load, r, settings)) for r in found] for split, found in rollouts.items()}
+    )
+
+
+def _numbered(folder: Path, ending: str) -> list[Path]:
+    """What has a number as name, in order of the numbers."""
+    found = [p for p in folder.iterdir() if re.fullmatch(rf"\d+{re.escape(ending)}", p.name)]
+    return sorted(found, key=lambda p: int(p.name.removesuffix(ending)))
+
+
+def _has_clusters(rollout: Path) -> bool:
+    files = _numbered(rollout, ".h5")
+    if not files:
+        return False
+    try:
+        with hdf5.opened(files[0]) as file:
+            return "clusters" in file
+    except Refusal:
+        return False
+
+
+def _load(rollout: Path, settings: ImportSettings, facts: Facts) -> Loaded:
+    files = _numbered(rollout, ".h5")
+    wrong = next((k for k, file in enumerate(files) if int(file.stem) != k), None)
+    if not files or wrong is not None:
+        raise Refusal(f"has no {wrong or 0}.h5", wrong or 0)
+    pos: list[np.ndarray] = []
+    vel: list[np.ndarray] = []
+    clusters = False
+    for k, path in enumerate(files):
+        try:
+            with hdf5.opened(path) as file:
+                if "shape_quats" in file:
+                    raise Refusal("has shape_quats: moving walls or grippers, of which the files do not hold the shape")
+                clusters = clusters or "clusters" in file
+                for name, arrays in (("positions", pos), ("velocities", vel)):
+                    arrays.append(hdf5.array(file, name, "node, component", "f"))
+                    if arrays[-1].shape != (len(pos[0]), 3):
+                        raise Refusal(f"{name} is {list(arrays[-1].shape)}, expected [{len(pos[0])}, 3]")
+        except Refusal as refusal:
+            raise Refusal(str(refusal), k) from None
+    kind = np.full(len(pos[0]), "fluid", dtype="U16")
+    if clusters:
+        if len(kind) <= NUM_RIGID:
+            raise Refusal(f"has clusters, as BoxBath, but only {len(kind)} nodes, of which the first {NUM_RIGID} should be the box")
+        kind[:NUM_RIGID] = "solid"
+    return build(Nodes(np.stack(pos), kind, vel=np.stack(vel)), facts)

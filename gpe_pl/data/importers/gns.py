@@ -1,0 +1,160 @@
+"""Particles of "Learning to Simulate" and of its PyTorch successor.
+
+``source`` is a folder with ``metadata.json`` and ``train``, ``valid`` and ``test`` as one of
+
+- ``.tfrecord``: a ``SequenceExample`` per trajectory with ``particle_type`` (int64 [node]) in its context and ``position`` (float32 [node × dim]) per frame;
+- ``.npz``: an object array ``(position [frame, node, dim], particle_type [node] or scalar[, material_property])`` per trajectory, or one array of such
+  tuples. These are pickles: they are read with ``allow_pickle=true`` only;
+- ``.h5``: a group per trajectory with ``positions``, ``particle_type`` and ``material_property``.
+
+``metadata.json`` has ``bounds``, ``dt``, ``default_connectivity_radius`` and ``sequence_length``, which is the number of frames, or one less. Its
+``vel_mean`` … are per frame and not used: the project computes its own statistics from the train split.
+
+Types are 0 rigid, 3 boundary, 5 water, 6 sand and 7 goop, which is plastic and becomes ``snow``. Bounds are walls. The property of sand is tan φ.
+Gravity is not in these files.
+
+Sources: Sanchez-Gonzalez et al. 2020, and the layout of github.com/google-deepmind/deepmind-research, learning_to_simulate; github.com/geoelements/gns.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpe_pl.data.importers import hdf5, npz, tfrecord
+from gpe_pl.data.importers.source import (
+    ASSUMED_FRICTION,
+    Facts,
+    ImportFailure,
+    ImportSettings,
+    Item,
+    Loaded,
+    Refusal,
+    Source,
+    bounds_in,
+    build,
+    number,
+    read_json,
+    split_files,
+    typed,
+)
+
+TYPES = {0: "solid", 3: "boundary", 5: "fluid", 6: "sand", 7: "snow"}
+PACKED = "gns_data"
+"""The one array of an archive that holds all trajectories."""
+
+
+def open_source(path: Path, settings: ImportSettings) -> Source:
+    """A data set in this format; raises ``ImportFailure``."""
+    files = split_files(path, (".tfrecord", ".npz", ".h5"))
+    described = (path if path.is_dir() else path.parent) / "metadata.json"
+    values = read_json(described)
+    if "bounds" not in values and isinstance(values.get("train"), dict):  # newer files say it apart for training and rollout
+        values = values["train"]
+    bounds = bounds_in(values, described)
+    walls = {f"{axis}_{side}": ASSUMED_FRICTION for axis in "xyz"[: len(bounds)] for side in ("low", "high")}
+    notes = [f"walls at the bounds with friction {ASSUMED_FRICTION:g}, which is not in the source (walls={{x_low: …}}, or {{}} for none)"]
+    if settings.gravity is None:
+        notes.append("gravity is not in the source; 0 is stored, and models learn it as any other force (gravity=[…])")
+    if "context_mean" in values:
+        notes.append("step_context, a global input per frame, has no place in the store and was left out")
+    facts = Facts(
+        number(values, "dt", described, low=1e-12),
+        bounds,
+        connectivity_radius=number(values, "default_connectivity_radius", described, low=1e-12),
+        walls=walls,
+        notes=tuple(notes),
+    ).overridden(settings)
+    length = values.get("sequence_length")
+    if length is not None and not isinstance(length, int):
+        raise ImportFailure(f"{described}: sequence_length = {length!r}, expected an integer")
+    readers = {".tfrecord": _in_records, ".npz": _in_archive, ".h5": _in_hdf5}
+    return Source(facts, {split: readers[file.suffix](file, len(bounds), length, settings) for split, file in files.items()})
+
+
+def _loaded(
+    pos: np.ndarray, types: np.ndarray, value: np.ndarray | None, length: int | None, settings: ImportSettings, facts: Facts
+) -> Loaded:
+    if length is not None and len(pos) not in (length, length + 1):
+        raise Refusal(f"has {len(pos)} frames; sequence_length = {length} in metadata.json stands for {length} or {length + 1}")
+    if types.size == 1:
+        types = np.full(pos.shape[1], types.item())
+    if types.shape != (pos.shape[1],):
+        raise Refusal(f"particle_type has shape {list(types.shape)} for {pos.shape[1]} nodes")
+    nodes = typed(pos, types, TYPES, settings)
+    if value is not None:
+        if "sand" in set(nodes.kind.tolist()):
+            nodes.parameters = {"sand": np.degrees(np.arctan(np.broadcast_to(np.asarray(value, np.float64).ravel(), pos.shape[1])))}
+        else:
+            nodes.notes.append("material_property is tan φ of sand, which no particle is: left out")
+    return build(nodes, facts)
+
+
+# --- containers ----------------------------------------------------------------------------------------------------------------------------
+
+
+def _in_records(path: Path, dim: int, length: int | None, settings: ImportSettings) -> list[Item]:
+    def load(record: tfrecord.Record, facts: Facts) -> Loaded:
+        context, lists = tfrecord.sequence_example(record.read())
+        frames = [_buffer(entry, "position", "<f4") for entry in lists.get("position", [])]
+        types = _buffer(context.get("particle_type"), "particle_type", "<i8")
+        wrong = [k for k, frame in enumerate(frames) if frame.size != dim * types.size]
+        if not frames or wrong:
+            sizes = f"position has {frames[wrong[0]].size} numbers" if wrong else "there is no position"
+            raise Refusal(f"{sizes}, expected {dim} for each of the {types.size} particle types", wrong[0] if wrong else -1)
+        return _loaded(np.stack(frames).reshape(len(frames), -1, dim), types, None, length, settings, facts)
+
+    return [Item(f"record {k}", partial(load, record)) for k, record in enumerate(tfrecord.records(path))]
+
+
+def _buffer(feature: tfrecord.Feature | None, name: str, dtype: str) -> np.ndarray:
+    """Numbers that a feature holds as one string of bytes."""
+    if not isinstance(feature, list) or len(feature) != 1 or len(feature[0]) % np.dtype(dtype).itemsize:
+        found = "missing" if feature is None else f"{len(feature)} values of {'bytes' if isinstance(feature, list) else feature.dtype}"
+        raise Refusal(f"{name} is {found}, expected one string of bytes of {np.dtype(dtype)}")
+    return np.frombuffer(feature[0], dtype)
+
+
+def _in_archive(path: Path, dim: int, length: int | None, settings: ImportSettings) -> list[Item]:
+    names = npz.names(path)
+    if names == [PACKED]:
+        packed = npz.read(path, PACKED, settings.allow_pickle)
+        parts: list[Any] = list(packed)
+        return [Item(f"{PACKED}[{k}]", partial(_from_parts, part, dim, length, settings)) for k, part in enumerate(parts)]
+
+    def load(name: str, facts: Facts) -> Loaded:
+        return _from_parts(npz.read(path, name, settings.allow_pickle), dim, length, settings, facts)
+
+    return [Item(name, partial(load, name)) for name in names]
+
+
+def _from_parts(parts: Any, dim: int, length: int | None, settings: ImportSettings, facts: Facts) -> Loaded:
+    if not isinstance(parts, (np.ndarray, tuple, list)) or len(parts) not in (2, 3):
+        raise Refusal("is not (position, particle_type[, material_property])")
+    arrays = []
+    for name, part in zip(("position", "particle_type", "material_property"), parts, strict=False):
+        array = np.asarray(part)
+        if array.dtype.kind not in "fiu":
+            raise Refusal(f"{name} has type {array.dtype}, expected numbers")
+        arrays.append(array)
+    pos, types = arrays[:2]
+    if pos.ndim != 3 or pos.shape[2] != dim:
+        raise Refusal(f"position has shape {list(pos.shape)}, expected [frame, node, {dim}]")
+    return _loaded(pos, types, arrays[2] if len(arrays) == 3 else None, length, settings, facts)
+
+
+def _in_hdf5(path: Path, dim: int, length: int | None, settings: ImportSettings) -> list[Item]:
+    def load(name: str, facts: Facts) -> Loaded:
+        with hdf5.opened(path) as file:
+            group = file[name]
+            pos = hdf5.array(group, "positions", "frame, node, dim", "f")
+            types = hdf5.array(group, "particle_type", "node", "iu")
+            value = hdf5.array(group, "material_property", "node") if "material_property" in group else None
+        if pos.shape[2] != dim:
+            raise Refusal(f"positions have {pos.shape[2]} components, bounds have {dim}")
+        return _loaded(pos, types, value, length, settings, facts)
+
+    return [Item(name, partial(load, name)) for name in hdf5.groups(path)]

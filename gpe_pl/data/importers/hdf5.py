@@ -1,0 +1,82 @@
+"""Arrays out of HDF5 files that others wrote: checked before they are read, and never from another file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from gpe_pl.data.importers.source import ImportFailure, Refusal
+from gpe_pl.errors import GpeError
+from gpe_pl.trajectory import LARGEST_DEFLATE_RATIO
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """A file for reading; whatever HDF5 raises on a damaged one becomes a ``Refusal``."""
+    if not path.is_file():
+        raise ImportFailure(f"{path}: no such file")
+    try:
+        with h5py.File(path, "r") as file:
+            yield file
+    except GpeError:
+        raise
+    except (
+        OSError,
+        RuntimeError,
+        LookupError,
+        ValueError,
+        TypeError,
+        MemoryError,
+        AttributeError,
+    ) as error:  # all of these come out of HDF5 and h5py
+        raise Refusal(f"{path.name}: not a readable HDF5 file (damaged or truncated: {error})") from None
+
+
+def groups(path: Path) -> list[str]:
+    """Names of a file's groups, in order; raises ``ImportFailure``."""
+    try:
+        with opened(path) as file:
+            names = [
+                name
+                for name in sorted(file)
+                if isinstance(file.get(name, getlink=True), h5py.HardLink) and isinstance(file[name], h5py.Group)
+            ]
+    except Refusal as refusal:
+        raise ImportFailure(f"{path}: {refusal}") from None
+    if not names:
+        raise ImportFailure(f"{path}: holds no groups, one of which each trajectory should be")
+    return names
+
+
+def array(group: h5py.Group, name: str, axes: str, kinds: str = "fiu") -> np.ndarray:
+    """One array.
+
+    Args:
+        group: file or group.
+        name: in the group.
+        axes: names of its axes, for messages; as many as the array must have.
+        kinds: NumPy's letters for the types that it may have.
+
+    Raises:
+        Refusal: it is missing, of another type or shape, larger than the file can hold, or damaged.
+    """
+    if name not in group:
+        raise Refusal(f"has no {name!r}; there are {', '.join(map(repr, sorted(group)[:10])) or 'no arrays'}")
+    dataset = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
+    if not isinstance(dataset, h5py.Dataset) or dataset.is_virtual or dataset.external:
+        raise Refusal(f"{name!r} is not an array inside this file")
+    count = len(axes.split(", "))
+    if dataset.shape is None or dataset.dtype.kind not in kinds or len(dataset.shape) != count:
+        raise Refusal(
+            f"{name!r} is {dataset.dtype}{list(dataset.shape or ())}, expected {'integers' if 'f' not in kinds else 'numbers'} [{axes}]"
+        )
+    if dataset.nbytes > dataset.id.get_storage_size() * LARGEST_DEFLATE_RATIO:  # a huge shape without data must not fill the memory
+        raise Refusal(f"{name!r} claims {dataset.nbytes} bytes, the file holds {dataset.id.get_storage_size()}")
+    try:
+        return np.asarray(dataset[()])
+    except (OSError, RuntimeError, MemoryError) as error:
+        raise Refusal(f"{name!r} is damaged ({error})") from None

@@ -1,0 +1,93 @@
+"""Particles of LagrangeBench, whose domains are periodic.
+
+``source`` is a folder with ``metadata.json`` and ``train.h5``, ``valid.h5`` and ``test.h5``, each with a group per trajectory: ``position`` (float32
+[frame, node, dim]) and ``particle_type`` ([node]; −1 padding, 0 fluid, 1 solid wall, 2 moving wall, 3 rigid body). The time between frames is
+``dt × write_every``. Lengths are in units of the case; the reference density is 1, so ``viscosity`` is kinematic.
+
+A moving wall slides steadily along a periodic axis: it is stored still, with its velocity. A ``force.py`` beside the data is code and is never run; the
+force of a dam break is gravity, others that ``g_ext_magnitude`` announces depend on the place and are left to learn.
+
+Source: Toshev et al. 2023, and the layout that github.com/tumaer/lagrangebench writes.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+from gpe_pl.data.importers import hdf5
+from gpe_pl.data.importers.source import (
+    Facts,
+    ImportFailure,
+    ImportSettings,
+    Item,
+    Loaded,
+    Refusal,
+    Repair,
+    Source,
+    bounds_in,
+    build,
+    number,
+    read_json,
+    split_files,
+    typed,
+)
+from gpe_pl.schema import MATERIALS, STICKY
+
+PADDING = -1
+TYPES = {0: "fluid", 1: "boundary", 2: "boundary", 3: "solid"}
+DAM_BREAKS = ("DAM", "DB")
+
+
+def open_source(path: Path, settings: ImportSettings) -> Source:
+    """A data set in this format; raises ``ImportFailure``."""
+    files = split_files(path, (".h5",))
+    folder = path if path.is_dir() else path.parent
+    described = folder / "metadata.json"
+    values = read_json(described)
+    bounds = bounds_in(values, described)
+    dim = len(bounds)
+    periodic = values.get("periodic_boundary_conditions")
+    if not isinstance(periodic, list) or len(periodic) < dim or not all(isinstance(p, bool) for p in periodic):
+        raise ImportFailure(f"{described}: periodic_boundary_conditions = {periodic!r}, expected true or false for each of {dim} axes")
+    notes, gravity = [], (0.0,) * dim
+    strength = number({"g_ext_magnitude": 0.0, **values}, "g_ext_magnitude", described)
+    if strength and values.get("case") in DAM_BREAKS:
+        gravity = (0.0, -strength, 0.0)[:dim]
+    elif strength:
+        notes.append(
+            f"an external force of magnitude {strength:g} that depends on the place: models that see no absolute position cannot tell it"
+        )
+    if (folder / "force.py").exists():
+        notes.append("force.py is code and was not run")
+    parameters = {}
+    if "viscosity" in values:
+        spec, viscosity = MATERIALS["fluid"], number(values, "viscosity", described, low=0.0)
+        parameters["fluid"] = min(max(viscosity, spec.low), spec.high)
+        if parameters["fluid"] != viscosity:
+            notes.append(f"viscosity {viscosity:g} is outside {spec.low:g} … {spec.high:g}; {parameters['fluid']:g} {spec.unit} is stored")
+    facts = Facts(
+        number(values, "dt", described, low=1e-12) * number({"write_every": 1, **values}, "write_every", described, low=1.0),
+        bounds,
+        tuple(periodic[:dim]),
+        gravity,
+        number(values, "dx", described, low=1e-12) if "dx" in values else None,
+        number(values, "default_connectivity_radius", described, low=1e-12),
+        parameters=parameters,
+        notes=tuple(notes),
+    ).overridden(settings)
+    friction = 0.0 if values.get("free_slip") else STICKY
+
+    def load(file: Path, name: str, facts: Facts) -> Loaded:
+        with hdf5.opened(file) as opened:
+            pos = hdf5.array(opened[name], "position", "frame, node, dim", "f")
+            types = hdf5.array(opened[name], "particle_type", "node", "iu")
+        if pos.shape[1:] != (len(types), dim):
+            raise Refusal(f"position is {list(pos.shape)} for {len(types)} particle types in {dim}D")
+        real = types != PADDING
+        nodes = typed(pos[:, real], types[real], TYPES, settings, friction=friction)
+        if not real.all():
+            nodes.repairs.append(Repair(f"{int((~real).sum())} padding nodes left out"))
+        return build(nodes, facts)
+
+    return Source(facts, {split: [Item(name, partial(load, file, name)) for name in hdf5.groups(file)] for split, file in files.items()})

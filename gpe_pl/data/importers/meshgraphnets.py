@@ -1,0 +1,133 @@
+"""Meshes of MeshGraphNets that move: cloth and deforming solids.
+
+``source`` is a folder with ``meta.json`` and ``train``, ``valid`` and ``test`` as ``.tfrecord`` (an ``Example`` per trajectory, each field one string of
+bytes) or ``.h5`` (a group per trajectory with a data set per field). ``meta.json`` gives ``field_names``, ``trajectory_length``, ``dt``, and of each of the
+``features`` its ``type`` (``static`` has one frame, ``dynamic`` all, ``dynamic_varlen`` another number of nodes in each), ``dtype`` and ``shape``. Read are
+``world_pos`` [frame, node, 3], ``mesh_pos`` [1, node, 2 or 3], ``cells`` [1, cell, corner] and ``node_type`` [1, node, 1].
+
+Types are 0 normal, 1 obstacle, 3 handle and 6 wall. Normal nodes become an ``elastomer``, the others boundary nodes, which must be still: cells with such
+nodes are left out, and the neighbour radius connects a handle to its cloth. Without ``world_pos`` the mesh is still and a field moves on it (``cylinder_flow``,
+``airfoil``), which is no trajectory of nodes. The source's ``stress`` is von Mises' only, which does not give a stress tensor: left out.
+
+Source: Pfaff et al. 2021, and the layout of github.com/google-deepmind/deepmind-research, meshgraphnets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpe_pl.data.importers import hdf5, tfrecord
+from gpe_pl.data.importers.source import (
+    Facts,
+    ImportFailure,
+    ImportSettings,
+    Item,
+    Loaded,
+    Refusal,
+    Source,
+    build,
+    number,
+    read_json,
+    split_files,
+    typed,
+)
+
+TYPES = {0: "elastomer", 1: "boundary", 3: "boundary", 6: "boundary"}
+NEEDED = ("world_pos", "mesh_pos", "cells", "node_type")
+
+
+def open_source(path: Path, settings: ImportSettings) -> Source:
+    """A data set in this format; raises ``ImportFailure``."""
+    files = split_files(path, (".tfrecord", ".h5"))
+    described = (path if path.is_dir() else path.parent) / "meta.json"
+    meta = read_json(described)
+    features = meta.get("features")
+    if not isinstance(features, dict) or not all(isinstance(f, dict) for f in features.values()):
+        raise ImportFailure(f"{described}: features = {features!r}, expected an object with an object for each field")
+    if "world_pos" not in features:
+        raise ImportFailure(
+            f"{described}: has no world_pos but {', '.join(sorted(features))}: a field on a still mesh, not nodes that move, which gpe_pl learns"
+        )
+    missing = [name for name in NEEDED if name not in features]
+    if missing:
+        raise ImportFailure(f"{described}: features lack {', '.join(missing)}")
+    varying = [name for name in NEEDED if features[name].get("type") == "dynamic_varlen"]
+    if varying or any(features[name].get("type") == "dynamic" for name in ("mesh_pos", "cells", "node_type")):
+        raise ImportFailure(
+            f"{described}: {', '.join(varying) or 'the mesh'} changes with time (remeshing); gpe_pl needs the same nodes in all frames"
+        )
+    length = meta.get("trajectory_length")
+    if type(length) is not int or length < 3:
+        raise ImportFailure(f"{described}: trajectory_length = {length!r}, expected an integer of at least 3")
+    notes = []
+    if settings.gravity is None:
+        notes.append("gravity is not in the source; 0 is stored, and models learn it as any other force (gravity=[…])")
+    if "stress" in features:
+        notes.append("stress of the source is von Mises' only: left out")
+    frame_dt = number(meta, "dt", described, low=0.0) if meta.get("dt") is not None else 0.0
+    if frame_dt == 0 and settings.frame_dt is None:
+        raise ImportFailure(f"{described}: dt = {meta.get('dt')!r} does not say how much time passes between frames; pass frame_dt=… [s]")
+    facts = Facts(frame_dt or None, notes=tuple(notes)).overridden(settings)
+
+    def from_record(record: tfrecord.Record, facts: Facts) -> Loaded:
+        stored = tfrecord.example(record.read())
+        return _loaded({name: _decoded(stored.get(name), name, features[name], length) for name in NEEDED}, length, settings, facts)
+
+    def from_group(file: Path, name: str, facts: Facts) -> Loaded:
+        with hdf5.opened(file) as opened:
+            fields = {key: hdf5.array(opened[name], key, "frame, row, component") for key in NEEDED}
+        return _loaded(fields, length, settings, facts)
+
+    splits = {}
+    for split, file in files.items():
+        if file.suffix == ".h5":
+            splits[split] = [Item(name, partial(from_group, file, name)) for name in hdf5.groups(file)]
+        else:
+            splits[split] = [Item(f"record {k}", partial(from_record, record)) for k, record in enumerate(tfrecord.records(file))]
+    return Source(facts, splits)
+
+
+def _decoded(stored: tfrecord.Feature | None, name: str, feature: Mapping[str, Any], length: int) -> np.ndarray:
+    """A field [frame, row, component] from its bytes, by the type and shape that ``meta.json`` gives."""
+    if not isinstance(stored, list) or len(stored) != 1:
+        raise Refusal(f"{name} is {'missing' if stored is None else 'not one string of bytes'}")
+    data = stored[0]
+    kind, shape = feature.get("dtype"), feature.get("shape")
+    if (
+        kind not in ("float32", "float64", "int32", "int64")
+        or not isinstance(shape, list)
+        or not shape
+        or type(shape[-1]) is not int
+        or shape[-1] < 1
+    ):
+        raise Refusal(f"{name}: meta.json says dtype {kind!r} and shape {shape!r}")
+    dtype, frames = np.dtype(kind).newbyteorder("<"), 1 if feature.get("type") == "static" else length
+    row_bytes = frames * shape[-1] * dtype.itemsize
+    if len(data) == 0 or len(data) % row_bytes:
+        raise Refusal(
+            f"{name} has {len(data)} bytes, which is no whole number of rows of {frames} frames × {shape[-1]} × {dtype.itemsize} bytes"
+        )
+    rows = shape[1] if len(shape) == 3 and type(shape[1]) is int else -1
+    if rows > 0 and len(data) != row_bytes * rows:
+        raise Refusal(f"{name} has {len(data)} bytes, meta.json says {kind}{[frames, *shape[1:]]}")
+    return np.frombuffer(data, dtype).reshape(frames, -1, shape[-1])
+
+
+def _loaded(fields: Mapping[str, np.ndarray], length: int, settings: ImportSettings, facts: Facts) -> Loaded:
+    pos, rest, cells, types = (fields[name] for name in NEEDED)
+    if len(pos) != length:
+        raise Refusal(f"world_pos has {len(pos)} frames, trajectory_length is {length}")
+    for name in ("mesh_pos", "cells", "node_type"):
+        if any(not np.array_equal(frame, fields[name][0]) for frame in fields[name][1:]):
+            raise Refusal(f"{name} changes with time (remeshing); gpe_pl needs the same nodes in all frames")
+    num_nodes, dim = pos.shape[1:]
+    if rest.shape[1] != num_nodes or types.shape[1:] != (num_nodes, 1) or not 1 <= rest.shape[2] <= dim:
+        raise Refusal(f"world_pos, mesh_pos and node_type are {list(pos.shape)}, {list(rest.shape)} and {list(types.shape)}")
+    flat = np.zeros((num_nodes, dim), np.float64)  # a sheet lies in a plane when at rest
+    flat[:, : rest.shape[2]] = rest[0]
+    return build(typed(pos, types[0, :, 0], TYPES, settings, cells=cells[0], rest_pos=flat), facts)

@@ -1,0 +1,68 @@
+"""Arrays out of ``.npz`` archives that others wrote: headers are checked before anything is read, and pickles are refused unless they are asked for."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy
+
+from gpe_pl.data.importers.source import ImportFailure, Refusal
+from gpe_pl.trajectory import LARGEST_DEFLATE_RATIO
+
+HEADERS: dict[tuple[int, int], Any] = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+
+DAMAGE = (
+    *(OSError, EOFError, KeyError, ValueError, MemoryError, NotImplementedError, zipfile.BadZipFile, zlib.error),
+    *(pickle.UnpicklingError, AttributeError, ImportError),
+)
+"""What reading a damaged archive, or a pickle that was asked for, can raise."""
+
+
+def names(path: Path) -> list[str]:
+    """Names of the arrays in an archive, in its order; raises ``ImportFailure``."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
+    except (OSError, zipfile.BadZipFile) as error:
+        raise ImportFailure(f"{path}: not a readable .npz archive ({error})") from None
+
+
+def read(path: Path, name: str, allow_pickle: bool = False) -> np.ndarray:
+    """One array.
+
+    Raises:
+        Refusal: it is damaged, or larger than the archive can hold.
+        ImportFailure: it holds Python objects, and ``allow_pickle`` is false.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            member = archive.getinfo(f"{name}.npy")
+            if member.file_size > max(member.compress_size, 1) * LARGEST_DEFLATE_RATIO:
+                raise Refusal(f"{name!r} claims {member.file_size} bytes, the archive holds {member.compress_size}")
+            with archive.open(member) as file:
+                version = npy.read_magic(file)
+                if version not in HEADERS:
+                    raise Refusal(f"{name!r} has version {version} of the .npy format, expected one of {', '.join(map(str, HEADERS))}")
+                shape, _, dtype = HEADERS[version](file)
+                if dtype.hasobject and not allow_pickle:
+                    raise ImportFailure(
+                        f"{path}: {name!r} is an array of Python objects, a pickle, which can run any code when it is read. If you trust whoever wrote "
+                        "it, pass allow_pickle=true"
+                    )
+                left = member.file_size - file.tell()
+                if not dtype.hasobject and math.prod(shape) * dtype.itemsize != left:
+                    raise Refusal(
+                        f"{name!r} claims {dtype}{list(shape)}, {math.prod(shape) * dtype.itemsize} bytes; the archive has {left}"
+                    )
+            with archive.open(member) as file:
+                return npy.read_array(file, allow_pickle=allow_pickle)
+    except DAMAGE as error:
+        if isinstance(error, (Refusal, ImportFailure)):
+            raise
+        raise Refusal(f"{name!r} is damaged ({error})") from None

@@ -1,0 +1,179 @@
+"""What a conversion found, assumed, repaired and refused: printed, and written beside the data as JSON and Markdown."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from gpe_pl.schema import MATERIALS
+
+REPORT_FILE = "report.json"
+PAGE_FILE = "report.md"
+MAX_LISTED = 20
+"""Repairs or refusals that are printed; the JSON file has all of them."""
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something about one trajectory; ``frame`` is -1 where it concerns none in particular."""
+
+    split: str
+    trajectory: str
+    frame: int
+    what: str
+
+    def __str__(self) -> str:
+        place = f"{self.split}, {self.trajectory}" + (f", frame {self.frame}" if self.frame >= 0 else "")
+        return printable(f"{place}: {self.what}")
+
+
+@dataclass
+class SplitCounts:
+    """Trajectories of a split, and the fewest and most frames and nodes that one has."""
+
+    trajectories: int = 0
+    frames: list[int] = field(default_factory=lambda: [0, 0])
+    nodes: list[int] = field(default_factory=lambda: [0, 0])
+    boundary_nodes: list[int] = field(default_factory=lambda: [0, 0])
+
+    def add(self, frames: int, nodes: int, boundary_nodes: int) -> None:
+        """Count one more trajectory."""
+        for name, value in (("frames", frames), ("nodes", nodes), ("boundary_nodes", boundary_nodes)):
+            low, high = getattr(self, name) if self.trajectories else (value, value)
+            setattr(self, name, [min(low, value), max(high, value)])
+        self.trajectories += 1
+
+
+@dataclass
+class Report:
+    """The result of a conversion; lengths in m, times in s.
+
+    Attributes:
+        name, format, source, folder: what became what.
+        dim: space dimension.
+        frame_dt, bounds, periodic, gravity, spacing, connectivity_radius: as stored.
+        materials: number of nodes, and the parameter's name, unit and smallest and largest value, by material.
+        splits: counts by split.
+        neighbours: dynamic neighbours of a dynamic node within the radius: ``mean``, ``min``, ``max``, and its ``boundary`` neighbours.
+        max_speed, velocity_std, acceleration_std: of the train split [m/s, m/s²], the last without gravity.
+        mean_acceleration: of the train split, per axis [m/s²]: what falls freely shows its gravity here.
+        step_in_spacings: the farthest that a node moves in a frame.
+        notes: what was assumed or left out, for the whole data set.
+        warnings: what looks wrong, and what to do.
+        repairs, refusals: by trajectory.
+    """
+
+    name: str
+    format: str
+    source: str
+    folder: str
+    dim: int = 0
+    frame_dt: float = 0.0
+    bounds: list[list[float]] = field(default_factory=list)
+    periodic: list[bool] = field(default_factory=list)
+    gravity: list[float] = field(default_factory=list)
+    spacing: float = 0.0
+    connectivity_radius: float = 0.0
+    materials: dict[str, dict[str, Any]] = field(default_factory=dict)
+    splits: dict[str, SplitCounts] = field(default_factory=dict)
+    neighbours: dict[str, float] = field(default_factory=dict)
+    max_speed: float = 0.0
+    velocity_std: float = 0.0
+    acceleration_std: float = 0.0
+    mean_acceleration: list[float] = field(default_factory=list)
+    step_in_spacings: float = 0.0
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    repairs: list[Event] = field(default_factory=list)
+    refusals: list[Event] = field(default_factory=list)
+
+    def write(self, folder: Path) -> None:
+        """Write both files, atomically."""
+        for name, text in ((REPORT_FILE, json.dumps(asdict(self), indent=1) + "\n"), (PAGE_FILE, self.markdown())):
+            temporary = folder / f".{name}.part"
+            temporary.write_text(text)
+            os.replace(temporary, folder / name)
+
+    def text(self) -> str:
+        """What the command prints."""
+        lines = [f"{self.name}: {self.format} data of {printable(self.source)}"]
+        lines += [f"  {key:<14}{value}" for key, value in self._facts()]
+        for title, items in self._lists():
+            if items:
+                lines.append(f"{title}:")
+                lines += [f"  - {item}" for item in items]
+        return "\n".join(lines)
+
+    def markdown(self) -> str:
+        """The page beside the data."""
+        lines = [f"# {self.name}", "", f"Imported from `{printable(self.source)}` ({self.format}).", "", "| | |", "|---|---|"]
+        lines += [f"| {key} | {value.replace('|', '/')} |" for key, value in self._facts()]
+        for title, items in self._lists():
+            lines += ["", f"## {title}", ""]
+            lines += [f"- {item}" for item in items] if items else ["None."]
+        return "\n".join(lines) + "\n"
+
+    def _facts(self) -> list[tuple[str, str]]:
+        """What to look at, by name."""
+        axes = "xyz"[: self.dim]
+        box = ", ".join(
+            f"{axis} {low:.6g} … {high:.6g}{' periodic' if repeats else ''}"
+            for axis, (low, high), repeats in zip(axes, self.bounds, self.periodic, strict=True)
+        )
+        rows = [
+            ("frame dt", f"{self.frame_dt:.6g} s"),
+            ("bounds", f"{box} m"),
+            ("gravity", f"({', '.join(f'{g:.4g}' for g in self.gravity)}) m/s²"),
+            ("spacing", f"{self.spacing:.4g} m"),
+            ("radius", f"{self.connectivity_radius:.4g} m = {self.connectivity_radius / self.spacing:.3g} spacings"),
+        ]
+        n = self.neighbours
+        if n:
+            rows.append(
+                (
+                    "neighbours",
+                    f"{n['mean']:.1f} within the radius ({n['min']:.0f} … {n['max']:.0f}), and {n['boundary']:.1f} boundary nodes",
+                )
+            )
+        for material, values in self.materials.items():
+            spec = MATERIALS[material]
+            span = _span([values["low"], values["high"]])
+            rows.append(
+                (material, f"{values['nodes']} nodes in all trajectories, {spec.name} {span}{'' if spec.unit == '1' else ' ' + spec.unit}")
+            )
+        for split, counts in self.splits.items():
+            boundary = f", {_span(counts.boundary_nodes)} boundary nodes" if counts.boundary_nodes[1] else ""
+            rows.append(
+                (split, f"{counts.trajectories} trajectories, {_span(counts.frames)} frames, {_span(counts.nodes)} nodes{boundary}")
+            )
+        mean = ", ".join(f"{a:.3g}" for a in self.mean_acceleration)
+        rows += [
+            ("speed", f"{self.velocity_std:.4g} m/s rms, {self.max_speed:.4g} m/s at most: {self.step_in_spacings:.2g} spacings per frame"),
+            ("acceleration", f"{self.acceleration_std:.4g} m/s² rms without gravity; mean with it ({mean}) m/s²"),
+        ]
+        return rows
+
+    def _lists(self) -> list[tuple[str, list[str]]]:
+        def first(events: list[Event]) -> list[str]:
+            more = len(events) - MAX_LISTED
+            return [str(e) for e in events[:MAX_LISTED]] + ([f"… and {more} more in {REPORT_FILE}"] if more > 0 else [])
+
+        return [
+            ("Warnings", [printable(text) for text in self.warnings]),
+            ("Assumed or left out", [printable(text) for text in self.notes]),
+            ("Repaired", first(self.repairs)),
+            ("Refused", first(self.refusals)),
+        ]
+
+
+def _span(values: list[Any]) -> str:
+    low, high = min(values), max(values)
+    return f"{low:.6g}" if low == high else f"{low:.6g} … {high:.6g}"
+
+
+def printable(text: str) -> str:
+    """Names in a hostile file must not steer a terminal."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)

@@ -1,0 +1,70 @@
+"""Statistics of a train split, written beside it: what training noise and figures are scaled by."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpe_pl import integrators
+from gpe_pl.schema import MATERIALS
+from gpe_pl.trajectory import Trajectory, read_trajectory, trajectory_names
+
+STATISTICS_FILE = "statistics.json"
+
+FRAMES_AT_ONCE = 2048
+"""Public data have trajectories of tens of thousands of frames, which in double precision would fill the memory."""
+
+
+def shard_moments(path: Path) -> tuple[str, dict[str, Any]]:
+    """Sums over one shard from which the statistics follow, and its path."""
+    sums: dict[str, Any] = {"velocity": [0, 0.0], "acceleration": [0, 0.0], "params": None, "nodes": 0, "frames": 0, "trajectories": 0}
+    for name in trajectory_names(path):
+        trajectory = read_trajectory(path, name)
+        dt = trajectory.metadata.frame_dt
+        for start in range(0, max(1, trajectory.num_frames - 2), FRAMES_AT_ONCE):
+            pos = trajectory.pos[start : start + FRAMES_AT_ONCE + 2].astype(np.float64)
+            vel = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
+            acc = integrators.acceleration(vel[1:], vel[:-1], dt) - np.asarray(trajectory.metadata.gravity)
+            for key, values in (("velocity", vel[1:] if start else vel), ("acceleration", acc)):
+                sums[key][0] += values.size
+                sums[key][1] += float(np.sum(values * values))
+        params = _scaled(trajectory)
+        finite = np.isfinite(params)
+        values = np.where(finite, params, 0.0)
+        triple = np.stack([finite.sum(axis=0), values.sum(axis=0), (values * values).sum(axis=0)])
+        sums["params"] = triple if sums["params"] is None else sums["params"] + triple
+        sums["param_names"] = trajectory.metadata.param_names
+        sums["nodes"] += trajectory.num_nodes
+        sums["frames"] += trajectory.num_frames
+        sums["trajectories"] += 1
+    return str(path), sums
+
+
+def _scaled(trajectory: Trajectory) -> np.ndarray:
+    """Material parameters [node, param], those on a logarithmic scale as natural logarithms."""
+    scale = {p.name: p.scale for p in MATERIALS.values()}
+    columns = trajectory.material_params.astype(np.float64).T
+    return np.stack([np.log(c) if scale[n] == "log" else c for n, c in zip(trajectory.metadata.param_names, columns, strict=True)], axis=-1)
+
+
+def combined(moments: list[dict[str, Any]]) -> dict[str, Any]:
+    """Root mean squares per component, and mean and standard deviation of the material parameters on the scale that ``schema`` gives them."""
+    rms = {}
+    for key in ("velocity", "acceleration"):
+        rms[key] = math.sqrt(math.fsum(m[key][1] for m in moments) / sum(m[key][0] for m in moments))
+    count, total, square = np.sum([m["params"] for m in moments], axis=0)
+    mean = total / np.maximum(count, 1)
+    std = np.sqrt(np.maximum(square / np.maximum(count, 1) - mean * mean, 0.0))
+    parameters = {p.name: p for p in MATERIALS.values()}
+    return {
+        "velocity_std": rms["velocity"],
+        "acceleration_std": rms["acceleration"],
+        "material_params": {
+            n: {"mean": float(m), "std": float(s), "scale": parameters[n].scale}
+            for n, m, s in zip(moments[0]["param_names"], mean, std, strict=True)
+        },
+        **{f"num_{key}": sum(m[key] for m in moments) for key in ("trajectories", "frames", "nodes")},
+    }

@@ -1,0 +1,98 @@
+"""Axes along which space repeats: what leaves the domain on one side enters it on the other.
+
+With L the period and low the lower bound of an axis::
+
+    shortest(d) = d − L round(d / L)               minimum image of a difference of positions
+    wrapped(x)  = x − L floor((x − low) / L)       image inside the domain
+
+Source: Allen and Tildesley, Computer Simulation of Liquids (1987), section 1.5.2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace, device
+
+from gpe_pl.errors import GpeError
+
+Array = Any
+"""A NumPy array or a torch tensor."""
+
+
+class PeriodicityError(GpeError, ValueError):
+    """A length that does not fit a periodic domain; the message names axis and period."""
+
+
+@dataclass(frozen=True)
+class Periodicity:
+    """Which axes repeat, and after what length; false where none does.
+
+    Attributes:
+        bounds: ``(low, high)`` per axis [m].
+        periodic: per axis.
+    """
+
+    bounds: tuple[tuple[float, float], ...] = ()
+    periodic: tuple[bool, ...] = ()
+
+    def __bool__(self) -> bool:
+        return any(self.periodic)
+
+    @cached_property
+    def axes(self) -> tuple[int, ...]:
+        """The axes that repeat."""
+        return tuple(axis for axis, repeats in enumerate(self.periodic) if repeats)
+
+    @cached_property
+    def period(self) -> np.ndarray:
+        """Length after which each axis repeats [m], 0 where it does not."""
+        return np.array([high - low if repeats else 0.0 for (low, high), repeats in zip(self.bounds, self.periodic, strict=True)])
+
+    def shortest(self, difference: Array) -> Array:
+        """Differences of positions [..., dim] in m, by the shortest way around; the same object where no axis repeats."""
+        return difference - self._turns(difference, round_down=False) if self else difference
+
+    def wrapped(self, pos: Array) -> Array:
+        """Positions [..., dim] in m inside the domain along periodic axes; the same object where no axis repeats."""
+        if not self:
+            return pos
+        xp = array_namespace(pos)
+        low, high = (self._row([b[side] for b in self.bounds], pos) for side in (0, 1))
+        inside = pos - self._turns(pos - low, round_down=True)
+        repeats = self._row([float(p) for p in self.periodic], pos) > 0
+        return xp.where(repeats & (inside >= high), low, inside)  # rounding can lead to the upper bound itself
+
+    def from_corner(self, pos: Array) -> Array:
+        """Positions [..., dim] in m from the domain's lower corner, below the period along periodic axes: what a k-d tree takes."""
+        xp = array_namespace(pos)
+        low, period = self._row([low for low, _ in self.bounds], pos), self._row(self.period, pos)
+        inside = self.wrapped(pos) - low
+        return xp.where((period > 0) & (inside >= period), 0.0 * inside, inside)  # rounded up
+
+    def check_radius(self, radius: float) -> None:
+        """Raise ``PeriodicityError`` unless a node's nearest image is the only one within the radius [m]."""
+        for axis in self.axes:
+            if not 2 * radius < self.period[axis]:
+                raise PeriodicityError(
+                    f"radius {radius:g} m must be below half the period {self.period[axis]:g} m of axis {'xyz'[axis]}, or nodes would be neighbours "
+                    "on both sides; choose a smaller connectivity radius or a larger domain"
+                )
+
+    def _turns(self, length: Array, round_down: bool) -> Array:
+        """Whole periods in lengths along each axis [m]."""
+        xp = array_namespace(length)
+        period = self._row(self.period, length)
+        turns = length / self._row(np.where(self.period > 0, self.period, 1.0), length)
+        return period * (xp.floor(turns) if round_down else xp.round(turns))
+
+    @staticmethod
+    def _row(values: Any, like: Array) -> Array:
+        return array_namespace(like).asarray(values, dtype=like.dtype, device=device(like))
+
+
+NOWHERE = Periodicity()
+"""No axis repeats."""

@@ -1,0 +1,44 @@
+"""What a rollout leaves out because the scene does not need it. Each level is a switch, so that it can be compared with its absence.
+
+Exact levels are on by default and change a rollout by rounding at most. Approximate levels (``gpe_pl.approximate``) are off by default; evaluation reports
+what they cost in accuracy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
+
+
+@dataclass(frozen=True)
+class Skips:
+    """Levels of a learned rollout.
+
+    Attributes:
+        absent_types: exact. Node types and relations that the scene has none of run no code.
+        static_boundary: exact. The boundary is sorted into a search tree once, not in every step.
+        isolated_nodes: exact. Nodes without an edge take no part in message passing.
+        edges_at_once: exact. Edge features and messages are computed for so many edges at a time, which bounds the memory; None: all together.
+        stress: leaves out the stress that a model decodes beside the motion; the motion stays as it is.
+        sleep_after: approximate. Groups of connected nodes that have been at rest for so many frames stand still until something moves in their
+            reach; None: never.
+        rest_speed, rest_acceleration: below which a node is at rest [m/s], [m/s²].
+        hold: approximate. Frames for which one prediction is held.
+    """
+
+    absent_types: bool = True
+    static_boundary: bool = True
+    isolated_nodes: bool = True
+    edges_at_once: Annotated[int, Field(ge=1)] | None = 65536
+    stress: bool = False
+    sleep_after: Annotated[int, Field(ge=1)] | None = None
+    rest_speed: Annotated[float, Field(gt=0)] = 0.01
+    rest_acceleration: Annotated[float, Field(gt=0)] = 0.5
+    hold: Annotated[int, Field(ge=1)] = 1
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether a rollout with these levels equals one without, up to rounding."""
+        return self.sleep_after is None and self.hold == 1

@@ -1,0 +1,237 @@
+"""The first frame of a recording of another solver as a scene: the ground, and the liquid in it or a flood, scaled to the spacing of a trained model.
+
+Gravity cannot be scaled, so a scene that is s times as long stays similar with equal Froude numbers v²/(g l)::
+
+    length ∝ s      time ∝ √s      velocity ∝ √s      kinematic viscosity ∝ s^(3/2)
+
+Format, of the data of DMCF [Prantl et al. 2022, "Guaranteed Conservation of Momentum for Learning Particle-based Fluid Dynamics"]: msgpack compressed with
+zstandard; a list of frames, each a map of arrays as msgpack-numpy stores them. Every frame has ``pos``, ``vel``, ``m`` and ``viscosity`` of its particles; the
+first also has ``box`` and ``box_normals``, points and unit normals of the walls. The y axis points up.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass as plain_dataclass
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
+
+from gpe_pl.errors import GpeError
+from gpe_pl.geometry import Shape, domain_walls, signed_distance
+from gpe_pl.schema import STICKY, node_code
+from gpe_pl.solvers.scenes import CLEARANCE, filled_box
+from gpe_pl.terrain import ground_of
+from gpe_pl.trajectory import Boundary, State
+
+PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+MAX_BYTES = 2**31
+"""Of an unpacked recording."""
+WATER = 1000.0
+"""Density of the recorded liquid [kg/m³], from which its spacing follows."""
+HEADROOM = 0.25
+"""Height of the domain above the highest wall, of that of the walls."""
+UPSTREAM = 1 / 3
+"""Part of the domain at low x in which a flood starts."""
+
+
+class RecordingError(GpeError, ValueError):
+    """A recording cannot be used; the message names the file and what to do."""
+
+
+@plain_dataclass(frozen=True)
+class Recording:
+    """A recorded scene with its vertical axis last.
+
+    Attributes:
+        walls, normals: points on the ground [point, 3] in m, and unit normals into free space.
+        pos, vel: of the particles [node, 3] in m and m/s.
+        viscosity: kinematic [m²/s].
+        spacing: of the particles [m].
+    """
+
+    walls: np.ndarray
+    normals: np.ndarray
+    pos: np.ndarray
+    vel: np.ndarray
+    viscosity: float
+    spacing: float
+
+    def scaled(self, s: float) -> Recording:
+        """The similar scene that is s times as long."""
+        return Recording(s * self.walls, self.normals, s * self.pos, math.sqrt(s) * self.vel, s**1.5 * self.viscosity, s * self.spacing)
+
+    def moved(self, by: np.ndarray) -> Recording:
+        """The scene somewhere else."""
+        return replace(self, walls=self.walls + by, pos=self.pos + by)
+
+
+def read_recording(path: Path | str) -> Recording:
+    """Read the first frame of a recording; nothing in the file is executed, and no more is unpacked than it needs.
+
+    Raises:
+        RecordingError: the file is missing, damaged or of another format, or holds numbers that no scene can have; or msgpack and zstandard are not installed.
+    """
+    path = Path(path)
+    try:
+        import msgpack
+        import zstandard
+    except ModuleNotFoundError as error:
+        raise RecordingError(f"{path}: needs the package {error.name}; install it with `pip install 'gpe_pl[import]'`") from None
+    if not path.is_file():
+        raise RecordingError(f"{path}: no such file (searched from {Path.cwd()})")
+    try:
+        with path.open("rb") as file, zstandard.ZstdDecompressor().stream_reader(file) as stream:
+            unpacker = msgpack.Unpacker(stream, raw=True, strict_map_key=False, max_buffer_size=MAX_BYTES)
+            if unpacker.read_array_header() < 1:
+                raise ValueError("it has no frames")
+            frame = unpacker.unpack()
+        arrays = {name: _array(frame, name) for name in ("box", "box_normals", "pos", "vel", "m", "viscosity")}
+    except Exception as error:  # what these packages raise on damaged files is not one type
+        raise RecordingError(f"{path}: not a recording in DMCF's format ({type(error).__name__}: {error})") from None
+    points, nodes = len(arrays["box"]), len(arrays["pos"])
+    wanted = {"box": (points, 3), "box_normals": (points, 3), "pos": (nodes, 3), "vel": (nodes, 3), "m": (nodes,), "viscosity": (nodes,)}
+    for name, shape in wanted.items():
+        if arrays[name].shape != shape or not np.isfinite(arrays[name]).all():
+            raise RecordingError(f"{path}: {name} of the first frame is {arrays[name].shape}, expected {shape}, all finite")
+    if min(shape[0] for shape in wanted.values()) < 1 or arrays["m"].min() <= 0 or arrays["viscosity"].min() <= 0:
+        raise RecordingError(f"{path}: the first frame must have walls, and particles with positive mass and viscosity")
+    up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    walls, normals, pos, vel = (arrays[name] @ up.T for name in ("box", "box_normals", "pos", "vel"))
+    return Recording(walls, normals, pos, vel, float(np.median(arrays["viscosity"])), float(np.cbrt(np.median(arrays["m"]) / WATER)))
+
+
+def _array(frame: Any, name: str) -> np.ndarray:
+    stored = frame[name.encode()]
+    dtype = np.dtype(stored[b"type"].decode())
+    if not stored[b"nd"] or dtype.kind not in "fiu":
+        raise ValueError(f"{name} is not an array of numbers")
+    return np.frombuffer(stored[b"data"], dtype).reshape(stored[b"shape"]).astype(np.float64)
+
+
+@dataclass(frozen=True, config={"extra": "forbid"})
+class RecordedScene:
+    """A recorded canyon, scaled so that its particles have the spacing of a trained model.
+
+    The walls are sampled anew at that spacing. Vertical walls stand around, the sky is open.
+
+    Attributes:
+        file: the recording, relative to the working directory.
+        grid_spacing: of the solver that made the training data [m].
+        particles_per_cell: along each axis; the rest spacing is ``grid_spacing / particles_per_cell``.
+        num_particles: fill the lowest free places of the upstream third with so many particles at rest; None takes those recorded.
+        density: [kg/m³].
+        gravity: [m/s²].
+        friction: of the ground.
+        connectivity_cells: recommended connectivity radius in grid cells.
+    """
+
+    file: str
+    grid_spacing: PositiveFloat
+    particles_per_cell: Annotated[int, Field(ge=1)] = 2
+    num_particles: Annotated[int, Field(ge=1)] | None = None
+    density: PositiveFloat = 1000.0
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    friction: Annotated[float, Field(ge=0, allow_inf_nan=False)] = STICKY
+    connectivity_cells: PositiveFloat = 1.5
+
+    @property
+    def spacing(self) -> float:
+        """Rest spacing of particles in m."""
+        return self.grid_spacing / self.particles_per_cell
+
+    @property
+    def scale(self) -> float:
+        """How many times as long the scene is as the recorded one; its times are √scale as long."""
+        return self.spacing / _read(self.file).spacing
+
+    @property
+    def recording(self) -> Recording:
+        """The recorded scene in this one's place and size: the low corner of its walls is the origin."""
+        scaled = _read(self.file).scaled(self.scale)
+        return scaled.moved(-scaled.walls.min(axis=0))
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], ...]:
+        length, width, height = self.recording.walls.max(axis=0)
+        return (0.0, float(length)), (0.0, float(width)), (0.0, float((1 + HEADROOM) * height))
+
+    @property
+    def connectivity_radius(self) -> float:
+        """Recommended neighbour radius of a learned simulator in m."""
+        return self.connectivity_cells * self.grid_spacing
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        return ("fluid",)
+
+    @property
+    def max_nodes(self) -> int:
+        """Largest number of dynamic nodes of a scene."""
+        return self.num_particles or len(_read(self.file).pos)
+
+    @property
+    def max_cells(self) -> int:
+        return 0
+
+    @property
+    def input_files(self) -> dict[str, str]:
+        return {"file": self.file}
+
+    def sample(self, values: Mapping[str, float], seed: int) -> State:
+        """The scene, as a pure function of its settings, the file and, for a flood, the seed.
+
+        Args:
+            values: of ``fluid``, the kinematic viscosity [m²/s]; as recorded, scaled, where it is not given.
+            seed: of a flood's particles.
+
+        Raises:
+            ValueError: the flood does not fit.
+        """
+        recording, bounds = self.recording, self.bounds
+        sides = domain_walls(bounds, self.friction)[:4]
+        shapes: tuple[Shape, ...] = (*sides, ground_of(recording.walls, recording.normals, bounds, self.grid_spacing, self.friction))
+        pos, vel = recording.pos, recording.vel
+        if self.num_particles is not None:
+            pos = self._flood(self.num_particles, shapes, bounds, seed)
+            vel = np.zeros_like(pos)
+        count = len(pos)
+        return State(
+            pos=pos,
+            vel=vel,
+            node_type=np.full(count, node_code("fluid"), dtype=np.uint8),
+            mass=np.full(count, self.density * self.spacing**3),
+            material_params=np.full((count, 1), float(values.get("fluid", recording.viscosity))),
+            boundary=Boundary.sample(shapes, self.spacing, 3),
+            gravity=np.array(self.gravity, dtype=np.float64),
+        )
+
+    def _flood(self, count: int, shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ...], seed: int) -> np.ndarray:
+        rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
+        points = filled_box(((0.0, UPSTREAM * bounds[0][1]), *bounds[1:]), self.spacing, rng)
+        points = points[signed_distance(shapes, points) > CLEARANCE * self.spacing * (1 - 1e-6)]
+        if len(points) < count:
+            raise ValueError(
+                f"{count} particles of spacing {self.spacing:g} m do not fit into the upstream third, at most {len(points)}; lower num_particles"
+            )
+        lowest = points[np.argsort(points[:, 2], kind="stable")[:count]]
+        return np.ascontiguousarray(rng.permutation(lowest))
+
+
+def _read(file: str) -> Recording:
+    """``read_recording``, once per content of the file."""
+    path = Path(file)
+    stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else (0, 0)
+    return _read_once(str(path.absolute()), stamp)
+
+
+@functools.lru_cache(maxsize=2)
+def _read_once(path: str, stamp: tuple[int, int]) -> Recording:
+    return read_recording(path)

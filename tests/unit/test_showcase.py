@@ -1,0 +1,79 @@
+"""A showcase counts what happens in it, keeps few frames, and says why it stopped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from gpe_pl import showcase
+from gpe_pl.learned_simulator import LearnedSimulator, SceneError
+from gpe_pl.models.gpe import GPE
+from gpe_pl.showcase import Record, ShowcaseSettings, run
+from gpe_pl.solvers.fluid_scenes import FluidScene
+from tests import scenes
+
+CANYON = FluidScene("canyon", ((0.0, 3.0), (0.0, 1.5), (0.0, 1.5)), 2 * scenes.SPACING, 60)
+SETTINGS = ShowcaseSettings(num_steps=3, num_uncontained_steps=2, values={"fluid": 10.0})
+
+
+def simulator(accelerations: float = 1.0) -> LearnedSimulator:
+    torch.manual_seed(0)
+    build = scenes.builder(("fluid",), 3, history=2)
+    simulated = LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=8), build).eval()
+    simulated.acceleration_std.fill_(accelerations)
+    return simulated
+
+
+def values(records: list[Record]) -> dict[str, float]:
+    return {r.metric: r.value for r in records}
+
+
+def test_a_rollout_from_rest_is_counted_and_drawn(tmp_path: Path) -> None:
+    seen: list[tuple[int, int]] = []
+    records = run(simulator(), CANYON, SETTINGS, tmp_path, lambda done, total: seen.append((done, total)))
+    found = values(records)
+    assert found["num_nodes"] == 60 and found["num_steps"] == 3 and found["num_boundary_nodes"] > 1000
+    assert found["share_outside_at_end"] == 0 and 0 <= found["share_corrected"] < 1
+    assert found["max_speed"] > 0 and found["peak_memory"] > 1e6 and found["seconds_per_step"] > 0
+    assert seen == [(k, 5) for k in range(1, 6)]
+    written = json.loads((tmp_path / "showcase.json").read_text())
+    assert {r["metric"]: r["value"] for r in written["records"]} == found and written["stopped"] is None
+    assert (tmp_path / "showcase.png").stat().st_size > 1000
+    assert [*tmp_path.glob("showcase.gif"), *tmp_path.glob("showcase.mp4")]
+
+
+def test_without_containment_what_enters_a_wall_is_counted(tmp_path: Path) -> None:
+    heavy = simulator(2000.0)  # some fly into the ground at once
+    found = values(run(heavy, CANYON, SETTINGS, tmp_path))
+    assert found["share_outside_uncontained"] > 0 and found["share_corrected"] > 0
+    assert found["share_outside_at_end"] == 0
+
+
+def test_a_rollout_that_explodes_says_so(tmp_path: Path) -> None:
+    records = run(simulator(float("inf")), CANYON, SETTINGS, tmp_path)
+    assert values(records)["num_steps"] == 0
+    assert "not finite" in json.loads((tmp_path / "showcase.json").read_text())["stopped"]
+
+
+def test_nodes_faster_than_gravity_explains_are_counted(tmp_path: Path) -> None:
+    fast, slow = (values(run(simulator(a), CANYON, SETTINGS, tmp_path)) for a in (1e5, 1.0))
+    assert slow["share_too_fast"] == 0 and slow["max_speed"] < 1
+    assert fast["share_too_fast"] > 0.1 and fast["max_speed"] > 20
+
+
+def test_a_long_rollout_keeps_few_frames() -> None:
+    state = scenes.state(5, ("fluid",), dim=3).to_torch()
+    film = showcase._Film(state, scenes.metadata(("fluid",), 3), 1000)
+    for frame in range(1, 1001):
+        film.add(frame, state)
+    assert 40 <= len(film.pos) <= showcase.MAX_PICTURES + 1
+    assert film.metadata.frame_dt == pytest.approx(film.stride * 0.005)
+
+
+def test_a_scene_of_another_spacing_is_refused(tmp_path: Path) -> None:
+    coarse = FluidScene("canyon", CANYON.bounds, 3 * scenes.SPACING, 20)
+    with pytest.raises(SceneError, match=r"the scene has .* spacing=0\.075 m"):
+        run(simulator(), coarse, SETTINGS, tmp_path)
