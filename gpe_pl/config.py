@@ -151,6 +151,8 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
         def run(cfg: DictConfig) -> Any:
             nonlocal is_composed
             is_composed = True
+            if RESULT in os.environ:
+                launcher.end_with_sweep()
             try:
                 if "dimension" in list(cfg) and cfg.dimension not in (2, 3):
                     raise ConfigError(f"dimension={cfg.dimension}: must be 2 or 3")
@@ -166,7 +168,11 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
                     raise
                 hint = "; data, scene and dimension do not fit together" if "'data." in str(error) else ""
                 _fail(ConfigError(f"{' '.join(str(error).split())}{hint}"))
-            except (GpeError, OmegaConfBaseException) as error:
+            except (
+                GpeError,
+                OmegaConfBaseException,
+                OSError,
+            ) as error:  # OSError: full disks, folders that cannot be written, files that are gone
                 if verbose:
                     raise
                 _fail(error)

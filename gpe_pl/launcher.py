@@ -10,6 +10,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -61,7 +62,8 @@ class Job:
         with open(self.folder / LOG, "ab") as log:
             command = [sys.executable, "-m", module, *self.overrides, *here]
             environment = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"} | {RESULT: str(result)}
-            code = subprocess.run(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, env=environment).returncode
+            with subprocess.Popen(command, stdout=log, stderr=log, stdin=subprocess.PIPE, env=environment) as process:
+                code = process.wait()
         if code == USAGE_ERROR:
             raise SweepError(self._last_words(code))
         if code:
@@ -74,6 +76,20 @@ class Job:
         lines = (self.folder / LOG).read_text(errors="replace").splitlines()
         last = next((line for line in reversed(lines) if line.strip()), f"ended with code {code}")
         return f"{last.removeprefix('error: ')} (see {self.folder / LOG})"
+
+
+def end_with_sweep() -> None:
+    """End this run when the sweep that started it is gone, however it ended: the pipe that is its standard input then closes.
+
+    Otherwise the same command, given again, would meet the run in its folder.
+    """
+
+    def watch() -> None:
+        while os.read(0, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 class ProcessLauncher(Launcher):

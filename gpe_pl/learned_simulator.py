@@ -10,6 +10,7 @@ import copy
 import importlib
 import inspect
 import os
+import zipfile
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -320,14 +321,9 @@ class LearnedSimulator(nn.Module):
         """Load a training checkpoint (averaged weights if the run averaged them), in evaluation mode. Only tensors and plain values are unpickled.
 
         Raises:
-            CheckpointError: not a readable checkpoint of gpe_pl, or one of another model.
+            CheckpointError: not a readable checkpoint of gpe_pl, damaged, or one of another model.
         """
-        if not Path(path).is_file():
-            raise CheckpointError(f"{path}: no such checkpoint")
-        try:
-            checkpoint = torch.load(path, map_location=device, weights_only=True)
-        except Exception as error:  # torch raises many types for damaged or unsafe files
-            raise CheckpointError(f"{path}: not a safe, complete checkpoint ({_reason(error)})") from None
+        checkpoint = load_checkpoint(path, device)
         try:
             simulator = cls.from_description(checkpoint["simulator"])
             weights = {k.removeprefix("simulator."): v for k, v in checkpoint["state_dict"].items() if k.startswith("simulator.")}
@@ -335,6 +331,24 @@ class LearnedSimulator(nn.Module):
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model ({_reason(error)})") from None
         return simulator.to(device).eval()
+
+
+def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:
+    """What is in a checkpoint; only tensors and plain values are unpickled, and the checksums of the archive are compared first, which PyTorch does not.
+
+    Raises:
+        CheckpointError: no such file, damaged, or with anything else in it.
+    """
+    if not Path(path).is_file():
+        raise CheckpointError(f"{path}: no such checkpoint")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise zipfile.BadZipFile(f"checksum mismatch in {damaged}")
+        return torch.load(path, map_location=device, weights_only=True)
+    except Exception as error:  # zipfile and torch raise many types for damaged or unsafe files
+        raise CheckpointError(f"{path}: not a safe, complete checkpoint ({_reason(error)})") from None
 
 
 def _per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterator[tuple[int, Tensor, Tensor]]:

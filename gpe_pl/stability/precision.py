@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -10,12 +11,15 @@ import numpy as np
 import torch
 from torch_geometric.data import HeteroData
 
+from gpe_pl.approximate import approximate
 from gpe_pl.containment import Contained
 from gpe_pl.geometry import signed_distance
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.machine import resident_bytes
+from gpe_pl.metrics import per_frame_mse
 from gpe_pl.rollout import Guard, rollout
+from gpe_pl.skips import Skips
 from gpe_pl.stability.horizon import PERTURBATION, separation
 from gpe_pl.stability.inputs import Spoiled
 from gpe_pl.stability.subject import (
@@ -77,16 +81,61 @@ def memory(subject: Subject) -> Outcome:
     return Outcome(growth < 0.01, f"{100 * growth:.2g} %, {len(edges)} numbers of edges; rollouts compile nothing")
 
 
-@stress_test(28, "skipped work", "boundary nodes without edges left out or not: change < 1e-6; there are no approximate levels")
+@stress_test(28, "skipped work", "exact levels: change < 1e-6; sleeping: error after 20 steps ≤ 1.05 times that of computing everything")
 def skipping(subject: Subject) -> Outcome:
-    builder = subject.simulator.builder
-    other = GraphBuilder(replace(builder.config, trim_boundary=not builder.config.trim_boundary), builder.metadata)
     changes = []
     for share in (0.1, 0.5, 0.9):
         state = subject.state(0, share)
-        one, two = (output(subject.simulator, build(state), state.num_nodes) for build in (builder, other))
-        changes.append(relative_change(two, one))
-    return Outcome(max(changes) < 1e-6, f"{max(changes):.1e}")
+        everything = acceleration(_skipping(subject, NOTHING), state)
+        changes += [relative_change(acceleration(_skipping(subject, skips), state), everything) for skips in EXACT]
+        builder = subject.simulator.builder
+        other = GraphBuilder(replace(builder.config, trim_boundary=not builder.config.trim_boundary), builder.metadata, NOTHING)
+        untrimmed = output(subject.simulator, other(state), state.num_nodes).double() * subject.acceleration_std
+        changes.append(relative_change(untrimmed, everything))
+    ratio, speed_up, share = sleeping(subject)
+    text = (
+        f"exact levels {max(changes):.1e}; sleeping {ratio:.3f} times the error, {speed_up:.2f} times as fast, {100 * share:.2g} % asleep"
+    )
+    return Outcome(max(changes) < 1e-6 and ratio <= 1.05, text)
+
+
+NOTHING = Skips(absent_types=False, static_boundary=False, isolated_nodes=False, edges_at_once=None)
+EXACT = (
+    Skips(),
+    *(replace(NOTHING, **{name: True}) for name in ("absent_types", "static_boundary", "isolated_nodes")),
+    replace(NOTHING, edges_at_once=64),
+)
+ASLEEP = Skips(sleep_after=5)
+
+
+def _skipping(subject: Subject, skips: Skips) -> LearnedSimulator:
+    simulator = copy.deepcopy(subject.simulator)
+    simulator.skips = skips
+    return simulator
+
+
+def sleeping(subject: Subject, num_steps: int = 20) -> tuple[float, float, float]:
+    """What sleeping costs: the ratio of mean square errors over rollouts that start all along the scenes; the ratio of times; and the share asleep."""
+    runners = {"asleep": approximate(_skipping(subject, ASLEEP)), "awake": subject.simulator}
+    errors, seconds, num_asleep, num_steps_of_nodes = dict.fromkeys(runners, 0.0), dict.fromkeys(runners, 0.0), 0, 0
+
+    def count(_: int, state: State) -> None:
+        nonlocal num_asleep, num_steps_of_nodes
+        num_asleep, num_steps_of_nodes = num_asleep + state.num_asleep, num_steps_of_nodes + state.num_nodes
+
+    for truth in subject.scenes:
+        for frame in np.unique(
+            np.linspace(subject.history, max(subject.history, truth.num_frames - 1 - num_steps), 4).astype(int)
+        ).tolist():
+            start, known = subject.simulator.initial_state(truth, frame), truth.frames(frame, frame + num_steps + 1)
+            for name, runner in runners.items():
+                began = time.perf_counter()
+                result = rollout(
+                    Contained(runner, subject.dt), start, known.num_frames - 1, known.metadata, None, count if name == "asleep" else None
+                )
+                seconds[name] += time.perf_counter() - began
+                errors[name] += float(per_frame_mse(result, known)[1:].mean())
+    return errors["asleep"] / max(errors["awake"], 1e-300), seconds["awake"] / seconds["asleep"], num_asleep / max(1, num_steps_of_nodes)
 
 
 # --- training -------------------------------------------------------------------------------------------------------------------------------
