@@ -28,6 +28,7 @@ from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import Standardize
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, EdgeType, FeatureSpec, node_code, role
+from gpe_pl.signatures import checked
 from gpe_pl.skips import Skips
 from gpe_pl.trajectory import Metadata, State, Stress, Trajectory
 
@@ -286,6 +287,12 @@ class LearnedSimulator(nn.Module):
         history = torch.cat([history_of(state)[:, 1:], vel[:, None]], dim=1)
         return replace(state, pos=state.periodicity.wrapped(pos), vel=vel, velocity_history=history, time=state.time + dt, stress=None)
 
+    def _check_finite(self) -> None:
+        for name, values in self.state_dict().items():
+            is_range = name.startswith("trained_")  # unlimited before training
+            if bool(values.isnan().any()) or not (is_range or bool(values.isfinite().all())):
+                raise ValueError(f"{name} has values that are not finite")
+
     # --- checkpoints ----------------------------------------------------------------------------------------------------------------------
 
     def description(self) -> dict[str, Any]:
@@ -304,8 +311,9 @@ class LearnedSimulator(nn.Module):
         """Rebuild from ``description``; raises ``ValueError`` for anything else."""
         if values.get("format") != CHECKPOINT_FORMAT:
             raise ValueError(f"checkpoint format {values.get('format')!r}, this version reads {CHECKPOINT_FORMAT}")
-        builder = GraphBuilder(GraphConfig(**values["graph"]), Metadata(**values["metadata"]))
-        return cls(model_class(values["model"])(builder.spec, **values["settings"]), builder)
+        graph, metadata = (of(**checked(of, values[key])) for of, key in ((GraphConfig, "graph"), (Metadata, "metadata")))
+        builder, model = GraphBuilder(graph, metadata), model_class(values["model"])
+        return cls(model(builder.spec, **checked(model, values["settings"], "spec")), builder)
 
     def save(self, path: Path | str) -> None:
         """Write weights and description alone, which ``from_checkpoint`` reads, atomically; a training checkpoint also holds the optimiser's state."""
@@ -328,6 +336,7 @@ class LearnedSimulator(nn.Module):
             simulator = cls.from_description(checkpoint["simulator"])
             weights = {k.removeprefix("simulator."): v for k, v in checkpoint["state_dict"].items() if k.startswith("simulator.")}
             simulator.load_state_dict(weights)
+            simulator._check_finite()
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model ({_reason(error)})") from None
         return simulator.to(device).eval()
