@@ -344,9 +344,9 @@ def test_a_file_of_torch_that_is_no_checkpoint_says_so(tmp_path: Path, content: 
     ("key", "value", "message"),
     [
         ("settings", {"hidden_channels": 16}, "size mismatch"),
-        ("settings", {"width": 8}, "unexpected keyword argument 'width'"),
+        ("settings", {"width": 8}, "width Extra inputs are not permitted"),
         ("graph", {"history": 3}, "size mismatch"),
-        ("metadata", {"dataset": "x"}, "missing"),
+        ("metadata", {"dataset": "x"}, "materials Field required"),
         ("model", "os.system", "not one of gpe_pl.models"),
         ("model", "gpe_pl.models.gpe.torch", "is not a model"),
         ("model", "gpe_pl.models.gpe.Nothing", "does not exist"),
