@@ -231,6 +231,10 @@ class LearnedSimulator(nn.Module):
             bad = ~torch.isfinite(values).flatten(1).all(dim=1)
             if bad.any():
                 raise SceneError(f"{where}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
+        bad = ~(torch.isfinite(state.mass) & (state.mass > 0))
+        if bad.any():
+            node = int(bad.nonzero()[0])
+            raise SceneError(f"node {node} has a mass of {float(state.mass[node]):g} kg")
         for material, spec in MATERIALS.items():
             if material in self.builder.metadata.materials:
                 rows = torch.nonzero(state.node_type == node_code(material)).flatten()
