@@ -53,7 +53,7 @@ def verdicts(faults: Sequence[Fault], limit: float = 60.0) -> Iterator[Verdict]:
     while first < len(faults):
         ours, theirs = context.Pipe(duplex=False)
         folder = tempfile.mkdtemp(prefix="faults-")
-        worker = context.Process(target=_attack, args=(faults[first:], theirs, folder), daemon=True)
+        worker = context.Process(target=_attack, args=(faults[first:], theirs, folder))
         worker.start()
         theirs.close()
         try:

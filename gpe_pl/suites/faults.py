@@ -89,7 +89,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
         root.chmod(0o755)
         commands = _prepared(settings, root)
         faults = _faults(settings, specs, commands, root)
-        for fault, verdict in zip(faults, isolation.verdicts(faults, settings.limit), strict=True):
+        for fault, verdict in zip(faults, isolation.verdicts(faults, 4 * settings.limit), strict=True):
             _note(records, fault.kind, fault.name, verdict)
         for name, command in commands.items():
             count = settings.commands[name].num_kills
