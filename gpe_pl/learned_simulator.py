@@ -315,7 +315,7 @@ class LearnedSimulator(nn.Module):
         """Rebuild from ``description``; raises ``ValueError`` for anything else."""
         if values.get("format") != CHECKPOINT_FORMAT:
             raise ValueError(f"checkpoint format {values.get('format')!r}, this version reads {CHECKPOINT_FORMAT}")
-        graph, metadata = (of(**checked(of, values[key])) for of, key in ((GraphConfig, "graph"), (Metadata, "metadata")))
+        graph, metadata = GraphConfig(**checked(GraphConfig, values["graph"])), Metadata(**checked(Metadata, values["metadata"]))
         builder, model = GraphBuilder(graph, metadata), model_class(values["model"])
         return cls(model(builder.spec, **checked(model, values["settings"], "spec")), builder)
 

@@ -107,4 +107,4 @@ def _status(key: str) -> int:
 
 def resident_bytes() -> int:
     """Bytes of this process in use now, or at most so far where the system does not tell."""
-    return _status("VmRSS") if CLEAR_REFS.exists() else _peak()
+    return _status("VmRSS") if CLEAR_REFS.exists() else peak_resident()

@@ -178,7 +178,8 @@ def _others(sound: Path) -> Iterator[tuple[str, str, Callable[[Path], Verdict]]]
     for key in weights:
         for value in (float("nan"), float("inf")):
             yield "checkpoint, not finite", f"{key}: {value}", partial(load_not_finite, sound, key, value)
-    for content in (torch.zeros(3), [1, 2], {}, 5, "text", None, {"simulator": None}, {"simulator": {}, "state_dict": []}):
+    contents: tuple[Any, ...] = (torch.zeros(3), [1, 2], {}, 5, "text", None, {"simulator": None}, {"simulator": {}, "state_dict": []})
+    for content in contents:
         yield "checkpoint, another model", f"content {content}", partial(load_content, content)
     for kind in PAYLOADS:
         for place in PLACES:

@@ -151,6 +151,7 @@ def _run_command(command: str, arguments: list[str], output: str, prepare: Calla
     with open(output, "wb", buffering=0) as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
+    os.environ.pop("HYDRA_FULL_ERROR", None)  # of the command that attacks: it would show tracebacks
     if prepare is not None:
         prepare()
     sys.argv = [command, *arguments]

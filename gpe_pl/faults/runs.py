@@ -143,7 +143,8 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
         return
     expected, number = digests(whole), 0
     while number < count:
-        own, moments = folder / f"killed-{number}", []
+        own = folder / f"killed-{number}"
+        moments: list[str] = []
         problem: Verdict | None = None
         while len(moments) < min(in_a_row, count - number):
             kind = signal.SIGKILL if len(moments) % 2 == 0 else signal.SIGTERM
@@ -171,8 +172,8 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
                 problem = problem or Verdict("half-written", "; ".join(broken))
         number += len(moments)
         verdict = problem or _finished(command, own, expected, limit)
-        for moment in moments:
-            yield Verdict(verdict.status, f"{moment}; {verdict.detail}")
+        for text in moments:
+            yield Verdict(verdict.status, f"{text}; {verdict.detail}")
         shutil.rmtree(own, ignore_errors=True)
 
 

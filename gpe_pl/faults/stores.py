@@ -58,7 +58,7 @@ def flipped(seed: int, data: bytes) -> bytes:
 def overwritten(seed: int, data: bytes) -> bytes:
     """A block of random bytes, as a bad sector leaves."""
     rng = np.random.default_rng(seed)
-    length = int(min(len(data), rng.integers(1, 4096)))
+    length = min(len(data), int(rng.integers(1, 4096)))
     start = int(rng.integers(len(data) - length + 1))
     return data[:start] + rng.bytes(length) + data[start + length :]
 

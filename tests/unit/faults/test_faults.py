@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -165,7 +166,13 @@ def _raises(_: Path) -> Verdict:
 
 @pytest.mark.slow
 def test_what_hangs_or_dies_costs_only_itself() -> None:
-    attacks = {"refused": _finds, "hung": _hangs, "died": _dies, "traceback": _raises, "harmless": partial(_sleeps, 0.01)}
+    attacks: dict[str, Callable[[Path], Verdict]] = {
+        "refused": _finds,
+        "hung": _hangs,
+        "died": _dies,
+        "traceback": _raises,
+        "harmless": partial(_sleeps, 0.01),
+    }
     faults = [Fault("kind", name, attack) for name, attack in attacks.items()] * 2
     assert [v.status for v in verdicts(faults, limit=20.0)] == [f.name for f in faults]
 
