@@ -63,16 +63,18 @@ def bad(faults: list[Fault], folder: Path) -> list[tuple[str, str, Verdict]]:
 # --- what is wrong is refused ---------------------------------------------------------------------------------------------------------------
 
 
-def test_damaged_and_wrong_shards(shard: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.slow)])
+def test_damaged_and_wrong_shards(shard: Path, tmp_path: Path, step: int) -> None:
     faults = stores.faults(shard, 16)
     assert len(faults) > 100
-    assert not bad(faults, tmp_path)
+    assert not bad(faults[::step], tmp_path)
 
 
-def test_damaged_wrong_and_hostile_checkpoints(checkpoint: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("step", [8, pytest.param(1, marks=pytest.mark.slow)])
+def test_damaged_wrong_and_hostile_checkpoints(checkpoint: Path, tmp_path: Path, step: int) -> None:
     faults = checkpoints.faults(checkpoint, 16)
     assert len(faults) > 100
-    assert not bad(faults, tmp_path)
+    assert not bad(faults[::step], tmp_path)
 
 
 def test_every_bit_of_a_weight_counts(checkpoint: Path, tmp_path: Path) -> None:
