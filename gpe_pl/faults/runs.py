@@ -26,7 +26,6 @@ from gpe_pl.learned_simulator import load_checkpoint
 
 SAVED = ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers", "global_step", "simulator")
 """What of a training checkpoint does not depend on where it lies."""
-UNPRIVILEGED = 65534
 
 
 @dataclass(frozen=True)
@@ -217,13 +216,6 @@ def limit_file_size(size: int) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 
 
-def without_privileges() -> None:
-    """From now on the permissions of folders count, also for root."""
-    if os.geteuid() == 0:
-        os.setegid(UNPRIVILEGED)
-        os.seteuid(UNPRIVILEGED)
-
-
 @contextlib.contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[bool]:
     """A file system of so many bytes in a folder; yields whether there is one, which needs the right to mount."""
@@ -268,18 +260,26 @@ def file_limit(command: Command, size: int, expected: dict[str, str], limit: flo
     return again if again.status != "harmless" else Verdict("refused", f"{verdict.detail}; then {again.detail}")
 
 
-def read_only(command: Command, what: str, limit: float, folder: Path) -> Verdict:
-    """Run a command in a folder that cannot be written, or that is a file."""
-    own = folder / "own"
-    own.mkdir(mode=0o777)
-    if what == "folder":
-        own.chmod(0o555)
-        folder.chmod(0o755)
-    else:
-        (own / what).write_text("a file")
-    verdict = isolation.run(command.module, command.given(own), limit, without_privileges if what == "folder" else None).verdict("accepted")
-    own.chmod(0o777)
-    return verdict
+def read_only(command: Command, limit: float, folder: Path) -> Verdict:
+    """Run a command in a folder that cannot be written."""
+    with small_disk(folder / "disk", 2**20) as is_mounted:
+        own = folder / "disk"
+        if is_mounted:
+            subprocess.run(["mount", "-o", "remount,ro", str(own)], check=True, capture_output=True)
+        elif os.geteuid() == 0:  # permissions do not bind
+            return Verdict("harmless", "not done, for want of the right to mount")
+        else:
+            own.chmod(0o555)
+        verdict = isolation.run(command.module, command.given(own), limit).verdict("accepted")
+        if not is_mounted:
+            own.chmod(0o777)
+        return verdict
+
+
+def file_in_the_way(command: Command, limit: float, folder: Path) -> Verdict:
+    """Run a command where a file lies in place of the folder that it writes to."""
+    (folder / ("data" if command.data is None else "runs")).write_text("a file")
+    return isolation.run(command.module, command.given(folder), limit).verdict("accepted")
 
 
 def disk_faults(command: Command, sizes: Sequence[int], expected: dict[str, str], limit: float) -> list[Fault]:
@@ -288,7 +288,6 @@ def disk_faults(command: Command, sizes: Sequence[int], expected: dict[str, str]
     for size in sizes:
         found.append(Fault("disk full", f"{command.name}, {size} bytes", partial(full_disk, command, size, expected, limit)))
         found.append(Fault("file too large", f"{command.name}, {size} bytes", partial(file_limit, command, size, expected, limit)))
-    for what in ("folder", "data", "runs"):
-        if what != "data" or command.data is None:
-            found.append(Fault("folder not writable", f"{command.name}, {what}", partial(read_only, command, what, limit)))
+    found.append(Fault("folder not writable", f"{command.name}, read-only", partial(read_only, command, limit)))
+    found.append(Fault("folder not writable", f"{command.name}, a file in the way", partial(file_in_the_way, command, limit)))
     return found
