@@ -333,7 +333,8 @@ class GPE(nn.Module):
         """``forward`` on plain tensors: the part that ``torch.compile`` sees. Accelerations and stresses per material."""
         if self.interaction == "negated":
             edges = {r: (*orient(index, odd), even) if is_symmetric(r) else (index, odd, even) for r, (index, odd, even) in edges.items()}
-        chunk = None if torch.is_grad_enabled() else self.skips.edges_at_once
+        is_inference = not torch.is_grad_enabled()
+        chunk = self.skips.edges_at_once if is_inference else None
         h = {t: self._encode_node(t, x[t], params.get(t)) for t in x}
         e = {r: self._encode_edges(r, odd, even, chunk) for r, (_, odd, even) in edges.items()}
 
@@ -349,7 +350,9 @@ class GPE(nn.Module):
                     source, _, target = relation
                     edge_index, _, even = edges[relation]
                     conv = convs[self.key(relation)]
-                    at_target, at_source, state = conv(h[source], h[target], edge_index, e[relation], even, update_edges, chunk)
+                    at_target, at_source, state = conv(
+                        h[source], h[target], edge_index, e[relation], even, update_edges, chunk, is_inference
+                    )
                     if target in receivers:
                         total[target] = total[target] + at_target if target in total else at_target
                     if source in receivers and self.type_key(source) in updates:

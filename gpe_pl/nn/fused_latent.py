@@ -29,9 +29,9 @@ FASTMATH = {"contract", "nsz", "arcp"}
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _activate(a, b, w, slope, source, target, x):
+def _activate(a, b, w, slope, source, target, first, x):
     for k in range(len(w)):
-        i, j = target[k], source[k]
+        i, j = target[first + k], source[first + k]
         for c in range(w.shape[1]):
             z = a[i, c] + b[j, c] + w[k, c]
             x[k, c] = z if z > 0 else slope * z
@@ -39,9 +39,9 @@ def _activate(a, b, w, slope, source, target, x):
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _activate_odd(a, b, w, u, slope, source, target, x):
+def _activate_odd(a, b, w, u, slope, source, target, first, x):
     for k in range(len(w)):
-        i, j = target[k], source[k]
+        i, j = target[first + k], source[first + k]
         for c in range(w.shape[1]):
             y = a[i, c] + b[j, c] + u[k, c] + w[k, c]
             z = a[j, c] + b[i, c] + u[k, c] - w[k, c]
@@ -50,20 +50,22 @@ def _activate_odd(a, b, w, u, slope, source, target, x):
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _update(m, e, source, target, new, at_target, at_source):
+def _update(m, bias, e, source, target, first, at_target, at_source):
+    """Adds m + bias to the states e of a block, and to the sums at its ends."""
     for k in range(len(m)):
-        i, j = target[k], source[k]
+        i, j = target[first + k], source[first + k]
         for c in range(m.shape[1]):
-            new[k, c] = e[k, c] + m[k, c]
-            at_target[i, c] += m[k, c]
-            at_source[j, c] -= m[k, c]
+            message = m[k, c] + bias[c]
+            e[k, c] += message
+            at_target[i, c] += message
+            at_source[j, c] -= message
 
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _sum(x, source, target, at_target, at_source):
+def _sum(x, source, target, first, at_target, at_source):
     for k in range(len(x)):
-        i, j = target[k], source[k]
+        i, j = target[first + k], source[first + k]
         for c in range(x.shape[1]):
             at_target[i, c] += x[k, c]
             at_source[j, c] -= x[k, c]
@@ -71,19 +73,31 @@ def _sum(x, source, target, at_target, at_source):
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _gather_grad(grad_target, grad_source, source, target, g):
+def _gather_grad(grad_target, grad_source, source, target, first, g):
     for k in range(len(g)):
-        i, j = target[k], source[k]
+        i, j = target[first + k], source[first + k]
         for c in range(g.shape[1]):
             g[k, c] = grad_target[i, c] - grad_source[j, c]
 
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _backward(a, b, w, slope, source, target, g, grad_a, grad_b, below):
+def _gather_message_grad(grad_target, grad_source, grad_new, source, target, first, g, total):
+    """Gradients of the messages, which also reach the new states, and their sum in ``total``."""
+    for k in range(len(g)):
+        i, j = target[first + k], source[first + k]
+        for c in range(g.shape[1]):
+            y = grad_target[i, c] - grad_source[j, c] + grad_new[k, c]
+            g[k, c] = y
+            total[c] += y
+
+
+@njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@no_type_check
+def _backward(a, b, w, slope, source, target, first, g, grad_a, grad_b, below):
     """Turns g, the gradient of x, into that of z."""
     for k in range(len(w)):
-        i, j = target[k], source[k]
+        i, j = target[first + k], source[first + k]
         for c in range(w.shape[1]):
             z = a[i, c] + b[j, c] + w[k, c]
             negative = z <= 0
@@ -96,10 +110,10 @@ def _backward(a, b, w, slope, source, target, g, grad_a, grad_b, below):
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _backward_odd(a, b, w, u, slope, source, target, g, even, grad_a, grad_b, below):
+def _backward_odd(a, b, w, u, slope, source, target, first, g, even, grad_a, grad_b, below):
     """Turns g, the gradient of x, into that of W e; ``even`` becomes that of V s."""
     for k in range(len(w)):
-        i, j = target[k], source[k]
+        i, j = target[first + k], source[first + k]
         for c in range(w.shape[1]):
             y = a[i, c] + b[j, c] + u[k, c] + w[k, c]
             z = a[j, c] + b[i, c] + u[k, c] - w[k, c]
@@ -115,106 +129,134 @@ def _backward_odd(a, b, w, u, slope, source, target, g, even, grad_a, grad_b, be
 
 
 @dataclass(frozen=True)
+class _Layer:
+    """What all blocks of a layer share: rows a and b, edges, and the first linear map."""
+
+    a: Tensor
+    b: Tensor
+    e: Tensor
+    s: Tensor | None
+    weight: Tensor
+    even_weight: Tensor
+    slope: Tensor
+    edge_index: Tensor
+
+    def blocks(self) -> Iterator[_Block]:
+        """Edges ``BLOCK`` at a time, their W e and V s multiplied."""
+        source, target = self.edge_index.contiguous().numpy()
+        weight, even_weight = self.weight.t(), self.even_weight.t()
+        w, u, x = self.e.new_empty(3, BLOCK, self.weight.shape[0])
+        rows = [None] * -(-len(self.e) // BLOCK) if self.s is None else self.s.split(BLOCK)
+        for number, (e, s) in enumerate(zip(self.e.split(BLOCK), rows, strict=False)):  # of no edges, ``split`` makes one part
+            n = len(e)
+            if n < BLOCK:
+                w, u, x = w[:n], u[:n], x[:n]
+            torch.mm(e, weight, out=w)
+            if s is not None:
+                torch.mm(s, even_weight, out=u)
+            yield _Block(e, s, (source, target, number * BLOCK), w, u, x)
+
+    def activate(self, block: _Block) -> None:
+        """Fills ``block.x``."""
+        a, b, w, p, x = self.a.numpy(), self.b.numpy(), block.w.numpy(), self.slope.numpy()[0], block.x.numpy()
+        if self.s is None:
+            _activate(a, b, w, p, *block.ends, x)
+        else:
+            _activate_odd(a, b, w, block.u.numpy(), p, *block.ends, x)
+
+
+@dataclass(frozen=True)
 class _Block:
-    """Some edges: their rows of e and s, their ends, and W e and V s."""
+    """Some edges: their rows of e and s, their ends and the number of the first, W e, V s, and room for as many rows."""
 
     e: Tensor
-    s: Tensor
-    source: np.ndarray
-    target: np.ndarray
+    s: Tensor | None
+    ends: tuple[np.ndarray, np.ndarray, int]
     w: Tensor
     u: Tensor
+    x: Tensor
 
 
-def _blocks(e: Tensor, s: Tensor, weight: Tensor, even_weight: Tensor, edge_index: Tensor) -> Iterator[_Block]:
-    source, target = edge_index.contiguous().numpy()
-    buffers = e.new_empty(2, BLOCK, weight.shape[0])
-    for first in range(0, len(e), BLOCK):
-        last = min(first + BLOCK, len(e))
-        w, u = buffers[:, : last - first]
-        torch.mm(e[first:last], weight.t(), out=w)
-        if s.shape[1]:
-            torch.mm(s[first:last], even_weight.t(), out=u)
-        else:
-            u.zero_()
-        yield _Block(e[first:last], s[first:last], source[first:last], target[first:last], w, u)
-
-
-def _activations(block: _Block, a: Tensor, b: Tensor, slope: Any, is_odd: bool, x: Tensor) -> None:
-    ends = block.source, block.target
-    if is_odd:
-        _activate_odd(a.numpy(), b.numpy(), block.w.numpy(), block.u.numpy(), slope, *ends, x.numpy())
-    else:
-        _activate(a.numpy(), b.numpy(), block.w.numpy(), slope, *ends, x.numpy())
+def _forward(layer: _Layer, out: tuple[Tensor, Tensor] | None, overwrites: bool) -> tuple[Tensor, Tensor, Tensor | None]:
+    at_target, at_source = torch.zeros_like(layer.a), torch.zeros_like(layer.b)
+    new = None if out is None else layer.e if overwrites else torch.empty_like(layer.e)
+    states = iter(() if new is None else new.split(BLOCK))
+    for block in layer.blocks():
+        layer.activate(block)
+        sums = at_target.numpy(), at_source.numpy()
+        if out is None:
+            _sum(block.x.numpy(), *block.ends, *sums)
+            continue
+        weight, bias = out
+        state = next(states)
+        if not overwrites:
+            state.copy_(block.e)
+        m = torch.mm(block.x, weight.t(), out=block.w)
+        _update(m.numpy(), bias.numpy(), state.numpy(), *block.ends, *sums)
+    return at_target, at_source, new
 
 
 class _FusedLatent(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, is_odd: bool, a: Tensor, b: Tensor, e: Tensor, s: Tensor, *weights: Tensor) -> Any:
-        weight, even_weight, slope, out_weight, out_bias, edge_index = weights
-        ctx.is_odd = is_odd
-        ctx.save_for_backward(a, b, e, s, *weights)
-        a, b, e, s = (t.detach().contiguous() for t in (a, b, e, s))
-        weight, even_weight, out_weight, out_bias = (t.detach() for t in (weight, even_weight, out_weight, out_bias))
-        p = slope.detach().numpy()[0]
-        updates = out_weight.numel() > 0
-        at_target, at_source = torch.zeros_like(a), torch.zeros_like(b)
-        new = torch.empty_like(e) if updates else e[:0]
-        x, m = e.new_empty(2, BLOCK, a.shape[1])
-        first = 0
-        for block in _blocks(e, s, weight, even_weight, edge_index):
-            n = len(block.e)
-            _activations(block, a, b, p, is_odd, x[:n])
-            ends = block.source, block.target
-            if updates:
-                torch.mm(x[:n], out_weight.t(), out=m[:n])
-                m[:n] += out_bias
-                rows = new[first : first + n]
-                _update(m[:n].numpy(), block.e.numpy(), *ends, rows.numpy(), at_target.numpy(), at_source.numpy())
-            else:
-                _sum(x[:n].numpy(), *ends, at_target.numpy(), at_source.numpy())
-            first += n
-        return at_target, at_source, new
+    def forward(ctx: Any, a: Tensor, b: Tensor, e: Tensor, s: Tensor | None, *others: Tensor) -> Any:
+        weight, even_weight, slope, out_weight, out_bias, edge_index = others
+        ctx.is_odd, ctx.updates = s is not None, out_weight.numel() > 0
+        ctx.save_for_backward(a, b, e, s, *others)
+        layer = _layer(a, b, e, s, weight, even_weight, slope, edge_index)
+        at_target, at_source, new = _forward(layer, (out_weight.detach(), out_bias.detach()) if ctx.updates else None, False)
+        return at_target, at_source, layer.e[:0] if new is None else new
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_target: Tensor, grad_source: Tensor, grad_new: Tensor) -> Any:  # type: ignore[override]
         a, b, e, s, weight, even_weight, slope, out_weight, out_bias, edge_index = ctx.saved_tensors
-        a, b, e, s, grad_target, grad_source, grad_new = (t.contiguous() for t in (a, b, e, s, grad_target, grad_source, grad_new))
-        p, updates = slope.numpy()[0], out_weight.numel() > 0
-        grads = [torch.zeros_like(t) for t in (a, b, s, weight, even_weight, out_weight, out_bias)]
-        grad_a, grad_b, grad_s, grad_weight, grad_even_weight, grad_out_weight, grad_out_bias = grads
-        grad_e = torch.empty_like(e)
-        below = a.new_zeros(a.shape[1])
-        x, g, even, grad_m = e.new_empty(4, BLOCK, a.shape[1])
-        first = 0
-        for block in _blocks(e, s, weight, even_weight, edge_index):
+        layer = _layer(a, b, e, s, weight, even_weight, slope, edge_index)
+        arriving = grad_target.contiguous().numpy(), grad_source.contiguous().numpy()
+        p = slope.numpy()[0]
+        grad_a, grad_b, grad_weight, grad_even_weight, grad_out_weight, grad_out_bias = (
+            torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (a, b, weight, even_weight, out_weight, out_bias)
+        )
+        grad_e = torch.empty_like(layer.e)
+        grad_s = torch.empty_like(layer.s) if layer.s is not None and ctx.needs_input_grad[3] else None
+        below = e.new_zeros(a.shape[1])
+        sums = grad_a.numpy(), grad_b.numpy(), below.numpy()
+        g, grad_m, even = e.new_empty(3, BLOCK, a.shape[1])
+        blocks, of_e = layer.blocks(), grad_e.split(BLOCK)
+        of_new = grad_new.contiguous().split(BLOCK) if ctx.updates else [None] * len(of_e)
+        of_s = [None] * len(of_e) if grad_s is None else grad_s.split(BLOCK)
+        for block, grad_e_rows, grad_new_rows, grad_s_rows in zip(blocks, of_e, of_new, of_s, strict=False):
             n = len(block.e)
-            rows, ends = slice(first, first + n), (block.source, block.target)
-            first += n
-            _gather_grad(grad_target.numpy(), grad_source.numpy(), *ends, g[:n].numpy())
-            if updates:
-                _activations(block, a, b, p, ctx.is_odd, x[:n])
-                torch.add(g[:n], grad_new[rows], out=grad_m[:n])
-                grad_out_weight.addmm_(grad_m[:n].t(), x[:n])
-                grad_out_bias += grad_m[:n].sum(dim=0)
-                torch.mm(grad_m[:n], out_weight, out=g[:n])
-            values = a.numpy(), b.numpy(), block.w.numpy()
-            sums = grad_a.numpy(), grad_b.numpy(), below.numpy()
-            if ctx.is_odd:
-                _backward_odd(*values, block.u.numpy(), p, *ends, g[:n].numpy(), even[:n].numpy(), *sums)
-                grad_even_weight.addmm_(even[:n].t(), block.s)
-                if ctx.needs_input_grad[4]:
-                    torch.mm(even[:n], even_weight, out=grad_s[rows])
+            if n < BLOCK:
+                g, grad_m, even = g[:n], grad_m[:n], even[:n]
+            if grad_new_rows is None:
+                _gather_grad(*arriving, *block.ends, g.numpy())
             else:
-                _backward(*values, p, *ends, g[:n].numpy(), *sums)
-            grad_weight.addmm_(g[:n].t(), block.e)
-            if updates:
-                torch.addmm(grad_new[rows], g[:n], weight, out=grad_e[rows])
+                layer.activate(block)
+                _gather_message_grad(*arriving, grad_new_rows.numpy(), *block.ends, grad_m.numpy(), grad_out_bias.numpy())
+                grad_out_weight.addmm_(grad_m.t(), block.x)
+                torch.mm(grad_m, out_weight, out=g)
+            values = layer.a.numpy(), layer.b.numpy(), block.w.numpy()
+            if block.s is None:
+                _backward(*values, p, *block.ends, g.numpy(), *sums)
             else:
-                torch.mm(g[:n], weight, out=grad_e[rows])
-        grad_slope = below.sum().reshape(1)
-        return None, grad_a, grad_b, grad_e, grad_s, grad_weight, grad_even_weight, grad_slope, grad_out_weight, grad_out_bias, None
+                _backward_odd(*values, block.u.numpy(), p, *block.ends, g.numpy(), even.numpy(), *sums)
+                grad_even_weight.addmm_(even.t(), block.s)
+                if grad_s_rows is not None:
+                    torch.mm(even, even_weight, out=grad_s_rows)
+            grad_weight.addmm_(g.t(), block.e)
+            torch.mm(g, weight, out=grad_e_rows)
+            if grad_new_rows is not None:
+                grad_e_rows += grad_new_rows
+        grads = grad_weight, grad_even_weight, below.sum().reshape(1), grad_out_weight, grad_out_bias
+        return grad_a, grad_b, grad_e, grad_s, *grads, None
+
+
+def _layer(
+    a: Tensor, b: Tensor, e: Tensor, s: Tensor | None, weight: Tensor, even_weight: Tensor, slope: Tensor, edge_index: Tensor
+) -> _Layer:
+    s = None if s is None else s.detach().contiguous()
+    a, b, e = (t.detach().contiguous() for t in (a, b, e))
+    return _Layer(a, b, e, s, weight.detach(), even_weight.detach(), slope.detach(), edge_index)
 
 
 def fused_latent(
@@ -227,6 +269,7 @@ def fused_latent(
     slope: Float[Tensor, " 1"],
     out: tuple[Float[Tensor, "hidden hidden"], Float[Tensor, " hidden"] | None] | None,
     edge_index: Int64[Tensor, "2 edge"],
+    overwrites: bool = False,
 ) -> tuple[Float[Tensor, "target hidden"], Float[Tensor, "source hidden"], Float[Tensor, "edge state"] | None]:
     """T, S and e' of the module's text, on the CPU in single or double precision; differentiable once in all but ``edge_index``.
 
@@ -235,10 +278,12 @@ def fused_latent(
     Args:
         s: for odd messages, which need both ends of an edge to be of one type: a and b then have the same rows; None for the others.
         out: C, and c if there is one; states then have as many channels as the messages. None: T and S are sums of x, and there is no e'.
+        overwrites: e' may take the place of e in memory, where no gradient is asked for.
     """
-    is_odd = s is not None
-    even = e.new_empty(len(e), 0) if s is None else s
     c, bias = out if out is not None else (e.new_empty(0, 0), None)
     bias = c.new_zeros(len(c)) if bias is None else bias
-    at_target, at_source, new = _FusedLatent.apply(is_odd, a, b, e, even, weight, even_weight, slope, c, bias, edge_index)  # type: ignore[no-untyped-call]
+    if not torch.is_grad_enabled():
+        layer = _layer(a, b, e, s, weight, even_weight, slope, edge_index)
+        return _forward(layer, None if out is None else (c.detach(), bias.detach()), overwrites)
+    at_target, at_source, new = _FusedLatent.apply(a, b, e, s, weight, even_weight, slope, c, bias, edge_index)  # type: ignore[no-untyped-call]
     return at_target, at_source, new if out is not None else None

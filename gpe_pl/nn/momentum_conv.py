@@ -83,17 +83,19 @@ class MomentumConv(MessagePassing):
         s: Float[Tensor, "edge even"],
         update_edges: bool = True,
         edges_at_once: int | None = None,
+        overwrites: bool = False,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Sums of messages at the target nodes, at the source nodes, and the new edge states e_ij + m_ij, which need as many channels as the messages.
 
         Without ``update_edges`` the last linear map is applied after the sum (it commutes), once per node instead of once per edge; the new states are
         then None. In a relation of one type with itself pass the same tensor twice and add the two sums.
 
-        With ``edges_at_once``, what is computed on the way exists for so many edges only; this is meant for inference.
+        For inference: with ``edges_at_once``, what is computed on the way exists for so many edges only, and with ``overwrites``, new edge states may take
+        the place of the old ones in memory.
         """
         size = (h_source.shape[0], h_target.shape[0])
         if self._is_fused(h_source, h_target, e):
-            return self._fused(h_source, h_target, edge_index, e, s, update_edges)
+            return self._fused(h_source, h_target, edge_index, e, s, update_edges, overwrites)
         w = None
         if self.implementation == "plain":
             terms = {"a": (h_source, h_target), "b": (None, None), "s": s}
@@ -111,7 +113,7 @@ class MomentumConv(MessagePassing):
                 "s": s if self.is_odd and self.widths[3] else None,
             }
         if edges_at_once is not None and edges_at_once < edge_index.shape[1]:
-            return self._in_parts(edge_index, e, w, terms, size, update_edges, edges_at_once)
+            return self._in_parts(edge_index, e, w, terms, size, update_edges, edges_at_once, overwrites)
         terms["e"] = e if w is None else functional.linear(e, w)
         at_target, at_source, messages = self.propagate(edge_index, size=size, with_messages=update_edges, **terms)
         return at_target, at_source, e + messages if update_edges else None
@@ -122,13 +124,14 @@ class MomentumConv(MessagePassing):
         return self.implementation == "factored" and kind and works_on(h_source, h_target, e)
 
     def _fused(
-        self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, e: Tensor, s: Tensor, update_edges: bool
+        self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, e: Tensor, s: Tensor, update_edges: bool, overwrites: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         a, b, w, v = self.lin_in.weight.split(self.widths, dim=1)
         at, bs = functional.linear(h_target, a, self.lin_in.bias), functional.linear(h_source, b)
         if update_edges or self.is_odd or self.widths[2] > RAW:
             out = (self.lin_out.weight, self.lin_out.bias) if update_edges else None
-            at_target, at_source, state = fused_latent(at, bs, e, s if self.is_odd else None, w, v, self.act.weight, out, edge_index)
+            even = s if self.is_odd else None
+            at_target, at_source, state = fused_latent(at, bs, e, even, w, v, self.act.weight, out, edge_index, overwrites)
         else:
             at_target, at_source = fused_messages(at, bs, e, w, self.act.weight, edge_index)
             state = None
@@ -138,14 +141,22 @@ class MomentumConv(MessagePassing):
         return self._last_linear(at_target, i, 1), self._last_linear(at_source, j, -1), None
 
     def _in_parts(
-        self, edge_index: Tensor, e: Tensor, w: MaybeTensor, terms: dict[str, Any], size: tuple[int, int], update_edges: bool, chunk: int
+        self,
+        edge_index: Tensor,
+        e: Tensor,
+        w: MaybeTensor,
+        terms: dict[str, Any],
+        size: tuple[int, int],
+        update_edges: bool,
+        chunk: int,
+        overwrites: bool,
     ) -> tuple[Tensor, Tensor, MaybeTensor]:
         """What follows the products per node, for ``chunk`` edges after the other."""
         count, width = edge_index.shape[1], self.lin_out.in_features
         at_source, at_target = (e.new_zeros(n, width) for n in size)
         even_source, even_target = (at_source, at_target) if self.lin_even is None else (e.new_zeros(n, width) for n in size)
         directions, sign = e.split(count), 1  # of ``directed`` two
-        new = torch.empty_like(e) if update_edges else None
+        new = None if not update_edges else e if overwrites else torch.empty_like(e)
         for first in range(0, count, chunk):
             part = slice(first, first + chunk)
             j, i = edge_index[:, part]

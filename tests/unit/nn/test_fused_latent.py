@@ -74,12 +74,33 @@ def test_results_and_gradients_equal_the_plain_ones(
     assert num_edges == 0 or results[1][0].abs().max() > 0
 
 
-def test_views_are_read_as_they_are() -> None:
+@pytest.mark.parametrize("update", [True, False])
+@pytest.mark.parametrize("is_odd", [True, False])
+def test_without_gradients_states_may_take_the_place_of_the_old_ones(is_odd: bool, update: bool) -> None:
+    values, edges = inputs(45, torch.float64, is_odd)
+    before = [v.clone() for v in values]
+    a, b, e, s, weight, even, slope, out, bias = values
+    others = s if is_odd else None, weight, even, slope, (out, None if is_odd else bias) if update else None, edges
+    expected = plain(values, edges, is_odd, update)
+    with torch.no_grad():
+        kept = fused_latent(a, b, e, *others)
+        for value, old in zip(values, before, strict=True):
+            torch.testing.assert_close(value, old, rtol=0, atol=0)
+        written = fused_latent(a, b, e, *others, overwrites=True)
+    for found in (kept, written):
+        for x, y in zip(expected, (f for f in found if f is not None), strict=True):
+            torch.testing.assert_close(y, x, rtol=1e-12, atol=1e-12)
+    assert written[2] is None or written[2].data_ptr() == e.data_ptr()
+
+
+@pytest.mark.parametrize("has_gradient", [True, False])
+def test_views_are_read_as_they_are(has_gradient: bool) -> None:
     values, edges = inputs(30, torch.float64, is_odd=True)
     turned = [v.t().contiguous().t() if v.dim() == 2 else v for v in values]
     edges = edges.flip(0).contiguous().flip(0)
-    for x, y in zip(fused(turned, edges, True, True), plain(values, edges, True, True), strict=True):
-        torch.testing.assert_close(x, y, rtol=1e-12, atol=1e-12)
+    with torch.set_grad_enabled(has_gradient):
+        for x, y in zip(fused(turned, edges, True, True), plain(values, edges, True, True), strict=True):
+            torch.testing.assert_close(x, y, rtol=1e-12, atol=1e-12)
 
 
 def test_not_a_number_stays_one() -> None:

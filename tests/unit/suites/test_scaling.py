@@ -10,8 +10,9 @@ from gpe_pl.suites.scaling import Settings, figures, run
 
 def test_a_power_law_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scaling, "peak_memory", lambda *_: 1000)
-    sizes = iter([30, 60, 120] * 2)
-    times = iter(t for n in sizes for t in (1e-4 * n**1.5 / 4, 3e-4 * n**1.5 / 4))  # graph and forward
+    of_size = [(1e-4 * n**1.5 / 4, 3e-4 * n**1.5 / 4) for n in (30, 60, 120)]  # graph and forward
+    of_dimension = [t for pair in of_size for t in pair] + [1.5e-4 * 120**1.5 / 4]  # and forward with sorted nodes
+    times = iter(of_dimension * 2)
     monkeypatch.setattr(scaling, "_fastest", lambda *_: next(times))
     settings = Settings(num_nodes=[30, 60, 120], fitted=(30, 120), num_message_passing_steps=2, hidden_channels=8, budget=0.0)
     records, table = run(settings)
@@ -20,6 +21,8 @@ def test_a_power_law_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
         assert found["scaling_exponent", f"{dim}d"] == pytest.approx(1.5)
         edges = found["num_edges", f"{dim}d, 120"] / found["num_edges", f"{dim}d, 30"]
         assert found["edge_layer_time_ratio", f"{dim}d"] == pytest.approx(8 / edges)
+        assert found["sorted_time_ratio", f"{dim}d"] == pytest.approx(0.5)
+    assert "takes 50 % of the time" in table
     assert "N^1.500" in table and table.count("| 3D |") == 3
     assert figures(records)["scaling"].axes[0].get_ylabel() == "time of a step [s]"
 
