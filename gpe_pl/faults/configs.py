@@ -18,7 +18,7 @@ from gpe_pl.faults.verdict import Fault, Verdict
 PLACES = (
     "paths",
     "hydra",
-    "size.comparison",
+    "size",
     "data.comparison",
     "data.dimensions",
     "data.sizes",
