@@ -177,6 +177,10 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
                 return hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
             except SweepError as error:
                 _fail(error)
+            except OSError as error:  # before the command itself begins: Hydra makes the folder of the results
+                if verbose:
+                    raise
+                _fail(error)
             except (HydraException, OmegaConfBaseException, ValueError) as error:
                 if verbose or (is_composed and isinstance(error, ValueError)):
                     raise

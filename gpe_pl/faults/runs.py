@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from gpe_pl.errors import GpeError
 from gpe_pl.faults import isolation, stores
-from gpe_pl.faults.verdict import Fault, Verdict
+from gpe_pl.faults.verdict import MAX_DETAIL, Fault, Verdict
 from gpe_pl.learned_simulator import load_checkpoint
 
 SAVED = ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers", "global_step", "simulator")
@@ -189,7 +190,10 @@ def damaged_file(command: Command, sound: Path, name: str, damage: Callable[[byt
     ended = isolation.run(command.module, command.given(folder), limit)
     if ended.code != 0:
         return ended.verdict()
-    expected, found = digests(sound), digests(folder)
+    try:
+        expected, found = digests(sound), digests(folder)
+    except GpeError as error:  # the command had no need of the file; whoever has is refused
+        return Verdict("refused", str(error)[:MAX_DETAIL])
     wrong = sorted(k for k in expected if found.get(k) != expected[k])
     return Verdict("accepted", f"no error, but {', '.join(wrong)} differ") if wrong else Verdict("harmless")
 
