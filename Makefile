@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install fit test test-all fuzz physics check lint types contracts format-page format bench notebooks clean
+.PHONY: help install fit test test-all fuzz physics check lint types contracts format-page format bench notebooks docs links clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  %-12s %s\n", $$1, $$2}'
@@ -18,7 +18,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "Python 3.11 or newer is needed; name one with: make PYTHON=/path/to/python3.11"; exit 1; }
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev,docs]'
 	@touch $@
 
 fit: install ## momentum ablation of the paper: generates data, trains, evaluates, reports (ARGS="size=tiny" and the like)
@@ -64,6 +64,13 @@ bench: install ## speed of the message-passing layers and of the solvers
 notebooks: install ## execute every notebook from start to end
 	$(BIN)/python -m pytest -m notebook $(PYTEST_ARGS)
 
+docs: install ## user guide and reference in docs/_build/html; warnings and broken links within are errors
+	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going --jobs auto docs docs/_build/html
+	$(BIN)/python docs/check_links.py docs/_build/html
+
+links: install ## links of the documentation that lead elsewhere (needs the network)
+	$(BIN)/sphinx-build --quiet -b linkcheck docs docs/_build/linkcheck
+
 clean: ## remove caches and build products; data sets, runs and .venv stay
-	rm -rf build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf build dist docs/_build docs/reference/generated *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find gpe_pl tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -27,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 from pydantic import ValidationError
 
-from gpe_pl import launcher
+from gpe_pl import plugins
 from gpe_pl.errors import GpeError
 from gpe_pl.launcher import RESULT, USAGE_ERROR, SweepError
 from gpe_pl.signatures import checked, parameters
@@ -35,7 +35,7 @@ from gpe_pl.signatures import checked, parameters
 WITHOUT_KEY = {"comparison", "experiment", "scene", "solver"}
 """Config groups that fill other keys than one of their own."""
 
-launcher.register()  # conf/ names it
+plugins.register()  # conf/ names them
 OmegaConf.register_new_resolver("times", lambda a, b: a * b, replace=True)  # ${times:a,b} in conf/
 
 
@@ -296,6 +296,7 @@ class Report(Callback):
                 report_domains(folder)
             else:
                 report_sweep(folder)
+            print(folder)
         except GpeError as error:
             _fail(error)
         except Exception:

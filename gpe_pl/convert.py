@@ -26,7 +26,7 @@ def convert(cfg: DictConfig) -> None:
         report = import_dataset(cfg.paths.data, settings, on_progress)
     print(report.text())
     if {"train", "val", "test"} <= set(report.splits):
-        print(f"train on it: python -m gpe_pl.fit data=imported data.name={report.name}")
+        print(f"train on it: python -m gpe_pl.fit data=imported data.name={report.name} name={report.name}")
     print(draw_contact_sheet(report))
     print(Path(report.folder) / PAGE_FILE)
 

@@ -246,6 +246,15 @@ def read_rows(path: Path) -> Iterator[Row]:
             raise MetricsError(f"{path}, line {reader.line_num}: damaged ({error}); delete the file to evaluate again") from None
 
 
+def means(rows: list[Row], label: str = LEARNED) -> dict[str, float]:
+    """Means over trajectories of what was evaluated of a model, as ``split/metric@horizon``."""
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        if row.model == label:
+            values.setdefault(f"{row.split}/{row.metric}@{row.horizon}", []).append(row.value)
+    return {key: float(np.mean(v)) for key, v in values.items()}
+
+
 def _pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predictions: dict[str, Trajectory]) -> None:
     from gpe_pl.viz.figures import rollout_figure
     from gpe_pl.viz.video import write_animation

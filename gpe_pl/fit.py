@@ -21,14 +21,16 @@ def fit(cfg: DictConfig) -> float:
     from omegaconf import OmegaConf
 
     from gpe_pl.data.datamodule import TrajectoryDataModule
+    from gpe_pl.data.dataset import BatchSize
     from gpe_pl.data.noise import Noise
-    from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, read_rows
+    from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
     from gpe_pl.simulate import ensure_data, evaluated_config
     from gpe_pl.training.budget import digest, step_time, within_budget
     from gpe_pl.training.module import TrainingModule
-    from gpe_pl.training.run import LoggerSettings, TrainerSettings, TrainingSettings, adopt, claim, set_threads, train
+    from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, claim, set_threads, train
+    from gpe_pl.training.tracking import LoggerSettings, publish
 
     if type(cfg.seed) is not int or cfg.seed < 0:
         raise ConfigError(f"seed={cfg.seed!r}: must be an integer of at least 0")
@@ -41,6 +43,7 @@ def fit(cfg: DictConfig) -> float:
     logger = construct(LoggerSettings, cfg.logger, "logger")
     new_model = bind(model_class(cfg.model._target_), {k: v for k, v in cfg.model.items() if k != "_target_"}, "model", "spec")
     noise = Noise(training.noise, training.noise_std, training.noise_correction)
+    batch_size = construct(BatchSize, cfg.batching, "batching", num_graphs=training.batch_size)
 
     run_dir = output_dir(cfg)
     Path(cfg.paths.data).mkdir(parents=True, exist_ok=True)
@@ -53,7 +56,7 @@ def fit(cfg: DictConfig) -> float:
     @cache
     def data() -> TrajectoryDataModule:
         stress = bool(cfg.model.get("stress", False))
-        return TrajectoryDataModule(root, graph, noise, training.batch_size, cfg.seed, trainer.num_workers, stress=stress)
+        return TrajectoryDataModule(root, graph, noise, batch_size, cfg.seed, trainer.num_workers, stress=stress)
 
     def new_module(training: TrainingSettings) -> TrainingModule:
         L.seed_everything(cfg.seed, verbose=False)
@@ -63,21 +66,29 @@ def fit(cfg: DictConfig) -> float:
         return TrainingModule(simulator, **{n: getattr(training, n) for n in names})
 
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    unusual = {"batching": settings["batching"]} if batch_size.max_nodes is not None else {}  # as runs had it before there was a choice
     if training.budget_minutes is not None:
         dataset = {k: v for k, v in settings["data"].items() if k != "comparison"}
         parts = {k: settings[k] for k in ("graph", "model")} | {"data": dataset, "batch_size": training.batch_size, "device": device}
+        parts |= unusual
         key = f"{cfg.data.name} {cfg.size.name} {cfg.model._target_.rpartition('.')[2]} {digest(parts)}"
         times = Path(cfg.paths.runs) / (cfg.reuse or cfg.name) / "step_times.json"
         training = within_budget(
-            training, times, key, lambda settings: step_time(new_module(settings).to(device), data().train_set, settings)
+            training,
+            times,
+            key,
+            lambda settings: step_time(new_module(settings).to(device), data().train_set, batch_size, settings.gradient_clip),
         )
     settings["training"] = asdict(training)
-    trained = {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training")}
-    claim(run_dir, trained | {"evaluation": settings["evaluation"]})
+    trained = {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training")} | unusual
+    config = trained | {"evaluation": settings["evaluation"]}
+    claim(run_dir, config)
     if not (run_dir / "metrics.csv").exists():
         best = None if cfg.reuse is None else adopt(Path(cfg.paths.runs) / cfg.reuse, trained, run_dir)
-        best = best or train(new_module(training), data(), training, trainer, logger.loggers(run_dir), run_dir)
-        evaluate(LearnedSimulator.from_checkpoint(best, device), evaluated, evaluation, run_dir)
+        loggers = logger.loggers(run_dir, cfg.name, config)
+        best = best or train(new_module(training), data(), training, trainer, loggers, run_dir)
+        rows = evaluate(LearnedSimulator.from_checkpoint(best, device), evaluated, evaluation, run_dir)
+        publish(loggers, run_dir, means(rows))
 
     values = [
         r.value

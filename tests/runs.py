@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -51,4 +52,9 @@ def generate_tiny(folder: Path) -> Path:
 def first_choices(experiment: str) -> list[str]:
     """The first value of every axis that an experiment sweeps over."""
     params: Any = compose("fit", f"experiment={experiment}", hydra_config=True).hydra.sweeper.params
-    return [f"{key}={str(values).split(',')[0]}" for key, values in (params or {}).items()]
+    return [f"{key}={_first_choice(str(values))}" for key, values in (params or {}).items()]
+
+
+def _first_choice(values: str) -> str:
+    interval = re.search(r"interval\(([^,]+),", values)
+    return interval.group(1) if interval else values.split(",")[0]

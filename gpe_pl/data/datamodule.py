@@ -12,7 +12,8 @@ import torch
 from torch_geometric.data import HeteroData
 from torch_geometric.loader import DataLoader
 
-from gpe_pl.data.dataset import StepSampler, WindowDataset, open_split
+from gpe_pl import ranks
+from gpe_pl.data.dataset import BatchSampler, BatchSize, WindowDataset, open_split
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.statistics import is_intact
 from gpe_pl.graphs.builder import GraphBuilder
@@ -39,7 +40,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         root: folder of the data set.
         graph: how states become graphs.
         noise: on training inputs.
-        batch_size: graphs per step.
+        batch_size: samples per step, all ranks together.
         seed: of order and noise.
         num_workers: processes that build graphs; 0 builds them in the training process.
         num_val_windows: windows of the one-step validation loss, evenly spread over the ``val`` split.
@@ -51,7 +52,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         root: Path | str,
         graph: GraphConfig,
         noise: Noise,
-        batch_size: int = 2,
+        batch_size: BatchSize,
         seed: int = 0,
         num_workers: int = 0,
         num_val_windows: int = 256,
@@ -80,11 +81,9 @@ class TrajectoryDataModule(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader:
         trainer = self.trainer
         assert trainer is not None
-        sampler = StepSampler(len(self.train_set), self.seed, start=lambda: trainer.global_step * self.batch_size)
         return DataLoader(
             self.train_set,
-            batch_size=self.batch_size,
-            sampler=sampler,
+            batch_sampler=BatchSampler(self.train_set, self.batch_size, self.seed, step=lambda: trainer.global_step),
             num_workers=self.num_workers,
             persistent_workers=self.num_workers > 0,
             prefetch_factor=4 if self.num_workers else None,
@@ -93,7 +92,9 @@ class TrajectoryDataModule(L.LightningDataModule):
 
     def val_dataloader(self) -> DataLoader:
         windows = [int(w) for w in _spread(len(self.val_set), self.num_val_windows)]
-        return DataLoader([self.val_set[w] for w in windows], batch_size=8)
+        if len(windows) < ranks.num_ranks():
+            raise StoreError(f"{self.root}: split 'val' has {len(windows)} windows, too few for {ranks.num_ranks()} processes")
+        return DataLoader([self.val_set[w] for w in windows[ranks.rank() :: ranks.num_ranks()]], batch_size=8)
 
 
 def _spread(length: int, count: int) -> np.ndarray:

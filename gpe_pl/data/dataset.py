@@ -7,14 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
+from pydantic import Field
 from torch.utils.data import Dataset, Sampler
 from torch_geometric.data import HeteroData
 
-from gpe_pl import integrators
+from gpe_pl import integrators, ranks
 from gpe_pl.data.noise import Noise
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.trajectory import State, StoreError, Trajectory, open_group, open_shard, read_trajectory, shards
@@ -30,6 +33,7 @@ class StoredTrajectory:
     path: Path
     name: str
     num_frames: int
+    num_nodes: int
     held: Trajectory | None
 
     def window(self, start: int, stop: int) -> Trajectory:
@@ -46,10 +50,10 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
     stored = []
     for path in paths:
         with open_shard(path) as file:
-            lengths = {name: open_group(file, name)["pos"].shape[0] for name in sorted(file)}
-        for name, num_frames in lengths.items():
+            shapes = {name: open_group(file, name)["pos"].shape[:2] for name in sorted(file)}
+        for name, (num_frames, num_nodes) in shapes.items():
             held = _read_only(read_trajectory(path, name)) if hold else None
-            stored.append(StoredTrajectory(path, name, num_frames, held))
+            stored.append(StoredTrajectory(path, name, num_frames, num_nodes, held))
     return stored
 
 
@@ -105,6 +109,10 @@ class WindowDataset(Dataset[HeteroData]):
         trajectory = int(np.searchsorted(self.ends, window, side="right"))
         start = 0 if trajectory == 0 else int(self.ends[trajectory - 1])
         return trajectory, window - start + self.builder.config.history
+
+    def num_nodes(self, window: int) -> int:
+        """Nodes of a window, without those of the boundary and of coarser levels."""
+        return self.trajectories[self.locate(window)[0]].num_nodes
 
     def __getitem__(self, key: int | tuple[int, int]) -> HeteroData:
         """The graph of a window; ``key`` is its number, or (sample number, window number) where the sample number seeds the noise."""
@@ -171,3 +179,74 @@ class StepSampler(Sampler[tuple[int, int]]):
             for window in order[offset:]:
                 yield sample, int(window)
                 sample += 1
+
+
+@dataclass(frozen=True)
+class BatchSize:
+    """How many samples an optimiser step takes, all ranks together.
+
+    Attributes:
+        num_graphs: so many.
+        max_nodes: if given, instead: the next ones in the order whose nodes (see ``WindowDataset.num_nodes``) are at most so many together, at least one.
+    """
+
+    num_graphs: Annotated[int, Field(ge=1)]
+    max_nodes: Annotated[int, Field(ge=1)] | None = None
+
+    def batches(self, data: WindowDataset, seed: int, step: int) -> Iterator[list[tuple[int, int]]]:
+        """The samples of each optimiser step, from a step on, without end."""
+        if self.max_nodes is None:
+            samples = iter(StepSampler(len(data), seed, start=lambda: step * self.num_graphs))
+            while True:
+                yield list(islice(samples, self.num_graphs))
+        else:
+            yield from islice(self._packed(data, iter(StepSampler(len(data), seed)), self.max_nodes), step, None)
+
+    @staticmethod
+    def _packed(data: WindowDataset, samples: Iterator[tuple[int, int]], max_nodes: int) -> Iterator[list[tuple[int, int]]]:
+        batch, total = [next(samples)], 0
+        for sample in samples:
+            total += data.num_nodes(batch[-1][1])
+            if total + data.num_nodes(sample[1]) > max_nodes:
+                yield batch
+                batch, total = [], 0
+            batch.append(sample)
+
+
+class BatchSampler(Sampler[list[tuple[int, int]]]):
+    """What this rank takes of the samples of each optimiser step. The order is one for all ranks, and the same as that of a single process.
+
+    Args:
+        data: training windows.
+        size: of the batches.
+        seed: of the order.
+        step: called when iteration begins; the number of optimiser steps already taken.
+
+    Raises:
+        StoreError: batches may have fewer samples than there are ranks.
+    """
+
+    def __init__(self, data: WindowDataset, size: BatchSize, seed: int, step: Callable[[], int]) -> None:
+        self.data, self.size, self.seed, self.step = data, size, seed, step
+        largest = max(t.num_nodes for t in data.trajectories)
+        fewest = size.num_graphs if size.max_nodes is None else size.max_nodes // largest
+        if fewest < ranks.num_ranks() > 1:
+            what = f"training.batch_size={size.num_graphs}" if size.max_nodes is None else f"batching.max_nodes={size.max_nodes}"
+            nodes = "" if size.max_nodes is None else f" of up to {largest} nodes"
+            raise StoreError(f"{what}: too small for {ranks.num_ranks()} processes, each of which takes at least one graph{nodes}")
+
+    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
+        for batch in self.size.batches(self.data, self.seed, self.step()):
+            yield batch if ranks.num_ranks() == 1 else self._part(batch)
+
+    def _part(self, batch: list[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Samples dealt by their nodes, the largest first, each to the rank that has the fewest so far."""
+        nodes = {sample: self.data.num_nodes(window) for sample, window in batch}
+        load = [0] * ranks.num_ranks()
+        own = set()
+        for sample in sorted(nodes, key=lambda sample: -nodes[sample]):
+            fewest = load.index(min(load))
+            load[fewest] += nodes[sample]
+            if fewest == ranks.rank():
+                own.add(sample)
+        return [(sample, window) for sample, window in batch if sample in own]

@@ -3,9 +3,9 @@
 A window holds positions x[t−H … t+1] [history + 2, node, dim]. Both kinds are additive on positions, so velocities and the target acceleration follow from
 the noisy window by the integrator's own formulas.
 
-``paper``     the same offset on every position, the target's included (paper, section 3.2): velocities and target stay as they are
-``velocity``  a random walk over the H velocities, integrated to positions; the next velocity stays the true one, so the target corrects the velocity
-              noise exactly and the position noise not at all [Sanchez-Gonzalez et al. 2020, as in their published code]
+- ``paper``: the same offset on every position, the target's included (paper, section 3.2): velocities and target stay as they are.
+- ``velocity``: a random walk over the H velocities, integrated to positions; the next velocity stays the true one, so the target corrects the velocity
+  noise exactly and the position noise not at all [Sanchez-Gonzalez et al. 2020, as in their published code].
 """
 
 from dataclasses import dataclass

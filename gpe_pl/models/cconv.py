@@ -8,6 +8,7 @@ Layers of the paper, with features f of particles and g of boundary nodes, ReLU 
 Filters have 4^d points and the radius of the graph; a particle is no neighbour of itself, the dense layers stand for that.
 
 Where this differs from the paper, because all models here share graphs, inputs and targets:
+
 - the output is the acceleration without gravity in units of its standard deviation, not 1/128 of a position correction after a step under gravity;
 - particles carry the standardised features of the graph (velocity history, gravity, material parameter) and one column per material, which is the paper's
   constant 1 if there is one material; boundary nodes carry velocity, normal and boundary condition, the paper's the normal;

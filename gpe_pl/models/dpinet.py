@@ -15,6 +15,7 @@ Enc_p has two and Enc_r three linear layers, each followed by a ReLU; three line
 A graph without virtual nodes has the first stage alone, as the paper's fluids have.
 
 Where this differs from the paper, because all models here share graphs, inputs and targets:
+
 - it predicts the acceleration without gravity, the paper's the velocity, and that of rigid bodies through a rigid motion;
 - particles carry the standardised features of the graph and a one-hot type, relations its edge features, in the place of absolute positions and of a flag,
   so that the result does not depend on where the scene lies; there are no edges from a particle to itself;

@@ -10,6 +10,7 @@ the decoder::
     a_i  = MLP(h_i)
 
 Where this differs from the paper, because all models here share graphs, inputs and targets:
+
 - edges carry the channels that ``graph.features`` asks for, and the length of the standardised displacement; relations of meshes, if the graph has any, carry
   theirs (the paper's topology is ``graph=particles``);
 - walls are boundary nodes with velocity, normal and boundary condition, as in the other models, instead of distances to the box; they have no edges among

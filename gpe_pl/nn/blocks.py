@@ -28,9 +28,11 @@ class ReluMLP(nn.Sequential):
 
 
 class EdgeLinear(nn.Module):
-    """A linear map of (edge, target, source), which multiplies nodes before it gathers them to edges::
+    """A linear map of (edge, target, source), which multiplies nodes before it gathers them to edges.
 
-    W [e, h_i, h_j] + b = W_e e + (W_i h + b)_i + (W_j h)_j                              (i target, j source)
+    With target i and source j it is
+
+        W [e, h_i, h_j] + b = W_e e + (W_i h + b)_i + (W_j h)_j
     """
 
     def __init__(self, edge_channels: int, node_channels: int, out_channels: int) -> None:

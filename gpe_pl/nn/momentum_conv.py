@@ -4,10 +4,10 @@ The message is a two-layer MLP, whose first layer is linear in its parts, so tha
 
     z_ij = A h_i + B h_j + W e_ij + S s_ij + b                       (i target, j source, e odd or latent edge state, s even features)
 
-``directed``    m_ij = C φ(z_ij) + c for both directions of every edge
-``negated``     m_ij = C φ(z_ij) + c and m_ji = −m_ij, the paper's form (section 2.3); it depends on which end is called i, see ``orient``
-``odd``         m_ij = C (φ(z_ij) − φ(z_ji)), antisymmetric whichever end is called i
-``odd_even``    as ``odd``, and D (φ(z_ij) + φ(z_ji)) goes to both ends
+- ``directed``: m_ij = C φ(z_ij) + c for both directions of every edge
+- ``negated``: m_ij = C φ(z_ij) + c and m_ji = −m_ij, the paper's form (section 2.3); it depends on which end is called i, see ``orient``
+- ``odd``: m_ij = C (φ(z_ij) − φ(z_ji)), antisymmetric whichever end is called i
+- ``odd_even``: as ``odd``, and D (φ(z_ij) + φ(z_ji)) goes to both ends
 
 A relation between two node types has a direction already, and is ``negated`` unless the layer is ``directed``.
 """

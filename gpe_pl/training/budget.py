@@ -10,7 +10,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import torch
 from filelock import FileLock
 from torch_geometric.data import Batch
 
-from gpe_pl.data.dataset import StepSampler, WindowDataset
+from gpe_pl.data.dataset import BatchSize, WindowDataset
 from gpe_pl.errors import GpeError
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
 from gpe_pl.training.run import TrainingSettings
@@ -40,7 +40,7 @@ class BudgetError(GpeError, ValueError):
     """The file of measured step times cannot be used; names it and what to do."""
 
 
-def step_time(module: TrainingModule, data: WindowDataset, settings: TrainingSettings) -> float:
+def step_time(module: TrainingModule, data: WindowDataset, size: BatchSize, gradient_clip: float) -> float:
     """Seconds per optimiser step, the building of its graphs included: processor time, or on a GPU wall time, in the fastest of several rounds.
 
     Other processes can only lengthen it, through shared caches and memory even where processor time is counted.
@@ -48,14 +48,14 @@ def step_time(module: TrainingModule, data: WindowDataset, settings: TrainingSet
     on_gpu = next(module.parameters()).is_cuda
     clock = time.perf_counter if on_gpu else time.process_time
     optimizer = torch.optim.Adam(module.parameters(), lr=0.0, fused=True)
-    batches = _batches(data, settings.batch_size)
+    batches = (Batch.from_data_list([data[sample] for sample in batch]) for batch in size.batches(data, seed=0, step=0))
 
     def steps(count: int) -> float:
         start = clock()
         for _ in range(count):
             optimizer.zero_grad()
             module.loss(next(batches).to(module.device)).backward()
-            torch.nn.utils.clip_grad_norm_(module.parameters(), settings.gradient_clip)
+            torch.nn.utils.clip_grad_norm_(module.parameters(), gradient_clip)
             optimizer.step()
         if on_gpu:
             torch.cuda.synchronize()
@@ -64,12 +64,6 @@ def step_time(module: TrainingModule, data: WindowDataset, settings: TrainingSet
     with module.compiled():
         steps(WARM_UP_STEPS)
         return min(steps(MEASURED_STEPS) for _ in range(ROUNDS)) / MEASURED_STEPS
-
-
-def _batches(data: WindowDataset, batch_size: int) -> Iterator[Batch]:
-    samples = iter(StepSampler(len(data), seed=0))
-    while True:
-        yield Batch.from_data_list([data[next(samples)] for _ in range(batch_size)])
 
 
 def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Callable[[TrainingSettings], float]) -> TrainingSettings:

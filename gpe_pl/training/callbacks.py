@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import zip_longest
 from typing import Any
 
 import lightning as L
@@ -9,6 +10,7 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, WeightAveraging
 
+from gpe_pl import ranks
 from gpe_pl.containment import Contained
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import per_frame_mse
@@ -36,7 +38,7 @@ class WarmAverage(WeightAveraging):
 class RolloutValidation(Callback):
     """Rolls the current (averaged) model out on validation trajectories and logs the position MSE as ``val/rollout_mse``.
 
-    Stands before ``WarmAverage`` in the list of callbacks, so that it sees the averaged weights.
+    Stands before ``WarmAverage`` in the list of callbacks, so that it sees the averaged weights. Ranks share the trajectories.
 
     Args:
         trajectories: ground truth.
@@ -58,14 +60,19 @@ class RolloutValidation(Callback):
 
     def _mse(self, simulator: LearnedSimulator) -> float:
         history = simulator.builder.config.history
-        truths = [t.frames(history, history + self.num_steps + 1) for t in self.trajectories]
+        trajectories = self.trajectories[ranks.rank() :: ranks.num_ranks()]
+        truths = [t.frames(history, history + self.num_steps + 1) for t in trajectories]
         starts, worst = [], []
-        for trajectory, truth in zip(self.trajectories, truths, strict=True):
+        for trajectory, truth in zip(trajectories, truths, strict=True):
             bounds = truth.metadata.bounds
             size = max(high - low for low, high in bounds)
             guard = Guard(bounds=bounds, margin=size, max_speed=1e3)
             starts.append(Start(simulator.initial_state(trajectory, history), truth.num_frames - 1, truth.metadata, guard))
             worst.append(size**2)  # a rollout that stopped early counts as lost from there on
-        predictions = rollouts(Contained(simulator, truths[0].metadata.frame_dt), starts)
+        predictions = rollouts(Contained(simulator, self.trajectories[0].metadata.frame_dt), starts)
         errors = [per_frame_mse(p, t)[1:] for p, t in zip(predictions, truths, strict=True)]
-        return float(np.mean([np.where(np.isfinite(e), e, w).mean() for e, w in zip(errors, worst, strict=True)]))
+        means = [float(np.where(np.isfinite(e), e, w).mean()) for e, w in zip(errors, worst, strict=True)]
+        everywhere = [
+            mean for part in zip_longest(*ranks.gathered(means)) for mean in part if mean is not None
+        ]  # in the order of the trajectories
+        return float(np.mean(everywhere))

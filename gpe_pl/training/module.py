@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 from torch_geometric.data import HeteroData
 
+from gpe_pl import ranks
 from gpe_pl.errors import GpeError
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE
@@ -140,25 +141,33 @@ class TrainingModule(L.LightningModule):
             del model.compute  # back to the class's own
 
     def loss(self, batch: HeteroData) -> Tensor:
-        """Mean squared error of the normalised accelerations, and of the normalised stress where there is one."""
+        """Mean squared error of the normalised accelerations, and of the normalised stress where there is one; of several ranks, the part of this one."""
         predicted = self.simulator(batch)
-        loss = torch.cat([(a - self._normalized(batch[m].target)).square() for m, a in predicted.acceleration.items()]).mean()
-        if predicted.stress:
-            std = self.simulator.stress_std.float()
-            loss = (
-                loss
-                + self.stress_weight * torch.cat([(s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]).mean()
-            )
+        std = self.simulator.stress_std.float()
+        acceleration = [(a - self._normalized(batch[m].target)).square() for m, a in predicted.acceleration.items()]
+        stress = [(s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]
+        shares = self._shares(acceleration, stress)
+        loss = torch.cat(acceleration).mean() * shares[0]
+        if stress:
+            loss = loss + self.stress_weight * torch.cat(stress).mean() * shares[1]
         return loss
+
+    def _shares(self, *errors: list[Tensor]) -> list[float]:
+        """How many of all ranks' errors of each kind are on this one. The ranks exchange it also where this one has none of a kind."""
+        if ranks.num_ranks() == 1:
+            return [1.0] * len(errors)
+        here = torch.tensor([sum(e.numel() for e in kind) for kind in errors], device=self.device)
+        return [n / max(1, total) for n, total in zip(here.tolist(), ranks.summed(here).tolist(), strict=True)]
 
     def training_step(self, batch: HeteroData, batch_idx: int) -> Tensor | None:
         """The loss, or None where it is not finite: then this step changes nothing."""
         loss = self.loss(batch)
         self._windows = list(zip(batch.trajectory.tolist(), batch.frame.tolist(), strict=True))
-        if not torch.isfinite(loss):
-            self._skip("loss", loss)
-            return None
-        self.log("train/loss", loss, batch_size=1)
+        total = ranks.summed(loss.detach())
+        if not torch.isfinite(total):
+            self._skip("loss", total)
+            return None if ranks.num_ranks() == 1 else loss  # ranks wait for each other's gradients, which are dropped afterwards
+        self.log("train/loss", total, batch_size=1)
         return loss
 
     def configure_gradient_clipping(
@@ -167,16 +176,18 @@ class TrainingModule(L.LightningModule):
         """Clip by norm; a gradient that is not finite is dropped before it spoils the weights."""
         norm = torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), math.inf if gradient_clip_val is None else gradient_clip_val)
         if not torch.isfinite(norm):
-            self._skip("gradient norm", norm)
+            if not self._skipped or self._skipped[-1] != self.global_step:  # else its loss was not finite either
+                self._skip("gradient norm", norm)
             optimizer.zero_grad(set_to_none=True)  # without gradients Adam leaves weights and moments as they are
 
     def _skip(self, name: str, value: Tensor) -> None:
-        """Go on without a batch, unless too many of the last ones were like it.
+        """Go on without a batch, unless too many of the last ones were like it; on all ranks, as the value is a sum over them.
 
         Raises:
             TrainingError: names step, trajectories and frames.
         """
-        what = f"step {self.global_step}: the {name} is {value.item()} for (trajectory, frame) = {', '.join(map(str, self._windows))}"
+        windows = [window for part in ranks.gathered(self._windows) for window in part]
+        what = f"step {self.global_step}: the {name} is {value.item()} for (trajectory, frame) = {', '.join(map(str, windows))}"
         if len(self._skipped) == MAX_SKIPPED and self.global_step - self._skipped[0] < SKIP_WINDOW:
             raise TrainingError(
                 f"{what}, as in {MAX_SKIPPED} other batches since step {self._skipped[0]}; the last good checkpoint is kept. "

@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import shutil
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,7 +14,7 @@ from typing import Annotated, Any, Literal
 import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint, TQDMProgressBar
-from lightning.pytorch.loggers import CSVLogger, Logger
+from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
@@ -23,6 +24,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.training.callbacks import RolloutValidation, WarmAverage
 from gpe_pl.training.checkpoints import AtomicCheckpoints
 from gpe_pl.training.module import Compile, Schedule, TrainingModule
+from gpe_pl.training.parallel import SummedGradients
 
 log = logging.getLogger(__name__)
 
@@ -65,41 +67,21 @@ class TrainingSettings:
 
 @dataclass(frozen=True)
 class TrainerSettings:
-    """Where the training runs."""
+    """Where the training runs: in one process per device, each of which takes a part of every batch (see ``training.parallel``).
+
+    ``devices`` are those of one of ``num_nodes`` machines.
+    """
 
     accelerator: Literal["cpu", "gpu", "auto"] = "cpu"
     devices: Annotated[int, Field(ge=1)] = 1
+    num_nodes: Annotated[int, Field(ge=1)] = 1
     num_threads: Annotated[int, Field(ge=1)] | None = None
     num_workers: Annotated[int, Field(ge=0)] = 0
     progress: bool = True
 
-
-@dataclass(frozen=True)
-class LoggerSettings:
-    """Where the metrics go; files in the run's folder are always written."""
-
-    kind: Literal["csv", "wandb"] = "csv"
-    project: str = "gpe_pl"
-    mode: Literal["online", "offline", "disabled"] | None = None
-
-    def loggers(self, run_dir: Path) -> list[Logger]:
-        """CSV under ``run_dir/log``, one version per start of the run, and W&B if asked for (offline without an API key)."""
-        loggers: list[Logger] = [CSVLogger(run_dir, name="log", flush_logs_every_n_steps=1)]
-        if self.kind == "wandb":
-            from lightning.pytorch.loggers import WandbLogger
-
-            has_key = bool(os.environ.get("WANDB_API_KEY"))
-            mode = self.mode or ("online" if has_key else "offline")
-            loggers.append(WandbLogger(project=self.project, save_dir=run_dir, id=run_id(run_dir), resume="allow", mode=mode))
-        return loggers
-
-
-def run_id(run_dir: Path) -> str:
-    """An identifier that a resumed run finds again; written once."""
-    path = run_dir / "run_id"
-    if not path.exists():
-        path.write_text(os.urandom(6).hex())
-    return path.read_text().strip()
+    @property
+    def num_processes(self) -> int:
+        return self.devices * self.num_nodes
 
 
 def claim(run_dir: Path, config: dict[str, Any]) -> None:
@@ -117,18 +99,18 @@ def claim(run_dir: Path, config: dict[str, Any]) -> None:
                 f"{run_dir} holds a run with another configuration ({'; '.join(different[:3])}); choose another name=… or delete the folder"
             )
         return
-    temporary = path.with_suffix(".part")
+    temporary = path.with_suffix(f".{os.getpid()}.part")
     temporary.write_text(json.dumps(config, indent=1, sort_keys=True))
     os.replace(temporary, path)
 
 
 def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
-    """Copy the checkpoint of a finished run below ``folder`` whose configuration has all values of ``config``; None if there is no such run."""
+    """Copy the checkpoint of a finished run below ``folder`` that was trained with the configuration ``config``; None if there is no such run."""
     for path in sorted(folder.rglob("config.json")):
         trained = path.parent / "checkpoints" / "best.ckpt"
         if (path.parent / "metrics.csv").exists() and trained.exists():
             there = _config_in(path)
-            if not _differences({key: there.get(key) for key in config}, config):
+            if not _differences({key: value for key, value in there.items() if key != "evaluation"}, config):
                 log.info("taking the model that was trained in %s", path.parent)
                 own = run_dir / "checkpoints" / "best.ckpt"
                 own.parent.mkdir(parents=True, exist_ok=True)
@@ -159,7 +141,11 @@ def train(
     loggers: list[Logger],
     run_dir: Path,
 ) -> Path:
-    """Train to ``num_steps``, resuming from ``checkpoints/last.ckpt`` if there is one; returns the checkpoint with the best validation rollout."""
+    """Train to ``num_steps``, resuming from ``checkpoints/last.ckpt`` if there is one; returns the checkpoint with the best validation rollout.
+
+    Of several processes only the first returns, the others end. Unless something else starts them (``torchrun``, Slurm), each runs the command that is
+    running.
+    """
     folder = run_dir / "checkpoints"
     last = folder / "last.ckpt"
     options: dict[str, Any] = {"save_top_k": 1, "save_on_train_epoch_end": False, "enable_version_counter": False}
@@ -176,10 +162,17 @@ def train(
     ]
     if trainer_settings.progress:
         callbacks.append(TQDMProgressBar(refresh_rate=50))
+    is_parallel = trainer_settings.num_processes > 1
+    if is_parallel:
+        os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # else Lightning shares out all cores
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     try:
         trainer = L.Trainer(
             accelerator=trainer_settings.accelerator,
             devices=trainer_settings.devices,
+            num_nodes=trainer_settings.num_nodes,
+            strategy=SummedGradients() if is_parallel else "auto",
+            use_distributed_sampler=False,  # the data module's samplers know the ranks
             max_steps=training.num_steps,
             max_epochs=-1,
             val_check_interval=min(training.val_interval, training.num_steps),
@@ -197,11 +190,14 @@ def train(
         raise RunError(f"trainer.accelerator={trainer_settings.accelerator}, trainer.devices={trainer_settings.devices}: {error}") from None
     if last.exists():
         log.info("resuming from %s", last)
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     try:
         trainer.fit(module, datamodule, ckpt_path=str(last) if last.exists() else None, weights_only=True)
     except SystemExit:  # Lightning's answer to Ctrl-C
         raise RunError(f"interrupted; run the same command again to resume from {last}") from None
+    if is_parallel:
+        if trainer.global_rank > 0:
+            sys.exit()  # what comes after training is for one process
+        torch.distributed.destroy_process_group()
     return folder / "best.ckpt"
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from gpe_pl.metrics import Interval
 from gpe_pl.viz.coloring import PALETTE
@@ -123,6 +124,9 @@ def cost_error_figure(panels: Mapping[str, Mapping[str, Sequence[tuple[str, floa
                 axes.plot([cost], [error], "o", markersize=5, color=PALETTE[k % len(PALETTE)], label=name)
         for style, (name, _, error) in zip((":", "--"), families.get("trivial", ()), strict=False):
             axes.axhline(error, linestyle=style, linewidth=1, color="0.6", label=name)
+        low, high = np.log10(axes.get_xlim())
+        axes.set_xlim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))  # whole decades, since labels of their parts would overlap
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_title(title, fontsize=8)
         axes.set_xlabel(x_label, fontsize=7)
         axes.tick_params(which="both", labelsize=7)

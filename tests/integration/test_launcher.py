@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import json
 import os
 import subprocess
 import sys
@@ -9,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from gpe_pl.evaluation import read_rows
 from gpe_pl.launcher import ProcessLauncher, default_processes
+from gpe_pl.trajectory import iter_trajectories
 from tests.runs import DATA, RUN
 
 
@@ -49,11 +53,76 @@ def test_a_wrong_configuration_is_said_once(tiny_data: Path, tmp_path: Path) -> 
     assert "training.learning_rate=-1" in result.stderr and "greater than 0" in result.stderr
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("launcher", "settings"), [("processes", []), ("slurm", ["hydra.launcher.cluster=local"]), ("ray", ["hydra.launcher.num_cpus=1"])]
+)
+def test_parts_of_a_data_set_are_generated_by_any_launcher(tiny_data: Path, tmp_path: Path, launcher: str, settings: list[str]) -> None:
+    module = {"slurm": "submitit"}.get(launcher, launcher)
+    if launcher != "processes" and importlib.util.find_spec(module) is None:
+        pytest.skip(f"{module} is not installed")
+    shards = "++data.sizes.tiny.trajectories_per_shard=1"
+    command = [
+        sys.executable,
+        "-m",
+        "gpe_pl.simulate",
+        "-m",
+        *DATA,
+        shards,
+        f"paths.data={tmp_path}",
+        "num_workers=1",
+        "num_parts=2",
+        "part=0,1",
+    ]
+    result = subprocess.run([*command, f"hydra/launcher={launcher}", *settings], capture_output=True, text=True, timeout=500)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "2/2 done" in result.stdout
+    folder, whole = tmp_path / "sand" / "tiny", tiny_data / "sand" / "tiny"
+    assert json.loads((folder / "statistics.json").read_text()) == pytest.approx(json.loads((whole / "statistics.json").read_text()))
+    assert sorted(p.name for p in (folder / "train").glob("*.h5")) == ["shard-00000.h5", "shard-00001.h5"]
+    for split in ("train", "val", "test", "test_unseen"):
+        for part, there in zip(iter_trajectories(folder, split), iter_trajectories(whole, split), strict=True):
+            assert part.pos.tobytes() == there.pos.tobytes()
+    assert len([*(tmp_path / "jobs").rglob("output.log")]) == 2
+
+
+@pytest.mark.slow
+def test_optuna_searches_with_any_launcher(tiny_data: Path, tmp_path: Path) -> None:
+    pytest.importorskip("optuna")
+    search = ["experiment=search", "evaluation.num_trajectories=1", "hydra.sweeper.num_trials=3", "hydra.sweeper.num_at_once=2"]
+    command = [sys.executable, "-m", "gpe_pl.fit", *DATA, *RUN, *search, f"paths.data={tiny_data}", f"paths.runs={tmp_path}"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "best of 3 trials" in result.stdout
+    best = json.loads((tmp_path / "search" / "best.json").read_text())
+    assert set(best["values"]) == {"training.learning_rate", "training.noise_std"}
+    assert len(finished(tmp_path)) == 3
+    assert (tmp_path / "search" / "table.md").exists()
+    again = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    assert again.returncode == 0 and "runs," not in again.stdout  # nothing is left to try
+
+
+@pytest.mark.slow
+def test_a_command_with_two_devices_starts_two_processes(tiny_data: Path, tmp_path: Path) -> None:
+    steps = ["training.num_steps=4", "training.val_interval=2", "training.warmup_steps=1"]
+    command = [sys.executable, "-m", "gpe_pl.fit", *DATA, *RUN, *steps, f"paths.data={tiny_data}", f"paths.runs={tmp_path}"]
+    for name, devices in (("one", 1), ("two", 2)):
+        result = subprocess.run([*command, f"name={name}", f"trainer.devices={devices}"], capture_output=True, text=True, timeout=500)
+        assert result.returncode == 0, result.stdout + result.stderr
+    values = {
+        n: {(r.trajectory, r.metric, r.horizon, r.split): r.value for r in read_rows(tmp_path / n / "metrics.csv")} for n in ("one", "two")
+    }
+    assert values["two"] == pytest.approx(values["one"], rel=1e-3, abs=1e-9, nan_ok=True)
+    assert len([*(tmp_path / "two" / "log").iterdir()]) == 1
+    assert (tmp_path / "two" / "table.md").exists()
+
+
 def test_as_many_runs_at_once_as_there_are_cores() -> None:
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     assert default_processes(1) == cores
     assert default_processes(None) == 1
     assert default_processes(cores + 1) == 1
+    assert default_processes(1, devices=cores) == 1
 
 
 @pytest.mark.parametrize("number", [0, -1, True])

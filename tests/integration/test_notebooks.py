@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import os
 import shutil
 import subprocess
@@ -19,32 +20,41 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 MOMENTUM = ROOT / "notebooks" / "momentum_ablation.ipynb"
 MAX_CELLS = 12
 
-# The whole ablation, as small as it goes: every split and both kinds of unseen parameters, few particles, frames and steps.
-MINIATURE = (
+# Everything as small as it goes: every split and both kinds of unseen parameters, few particles, frames and steps.
+DATA = (
     *("data.sizes.tiny.num_train=2", "data.sizes.tiny.num_val=1", "data.sizes.tiny.num_test=2", "data.sizes.tiny.num_test_unseen=2"),
     *("data.sizes.tiny.num_frames=30", "data.sizes.tiny.d2.num_particles=40"),
+)
+RUN = (
     *("model.hidden_channels=8", "model.num_message_passing_steps=1"),
     *("training.num_steps=4", "training.val_interval=2", "training.warmup_steps=0", "training.compile=off"),
     *("training.num_val_rollouts=1", "training.val_rollout_steps=5"),
     *("evaluation.horizons=[5,20]", "evaluation.num_pictures=0", "trainer.progress=false"),
 )
+CANYON = ("data.sizes.tiny.num_frames=12", "data.sizes.tiny.d3.num_particles=60", "evaluation.splits=[test]")
+BENCHMARK = ("suite.factors=[2.0]", "suite.num_trajectories=1", "suite.horizons=[5,20]")
+
+# Notebooks that read any run take those of the ablation, and train for as many steps as it.
+SETTINGS = {"GPE_NAME": "ablation_momentum", "GPE_STEPS": "4"}
 
 
 @pytest.fixture(scope="module")
-def ablation(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with ``data`` and ``runs`` of a finished miniature of the momentum ablation."""
-    folder = tmp_path_factory.mktemp("ablation")
-    command = [
-        sys.executable,
-        "-m",
-        "gpe_pl.fit",
-        "experiment=ablation_momentum",
-        f"paths.data={folder / 'data'}",
-        f"paths.runs={folder / 'runs'}",
-    ]
-    child = subprocess.run([*command, *MINIATURE], capture_output=True, text=True, cwd=ROOT, env=_environment(), check=False)
-    assert child.returncode == 0, child.stdout[-2000:] + child.stderr[-2000:]
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with ``data`` and ``runs`` of what the notebooks read: miniatures of two experiments and of a benchmark, made once for all."""
+    folder = tmp_path_factory.mktemp("results")
+    in_one_process = "hydra/launcher=basic"  # eight processes would import PyTorch for seconds to train for one
+    _command(folder, "fit", "experiment=ablation_momentum", in_one_process, *DATA, *RUN)
+    case = "suite.cases.sand.overrides=" + json.dumps(["data=sand", "size=tiny", *DATA])
+    runs = f"suite.runs=[{folder / 'runs' / 'ablation_momentum'}]"
+    _command(folder, "benchmark", "suite=runtime_vs_error", runs, case, "~suite.cases.fluid", "~suite.cases.fem", *BENCHMARK)
+    _command(folder, "fit", "experiment=canyon", *DATA[:-1], *CANYON, *RUN)
     return folder
+
+
+def _command(folder: Path, name: str, *overrides: str) -> None:
+    command = [sys.executable, "-m", f"gpe_pl.{name}", *overrides, f"paths.data={folder / 'data'}", f"paths.runs={folder / 'runs'}"]
+    child = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env=_environment(), check=False)
+    assert child.returncode == 0, child.stdout[-2000:] + child.stderr[-2000:]
 
 
 def _environment() -> dict[str, str]:
@@ -59,9 +69,15 @@ def _execute(path: Path, folder: Path, runs: Path, data: Path) -> Any:
     write_kernel_spec(folder / "jupyter" / "kernels" / "python3")  # one that a user has installed may be another interpreter
     copy = Path(shutil.copy(path, folder))
     notebook = nbformat.read(copy, as_version=4)
-    own = {"JUPYTER_PATH": folder / "jupyter", "IPYTHONDIR": folder / "ipython", "GPE_RUNS": runs, "GPE_DATA": data}
+    own = {
+        "JUPYTER_PATH": folder / "jupyter",
+        "IPYTHONDIR": folder / "ipython",
+        "GPE_RUNS": runs,
+        "GPE_DATA": data,
+        "GPE_WORK": folder / "work",
+    }
     with pytest.MonkeyPatch.context() as monkeypatch:
-        for key, value in {**_environment(), **own}.items():
+        for key, value in {**_environment(), **SETTINGS, **own}.items():
             monkeypatch.setenv(key, str(value))
         client = NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(folder)}})
         try:
@@ -72,9 +88,9 @@ def _execute(path: Path, folder: Path, runs: Path, data: Path) -> Any:
 
 
 @pytest.fixture(scope="module")
-def executed(ablation: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Any]:
+def executed(results: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Any]:
     """Gives a notebook with its outputs on the miniature; executes each only once."""
-    return functools.cache(lambda path: _execute(path, tmp_path_factory.mktemp(path.stem), ablation / "runs", ablation / "data"))
+    return functools.cache(lambda path: _execute(path, tmp_path_factory.mktemp(path.stem), results / "runs", results / "data"))
 
 
 def _outputs(notebook: Any) -> list[Any]:
@@ -109,14 +125,14 @@ def test_momentum_ablation_without_results_says_how_to_make_them(tmp_path: Path)
 
 
 @pytest.mark.notebook
-def test_momentum_ablation_half_done_names_what_is_missing(ablation: Path, tmp_path: Path) -> None:
+def test_momentum_ablation_half_done_names_what_is_missing(results: Path, tmp_path: Path) -> None:
     from nbclient.exceptions import CellExecutionError
 
-    runs = shutil.copytree(ablation / "runs", tmp_path / "runs")
+    runs = shutil.copytree(results / "runs", tmp_path / "runs")
     for path in runs.rglob("model.interaction=odd"):
         shutil.rmtree(path)
     with pytest.raises(CellExecutionError, match="no finished run of odd. Run `make fit` again"):
-        _execute(MOMENTUM, tmp_path, runs, ablation / "data")
+        _execute(MOMENTUM, tmp_path, runs, results / "data")
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)

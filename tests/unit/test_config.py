@@ -319,6 +319,6 @@ def test_commands_fail_in_one_line(tmp_path: Path, command: str, arguments: list
 
 
 def test_a_table_by_model_has_a_default() -> None:
-    table = ["+comparison=equal_steps", "data.comparison.noise_std.default=0.5", "+data.comparison.noise_std.GNS=2.0"]
+    table = ["data=mixed", "+comparison=equal_steps", "data.comparison.noise_std.default=0.5", "++data.comparison.noise_std.GNS=2.0"]
     assert compose("fit", *table).training.noise_std == 0.5
     assert compose("fit", *table, "model=gns").training.noise_std == 2.0

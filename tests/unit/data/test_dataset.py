@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import itertools
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ import pytest
 import torch
 
 from gpe_pl import integrators
-from gpe_pl.data.dataset import StepSampler, StoredTrajectory, WindowDataset, open_split
+from gpe_pl.data.dataset import BatchSize, StepSampler, StoredTrajectory, WindowDataset, open_split
 from gpe_pl.data.noise import Noise
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
@@ -167,4 +168,44 @@ def test_step_sampler_asks_for_its_start_when_iteration_begins() -> None:
 def test_opening_a_split_reads_no_frames_that_are_not_held(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gpe_pl.data.dataset.read_trajectory", lambda *_, **__: pytest.fail("read a trajectory"))
     stored = open_split(store, "train", cache_bytes=0)
-    assert [(type(s), s.name, s.num_frames) for s in stored] == [(StoredTrajectory, "00000", 6), (StoredTrajectory, "00001", 6)]
+    assert [(type(s), s.name, s.num_frames, s.num_nodes) for s in stored] == [
+        (StoredTrajectory, "00000", 6, 12),
+        (StoredTrajectory, "00001", 6, 12),
+    ]
+
+
+def test_batches_of_a_node_budget_hold_as_many_nodes_as_fit(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> None:
+    sizes = (5, 30, 12, 8)
+    write_shard(tmp_path / "train" / "shard-00000.h5", [new_trajectory(k, num_nodes=n) for k, n in enumerate(sizes)])
+    data = dataset(tmp_path)
+    order = list(itertools.islice(StepSampler(len(data), seed=4), 200))
+    batches = list(itertools.islice(BatchSize(2, max_nodes=40).batches(data, seed=4, step=0), 30))
+    taken = [sample for batch in batches for sample in batch]
+    assert taken == order[: len(taken)]  # the order of any other batches, over the ends of epochs too
+    assert len(taken) > 2 * len(data)
+    nodes = [[sizes[data.locate(window)[0]] for _, window in batch] for batch in batches]
+    assert all(sum(batch) <= 40 < sum(batch) + following[0] for batch, following in itertools.pairwise(nodes))
+    assert len({len(batch) for batch in batches}) > 1
+    assert list(itertools.islice(BatchSize(2, max_nodes=40).batches(data, seed=4, step=17), 13)) == batches[17:]
+    assert [len(b) for b in itertools.islice(BatchSize(2, max_nodes=1).batches(data, seed=4, step=0), 20)] == [1] * 20
+
+
+def test_batches_of_a_number_of_graphs_are_cut_from_the_order(store: Path) -> None:
+    data = dataset(store)
+    order = list(itertools.islice(StepSampler(len(data), seed=4), 24))
+    assert list(itertools.islice(BatchSize(4).batches(data, seed=4, step=2), 4)) == [order[k : k + 4] for k in (8, 12, 16, 20)]
+
+
+def test_a_split_that_is_not_held_takes_the_memory_of_a_window(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> None:
+    write_shard(tmp_path / "train" / "shard-00000.h5", [new_trajectory(0, num_frames=600, num_nodes=60)])
+    size = read_trajectory(tmp_path / "train" / "shard-00000.h5", "00000").pos.nbytes
+    data = dataset(tmp_path, cache_bytes=0)
+    data[0]  # what the first one loads stays
+    tracemalloc.start()
+    for sample, window in itertools.islice(StepSampler(len(data), 0), 12):
+        data[sample, window]
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < size
+    data = dataset(tmp_path)  # held: reading it takes more, which the test could not see otherwise
+    assert sum(t.held.pos.nbytes for t in data.trajectories if t.held is not None) == size

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from gpe_pl.data.dataset import WindowDataset, open_split
+from gpe_pl.data.dataset import BatchSize, WindowDataset, open_split
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
@@ -86,5 +86,5 @@ def test_measuring_trains_nothing(tiny_data: Path, monkeypatch: pytest.MonkeyPat
     builder = GraphBuilder(GraphConfig(history=2), stored[0].window(0, 1).metadata)
     module = TrainingModule(LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder), num_steps=10)
     before = {k: v.clone() for k, v in module.state_dict().items()}
-    assert step_time(module, WindowDataset(stored, builder), SETTINGS) > 0
+    assert step_time(module, WindowDataset(stored, builder), BatchSize(2), gradient_clip=1.0) > 0
     assert all(torch.equal(v, before[k]) for k, v in module.state_dict().items())

@@ -1,0 +1,58 @@
+"""Configuration of the documentation: ``make docs`` builds it with Sphinx, MyST Markdown and the theme Furo."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections import _tuplegetter  # type: ignore[attr-defined]
+from pathlib import Path
+from typing import Any
+
+project = "gpe_pl"
+author = "the gpe_pl developers"
+version = release = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["version"]
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx_copybutton"]
+exclude_patterns = ["_build", "results/*/*.md"]  # those tables are included by pages
+templates_path = ["_templates"]
+
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 3
+suppress_warnings = ["config.cache"]
+
+autosummary_generate = True
+autodoc_inherit_docstrings = False
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+python_use_unqualified_type_names = True
+python_maximum_signature_line_length = 100
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_rtype = False
+
+html_theme = "furo"
+html_title = "gpe_pl"
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
+html_show_sphinx = False
+html_show_copyright = False
+copybutton_exclude = ".linenos, .gp"
+
+
+def escape_bars(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Formulas have norms, |x|, which would be substitutions."""
+    for k, line in enumerate(lines):
+        parts = line.split("``")
+        lines[k] = "``".join(part if inside % 2 else re.sub(r"\|(?=\S)", r"\\|", part) for inside, part in enumerate(parts))
+
+
+def skip_described_fields(app: Any, what: str, name: str, obj: Any, skip: bool, options: Any) -> bool | None:
+    """Fields of a NamedTuple stand in its docstring."""
+    return True if isinstance(obj, _tuplegetter) else None
+
+
+def setup(app: Any) -> None:
+    """Called by Sphinx."""
+    app.connect("autodoc-skip-member", skip_described_fields)
+    app.connect("autodoc-process-docstring", escape_bars, priority=400)  # before napoleon makes reStructuredText of it

@@ -1,0 +1,95 @@
+"""Where the numbers of a run go: CSV files in its folder always, Weights & Biases if asked for."""
+
+from __future__ import annotations
+
+import logging
+import netrc
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import urlparse
+
+from lightning.pytorch.loggers import CSVLogger, Logger
+
+log = logging.getLogger(__name__)
+
+WANDB_URL = "https://api.wandb.ai"
+FILMS: tuple[Literal["gif", "mp4"], ...] = ("gif", "mp4")
+RUN_ID = "run_id"
+"""File in a run's folder: the identifier under which W&B knows the run."""
+
+
+@dataclass(frozen=True)
+class LoggerSettings:
+    """Where the metrics go; files in the run's folder are always written."""
+
+    kind: Literal["csv", "wandb"] = "csv"
+    project: str = "gpe_pl"
+    mode: Literal["online", "offline", "disabled"] | None = None
+
+    def loggers(self, run_dir: Path, name: str, config: Mapping[str, Any]) -> list[Logger]:
+        """CSV under ``run_dir/log``, one version per start of the run, and W&B if asked for, offline without an API key.
+
+        Args:
+            run_dir: folder of the run; it keeps the identifier by which a resumed run goes on in W&B.
+            name: of the experiment or sweep that the run belongs to, the group in W&B.
+            config: of the run, shown in W&B.
+        """
+        loggers: list[Logger] = [CSVLogger(run_dir, name="log", flush_logs_every_n_steps=1)]
+        if self.kind == "wandb":
+            from lightning.pytorch.loggers import WandbLogger
+
+            mode = self.mode or ("online" if has_key() else "offline")
+            own = (
+                run_dir.parts[run_dir.parts.index(name) + 1 :] if name in run_dir.parts else ()
+            )  # of a sweep: what is special about this run
+            options: dict[str, Any] = {"group": name, "mode": mode, "resume": "allow"}
+            loggers.append(WandbLogger("/".join(own) or name, save_dir=run_dir, project=self.project, id=run_id(run_dir), **options))
+            loggers[-1].log_hyperparams({**config, "run_dir": str(run_dir)})
+        return loggers
+
+
+def has_key() -> bool:
+    """Whether this user has an API key for W&B: in ``WANDB_API_KEY``, or in ``~/.netrc``, where ``wandb login`` puts it."""
+    if os.environ.get("WANDB_API_KEY"):
+        return True
+    host = urlparse(os.environ.get("WANDB_BASE_URL", WANDB_URL)).hostname or ""
+    try:
+        found = netrc.netrc(os.environ.get("NETRC")).authenticators(host)
+    except (OSError, netrc.NetrcParseError):
+        return False
+    return found is not None and bool(found[2])
+
+
+def run_id(run_dir: Path) -> str:
+    """An identifier that a resumed run finds again; written once."""
+    path = run_dir / RUN_ID
+    run_dir.mkdir(parents=True, exist_ok=True)
+    if not path.exists():
+        temporary = path.with_suffix(f".{os.getpid()}.part")
+        temporary.write_text(os.urandom(6).hex())
+        os.replace(temporary, path)
+    return path.read_text().strip()
+
+
+def publish(loggers: Iterable[Logger], run_dir: Path, results: Mapping[str, float]) -> None:
+    """Give W&B, where it is among the loggers, the results of the evaluation with its figures and animations, and close the run."""
+    from lightning.pytorch.loggers import WandbLogger
+
+    for logger in loggers:
+        if isinstance(logger, WandbLogger):
+            import wandb
+
+            run: Any = logger.experiment
+            pictures = {path.stem: wandb.Image(str(path)) for path in sorted(run_dir.glob("*.png"))}
+            films = {
+                f"{path.stem} ({kind})": wandb.Video(str(path), format=kind) for kind in FILMS for path in sorted(run_dir.glob(f"*.{kind}"))
+            }
+            run.log({**pictures, **films})
+            run.summary.update(dict(results))
+            folder, is_offline = Path(run.dir).parent, run.settings.mode == "offline"
+            run.finish()
+            if is_offline:
+                log.warning("W&B: kept offline%s; upload it with `wandb sync %s`", "" if has_key() else ", as there is no API key", folder)

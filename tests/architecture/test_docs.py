@@ -1,0 +1,62 @@
+"""What the guide names exists, what exists is named, and every command in it composes."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+from typing import get_args
+
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+
+from gpe_pl.config import compose
+from gpe_pl.data.importers import Format
+
+ROOT = Path(__file__).resolve().parents[2]
+GUIDE = ROOT / "docs" / "guide"
+PAGES = (ROOT / "README.md", ROOT / "docs" / "faq.md", *sorted(GUIDE.glob("*.md")))
+NO_COMPOSITION = {"--help", "--cfg", "job", "--resolve", "-m"}
+
+
+def commands() -> dict[str, tuple[str, list[str]]]:
+    """Name and overrides of every command of the package that a page shows, the first value of what it sweeps over."""
+    found: dict[str, tuple[str, list[str]]] = {}
+    for page in PAGES:
+        blocks = re.findall(r"```sh\n(.*?)```", page.read_text(), re.DOTALL)
+        lines = [*"\n".join(blocks).splitlines(), *re.findall(r"`(python -m gpe_pl\.[^`]+)`", page.read_text())]
+        for command in (part.strip() for line in lines for part in line.split("&&")):
+            if match := re.match(r"python -m gpe_pl\.(fit|simulate|evaluate|benchmark|convert)\b(.*)", command):
+                words = [word for word in shlex.split(match[2], comments=True) if word not in NO_COMPOSITION]
+                if not any("…" in word or word.isupper() for word in words):
+                    found[f"{match[1]} {' '.join(words)}"] = match[1], [re.sub(r"^([^=\[{]+=[^,\[{]+),.*", r"\1", word) for word in words]
+    return found
+
+
+@pytest.mark.parametrize(("name", "overrides"), commands().values(), ids=commands())
+def test_commands_compose(name: str, overrides: list[str]) -> None:
+    GlobalHydra.instance().clear()
+    compose(name, [word for word in overrides if not word.startswith(("hydra/", "hydra."))])
+
+
+def named(page: str, key: str) -> set[str]:
+    """First columns of the table whose head is ``key=``."""
+    rows = re.search(rf"\| `(?:benchmark )?{key}=` \|.*?\n\n", (GUIDE / page).read_text() + "\n\n", re.DOTALL)
+    assert rows, f"{page} has no table of {key}="
+    cells = [row.split("|")[1] for row in rows[0].strip().splitlines()[2:]]
+    return {name for cell in cells for name in re.findall(r"`(\w+)`", cell)}
+
+
+@pytest.mark.parametrize(("page", "key"), [("training.md", "experiment"), ("speed.md", "suite"), ("data.md", "data")])
+def test_tables_name_every_choice(page: str, key: str) -> None:
+    choices = {path.stem for path in (ROOT / "conf" / key).glob("*.yaml")} - {"imported"}
+    assert named(page, key) == choices
+
+
+def test_every_format_is_in_the_table() -> None:
+    assert named("own_data.md", "format") == {*get_args(Format)}
+
+
+def test_every_notebook_is_in_the_table() -> None:
+    listed = set(re.findall(r"\| `(\w+)\.ipynb`", (GUIDE / "notebooks.md").read_text()))
+    assert listed == {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")}
