@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install fit test test-all physics check lint types contracts format-page format bench notebooks docs links clean
+.PHONY: help install fit test test-all fuzz physics check lint types contracts format-page format bench notebooks docs links clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  %-12s %s\n", $$1, $$2}'
@@ -29,6 +29,9 @@ test: install ## fast tests on all cores (PYTEST_ARGS="-x" and the like for one)
 
 test-all: install ## all tests, analytic physics and notebooks included
 	$(BIN)/python -m pytest -m "" $(PYTEST_ARGS)
+
+fuzz: install ## random states, scenes, graphs and files, thousands of each and others every time
+	$(BIN)/python -m pytest tests/fuzz tests/unit/test_integrators.py --hypothesis-profile=fuzz $(ARGS) $(PYTEST_ARGS)
 
 physics: install ## solvers against formulas and experiments; writes docs/results/physics.md
 	$(BIN)/python -m pytest tests/physics -m "not notebook" --physics-page docs/results/physics.md $(PYTEST_ARGS) -n 0

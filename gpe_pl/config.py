@@ -7,16 +7,15 @@ type or out of range is refused by the signature of the class or function that t
 from __future__ import annotations
 
 import importlib
-import inspect
 import json
 import os
 import re
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
@@ -26,11 +25,12 @@ from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
-from pydantic import ConfigDict, ValidationError, create_model
+from pydantic import ValidationError
 
 from gpe_pl import plugins
 from gpe_pl.errors import GpeError
 from gpe_pl.launcher import RESULT, USAGE_ERROR, SweepError
+from gpe_pl.signatures import checked, parameters
 
 WITHOUT_KEY = {"comparison", "experiment", "scene", "solver"}
 """Config groups that fill other keys than one of their own."""
@@ -97,27 +97,19 @@ def construct_target(settings: Mapping[str, Any], path: str, package: str) -> An
 
 def bind(target: Callable[..., T], settings: Mapping[str, Any], path: str, *later: str) -> Callable[..., T]:
     """``construct`` in two steps: checks the settings now, calls the target when the arguments ``later`` are known."""
-    annotated = target.__init__ if inspect.isclass(target) and not is_dataclass(target) else target
-    hints = get_type_hints(annotated, include_extras=True)
-    fields: dict[str, Any] = {}
-    for name, parameter in inspect.signature(target).parameters.items():
-        if name not in later:
-            default = ... if parameter.default is inspect.Parameter.empty else parameter.default
-            fields[name] = (hints.get(name, Any), default)
     values: Any = OmegaConf.to_container(settings, resolve=True) if isinstance(settings, DictConfig) else dict(settings)
-    unknown = set(values) - set(fields)
+    valid = parameters(target, *later)
+    unknown = set(values) - set(valid)
     if unknown:
-        raise ConfigError(f"{path}.{min(unknown)}: unknown key; valid keys: {', '.join(fields)}")
-    config = ConfigDict(extra="forbid", arbitrary_types_allowed=True, protected_namespaces=(), allow_inf_nan=False)
-    checker = create_model("Settings", __config__=config, **fields)
+        raise ConfigError(f"{path}.{min(unknown)}: unknown key; valid keys: {', '.join(valid)}")
     try:
-        checked = checker(**values)
+        arguments = checked(target, values, *later)
     except ValidationError as error:
         raise ConfigError(_one_line(error, path)) from None
 
     def call(**given: Any) -> T:
         try:
-            return target(**{name: getattr(checked, name) for name in checked.model_fields_set}, **given)
+            return target(**arguments, **given)
         except ValidationError as error:  # of a class that checks how its values fit together
             raise ConfigError(_one_line(error, path)) from None
         except ValueError as error:
@@ -151,6 +143,8 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
         def run(cfg: DictConfig) -> Any:
             nonlocal is_composed
             is_composed = True
+            if RESULT in os.environ:
+                launcher.end_with_sweep()
             try:
                 if "dimension" in list(cfg) and cfg.dimension not in (2, 3):
                     raise ConfigError(f"dimension={cfg.dimension}: must be 2 or 3")
@@ -166,7 +160,11 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
                     raise
                 hint = "; data, scene and dimension do not fit together" if "'data." in str(error) else ""
                 _fail(ConfigError(f"{' '.join(str(error).split())}{hint}"))
-            except (GpeError, OmegaConfBaseException) as error:
+            except (
+                GpeError,
+                OmegaConfBaseException,
+                OSError,
+            ) as error:  # OSError: full disks, folders that cannot be written, files that are gone
                 if verbose:
                     raise
                 _fail(error)
@@ -178,6 +176,10 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             try:
                 return hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
             except SweepError as error:
+                _fail(error)
+            except OSError as error:  # before the command itself begins: Hydra makes the folder of the results
+                if verbose:
+                    raise
                 _fail(error)
             except (HydraException, OmegaConfBaseException, ValueError) as error:
                 if verbose or (is_composed and isinstance(error, ValueError)):

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -185,7 +185,7 @@ def _start(simulator: LearnedSimulator, trajectory: Trajectory, truth: Trajector
     bounds = truth.metadata.bounds
     size = max(high - low for low, high in bounds)
     speed = float(np.linalg.norm(trajectory.vel, axis=-1).max(initial=0.0))
-    guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, size), bounds=bounds, margin=size)
+    guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, size), bounds=bounds, margin=size, spacing=truth.metadata.spacing)
     return Start(simulator.initial_state(trajectory, simulator.builder.config.history), truth.num_frames - 1, truth.metadata, guard)
 
 
@@ -219,20 +219,31 @@ def write_rows(path: Path, rows: list[Row]) -> None:
     os.replace(temporary, path)
 
 
+class MetricsError(GpeError, ValueError):
+    """A ``metrics.csv`` is damaged; the message names file and line."""
+
+
 def read_rows(path: Path) -> Iterator[Row]:
-    """Rows of a ``metrics.csv``."""
+    """Rows of a ``metrics.csv``.
+
+    Raises:
+        MetricsError: a line is not one that ``write_rows`` has written.
+    """
     with open(path, newline="") as handle:
-        for r in csv.DictReader(handle):
-            yield Row(
-                r["model"],
-                r["split"],
-                int(r["trajectory"]),
-                r["parameter_group"],
-                float(r["parameter"]),
-                r["metric"],
-                r["horizon"],
-                float(r["value"]),
-            )
+        reader = csv.DictReader(handle, strict=True)
+        try:
+            for r in reader:
+                if set(r) != set(Row.__dataclass_fields__) or None in r.values():
+                    raise ValueError(f"expected the columns {', '.join(Row.__dataclass_fields__)}")
+                known: dict[str, Any] = {
+                    **r,
+                    "trajectory": int(r["trajectory"]),
+                    "parameter": float(r["parameter"]),
+                    "value": float(r["value"]),
+                }
+                yield Row(**known)
+        except (ValueError, csv.Error) as error:  # also what is not text
+            raise MetricsError(f"{path}, line {reader.line_num}: damaged ({error}); delete the file to evaluate again") from None
 
 
 def means(rows: list[Row], label: str = LEARNED) -> dict[str, float]:

@@ -32,7 +32,7 @@ import numpy as np
 from pydantic import Field, InstanceOf
 from pydantic.dataclasses import dataclass
 
-from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
+from gpe_pl.data.statistics import STATISTICS_FILE, combined, is_intact, shard_moments, with_checksum
 from gpe_pl.errors import GpeError
 from gpe_pl.rollout import Guard, SimulationError, Simulator, rollout
 from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup
@@ -351,7 +351,7 @@ def plan(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1)) ->
 
 
 def discard_damaged(root: Path | str, spec: DatasetSpec, num_workers: int = 1, part: tuple[int, int] = (0, 1)) -> None:
-    """Read all shards that are there and delete those whose content disagrees with their checksums, so that ``generate`` makes them again.
+    """Read all shards and statistics that are there and delete those whose content disagrees with their checksums, so that ``generate`` makes them again.
 
     Each of them is logged. This takes about a twentieth of the time to generate them. Arguments and errors are those of ``generate``.
     """
@@ -365,6 +365,17 @@ def discard_damaged(root: Path | str, spec: DatasetSpec, num_workers: int = 1, p
             if fault:
                 log.warning("generating a shard again: %s", fault)
                 path.unlink(missing_ok=True)
+    statistics = folder / STATISTICS_FILE
+    if statistics.is_file() and not _has_intact_statistics(statistics):
+        log.warning("computing the statistics again: %s is damaged", statistics)
+        statistics.unlink(missing_ok=True)
+
+
+def _has_intact_statistics(path: Path) -> bool:
+    try:
+        return is_intact(json.loads(path.read_text()))
+    except (ValueError, TypeError):
+        return False
 
 
 def _compile(spec: DatasetSpec) -> None:
@@ -440,7 +451,7 @@ def generate(
         if not statistics.is_file() and all(_is_complete(spec, folder, *shard) for shard in train):
             paths = [shard_path(folder, *shard) for shard in train]
             moments = {str(path): sums for path, sums in _run(pool, shard_moments, [(path,) for path in paths])}
-            _write_json(statistics, combined([moments[str(path)] for path in paths]))
+            _write_json(statistics, with_checksum(combined([moments[str(path)] for path in paths])))
     return folder
 
 
@@ -535,8 +546,11 @@ def _differences(stored: Any, wanted: Any, key: str = "") -> list[str]:
 
 def _write_json(path: Path, values: dict[str, Any]) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    temporary.write_text(json.dumps(values, indent=2, sort_keys=True) + "\n")
-    os.replace(temporary, path)
+    try:
+        temporary.write_text(json.dumps(values, indent=2, sort_keys=True) + "\n")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 # --- processes -----------------------------------------------------------------------------------------------------------------------------

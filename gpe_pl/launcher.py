@@ -15,6 +15,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -71,7 +72,8 @@ class Job:
         with open(self.folder / LOG, "ab") as log:
             command = [sys.executable, "-m", module, *self.overrides, *here]
             environment = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"} | {RESULT: str(result)}
-            code = subprocess.run(command, stdout=log, stderr=log, stdin=subprocess.DEVNULL, env=environment, cwd=self.directory).returncode
+            with subprocess.Popen(command, stdout=log, stderr=log, stdin=subprocess.PIPE, env=environment, cwd=self.directory) as process:
+                code = process.wait()
         if code:
             return self.failed((UsageError if code == USAGE_ERROR else SweepError)(self._last_words(code)))
         value = json.loads(result.read_text())
@@ -94,6 +96,20 @@ class Job:
         lines = (self.folder / LOG).read_text(errors="replace").splitlines()
         last = next((line for line in reversed(lines) if line.strip()), f"ended with code {code}")
         return f"{last.removeprefix('error: ')} (see {self.folder / LOG})"
+
+
+def end_with_sweep() -> None:
+    """End this run when the sweep that started it is gone, however it ended: the pipe that is its standard input then closes.
+
+    Otherwise the same command, given again, would meet the run in its folder.
+    """
+
+    def watch() -> None:
+        while os.read(0, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 class CommandLauncher(Launcher):

@@ -10,6 +10,7 @@ import copy
 import importlib
 import inspect
 import os
+import zipfile
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import Standardize
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, EdgeType, FeatureSpec, node_code, role
+from gpe_pl.signatures import checked
 from gpe_pl.skips import Skips
 from gpe_pl.trajectory import Metadata, State, Stress, Trajectory
 
@@ -229,6 +231,10 @@ class LearnedSimulator(nn.Module):
             bad = ~torch.isfinite(values).flatten(1).all(dim=1)
             if bad.any():
                 raise SceneError(f"{where}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
+        bad = ~(torch.isfinite(state.mass) & (state.mass > 0))
+        if bad.any():
+            node = int(bad.nonzero()[0])
+            raise SceneError(f"node {node} has a mass of {float(state.mass[node]):g} kg")
         for material, spec in MATERIALS.items():
             if material in self.builder.metadata.materials:
                 rows = torch.nonzero(state.node_type == node_code(material)).flatten()
@@ -240,15 +246,26 @@ class LearnedSimulator(nn.Module):
 
     @torch.inference_mode()
     def step(self, state: State) -> State:
-        return self._advance_all([state])[0]
+        return self._advance_all([state], [self.builder(state)])[0]
 
     @torch.inference_mode()
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        """``step`` of several scenes in one pass of the model."""
-        return [*self._advance_all(states)]
+        """``step`` of several scenes in one pass of the model; a scene that has no graph any more is answered with the reason."""
+        graphs = [self._graph(state) for state in states]
+        sound = [k for k, graph in enumerate(graphs) if not isinstance(graph, SimulationError)]
+        new: list[Any] = list(graphs)
+        if sound:
+            for k, state in zip(sound, self._advance_all([states[k] for k in sound], [new[k] for k in sound]), strict=True):
+                new[k] = state
+        return new
 
-    def _advance_all(self, states: list[State]) -> list[State]:
-        graphs = [self.builder(state) for state in states]
+    def _graph(self, state: State) -> HeteroData | SimulationError:
+        try:
+            return self.builder(state)
+        except SimulationError as error:
+            return error
+
+    def _advance_all(self, states: list[State], graphs: list[HeteroData]) -> list[State]:
         data = graphs[0] if len(graphs) == 1 else Batch.from_data_list(graphs)
         predicted = self(data)
         acc = [state.gravity.expand_as(state.pos).clone() for state in states]
@@ -274,6 +291,12 @@ class LearnedSimulator(nn.Module):
         history = torch.cat([history_of(state)[:, 1:], vel[:, None]], dim=1)
         return replace(state, pos=state.periodicity.wrapped(pos), vel=vel, velocity_history=history, time=state.time + dt, stress=None)
 
+    def _check_finite(self) -> None:
+        for name, values in self.state_dict().items():
+            is_range = name.startswith("trained_")  # unlimited before training
+            if bool(values.isnan().any()) or not (is_range or bool(values.isfinite().all())):
+                raise ValueError(f"{name} has values that are not finite")
+
     # --- checkpoints ----------------------------------------------------------------------------------------------------------------------
 
     def description(self) -> dict[str, Any]:
@@ -292,8 +315,9 @@ class LearnedSimulator(nn.Module):
         """Rebuild from ``description``; raises ``ValueError`` for anything else."""
         if values.get("format") != CHECKPOINT_FORMAT:
             raise ValueError(f"checkpoint format {values.get('format')!r}, this version reads {CHECKPOINT_FORMAT}")
-        builder = GraphBuilder(GraphConfig(**values["graph"]), Metadata(**values["metadata"]))
-        return cls(model_class(values["model"])(builder.spec, **values["settings"]), builder)
+        graph, metadata = GraphConfig(**checked(GraphConfig, values["graph"])), Metadata(**checked(Metadata, values["metadata"]))
+        builder, model = GraphBuilder(graph, metadata), model_class(values["model"])
+        return cls(model(builder.spec, **checked(model, values["settings"], "spec")), builder)
 
     def save(self, path: Path | str) -> None:
         """Write weights and description alone, which ``from_checkpoint`` reads, atomically; a training checkpoint also holds the optimiser's state."""
@@ -309,21 +333,35 @@ class LearnedSimulator(nn.Module):
         """Load a training checkpoint (averaged weights if the run averaged them), in evaluation mode. Only tensors and plain values are unpickled.
 
         Raises:
-            CheckpointError: not a readable checkpoint of gpe_pl, or one of another model.
+            CheckpointError: not a readable checkpoint of gpe_pl, damaged, or one of another model.
         """
-        if not Path(path).is_file():
-            raise CheckpointError(f"{path}: no such checkpoint")
-        try:
-            checkpoint = torch.load(path, map_location=device, weights_only=True)
-        except Exception as error:  # torch raises many types for damaged or unsafe files
-            raise CheckpointError(f"{path}: not a safe, complete checkpoint ({_reason(error)})") from None
+        checkpoint = load_checkpoint(path, device)
         try:
             simulator = cls.from_description(checkpoint["simulator"])
             weights = {k.removeprefix("simulator."): v for k, v in checkpoint["state_dict"].items() if k.startswith("simulator.")}
             simulator.load_state_dict(weights)
+            simulator._check_finite()
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model ({_reason(error)})") from None
         return simulator.to(device).eval()
+
+
+def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:
+    """What is in a checkpoint; only tensors and plain values are unpickled, and the checksums of the archive are compared first, which PyTorch does not.
+
+    Raises:
+        CheckpointError: no such file, damaged, or with anything else in it.
+    """
+    if not Path(path).is_file():
+        raise CheckpointError(f"{path}: no such checkpoint")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise zipfile.BadZipFile(f"checksum mismatch in {damaged}")
+        return torch.load(path, map_location=device, weights_only=True)
+    except Exception as error:  # zipfile and torch raise many types for damaged or unsafe files
+        raise CheckpointError(f"{path}: not a safe, complete checkpoint ({_reason(error)})") from None
 
 
 def _per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterator[tuple[int, Tensor, Tensor]]:

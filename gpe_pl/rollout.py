@@ -15,6 +15,7 @@ from array_api_compat import array_namespace
 
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import signed_distance
+from gpe_pl.schema import MATERIALS, node_code
 from gpe_pl.trajectory import Metadata, State, Stress, Termination, Trajectory
 
 
@@ -51,6 +52,13 @@ class Replay:
         return self.trajectory.state(frame)
 
 
+CROWDING_LIMIT = 32
+"""Nodes in the space that one of them has at rest beyond which a cloud has collapsed."""
+TUNNEL_DEPTH = 0.25
+"""Of a spacing: a path between two frames that goes deeper through a wall or obstacle than this has not gone around it."""
+MAX_PATH_SAMPLES = 64
+
+
 @dataclass(frozen=True)
 class Guard:
     """Limits beyond which a state is not trusted.
@@ -58,41 +66,105 @@ class Guard:
     Attributes:
         max_speed: m/s.
         bounds: ``(low, high)`` per axis of the region that nodes may not leave by more than ``margin`` [m].
+        spacing: rest spacing [m] of nodes, for recognising nodes that went through an obstacle within one frame and clouds that collapse; 0 does neither.
     """
 
     max_speed: float = math.inf
     bounds: tuple[tuple[float, float], ...] = ()
     margin: float = 0.0
+    spacing: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.max_speed <= 0 or self.margin < 0:
+        if self.max_speed <= 0 or self.margin < 0 or self.spacing < 0:
             raise ValueError(f"guard limits must be positive, got {self}")
 
-    def check(self, state: State, frame: int) -> Termination | None:
-        """The first violated limit of a state, or None."""
+    def check(self, state: State, frame: int, before: State | None = None) -> Termination | None:
+        """The first violated limit of a state, or None; ``before`` is the state one frame earlier."""
         if state.num_nodes == 0:
             return None
+        found = self._not_finite(state, frame) or self._escape(state, frame) or self._explosion(state, frame)
+        if found is None and self.spacing > 0:
+            found = self._clustering(state, frame) or (None if before is None else self._tunnelling(before, state, frame))
+        return found
+
+    def _not_finite(self, state: State, frame: int) -> Termination | None:
         xp = array_namespace(state.pos)
         finite = xp.all(xp.isfinite(state.pos) & xp.isfinite(state.vel), axis=-1)
-        if not bool(xp.all(finite)):
-            node = int(xp.argmax(xp.astype(~finite, xp.int8)))
-            return Termination("nan", frame, node, f"frame {frame}: node {node} has a position or velocity that is not finite")
+        if bool(xp.all(finite)):
+            return None
+        node = int(xp.argmax(xp.astype(~finite, xp.int8)))
+        return Termination("nan", frame, node, f"frame {frame}: node {node} has a position or velocity that is not finite")
+
+    def _escape(self, state: State, frame: int) -> Termination | None:
+        xp = array_namespace(state.pos)
         for axis, (low, high) in enumerate(self.bounds):
             outside = xp.maximum(low - state.pos[:, axis], state.pos[:, axis] - high)
             if float(xp.max(outside)) > self.margin:
                 node = int(xp.argmax(outside))
                 return Termination("escape", frame, node, f"frame {frame}: node {node} is {float(outside[node]):.3g} m outside the domain")
-        if math.isfinite(self.max_speed):
-            speed = xp.sqrt(xp.sum(state.vel * state.vel, axis=-1))
-            if float(xp.max(speed)) > self.max_speed:
-                node = int(xp.argmax(speed))
-                return Termination(
-                    "explosion",
-                    frame,
-                    node,
-                    f"frame {frame}: node {node} moves at {float(speed[node]):.3g} m/s, limit {self.max_speed:.3g} m/s",
-                )
         return None
+
+    def _explosion(self, state: State, frame: int) -> Termination | None:
+        if not math.isfinite(self.max_speed):
+            return None
+        xp = array_namespace(state.pos)
+        speed = xp.sqrt(xp.sum(state.vel * state.vel, axis=-1))
+        if not float(xp.max(speed)) > self.max_speed:
+            return None
+        node = int(xp.argmax(speed))
+        text = f"frame {frame}: node {node} moves at {float(speed[node]):.3g} m/s, limit {self.max_speed:.3g} m/s"
+        return Termination("explosion", frame, node, text)
+
+    def _clustering(self, state: State, frame: int) -> Termination | None:
+        counts = crowding(_numpy(state.pos), self.spacing)
+        if counts.max() <= CROWDING_LIMIT:
+            return None
+        node = int(np.argmax(counts))
+        text = f"frame {frame}: node {node} shares a box as wide as the spacing with {counts.max() - 1} others, limit {CROWDING_LIMIT}"
+        return Termination("clustering", frame, node, text)
+
+    def _tunnelling(self, before: State, state: State, frame: int) -> Termination | None:
+        """Nodes that were and are outside of all shapes, but not between the two frames."""
+        start = _numpy(before.pos)
+        end = start + state.periodicity.shortest(_numpy(state.pos) - start)
+        shapes, length = state.boundary.shapes, np.linalg.norm(end - start, axis=-1)
+        fast = np.flatnonzero(length > 2 * TUNNEL_DEPTH * self.spacing)
+        if not shapes or not len(fast):
+            return None
+        count = min(MAX_PATH_SAMPLES, math.ceil(length.max() / (0.5 * TUNNEL_DEPTH * self.spacing)))
+        shares = np.arange(1, count)[:, None, None] / count
+        distance = signed_distance(shapes, start[fast] + shares * (end - start)[fast])
+        ends = np.minimum(signed_distance(shapes, start[fast]), signed_distance(shapes, end[fast]))
+        depth = np.where(ends > -TUNNEL_DEPTH * self.spacing, -distance.min(axis=0), 0.0)
+        if not depth.max() > TUNNEL_DEPTH * self.spacing:
+            return None
+        node = int(fast[np.argmax(depth)])
+        text = f"frame {frame}: node {node} went {depth.max():.3g} m deep through a wall or obstacle within one frame"
+        return Termination("tunnelling", frame, node, text)
+
+
+def crowding(pos: np.ndarray, width: float) -> np.ndarray:
+    """For every node [node], how many there are in its box of a grid of this width [m]; two boxes very rarely count as one."""
+    primes = np.array([73_856_093, 19_349_663, 83_492_791])[: pos.shape[1]]  # spatial hash [Teschner et al. 2003]; products may overflow
+    _, box, counts = np.unique(np.floor(pos / width).astype(np.int64) @ primes, return_inverse=True, return_counts=True)
+    return counts[box]
+
+
+def impossible_material(state: State, metadata: Metadata) -> Termination | None:
+    """The first node whose material parameter is not finite or beyond what ``schema.MATERIALS`` calls possible, or None."""
+    params, types = _numpy(state.material_params), _numpy(state.node_type)
+    for material in metadata.materials:
+        spec = MATERIALS[material]
+        column = metadata.param_names.index(spec.name)
+        rows = np.flatnonzero(types == node_code(material))
+        wrong = rows[~((params[rows, column] >= spec.low * (1 - 1e-6)) & (params[rows, column] <= spec.high * (1 + 1e-6)))]
+        if len(wrong):
+            node = int(wrong[0])
+            limits = f"possible are {spec.low:g} to {spec.high:g}"
+            return Termination(
+                "material", 0, node, f"node {node}: {spec.name} of {material} is {params[node, column]:g} {spec.unit}; {limits}"
+            )
+    return None
 
 
 def step_all(simulator: Simulator, states: list[State]) -> list[State | SimulationError]:
@@ -130,7 +202,13 @@ class Start:
 
 def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int, int, State | Termination]]:
     """Step all scenes side by side and yield (scene, frame, new state), or a ``Termination`` as a scene's last item. Holds one state per scene."""
-    live = {scene: start.state for scene, start in enumerate(starts)}
+    live = {}
+    for scene, start in enumerate(starts):
+        impossible = None if start.guard is None else impossible_material(start.state, start.metadata)
+        if impossible is None:
+            live[scene] = start.state
+        else:
+            yield scene, 0, impossible
     frame = 0
     while True:
         frame += 1
@@ -138,7 +216,7 @@ def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int,
         if not live:
             return
         for scene, item in zip(list(live), step_all(simulator, list(live.values())), strict=True):
-            stop = _termination(item, frame, starts[scene].guard)
+            stop = _termination(item, frame, starts[scene].guard, live[scene])
             if stop is None:
                 live[scene] = cast(State, item)
             else:
@@ -146,10 +224,10 @@ def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int,
             yield scene, frame, stop or cast(State, item)
 
 
-def _termination(item: State | SimulationError, frame: int, guard: Guard | None) -> Termination | None:
+def _termination(item: State | SimulationError, frame: int, guard: Guard | None, before: State) -> Termination | None:
     if isinstance(item, SimulationError):
         return Termination(item.reason, frame, item.node, f"frame {frame}: {item}")
-    return None if guard is None else guard.check(item, frame)
+    return None if guard is None else guard.check(item, frame, before)
 
 
 def rollouts(simulator: Simulator, starts: Sequence[Start], on_frame: Callable[[int, int, State], Any] | None = None) -> list[Trajectory]:

@@ -13,6 +13,8 @@ from gpe_pl.geometry import domain_walls
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.schema import MESH_MATERIALS, STICKY, node_code, param_names
+from gpe_pl.stability.subject import permuted as permuted
+from gpe_pl.stability.subject import to_dtype as to_dtype
 from gpe_pl.trajectory import Boundary, Metadata, State
 
 SPACING = 0.05
@@ -130,33 +132,6 @@ def builder(materials: tuple[str, ...] = ("sand",), dim: int = 2, **config: obje
 def graph(materials: tuple[str, ...] = ("sand",), dtype: torch.dtype = torch.float64, **settings: object) -> HeteroData:
     """A graph of a random state with features of the given precision."""
     return to_dtype(builder(materials)(state(materials=materials, **settings).to_torch()), dtype)  # type: ignore[arg-type]
-
-
-def to_dtype(data: HeteroData, dtype: torch.dtype) -> HeteroData:
-    """The same graph with all floating-point features in another precision."""
-    out = data.clone()
-    for store in out.stores:
-        for key, value in store.items():
-            if isinstance(value, torch.Tensor) and value.is_floating_point():
-                store[key] = value.to(dtype)
-    return out
-
-
-def permuted(s: State, order: np.ndarray) -> State:
-    """The same state with its nodes in another order, or some of them (then without its mesh)."""
-    assert s.velocity_history is not None
-    rest_pos, cells = (s.rest_pos, s.cells) if len(order) == s.num_nodes else (None, None)
-    return replace(
-        s,
-        rest_pos=None if rest_pos is None else rest_pos[order],
-        cells=None if cells is None else np.argsort(order)[cells],
-        pos=s.pos[order],
-        vel=s.vel[order],
-        node_type=s.node_type[order],
-        mass=s.mass[order],
-        material_params=s.material_params[order],
-        velocity_history=s.velocity_history[order],
-    )
 
 
 def assert_equal_graphs(a: HeteroData, b: HeteroData) -> None:

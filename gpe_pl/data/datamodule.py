@@ -15,6 +15,7 @@ from torch_geometric.loader import DataLoader
 from gpe_pl import ranks
 from gpe_pl.data.dataset import BatchSampler, BatchSize, WindowDataset, open_split
 from gpe_pl.data.noise import Noise
+from gpe_pl.data.statistics import is_intact
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.trajectory import StoreError, Trajectory, iter_trajectories
@@ -25,6 +26,8 @@ def data_statistics(root: Path | str) -> dict[str, float]:
     path = Path(root) / "statistics.json"
     try:
         statistics = json.loads(path.read_text())
+        if not is_intact(statistics):
+            raise ValueError("checksum mismatch")
         return {"acceleration_std": float(statistics["acceleration_std"])}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StoreError(f"{path}: cannot be read ({error}); run `python -m gpe_pl.simulate` again") from None

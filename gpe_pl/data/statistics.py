@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -68,3 +70,17 @@ def combined(moments: list[dict[str, Any]]) -> dict[str, Any]:
         },
         **{f"num_{key}": sum(m[key] for m in moments) for key in ("trajectories", "frames", "nodes")},
     }
+
+
+def with_checksum(statistics: dict[str, Any]) -> dict[str, Any]:
+    """Statistics as they are stored: with a SHA-256 digest of their values."""
+    return {**statistics, "sha256": _checksum(statistics)}
+
+
+def is_intact(stored: dict[str, Any]) -> bool:
+    """Whether stored statistics agree with their digest; those of earlier versions have none."""
+    return "sha256" not in stored or stored["sha256"] == _checksum({k: v for k, v in stored.items() if k != "sha256"})
+
+
+def _checksum(statistics: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(statistics, sort_keys=True).encode()).hexdigest()

@@ -30,7 +30,8 @@ from gpe_pl.graphs.features import (
 )
 from gpe_pl.graphs.islands import find_islands, unwrapped
 from gpe_pl.graphs.multiscale import MultiscaleGraph, multiscale_graph
-from gpe_pl.graphs.neighbors import radius_between, radius_pairs
+from gpe_pl.graphs.neighbors import check_crowding, radius_between, radius_pairs
+from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of, node_code
 from gpe_pl.skips import Skips
 from gpe_pl.trajectory import Boundary, Metadata, State
@@ -83,13 +84,21 @@ class GraphBuilder:
         Raises:
             GraphError: the state holds a node type that the data set does not have, lacks velocity history, repeats along other axes, or has cells that
                 do not fit its nodes.
+            SimulationError: a position or velocity is not finite, or so many nodes lie within each other's radius that the material has collapsed.
         """
+        if state.pos.dtype != torch.float64:
+            raise GraphError(f"positions are {state.pos.dtype}; convert the state with State.to_torch, which makes them float64")
         if state.periodicity.axes != self.metadata.periodicity.axes:
             own, other = (", ".join("xyz"[a] for a in p.axes) or "no axis" for p in (self.metadata.periodicity, state.periodicity))
             raise GraphError(f"state is periodic along {other}, the data set {self.metadata.dataset!r} along {own}")
         history = history_of(state)
         if history.shape[1] != self.config.history:
             raise GraphError(f"state has a history of {history.shape[1]} velocities, the graph needs {self.config.history}")
+        bad = ~torch.isfinite(torch.cat([state.pos, history.flatten(1)], dim=1)).all(dim=1)
+        if bad.any():
+            node = int(bad.nonzero()[0])
+            raise SimulationError(f"node {node} has a position or velocity that is not finite", reason="nan", node=node)
+        check_crowding(_array(state.pos), self.scales.radius, self.scales.spacing, state.periodicity)
         rows = {m: self._rows(state, m) for m in self.spec.materials}
         if sum(len(r) for r in rows.values()) != state.num_nodes:
             present = {NODE_TYPES[code] for code in state.node_type.unique().tolist()}
@@ -103,7 +112,7 @@ class GraphBuilder:
             store.x = material_features(history[r], state.gravity, self.scales)
             column = self.metadata.param_names.index(MATERIALS[material].name)
             store.material_params = state.material_params[r, column : column + 1].float()
-            store.mass = state.mass[r].float()
+            store.mass = self._rounded(state.mass[r])
             store.node_id = r
         self._add_radius_edges(data, state, rows, mesh)
         if mesh is not None:
@@ -199,12 +208,16 @@ class GraphBuilder:
         islands = find_islands(state.num_nodes, edges, touches.cpu().numpy())
         label = torch.from_numpy(islands.label).to(state.pos.device)
         pos = self._kept_together(state, edges) if state.periodicity else state.pos
-        arms = _from_centre(pos, label, len(islands.is_free)).float()  # the network's precision has no room for where the island is
+        arms = self._rounded(_from_centre(pos, label, len(islands.is_free)))  # single precision has no room for where the island is
         for material, r in rows.items():
             data[material].pos = arms[r]
             data[material].island = label[r]
         data.island_is_free = torch.from_numpy(islands.is_free).to(state.pos.device)
         data.num_islands = torch.tensor([len(islands.is_free)], device=state.pos.device)
+
+    def _rounded(self, values: Tensor) -> Tensor:
+        """Values in the network's precision."""
+        return values.float()
 
     @staticmethod
     def _kept_together(state: State, edges: np.ndarray) -> Tensor:

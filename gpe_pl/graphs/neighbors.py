@@ -9,7 +9,40 @@ from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 
 from gpe_pl.periodicity import NOWHERE, Periodicity
+from gpe_pl.rollout import CROWDING_LIMIT, SimulationError, crowding
 from gpe_pl.trajectory import search_tree
+
+
+def pairs_at_rest(num_nodes: int, radius: float, spacing: float, dim: int) -> float:
+    """Pairs of a cloud with one node per spacing^dim: N/2 V_dim (R / spacing)^dim."""
+    ball = {1: 2.0, 2: np.pi, 3: 4 / 3 * np.pi}[dim]
+    return num_nodes / 2 * ball * (radius / spacing) ** dim
+
+
+def check_crowding(pos: Float64[np.ndarray, "node dim"], radius: float, spacing: float, periodicity: Periodicity = NOWHERE) -> None:
+    """Refuse a cloud that has collapsed: its pairs are counted before they are listed, which takes time but no memory,
+    and that only where a bound from the number of nodes in boxes does not say that there are few.
+
+    Raises:
+        SimulationError: ``CROWDING_LIMIT`` times as many pairs within the radius [m] as at rest; names the most crowded node. Reason ``clustering``.
+    """
+    num_nodes, dim = pos.shape
+    if num_nodes < 2:
+        return
+    limit = CROWDING_LIMIT * pairs_at_rest(num_nodes, radius, spacing, dim)
+    boxes = 4**dim if periodicity else 3**dim  # that the neighbours of a node lie in; at a seam some boxes are narrower
+    if boxes / 2 * float(crowding(periodicity.wrapped(pos), radius).sum()) <= limit:  # no fewer than there are
+        return
+    tree = search_tree(pos, periodicity)
+    num_pairs = (int(tree.count_neighbors(tree, radius)) - num_nodes) // 2
+    if num_pairs > limit:
+        node = int(np.argmax(tree.query_ball_point(tree.data, radius, return_length=True)))
+        raise SimulationError(
+            f"{num_pairs} pairs of nodes within the radius of {radius:.3g} m, most at node {node}; nodes {spacing:.3g} m apart would have "
+            f"{limit / CROWDING_LIMIT:.0f}: the material has collapsed onto itself",
+            reason="clustering",
+            node=node,
+        )
 
 
 def radius_pairs(pos: Float64[np.ndarray, "node dim"], radius: float, periodicity: Periodicity = NOWHERE) -> Int64[np.ndarray, "2 edge"]:

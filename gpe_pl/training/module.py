@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import shutil
+from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Annotated, Any, Literal
@@ -23,6 +24,9 @@ from gpe_pl.metrics import OneStepNMSE
 
 Schedule = Literal["cosine", "exponential"]
 Compile = Literal["auto", "on", "off"]
+
+MAX_SKIPPED, SKIP_WINDOW = 10, 100
+"""A run goes on without batches whose loss or gradient is not finite, unless there are so many of them within so many steps."""
 
 COMPILE_PAYS_AFTER = 10_000
 """Steps from which ``compile: auto`` repays the time that compilation takes."""
@@ -77,6 +81,7 @@ class TrainingModule(L.LightningModule):
         self.val_nmse = OneStepNMSE()
         self._compilation = ExitStack()
         self._windows: list[tuple[int, int]] = []  # (trajectory, frame) of the current batch
+        self._skipped: deque[int] = deque(maxlen=MAX_SKIPPED)  # the last steps without an update
 
     def configure_optimizers(self) -> Any:
         optimizer = torch.optim.Adam(self.simulator.parameters(), lr=self.learning_rate, fused=True)
@@ -154,28 +159,42 @@ class TrainingModule(L.LightningModule):
         here = torch.tensor([sum(e.numel() for e in kind) for kind in errors], device=self.device)
         return [n / max(1, total) for n, total in zip(here.tolist(), ranks.summed(here).tolist(), strict=True)]
 
-    def training_step(self, batch: HeteroData, batch_idx: int) -> Tensor:
+    def training_step(self, batch: HeteroData, batch_idx: int) -> Tensor | None:
+        """The loss, or None where it is not finite: then this step changes nothing."""
         loss = self.loss(batch)
         self._windows = list(zip(batch.trajectory.tolist(), batch.frame.tolist(), strict=True))
         total = ranks.summed(loss.detach())
-        self._stop_unless_finite("loss", total)
+        if not torch.isfinite(total):
+            self._skip("loss", total)
+            return None if ranks.num_ranks() == 1 else loss  # ranks wait for each other's gradients, which are dropped afterwards
         self.log("train/loss", total, batch_size=1)
         return loss
 
     def configure_gradient_clipping(
         self, optimizer: torch.optim.Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
-        """Clip by norm, and stop before a gradient that is not finite spoils the weights."""
+        """Clip by norm; a gradient that is not finite is dropped before it spoils the weights."""
         norm = torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), math.inf if gradient_clip_val is None else gradient_clip_val)
-        self._stop_unless_finite("gradient norm", norm)
+        if not torch.isfinite(norm):
+            if not self._skipped or self._skipped[-1] != self.global_step:  # else its loss was not finite either
+                self._skip("gradient norm", norm)
+            optimizer.zero_grad(set_to_none=True)  # without gradients Adam leaves weights and moments as they are
 
-    def _stop_unless_finite(self, name: str, value: Tensor) -> None:
-        if not torch.isfinite(value):  # on all ranks, as it is a sum over them
-            windows = [window for part in ranks.gathered(self._windows) for window in part]
+    def _skip(self, name: str, value: Tensor) -> None:
+        """Go on without a batch, unless too many of the last ones were like it; on all ranks, as the value is a sum over them.
+
+        Raises:
+            TrainingError: names step, trajectories and frames.
+        """
+        windows = [window for part in ranks.gathered(self._windows) for window in part]
+        what = f"step {self.global_step}: the {name} is {value.item()} for (trajectory, frame) = {', '.join(map(str, windows))}"
+        if len(self._skipped) == MAX_SKIPPED and self.global_step - self._skipped[0] < SKIP_WINDOW:
             raise TrainingError(
-                f"step {self.global_step}: the {name} is {value.item()} for (trajectory, frame) = {', '.join(map(str, windows))}; "
-                "the last good checkpoint is kept. Lower training.learning_rate, or validate the data with `python -m gpe_pl.data.validate`"
+                f"{what}, as in {MAX_SKIPPED} other batches since step {self._skipped[0]}; the last good checkpoint is kept. "
+                "Lower training.learning_rate, or validate the data with `python -m gpe_pl.data.validate`"
             )
+        self._skipped.append(self.global_step)
+        log.warning("%s; training goes on without this batch", what)
 
     def validation_step(self, batch: HeteroData, batch_idx: int) -> None:
         predicted = self.simulator(batch).acceleration

@@ -22,6 +22,7 @@ from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import NoiseKind
 from gpe_pl.errors import GpeError
 from gpe_pl.training.callbacks import RolloutValidation, WarmAverage
+from gpe_pl.training.checkpoints import AtomicCheckpoints
 from gpe_pl.training.module import Compile, Schedule, TrainingModule
 from gpe_pl.training.parallel import SummedGradients
 
@@ -190,6 +191,7 @@ def train(
             log_every_n_steps=min(50, training.num_steps),
             enable_progress_bar=trainer_settings.progress,
             enable_model_summary=False,
+            plugins=[AtomicCheckpoints()],
         )
     except MisconfigurationException as error:
         raise RunError(f"trainer.accelerator={trainer_settings.accelerator}, trainer.devices={trainer_settings.devices}: {error}") from None

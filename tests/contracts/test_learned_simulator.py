@@ -16,11 +16,11 @@ from torch import Tensor
 from gpe_pl import integrators
 from gpe_pl.containment import Contained
 from gpe_pl.data.dataset import WindowDataset, open_split
-from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.builder import GraphBuilder, GraphError
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import CHECKPOINT_FORMAT, CheckpointError, LearnedSimulator, SceneError, UnknownModelError, model_class
 from gpe_pl.models.gpe import GPE
-from gpe_pl.rollout import Guard, rollout
+from gpe_pl.rollout import Guard, SimulationError, rollout
 from gpe_pl.trajectory import State, Trajectory, iter_trajectories, write_shard
 from tests import scenes
 
@@ -344,9 +344,9 @@ def test_a_file_of_torch_that_is_no_checkpoint_says_so(tmp_path: Path, content: 
     ("key", "value", "message"),
     [
         ("settings", {"hidden_channels": 16}, "size mismatch"),
-        ("settings", {"width": 8}, "unexpected keyword argument 'width'"),
+        ("settings", {"width": 8}, "width Extra inputs are not permitted"),
         ("graph", {"history": 3}, "size mismatch"),
-        ("metadata", {"dataset": "x"}, "missing"),
+        ("metadata", {"dataset": "x"}, "materials Field required"),
         ("model", "os.system", "not one of gpe_pl.models"),
         ("model", "gpe_pl.models.gpe.torch", "is not a model"),
         ("model", "gpe_pl.models.gpe.Nothing", "does not exist"),
@@ -366,6 +366,45 @@ def test_only_models_of_the_package_are_looked_up() -> None:
     for name in ("torch.nn.Linear", "gpe_pl.nn.blocks.MLP", "GPE", ""):
         with pytest.raises(UnknownModelError):
             model_class(name)
+
+
+@pytest.mark.parametrize(("case", "reason"), [("collapsed", "clustering"), ("not finite", "nan")])
+def test_a_scene_without_a_graph_is_named_and_the_others_go_on(case: str, reason: str) -> None:
+    build = scenes.builder()
+    simulator = learned(build)
+    sound, bad = scenes.state(20).to_torch(), scenes.state(800).to_torch()
+    pos = bad.pos.clone()
+    if case == "collapsed":
+        pos[:] = 0.3 + 1e-4 * pos
+    else:
+        pos[17] = torch.nan
+    bad = replace(bad, pos=pos)
+    first, stop, last = simulator.step_all([sound, bad, sound])
+    assert isinstance(stop, SimulationError)
+    assert stop.reason == reason
+    assert f"node {stop.node}" in str(stop)
+    alone = simulator.step(sound)
+    for new in (first, last):
+        assert isinstance(new, State)
+        torch.testing.assert_close(new.pos, alone.pos)
+    with pytest.raises(SimulationError):
+        simulator.step(bad)
+
+
+def test_pairs_are_counted_before_they_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What would take gigabytes is refused; what is dense but possible is not."""
+    build = scenes.builder()
+    dense = scenes.state(400, low=0.3, high=0.4).to_torch()  # 14 times the density at rest
+    build(dense)
+    monkeypatch.setattr("gpe_pl.graphs.builder.radius_pairs", lambda *_: pytest.fail("listed"))
+    with pytest.raises(SimulationError, match="31996000 pairs of nodes within the radius of 0.12 m, most at node 0; .* would have 72382"):
+        build(scenes.state(8000, low=0.3, high=0.31).to_torch())
+
+
+def test_positions_that_are_not_float64_are_refused() -> None:
+    state = scenes.state(5).to_torch()
+    with pytest.raises(GraphError, match="positions are torch.int64; convert the state with State.to_torch"):
+        scenes.builder()(replace(state, pos=(100 * state.pos).long()))
 
 
 def test_gradients_reach_the_model_through_the_standardized_graph(simulator: LearnedSimulator) -> None:

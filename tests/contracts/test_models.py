@@ -18,7 +18,9 @@ from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
-from gpe_pl.schema import FeatureSpec, is_symmetric
+from gpe_pl.schema import FeatureSpec
+from gpe_pl.stability.invariances import turned
+from gpe_pl.stability.subject import in_order
 from tests import scenes
 
 Factory = Callable[[FeatureSpec], Any]
@@ -60,10 +62,7 @@ def make(request: pytest.FixtureRequest) -> Factory:
 
 def predict(model: Any, data: HeteroData, num_nodes: int) -> torch.Tensor:
     """Predictions in the order of the state's nodes."""
-    out = torch.full((num_nodes, model.spec.dim), float("nan"), dtype=torch.float64)
-    for material, value in model(data).acceleration.items():
-        out[data[material].node_id] = value
-    return out
+    return in_order(model(data), data, num_nodes, model.spec.dim)
 
 
 def assert_close(a: torch.Tensor, b: torch.Tensor, tolerance: float = 1e-12) -> None:
@@ -86,24 +85,6 @@ def test_edge_orientation_and_order_do_not_matter(make: Factory) -> None:
     data = scenes.to_dtype(build(scenes.state(materials=TWO).to_torch()), torch.float64)
     model = make(build.spec)
     assert_close(predict(model, turned(data, build.spec), 40), predict(model, data, 40))
-
-
-def turned(data: HeteroData, spec: FeatureSpec) -> HeteroData:
-    """The same graph with edges in another order, and half of those stored the other way round that can be."""
-    out = data.clone()
-    for relation in spec.relations:
-        store = out[relation]
-        count = store.edge_index.shape[1]
-        if is_symmetric(relation):
-            turn = torch.rand(count, generator=torch.Generator().manual_seed(0)) < 0.5
-            store.edge_index = torch.where(turn, store.edge_index.flip(0), store.edge_index)
-            for key in {"odd", "offset"} & set(store.keys()):
-                store[key] = torch.where(turn[:, None], -store[key], store[key])
-        order = torch.randperm(count, generator=torch.Generator().manual_seed(1))
-        store.edge_index = store.edge_index[:, order]
-        for key in {"odd", "even", "offset"} & set(store.keys()):
-            store[key] = store[key][order]
-    return out
 
 
 def test_translation_changes_nothing(make: Factory) -> None:

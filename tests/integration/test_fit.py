@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 import shutil
 import signal
 from collections.abc import Iterator
@@ -40,6 +41,7 @@ def losses(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[float]]:
 
     def training_step(self: TrainingModule, batch: Any, batch_idx: int) -> torch.Tensor:
         loss = plain(self, batch, batch_idx)
+        assert loss is not None
         seen.setdefault(self.global_step, []).append(loss.item())
         return loss
 
@@ -203,7 +205,7 @@ def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(
     cfg = tiny(tiny_data, tmp_path, *STEPS, "training.num_steps=60")
     plain = TrainingModule.training_step
 
-    def training_step(self: TrainingModule, batch: Any, batch_idx: int) -> torch.Tensor:
+    def training_step(self: TrainingModule, batch: Any, batch_idx: int) -> torch.Tensor | None:
         if self.global_step == 4:  # from now on
             data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
             stored = data.train_set.trajectories[1]
@@ -213,15 +215,39 @@ def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(
 
     monkeypatch.setattr(TrainingModule, "training_step", training_step)
     with pytest.raises(
-        TrainingError, match=r"step \d+: the loss is nan for \(trajectory, frame\) = .*\(1, \d+\).*last good checkpoint is kept"
+        TrainingError,
+        match=r"step \d+: the loss is nan for \(trajectory, frame\) = .*\(1, \d+\), as in 10 other batches since .*last good checkpoint is kept",
     ) as caught:
         fit(cfg)
     step = int(str(caught.value).split(":")[0].removeprefix("step "))
-    assert 4 < step < 20
+    assert 14 <= step < 50
     kept = checkpoint(cfg)
     assert kept["global_step"] == step // 2 * 2
     assert all(torch.isfinite(w).all() for k in ("state_dict", "current_model_state") for w in kept[k].values())
     assert not (tmp_path / "fit" / "metrics.csv").exists()
+
+
+def test_one_corrupted_batch_does_not_end_a_run(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It is named and changes nothing: weights and moments are those of the step before."""
+    plain = TrainingModule.training_step
+    weights: dict[int, list[torch.Tensor]] = {}
+
+    def training_step(self: TrainingModule, batch: Any, batch_idx: int) -> Any:
+        weights[self.global_step] = [p.detach().clone() for p in self.parameters()]
+        if self.global_step == 4:
+            for material in self.simulator.builder.spec.materials:
+                batch[material].target[0] = torch.nan
+        return plain(self, batch, batch_idx)
+
+    monkeypatch.setattr(TrainingModule, "training_step", training_step)
+    fit(tiny(tiny_data, tmp_path, *STEPS))
+    (warning,) = [r.message for r in caplog.records if "without this batch" in r.message]
+    assert re.match(r"step 4: the loss is nan for \(trajectory, frame\) = \(\d+, \d+\), ", warning)
+    assert all(torch.equal(a, b) for a, b in zip(weights[4], weights[5], strict=True))
+    assert not all(torch.equal(a, b) for a, b in zip(weights[3], weights[4], strict=True))
+    assert checkpoint(tiny(tiny_data, tmp_path, *STEPS))["global_step"] == 6
 
 
 def test_a_position_that_is_not_finite_stops_the_run_and_is_named(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -239,10 +239,10 @@ def call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, task: Callable[[DictCo
 @pytest.mark.parametrize(
     ("task", "arguments", "line"),
     [
-        (lambda cfg: None, ["suit=speed"], "error: suit: unknown key 'suit'; valid keys: paths, suite, trainer"),
+        (lambda cfg: None, ["suit=speed"], "error: suit: unknown key 'suit'; valid keys: paths, size, suite, trainer"),
         (lambda cfg: None, ["suite=3"], "error: Config group override must be a string or a list. Got int"),
         (lambda cfg: None, ["paths.data=null"], "error: paths.data=None: input should be a valid string"),
-        (lambda cfg: None, ["+foo=1"], "error: foo: unknown or missing key; valid keys: paths, suite, trainer"),
+        (lambda cfg: None, ["+foo=1"], "error: foo: unknown or missing key; valid keys: paths, size, suite, trainer"),
         (benchmark, ["suite.name=nope"], "error: suite.name='nope': must be one of "),
         (lambda cfg: None, ["suite.name=${nothing}"], "error: Interpolation key 'nothing' not found"),
         (lambda cfg: construct(Inner, {"size": cfg.suite.num_nodes}, "suite"), ["suite.num_nodes=0"], "error: suite.size=0: input should"),

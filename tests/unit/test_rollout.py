@@ -119,7 +119,55 @@ def test_guard_of_no_nodes(new_trajectory: New) -> None:
     assert Guard(max_speed=1.0, bounds=empty.metadata.bounds).check(empty.state(0), 1) is None
 
 
-@pytest.mark.parametrize("limits", [{"max_speed": 0.0}, {"max_speed": -1.0}, {"margin": -0.1}])
+def slid(node: int, to: tuple[float, float]) -> Callable[[State], State]:
+    def spoil(state: State) -> State:
+        pos = state.pos.copy()
+        pos[node] = to
+        return replace(state, pos=pos)
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("reason", "spoil", "node"),
+    [
+        ("tunnelling", slid(5, (0.62, 0.05)), 5),  # the obstacle reaches from 0.4 to 0.6 and up to 0.1
+        ("clustering", lambda state: replace(state, pos=0.35 + 1e-3 * state.pos), 0),
+    ],
+)
+def test_guard_sees_what_no_single_limit_shows(new_trajectory: New, reason: str, spoil: Callable[[State], State], node: int) -> None:
+    many = new_trajectory(num_nodes=40, gravity=(0.0, 0.0))
+    start = replace(many.state(0), vel=np.zeros((40, 2)))
+    start.pos[5] = 0.38, 0.05
+    guard = Guard(bounds=many.metadata.bounds, spacing=many.metadata.spacing)
+    assert rollout(FreeFall(0.01), start, 8, many.metadata, guard).termination is None
+    result = rollout(FreeFall(0.01, 4, spoil), start, 8, many.metadata, guard)
+    assert result.termination is not None
+    assert (result.termination.reason, result.termination.frame, result.termination.node) == (reason, 4, node)
+    assert result.num_frames == 4
+
+
+def test_a_path_around_an_obstacle_is_no_tunnel(new_trajectory: New) -> None:
+    one = new_trajectory(num_nodes=1, gravity=(0.0, 0.0))
+    before = replace(one.state(0), pos=np.array([[0.38, 0.2]]))
+    guard = Guard(spacing=one.metadata.spacing)
+    assert guard.check(replace(before, pos=np.array([[0.62, 0.2]])), 1, before) is None
+    assert guard.check(replace(before, pos=np.array([[0.42, 0.08]])), 1, before) is None  # inside: containment's business
+
+
+@pytest.mark.parametrize("value", [75.0, -1.0, np.nan, np.inf])
+def test_an_impossible_material_ends_the_rollout_before_it_begins(trajectory: Trajectory, value: float) -> None:
+    start = replace(trajectory.state(0), material_params=trajectory.material_params.copy())
+    start.material_params[7] = value
+    result = rollout(FreeFall(0.01), start, 8, trajectory.metadata, Guard())
+    assert result.termination is not None
+    assert (result.termination.reason, result.termination.frame, result.termination.node) == ("material", 0, 7)
+    assert result.termination.message.startswith("node 7: friction_angle of sand is ")
+    assert result.num_frames == 1
+    assert rollout(FreeFall(0.01), start, 8, trajectory.metadata).num_frames == 9  # nobody looks
+
+
+@pytest.mark.parametrize("limits", [{"max_speed": 0.0}, {"max_speed": -1.0}, {"margin": -0.1}, {"spacing": -0.1}])
 def test_guard_refuses_impossible_limits(limits: dict[str, float]) -> None:
     with pytest.raises(ValueError, match="must be positive"):
         Guard(**limits)  # type: ignore[arg-type]

@@ -20,7 +20,7 @@ from gpe_pl import integrators
 from gpe_pl.arrays import ArrayError
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
 from gpe_pl.data.importers.source import NAME, Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
-from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
+from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments, with_checksum
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.periodicity import PeriodicityError
 from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup, node_code, param_names
@@ -338,7 +338,7 @@ class _Conversion:
         split = "train" if "train" in self.survey.good else next(iter(self.survey.good))
         shards = sorted((folder / split).glob("shard-*.h5"))
         statistics = combined([shard_moments(path)[1] for path in shards])
-        (folder / STATISTICS_FILE).write_text(json.dumps(statistics, indent=2, sort_keys=True) + "\n")
+        (folder / STATISTICS_FILE).write_text(json.dumps(with_checksum(statistics), indent=2, sort_keys=True) + "\n")
         report = self.report
         report.velocity_std, report.acceleration_std = statistics["velocity_std"], statistics["acceleration_std"]
         if report.acceleration_std == 0:

@@ -25,7 +25,7 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import node_code, param_names
-from gpe_pl.training.module import TrainingError, TrainingModule
+from gpe_pl.training.module import MAX_SKIPPED, TrainingError, TrainingModule
 from gpe_pl.training.parallel import sum_gradients
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, train
 from gpe_pl.trajectory import StoreError, Trajectory, write_shard
@@ -206,14 +206,16 @@ def test_two_processes_resume_where_they_stopped(mixed: Path, tmp_path: Path) ->
             assert weight.tobytes() == after["weights"][name].tobytes(), name
 
 
-def test_numbers_that_go_bad_on_one_rank_stop_all(mixed: Path, tmp_path: Path) -> None:
+def test_numbers_that_go_bad_on_one_rank_are_skipped_on_all_and_stop_all(mixed: Path, tmp_path: Path) -> None:
     def on_rank(rank: int) -> str:
         m = module()
         m._windows = [(3 + rank, 17)]
         m._trainer = SimpleNamespace(global_step=4)  # type: ignore[assignment]
         loss = torch.tensor(float("nan") if rank else 1.0)
+        for _ in range(MAX_SKIPPED):
+            m._skip("loss", ranks.summed(loss))
         with pytest.raises(TrainingError) as caught:
-            m._stop_unless_finite("loss", ranks.summed(loss))
+            m._skip("loss", ranks.summed(loss))
         return str(caught.value)
 
     messages = on_ranks(tmp_path, on_rank)

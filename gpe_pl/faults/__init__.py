@@ -1,0 +1,1 @@
+"""Damage, hostility and interruption, done on purpose, and what comes of it."""

@@ -1,0 +1,297 @@
+"""Commands that are killed, run out of disk, or meet what a disk has done to their files; and the same command again."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gpe_pl.errors import GpeError
+from gpe_pl.faults import isolation, stores
+from gpe_pl.faults.verdict import MAX_DETAIL, Fault, Verdict
+from gpe_pl.learned_simulator import load_checkpoint
+
+SAVED = ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers", "global_step", "simulator")
+"""What of a training checkpoint does not depend on where it lies."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command, and how it is told where its data and results go.
+
+    Attributes:
+        name: row of the matrix.
+        module: ``python -m gpe_pl.{module}``.
+        arguments: all but the folders.
+        data: folder of the data, or None if the command makes them in its own.
+    """
+
+    name: str
+    module: str
+    arguments: tuple[str, ...]
+    data: str | None = None
+
+    def given(self, folder: Path) -> list[str]:
+        """The arguments with the folders."""
+        return [*self.arguments, f"paths.data={self.data or folder / 'data'}", f"paths.runs={folder / 'runs'}"]
+
+
+# --- what a command leaves ----------------------------------------------------------------------------------------------------------------
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """SHA-256 of what must not depend on how a command was interrupted: data, metrics, tables, weights and the state of the optimiser, bit for bit."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        name = str(path.relative_to(folder))
+        if path.suffix == ".ckpt":
+            stored = load_checkpoint(path)
+            found[name] = _digest({key: stored[key] for key in SAVED})
+        elif path.suffix == ".json":
+            found[name] = _digest(json.loads(path.read_text()))
+        elif path.suffix == ".h5" or path.name in ("metrics.csv", "table.csv", "table.md"):
+            found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
+
+
+def _digest(value: Any) -> str:
+    sha = hashlib.sha256()
+
+    def add(value: Any) -> None:
+        if isinstance(value, dict):
+            for key in sorted(value, key=str):
+                sha.update(f"{key}:".encode())
+                add(value[key])
+        elif isinstance(value, (list, tuple)):
+            for each in value:
+                add(each)
+        elif isinstance(value, torch.Tensor):
+            sha.update(
+                f"{value.dtype}{tuple(value.shape)}".encode() + value.detach().contiguous().view(-1).view(torch.uint8).numpy().tobytes()
+            )
+        else:
+            sha.update(repr(value).encode())
+
+    add(value)
+    return sha.hexdigest()
+
+
+def incomplete(folder: Path) -> list[str]:
+    """Files in their final place that cannot be read."""
+    found = []
+    for path in sorted(folder.rglob("*")):
+        try:
+            if path.suffix == ".h5" and not path.name.startswith("."):
+                stores.contents(path)
+            elif path.suffix == ".ckpt":
+                load_checkpoint(path)
+            elif path.suffix == ".json":
+                json.loads(path.read_text())
+        except Exception as error:
+            found.append(f"{path.name}: {error}")
+    return found
+
+
+def leftovers(folder: Path) -> list[str]:
+    """Temporary files."""
+    return [path.name for path in folder.rglob("*.part*")]
+
+
+def _finished(command: Command, folder: Path, expected: dict[str, str], limit: float) -> Verdict:
+    """Run a command to its end, and compare what it leaves."""
+    ended = isolation.run(command.module, command.given(folder), limit)
+    if ended.code != 0:
+        verdict = ended.verdict()
+        return Verdict("different", f"does not resume: {verdict.status}: {verdict.detail}")
+    found = digests(folder)
+    wrong = sorted(name for name in found.keys() | expected.keys() if found.get(name) != expected.get(name))
+    if wrong:
+        return Verdict("different", ", ".join(wrong))
+    left = leftovers(folder)
+    return Verdict("half-written", f"left behind: {', '.join(left)}") if left else Verdict("harmless", "equal bit for bit")
+
+
+# --- kills --------------------------------------------------------------------------------------------------------------------------------
+
+
+def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: int = 0, limit: float = 600.0) -> Iterator[Verdict]:
+    """Kill a command at random moments, with SIGKILL and SIGTERM in turn, start it again, and after some kills let it finish.
+
+    What it then leaves is compared with an undisturbed run. Yields a verdict per kill, which names the moment.
+    """
+    rng = np.random.default_rng(seed)
+    whole = folder / "whole"
+    started = time.monotonic()
+    ended = isolation.run(command.module, command.given(whole), limit)
+    duration = time.monotonic() - started
+    if ended.code != 0:
+        yield ended.verdict()
+        return
+    expected, number = digests(whole), 0
+    while number < count:
+        own = folder / f"killed-{number}"
+        moments: list[str] = []
+        problem: Verdict | None = None
+        while len(moments) < min(in_a_row, count - number):
+            kind = signal.SIGKILL if len(moments) % 2 == 0 else signal.SIGTERM
+            moment = float(rng.uniform(0.0, duration))
+            process = isolation.start(command.module, command.given(own), folder / "output")
+            try:
+                if isolation.waited(process, moment):  # it was faster; from the start again
+                    if process.exitcode != 0:
+                        problem = problem or isolation.Ended(process.exitcode, (folder / "output").read_text(errors="replace")).verdict()
+                    if moments:
+                        break
+                    duration *= 0.9
+                    shutil.rmtree(own, ignore_errors=True)
+                    continue
+                os.kill(process.pid, kind)
+                if not isolation.waited(process, limit):
+                    problem = Verdict("hung", f"after {kind.name}")
+            finally:
+                isolation.end(process)
+            moments.append(f"{kind.name} after {moment:.2f} s")
+            output = (folder / "output").read_text(errors="replace")
+            if kind is signal.SIGTERM and "Traceback (most recent call last)" in output:
+                problem = problem or Verdict("traceback", output.strip().splitlines()[-1][:200])
+            if broken := incomplete(own):
+                problem = problem or Verdict("half-written", "; ".join(broken))
+        number += len(moments)
+        verdict = problem or _finished(command, own, expected, limit)
+        for text in moments:
+            yield Verdict(verdict.status, f"{text}; {verdict.detail}")
+        shutil.rmtree(own, ignore_errors=True)
+
+
+# --- damaged files of a run ---------------------------------------------------------------------------------------------------------------
+
+
+def damaged_file(command: Command, sound: Path, name: str, damage: Callable[[bytes], bytes], limit: float, folder: Path) -> Verdict:
+    """Damage a file that a command has left, and give the command again: it refuses, or what it leaves is sound."""
+    for part in sound.iterdir():
+        (shutil.copytree if part.is_dir() else shutil.copy)(part, folder / part.name)
+    path = folder / name
+    before = path.read_bytes()
+    path.write_bytes(damage(before))
+    ended = isolation.run(command.module, command.given(folder), limit)
+    if ended.code != 0:
+        return ended.verdict()
+    try:
+        expected, found = digests(sound), digests(folder)
+    except GpeError as error:  # the command had no need of the file; whoever has is refused
+        return Verdict("refused", str(error)[:MAX_DETAIL])
+    wrong = sorted(k for k in expected if found.get(k) != expected[k])
+    return Verdict("accepted", f"no error, but {', '.join(wrong)} differ") if wrong else Verdict("harmless")
+
+
+def damage_faults(command: Command, sound: Path, count: int, seed: int, limit: float) -> list[Fault]:
+    """So many damages to files that a command has left in a folder, other than pictures, logs, and results as plain text."""
+    rng = np.random.default_rng(seed)
+    names = sorted(name for name in digests(sound) if not name.endswith((".csv", ".md")))  # text without checksums
+    kinds = list(stores.damages(4 * count, seed))
+    found = []
+    for _ in range(count if names else 0):
+        name, (kind, what, damage) = names[int(rng.integers(len(names)))], kinds[int(rng.integers(len(kinds)))]
+        attack = partial(damaged_file, command, sound, name, damage, limit)
+        found.append(Fault(f"file of a run, {kind}", f"{command.name}: {name}, {what}", attack))
+    return found
+
+
+# --- disks --------------------------------------------------------------------------------------------------------------------------------
+
+
+def limit_file_size(size: int) -> None:
+    """From now on no file of this process grows beyond a size: what a full disk does to a write, with another number of error."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+@contextlib.contextmanager
+def small_disk(folder: Path, size: int) -> Iterator[bool]:
+    """A file system of so many bytes in a folder; yields whether there is one, which needs the right to mount."""
+    folder.mkdir(parents=True)
+    done = (
+        subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)], capture_output=True, check=False).returncode
+        == 0
+    )
+    try:
+        yield done
+    finally:
+        if done:
+            subprocess.run(["umount", "-l", str(folder)], capture_output=True, check=False)
+
+
+def full_disk(command: Command, size: int, expected: dict[str, str], limit: float, folder: Path) -> Verdict:
+    """Run a command on a disk that fills up; then there is room again, and the same command finishes."""
+    with small_disk(folder / "disk", size) as is_mounted:
+        own = folder / "disk"
+        prepare = None if is_mounted else partial(limit_file_size, size)
+        ended = isolation.run(command.module, command.given(own), limit, prepare)
+        verdict = ended.verdict()
+        if verdict.status != "refused":
+            return verdict
+        if broken := incomplete(own):
+            return Verdict("half-written", "; ".join(broken))
+        if is_mounted:
+            subprocess.run(["mount", "-o", f"remount,size={2**28}", str(own)], check=True, capture_output=True)
+        again = _finished(command, own, expected, limit)
+        how = f"{size} bytes" if is_mounted else f"{size} bytes per file, for want of the right to mount"
+        return again if again.status != "harmless" else Verdict("refused", f"{how}: {verdict.detail}; then {again.detail}")
+
+
+def file_limit(command: Command, size: int, expected: dict[str, str], limit: float, folder: Path) -> Verdict:
+    """The same where no file may grow beyond a size."""
+    verdict = isolation.run(command.module, command.given(folder), limit, partial(limit_file_size, size)).verdict()
+    if verdict.status != "refused":
+        return verdict
+    if broken := incomplete(folder):
+        return Verdict("half-written", "; ".join(broken))
+    again = _finished(command, folder, expected, limit)
+    return again if again.status != "harmless" else Verdict("refused", f"{verdict.detail}; then {again.detail}")
+
+
+def read_only(command: Command, limit: float, folder: Path) -> Verdict:
+    """Run a command in a folder that cannot be written."""
+    with small_disk(folder / "disk", 2**20) as is_mounted:
+        own = folder / "disk"
+        if is_mounted:
+            subprocess.run(["mount", "-o", "remount,ro", str(own)], check=True, capture_output=True)
+        elif os.geteuid() == 0:  # permissions do not bind
+            return Verdict("harmless", "not done, for want of the right to mount")
+        else:
+            own.chmod(0o555)
+        verdict = isolation.run(command.module, command.given(own), limit).verdict("accepted")
+        if not is_mounted:
+            own.chmod(0o777)
+        return verdict
+
+
+def file_in_the_way(command: Command, limit: float, folder: Path) -> Verdict:
+    """Run a command where a file lies in place of the folder that it writes to."""
+    (folder / ("data" if command.data is None else "runs")).write_text("a file")
+    return isolation.run(command.module, command.given(folder), limit).verdict("accepted")
+
+
+def disk_faults(command: Command, sizes: Sequence[int], expected: dict[str, str], limit: float) -> list[Fault]:
+    """Full disks and files of so many bytes, and folders that cannot be written."""
+    found = []
+    for size in sizes:
+        found.append(Fault("disk full", f"{command.name}, {size} bytes", partial(full_disk, command, size, expected, limit)))
+        found.append(Fault("file too large", f"{command.name}, {size} bytes", partial(file_limit, command, size, expected, limit)))
+    found.append(Fault("folder not writable", f"{command.name}, read-only", partial(read_only, command, limit)))
+    found.append(Fault("folder not writable", f"{command.name}, a file in the way", partial(file_in_the_way, command, limit)))
+    return found

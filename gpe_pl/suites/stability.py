@@ -1,0 +1,255 @@
+"""Stress tests of trained models in the domains that they were trained in: thirty criteria, fixed before they were measured, one table."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import multiprocessing
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from gpe_pl.errors import GpeError
+from gpe_pl.generation import DatasetSpec, generate_trajectory
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.pretrained import checkpoint_path
+from gpe_pl.report import finished_runs, table_row
+from gpe_pl.stability import conservation, geometry, horizon, inputs, invariances, precision
+from gpe_pl.stability.subject import Outcome, StressTest, Subject
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+log = logging.getLogger(__name__)
+
+GROUPS = {
+    "invariances": invariances.TESTS,
+    "conservation": conservation.TESTS,
+    "degenerate geometry": geometry.TESTS,
+    "inputs": inputs.TESTS,
+    "long horizon": horizon.TESTS,
+    "precision and performance": precision.TESTS,
+}
+
+
+class NothingToTestError(GpeError, ValueError):
+    """No model for a data set; the message says where they were looked for."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A data set: what ``python -m gpe_pl.simulate`` would be given."""
+
+    overrides: list[str]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is tested.
+
+    Attributes:
+        cases: data sets, by name.
+        runs: folders of finished runs; the models among them that were trained on a case's data set take part, the first seed of each.
+        checkpoints: further ones, as files or as names of shipped models; they take part in the case whose data set they were trained on.
+        gating: settings of the models that must pass: those of the configuration that is shipped.
+        num_scenes: of ``test``, per data set.
+        horizon_factors: lengths of long rollouts over the trained horizon.
+        num_rest_steps: frames that a pile at rest is watched.
+        tests: numbers of the tests to run; none runs all.
+        num_workers: processes, each with data sets of its own.
+        num_threads: of PyTorch in each; the solvers use one.
+    """
+
+    cases: dict[str, Case]
+    runs: list[str] = field(default_factory=list)
+    checkpoints: list[str] = field(default_factory=list)
+    gating: dict[str, str] = field(default_factory=dict)
+    num_scenes: Annotated[int, Field(ge=1)] = 5
+    horizon_factors: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=1)] = field(default_factory=lambda: [1.0, 3.0, 10.0])
+    num_rest_steps: Annotated[int, Field(ge=1)] = 1000
+    tests: list[Annotated[int, Field(ge=1, le=30)]] = field(default_factory=list)
+    num_workers: Annotated[int, Field(ge=1)] = 2
+    num_threads: Annotated[int, Field(ge=1)] = 1
+
+
+def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
+    """A record per test and model, and a Markdown table per domain."""
+    records: list[dict[str, Any]] = []
+    untested = [name for name, spec in specs.items() if not any(_models(spec, settings))]
+    tested = {name: spec for name, spec in specs.items() if name not in untested}
+    if min(settings.num_workers, len(tested)) > 1:
+        with ProcessPoolExecutor(settings.num_workers, multiprocessing.get_context("spawn")) as pool:
+            for found in pool.map(_test_domain, tested, tested.values(), [settings] * len(tested)):
+                records += found
+    else:
+        for name, spec in tested.items():
+            records += _test_domain(name, spec, settings)
+    if not records:
+        raise NothingToTestError(
+            f"{', '.join([*settings.runs, *settings.checkpoints]) or 'suite.runs and suite.checkpoints are empty'}: no model that was trained on one of "
+            f"{', '.join(f'{s.name} {s.size}' for s in specs.values())}; train with `python -m gpe_pl.fit data={untested[0]} model=gpe_tuned` or set "
+            "suite.runs or suite.checkpoints"
+        )
+    return records, _report(records, untested)
+
+
+def _test_domain(name: str, spec: DatasetSpec, settings: Settings) -> list[dict[str, Any]]:
+    """Records of all models of a data set."""
+    torch.set_num_threads(settings.num_threads)
+    return [record for subject in subjects(name, spec, dict(_models(spec, settings)), settings) for record in test(subject, settings.tests)]
+
+
+def test(subject: Subject, numbers: Sequence[int] = ()) -> Iterator[dict[str, Any]]:
+    """Records of all tests, or of those with these numbers, of one model; a test that crashes has failed."""
+    for group, tests in GROUPS.items():
+        for stress_test in tests:
+            if not numbers or stress_test.number in numbers:
+                started = time.perf_counter()
+                outcome = _outcome(stress_test, subject)
+                seconds = time.perf_counter() - started
+                log.info("%s, %s: test %d took %.1f s", subject.domain, subject.name, stress_test.number, seconds)
+                yield {
+                    "test": f"{stress_test.number} {stress_test.name}",
+                    "group": group,
+                    "model": subject.name,
+                    "domain": subject.domain,
+                    "criterion": stress_test.criterion,
+                    "measured": outcome.measured,
+                    "status": {True: "passed", False: "failed", None: "not_applicable"}[outcome.passed],
+                    "gating": subject.is_gating,
+                    "curves": {k: [v if math.isfinite(v) else None for v in values] for k, values in outcome.curves.items()},
+                }
+
+
+test.__test__ = False  # type: ignore[attr-defined]
+
+
+def _outcome(stress_test: StressTest, subject: Subject) -> Outcome:
+    try:
+        return stress_test(subject)
+    except Exception as error:
+        log.warning("%s, %s: test %d crashed", subject.domain, subject.name, stress_test.number, exc_info=not isinstance(error, GpeError))
+        return Outcome(False, f"crashed: {type(error).__name__}: {' '.join(str(error).split())[:200]}")
+
+
+# --- what is tested -------------------------------------------------------------------------------------------------------------------------
+
+
+def subjects(domain: str, spec: DatasetSpec, models: dict[str, LearnedSimulator], settings: Settings) -> list[Subject]:
+    """The models of a data set with what they are tested on, the gating ones first."""
+    scenes = [generate_trajectory(spec, "test", k) for k in range(settings.num_scenes)]
+    speed = horizon.max_speed(spec, generate_trajectory, settings.num_scenes)
+    found = [
+        Subject(
+            name,
+            domain,
+            simulator,
+            spec,
+            scenes,
+            speed,
+            is_gating(simulator, settings.gating),
+            models,
+            settings.horizon_factors,
+            settings.num_rest_steps,
+        )
+        for name, simulator in models.items()
+    ]
+    return sorted(found, key=lambda s: not s.is_gating)
+
+
+def is_gating(simulator: LearnedSimulator, gating: dict[str, str]) -> bool:
+    """Whether a model has all of these settings."""
+    own = simulator.description()["settings"]
+    return bool(gating) and all(own.get(key) == value for key, value in gating.items())
+
+
+def _models(spec: DatasetSpec, settings: Settings) -> Iterator[tuple[str, LearnedSimulator]]:
+    """Simulators by name; one that has the name of another is left out."""
+    seen: set[str] = set()
+    for folder in settings.runs:
+        for finished in finished_runs(Path(folder)):
+            if (finished.config["data.name"], finished.config["size.name"]) == (spec.name, spec.size):
+                simulator = LearnedSimulator.from_checkpoint(finished.folder / "checkpoints" / "best.ckpt")
+                name = _label(simulator)
+                if name not in seen:
+                    seen.add(name)
+                    yield name, simulator
+    for checkpoint in settings.checkpoints:
+        simulator = LearnedSimulator.from_checkpoint(checkpoint_path(checkpoint))
+        metadata = simulator.builder.metadata
+        if (metadata.dataset, metadata.spacing) == (spec.name, spec.scene.spacing):
+            yield Path(checkpoint).stem, simulator
+
+
+def _label(simulator: LearnedSimulator) -> str:
+    """Class, depth, width, and what else is not at its default."""
+    cls, settings = type(simulator.model), dict(simulator.description()["settings"])
+    depth = next((settings.pop(k) for k in ("num_message_passing_steps", "num_propagation_steps", "num_convolutions") if k in settings), "")
+    plain = cast(Any, cls)(simulator.builder.spec).settings
+    other = [str(v) for k, v in settings.items() if k != "hidden_channels" and v != plain.get(k)]
+    return " ".join([f"{cls.__name__} {depth} × {settings['hidden_channels']}", *other])
+
+
+# --- the table ------------------------------------------------------------------------------------------------------------------------------
+
+MARKS = {"passed": "passed", "failed": "**failed**", "not_applicable": "–"}
+
+
+def _report(records: Sequence[dict[str, Any]], untested: Sequence[str] = ()) -> str:
+    """Counts, and a table per domain: a row per test, a column per model."""
+    gating = [r for r in records if r["gating"]]
+    failed = [r for r in gating if r["status"] == "failed"]
+    lines = [
+        f"Gating configurations: {sum(r['status'] == 'passed' for r in gating)} passed, {len(failed)} failed, "
+        f"{sum(r['status'] == 'not_applicable' for r in gating)} do not apply. Criteria were fixed before they were measured.",
+    ]
+    if untested:
+        lines += ["", f"Not tested, for want of a model: {', '.join(untested)}."]
+    for domain in dict.fromkeys(r["domain"] for r in records):
+        own = [r for r in records if r["domain"] == domain]
+        models = {r["model"]: r["gating"] for r in own}
+        header = ["test", "criterion", *(f"{m}{' (gating)' if is_gating else ''}" for m, is_gating in models.items())]
+        lines += ["", f"### {domain}", "", table_row(header), "|" + "---|" * len(header)]
+        for name in dict.fromkeys(r["test"] for r in own):
+            row = {r["model"]: r for r in own if r["test"] == name}
+            first = next(iter(row.values()))
+            cells = [f"{MARKS[row[m]['status']]}: {row[m]['measured']}".rstrip(": ") if m in row else "" for m in models]
+            lines.append(table_row([_cell(c) for c in (name, first["criterion"], *cells)]))
+    return "\n".join(lines)
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
+    """Per domain: energy and momentum over a long rollout, how long predictions are valid and rollouts alive, and growth of a perturbation."""
+    from gpe_pl.viz.stability import long_horizon_figure, perturbation_figure
+
+    found = {}
+    for domain in dict.fromkeys(r["domain"] for r in records):
+        curves = {
+            number: {
+                r["model"]: _with_infinities(r["curves"])
+                for r in records
+                if r["domain"] == domain and r["test"].startswith(f"{number} ") and r["curves"]
+            }
+            for number in (21, 23)
+        }
+        if curves[21]:
+            found[f"long_horizon_{domain}"] = long_horizon_figure(curves[21])
+        if curves[23]:
+            found[f"perturbation_{domain}"] = perturbation_figure(curves[23])
+    return found
+
+
+def _with_infinities(curves: dict[str, list[float | None]]) -> dict[str, np.ndarray]:
+    return {k: np.array([np.inf if v is None else v for v in values]) for k, values in json.loads(json.dumps(curves)).items()}

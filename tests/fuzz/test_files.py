@@ -1,0 +1,76 @@
+"""Whatever is stored comes back as it was; whatever happens to a file, it is refused or means the same."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gpe_pl.faults.checkpoints import PAYLOADS, PLACES, load_damaged, load_hostile
+from gpe_pl.faults.stores import content, read_damaged
+from gpe_pl.faults.verdict import GOOD
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
+from gpe_pl.trajectory import Trajectory, read_trajectory, write_shard
+from tests.conftest import make_trajectory
+from tests.scenes import builder
+from tests.strategies import damages, trajectories
+
+same_file = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@pytest.fixture(scope="module")
+def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("shard") / "shard-00000.h5"
+    write_shard(path, [make_trajectory(seed) for seed in (0, 1)])
+    return path
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
+    build = builder()
+    path = tmp_path_factory.mktemp("checkpoint") / "sound.ckpt"
+    LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=4), build).save(path)
+    return path
+
+
+@given(st.lists(trajectories(), max_size=2))
+def test_what_is_stored_comes_back(items: list[Trajectory]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "shard-00000.h5"
+        write_shard(path, items)
+        for k, trajectory in enumerate(items):
+            read = read_trajectory(path, f"{k:05d}", verify=True)
+            assert read.metadata == trajectory.metadata
+            assert content(read) == content(trajectory)
+        assert [p.name for p in Path(folder).iterdir()] == ["shard-00000.h5"]
+
+
+@given(damages())
+@same_file
+def test_a_damaged_shard_is_refused_or_means_the_same(shard: Path, damage: Callable[[bytes], bytes]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        verdict = read_damaged(shard, damage, Path(folder))
+    assert verdict.status in GOOD, verdict
+
+
+@given(damages())
+@same_file
+def test_a_damaged_checkpoint_is_refused_or_means_the_same(checkpoint: Path, damage: Callable[[bytes], bytes]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        verdict = load_damaged(checkpoint, damage, Path(folder))
+    assert verdict.status in GOOD, verdict
+
+
+@given(st.sampled_from(PAYLOADS), st.sampled_from(PLACES))
+@same_file
+def test_code_in_a_checkpoint_never_runs(checkpoint: Path, kind: str, place: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        verdict = load_hostile(checkpoint, kind, place, Path(folder))
+    assert verdict.status == "refused", verdict

@@ -1,0 +1,121 @@
+"""Commands that are killed, run out of disk, may not write, or meet their own files damaged: they say so in one line, and go on where they were."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gpe_pl.config import CONF
+from gpe_pl.faults import isolation, runs
+from gpe_pl.faults.runs import Command
+from gpe_pl.faults.verdict import Verdict
+from gpe_pl.training.checkpoints import AtomicCheckpoints
+
+pytestmark = pytest.mark.slow
+SUITE = yaml.safe_load((CONF / "suite" / "faults.yaml").read_text())
+
+
+def command(name: str, data: Path | None = None) -> Command:
+    """One of the miniatures of the suite."""
+    attacked = SUITE["commands"][name]
+    return Command(name, attacked["module"], (*SUITE["data"], *attacked["arguments"]), None if data is None else str(data))
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("simulated")
+    simulate = command("simulate")
+    ended = isolation.run("simulate", simulate.given(folder))
+    assert ended.code == 0, ended.output
+    return folder / "data"
+
+
+@pytest.mark.parametrize("name", ["simulate", "fit", "sweep"])
+def test_killed_at_random_moments(data: Path, tmp_path: Path, name: str) -> None:
+    found = list(runs.kills(command(name, None if name == "simulate" else data), tmp_path, 4, in_a_row=4, seed=1))
+    assert len(found) == 4
+    assert all(v.status == "harmless" for v in found), found
+
+
+@pytest.mark.parametrize("size", [100, 20_000])
+def test_a_full_disk(data: Path, tmp_path: Path, size: int) -> None:
+    fit = command("fit", data)
+    whole = tmp_path / "whole"
+    assert isolation.run("fit", fit.given(whole)).code == 0
+    for attack in (runs.full_disk, runs.file_limit):
+        own = tmp_path / attack.__name__
+        own.mkdir()
+        verdict = attack(fit, size, runs.digests(whole), 600.0, own)
+        assert verdict.status == "refused", verdict
+
+
+@pytest.mark.parametrize("attack", [runs.read_only, runs.file_in_the_way])
+def test_a_folder_that_cannot_be_written(data: Path, tmp_path: Path, attack: Callable[[Command, float, Path], Verdict]) -> None:
+    verdict = attack(command("fit", data), 600.0, tmp_path)
+    assert verdict.status == "refused" or "not done" in verdict.detail, verdict
+
+
+def test_a_damaged_checkpoint_is_not_resumed_from(data: Path, tmp_path: Path) -> None:
+    fit = command("fit", data)
+    assert isolation.run("fit", fit.given(tmp_path)).code == 0
+    run = tmp_path / "runs" / "fit"
+    (run / "metrics.csv").unlink()
+    last = run / "checkpoints" / "last.ckpt"
+    last.write_bytes(last.read_bytes()[:-1000])
+    ended = isolation.run("fit", fit.given(tmp_path))
+    assert ended.verdict().status == "refused"
+    assert "last.ckpt: not a safe, complete checkpoint" in ended.output
+    last.unlink()
+    assert isolation.run("fit", fit.given(tmp_path)).code == 0
+
+
+def test_runs_end_with_their_sweep(data: Path, tmp_path: Path) -> None:
+    """Otherwise the same command, given again, would meet them in their folders."""
+    arguments = [*SUITE["data"], *SUITE["commands"]["fit"]["arguments"], f"paths.data={data}", f"paths.runs={tmp_path}"]
+    endless = [a for a in arguments if "num_steps" not in a] + ["training.num_steps=1000000", "--multirun", "seed=0", "name=sweep"]
+    sweep = subprocess.Popen([sys.executable, "-m", "gpe_pl.fit", *endless], stdout=subprocess.DEVNULL, cwd=CONF.parent)
+    run = tmp_path / "sweep" / "seed=0"
+    deadline = time.monotonic() + 500
+    while not (run / "checkpoints" / "last.ckpt").exists():
+        assert sweep.poll() is None and time.monotonic() < deadline
+        time.sleep(0.1)
+    sweep.send_signal(signal.SIGKILL)
+    sweep.wait()
+    while _running(str(run)):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+def _running(text: str) -> list[int]:
+    """Processes with a text in their command line."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            if text in path.read_text() and int(path.parent.name) != os.getpid():
+                found.append(int(path.parent.name))
+    return found
+
+
+def test_checkpoints_are_written_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "last.ckpt"
+    AtomicCheckpoints().save_checkpoint({"a": 1}, path)
+    before = path.read_bytes()
+
+    def fails(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fails)
+    with pytest.raises(OSError, match="No space left"):
+        AtomicCheckpoints().save_checkpoint({"a": 2}, path)
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["last.ckpt"]
+    assert AtomicCheckpoints().load_checkpoint(path) == {"a": 1}

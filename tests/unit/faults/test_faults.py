@@ -1,0 +1,202 @@
+"""Faults in small numbers: what is wrong is refused, and the judges see it when it is not."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from gpe_pl.errors import GpeError
+from gpe_pl.faults import checkpoints, configs, scenes, stores
+from gpe_pl.faults.isolation import Ended, verdicts
+from gpe_pl.faults.verdict import GOOD, Fault, Verdict, judge
+from gpe_pl.generation import DatasetSpec
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
+from gpe_pl.simulate import dataset
+from gpe_pl.suites.faults import report
+from gpe_pl.trajectory import write_shard
+from tests.conftest import make_trajectory
+from tests.scenes import builder
+
+
+@pytest.fixture(scope="module")
+def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("shard") / "shard-00000.h5"
+    write_shard(path, [make_trajectory(seed) for seed in (0, 1)])
+    return path
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    torch.manual_seed(0)
+    build = builder()
+    path = tmp_path_factory.mktemp("checkpoint") / "sound.ckpt"
+    LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=4), build).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def spec() -> DatasetSpec:
+    return dataset("data=sand", "size=tiny", "data.sizes.tiny.d2.num_particles=40")
+
+
+def bad(faults: list[Fault], folder: Path) -> list[tuple[str, str, Verdict]]:
+    """Faults of which nothing good came."""
+    found = []
+    for k, fault in enumerate(faults):
+        own = folder / str(k)
+        own.mkdir()
+        verdict = fault.attack(own)
+        if verdict.status not in GOOD:
+            found.append((fault.kind, fault.name, verdict))
+    return found
+
+
+# --- what is wrong is refused ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.slow)])
+def test_damaged_and_wrong_shards(shard: Path, tmp_path: Path, step: int) -> None:
+    faults = stores.faults(shard, 16)
+    assert len(faults) > 100
+    assert not bad(faults[::step], tmp_path)
+
+
+@pytest.mark.parametrize("step", [8, pytest.param(1, marks=pytest.mark.slow)])
+def test_damaged_wrong_and_hostile_checkpoints(checkpoint: Path, tmp_path: Path, step: int) -> None:
+    faults = checkpoints.faults(checkpoint, 16)
+    assert len(faults) > 100
+    assert not bad(faults[::step], tmp_path)
+
+
+def test_every_bit_of_a_weight_counts(checkpoint: Path, tmp_path: Path) -> None:
+    """PyTorch does not compare the checksums of the archive that it writes."""
+    weights = torch.load(checkpoint, weights_only=True)["state_dict"]
+    sought = max(weights.values(), key=lambda w: w.numel()).numpy().tobytes()
+    where = checkpoint.read_bytes().index(sought)
+    verdict = checkpoints.load_damaged(checkpoint, lambda data: data[:where] + bytes([data[where] ^ 1]) + data[where + 1 :], tmp_path)
+    assert verdict.status == "refused"
+    assert "checksum mismatch" in verdict.detail
+
+
+@pytest.mark.parametrize("learned", [False, True], ids=["solver", "model"])
+def test_impossible_scenes(spec: DatasetSpec, tmp_path: Path, learned: bool) -> None:
+    every = [f for f in scenes.faults({"sand": spec}, 1) if ("model" in f.name) is learned]
+    assert {f.kind.removeprefix("scene, ") for f in every} == set(scenes.CHANGES)
+    assert not bad(every, tmp_path)
+
+
+# --- and it is seen when it is not ----------------------------------------------------------------------------------------------------------
+
+
+def test_judges_tell_what_came_of_it() -> None:
+    def fails(error: Exception) -> None:
+        raise error
+
+    assert judge(lambda: 1, lambda x: x == 1).status == "harmless"
+    assert judge(lambda: 2, lambda x: x == 1).status == "accepted"
+    assert judge(lambda: fails(GpeError("file, reason")), lambda _: True) == Verdict("refused", "file, reason")
+    assert judge(lambda: fails(GpeError("")), lambda _: True).status == "traceback"
+    assert judge(lambda: fails(KeyError("x")), lambda _: True) == Verdict("traceback", "KeyError: 'x'")
+
+
+def test_a_changed_value_with_a_fitting_checksum_is_accepted(shard: Path, tmp_path: Path) -> None:
+    def rewrite(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            file["00001"]["pos"][2, 3, 1] += np.float32(0.1)
+
+    assert stores.read_rewritten(shard, rewrite, tmp_path).status == "accepted"
+
+
+def test_payloads_work_where_they_are_let(tmp_path: Path) -> None:
+    for kind in checkpoints.PAYLOADS:
+        folder = tmp_path / kind
+        folder.mkdir()
+        torch.save(checkpoints.payload(kind, folder), folder / "evil.ckpt")
+        torch.load(folder / "evil.ckpt", weights_only=False)
+        assert (folder / checkpoints.TRACE).exists(), kind
+
+
+@pytest.mark.parametrize(
+    ("code", "output", "status"),
+    [
+        (0, "", "harmless"),
+        (2, "some text\nerror: name=1: must be a name\n", "refused"),
+        (1, "Traceback (most recent call last):\n  …\nKeyError: 1\n", "traceback"),
+        (2, "", "traceback"),  # no message
+        (-11, "", "died"),
+        (None, "", "hung"),
+    ],
+)
+def test_a_command_is_judged_by_its_last_words(code: int | None, output: str, status: str) -> None:
+    assert Ended(code, output).verdict().status == status
+
+
+def test_every_kind_of_wrong_configuration_is_made_of_a_value() -> None:
+    values = dict(configs.leaves({"a": {"b": 1, "c": 0.5, "d": True}, "e": "text", "f": [1, 2], "paths": {"data": "x"}}))
+    assert values == {"a.b": 1, "a.c": 0.5, "a.d": True, "e": "text", "f": [1, 2]}
+    for key, value in values.items():
+        kinds = {kind for kind, _, _ in configs.mutations(key, value)}
+        assert kinds >= {"unknown key", "missing key", "wrong type"}
+    assert ("wrong type", "a.b=banana", True) in list(configs.mutations("a.b", 1))
+
+
+def _finds(_: Path) -> Verdict:
+    return Verdict("refused", "found")
+
+
+def _hangs(_: Path) -> Verdict:
+    time.sleep(600)
+    return Verdict("harmless")
+
+
+def _dies(_: Path) -> Verdict:
+    os._exit(3)
+
+
+def _raises(_: Path) -> Verdict:
+    raise KeyError("by mistake")
+
+
+@pytest.mark.slow
+def test_what_hangs_or_dies_costs_only_itself() -> None:
+    attacks: dict[str, Callable[[Path], Verdict]] = {
+        "refused": _finds,
+        "hung": _hangs,
+        "died": _dies,
+        "traceback": _raises,
+        "harmless": partial(_sleeps, 0.01),
+    }
+    faults = [Fault("kind", name, attack) for name, attack in attacks.items()] * 2
+    assert [v.status for v in verdicts(faults, limit=20.0)] == [f.name for f in faults]
+
+
+def _sleeps(seconds: float, _: Path) -> Verdict:
+    time.sleep(seconds)
+    return Verdict("harmless")
+
+
+def test_the_matrix_counts_and_shows_what_is_bad() -> None:
+    records = [{"kind": "shard, truncated", "fault": f"{k}", "status": "refused", "detail": "x"} for k in range(3)]
+    records += [{"kind": "shard, truncated", "fault": "7|8", "status": "accepted", "detail": "no error"}]
+    records += [
+        {"kind": "fit killed", "fault": "", "status": status, "detail": "SIGKILL after 1 s"}
+        for status in ("harmless", "harmless", "different")
+    ]
+    text = report(records)
+    assert text.startswith(
+        "4 corrupted or hostile inputs: 0 tracebacks without a typed error, 1 silent acceptances, 0 executed payloads, 0 other failures. 3 kills: 2 "
+    )
+    assert "| fault | number | refused | harmless | accepted | different |" in text
+    assert "| shard, truncated | 4 | 3 | 0 | 1 | 0 |" in text
+    assert "| fit killed | 3 | 0 | 2 | 0 | 1 |" in text
+    assert "- shard, truncated, 7\\|8: accepted: no error" in text
+    assert "**2 failures**" in text
