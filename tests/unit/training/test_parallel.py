@@ -136,8 +136,9 @@ class Recorded(TrainingModule):
         self.steps: list[tuple[list[tuple[int, int]], dict[str, int]]] = []
         self.losses: list[float] = []
 
-    def training_step(self, batch: HeteroData, batch_idx: int) -> torch.Tensor:
+    def training_step(self, batch: HeteroData, batch_idx: int) -> torch.Tensor | None:
         loss = super().training_step(batch, batch_idx)
+        assert loss is not None
         self.steps.append((list(self._windows), {m: batch[m].x.shape[0] for m in MATERIALS}))
         self.losses.append(float(ranks.summed(loss.detach())))
         return loss
