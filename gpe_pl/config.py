@@ -29,7 +29,7 @@ from pydantic import ValidationError
 
 from gpe_pl import plugins
 from gpe_pl.errors import GpeError
-from gpe_pl.launcher import RESULT, USAGE_ERROR, SweepError
+from gpe_pl.launcher import RESULT, USAGE_ERROR, SweepError, end_with_sweep
 from gpe_pl.signatures import checked, parameters
 
 WITHOUT_KEY = {"comparison", "experiment", "scene", "solver"}
@@ -144,7 +144,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             nonlocal is_composed
             is_composed = True
             if RESULT in os.environ:
-                launcher.end_with_sweep()
+                end_with_sweep()
             try:
                 if "dimension" in list(cfg) and cfg.dimension not in (2, 3):
                     raise ConfigError(f"dimension={cfg.dimension}: must be 2 or 3")

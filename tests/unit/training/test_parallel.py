@@ -138,6 +138,7 @@ class Recorded(TrainingModule):
 
     def training_step(self, batch: HeteroData, batch_idx: int) -> torch.Tensor:
         loss = super().training_step(batch, batch_idx)
+        assert loss is not None
         self.steps.append((list(self._windows), {m: batch[m].x.shape[0] for m in MATERIALS}))
         self.losses.append(float(ranks.summed(loss.detach())))
         return loss
