@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import OmegaConf
+import yaml
 
 from gpe_pl.errors import GpeError
 from gpe_pl.faults.isolation import run
@@ -87,7 +87,7 @@ def faults(command: str, arguments: Sequence[str], count: int, seed: int = 0, li
         raise NoConfigError(f"{command} {' '.join(arguments)}: {shown.output}")
     rng = np.random.default_rng(seed)
     by_kind: dict[str, list[tuple[str, bool]]] = {}
-    for key, value in leaves(OmegaConf.to_container(OmegaConf.create(shown.output))):
+    for key, value in leaves(yaml.safe_load(shown.output)):
         for kind, override, must_fail in mutations(key, value):
             by_kind.setdefault(kind, []).append((override, must_fail))
     found = []

@@ -17,7 +17,13 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 MODULES = sorted((ROOT / "gpe_pl").rglob("*.py"))
 
 # Where the name of a distribution is not the name that one imports.
-IMPORT_NAMES = {"hydra-core": "hydra", "pillow": "PIL", "array-api-compat": "array_api_compat", "torch-geometric": "torch_geometric"}
+IMPORT_NAMES = {
+    "hydra-core": "hydra",
+    "pillow": "PIL",
+    "array-api-compat": "array_api_compat",
+    "torch-geometric": "torch_geometric",
+    "pyyaml": "yaml",
+}
 PARTS_OF_OTHERS = {"mpl_toolkits": "matplotlib"}
 
 
