@@ -81,7 +81,7 @@ def test_a_damaged_checkpoint_is_not_resumed_from(data: Path, tmp_path: Path) ->
 def test_runs_end_with_their_sweep(data: Path, tmp_path: Path) -> None:
     """Otherwise the same command, given again, would meet them in their folders."""
     arguments = [*SUITE["data"], *SUITE["commands"]["fit"]["arguments"], f"paths.data={data}", f"paths.runs={tmp_path}"]
-    endless = [a for a in arguments if "num_steps" not in a] + ["training.num_steps=1000000", "--multirun", "seed=0", "name=sweep"]
+    endless = [a for a in arguments if "num_steps" not in a] + ["training.num_steps=1000000", "hydra.mode=MULTIRUN", "seed=0", "name=sweep"]
     sweep = subprocess.Popen([sys.executable, "-m", "gpe_pl.fit", *endless], stdout=subprocess.DEVNULL, cwd=CONF.parent)
     run = tmp_path / "sweep" / "seed=0"
     deadline = time.monotonic() + 500
