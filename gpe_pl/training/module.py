@@ -25,8 +25,8 @@ from gpe_pl.metrics import OneStepNMSE
 Schedule = Literal["cosine", "exponential"]
 Compile = Literal["auto", "on", "off"]
 
-MAX_SKIPPED, SKIP_WINDOW = 10, 100
-"""A run goes on without batches whose loss or gradient is not finite, unless there are so many of them within so many steps."""
+MAX_SKIPPED, SKIP_WINDOW, MAX_IN_ROW = 10, 100, 3
+"""A run goes on without batches whose loss or gradient is not finite, unless there are so many of them within so many steps, or in a row."""
 
 COMPILE_PAYS_AFTER = 10_000
 """Steps from which ``compile: auto`` repays the time that compilation takes."""
@@ -82,6 +82,7 @@ class TrainingModule(L.LightningModule):
         self._compilation = ExitStack()
         self._windows: list[tuple[int, int]] = []  # (trajectory, frame) of the current batch
         self._skipped: deque[int] = deque(maxlen=MAX_SKIPPED)  # the last steps without an update
+        self._num_in_row = 0  # of these, since the last update
 
     def configure_optimizers(self) -> Any:
         optimizer = torch.optim.Adam(self.simulator.parameters(), lr=self.learning_rate, fused=True)
@@ -179,6 +180,8 @@ class TrainingModule(L.LightningModule):
             if not self._skipped or self._skipped[-1] != self.global_step:  # else its loss was not finite either
                 self._skip("gradient norm", norm)
             optimizer.zero_grad(set_to_none=True)  # without gradients Adam leaves weights and moments as they are
+        else:
+            self._num_in_row = 0
 
     def _skip(self, name: str, value: Tensor) -> None:
         """Go on without a batch, unless too many of the last ones were like it; on all ranks, as the value is a sum over them.
@@ -188,9 +191,11 @@ class TrainingModule(L.LightningModule):
         """
         windows = [window for part in ranks.gathered(self._windows) for window in part]
         what = f"step {self.global_step}: the {name} is {value.item()} for (trajectory, frame) = {', '.join(map(str, windows))}"
-        if len(self._skipped) == MAX_SKIPPED and self.global_step - self._skipped[0] < SKIP_WINDOW:
+        self._num_in_row += 1
+        is_often = len(self._skipped) == MAX_SKIPPED and self.global_step - self._skipped[0] < SKIP_WINDOW
+        if is_often or self._num_in_row == MAX_IN_ROW:
             raise TrainingError(
-                f"{what}, as in {MAX_SKIPPED} other batches since step {self._skipped[0]}; the last good checkpoint is kept. "
+                f"{what}, as in {len(self._skipped)} other batches since step {self._skipped[0]}; the last good checkpoint is kept. "
                 "Lower training.learning_rate, or validate the data with `python -m gpe_pl.data.validate`"
             )
         self._skipped.append(self.global_step)

@@ -107,8 +107,11 @@ def claim(run_dir: Path, config: dict[str, Any]) -> None:
             )
         return
     temporary = path.with_suffix(f".{os.getpid()}.part")
-    temporary.write_text(json.dumps(config, indent=1, sort_keys=True))
-    os.replace(temporary, path)
+    try:
+        temporary.write_text(json.dumps(config, indent=1, sort_keys=True))
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)  # of a full disk
 
 
 def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:

@@ -20,7 +20,7 @@ from gpe_pl.faults.runs import Command
 from gpe_pl.faults.verdict import Verdict
 from gpe_pl.training.checkpoints import AtomicCheckpoints
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 SUITE = yaml.safe_load((CONF / "suite" / "faults.yaml").read_text())
 
 

@@ -28,9 +28,10 @@ def finished(folder: Path) -> dict[Path, int]:
     return {p: p.stat().st_mtime_ns for p in folder.rglob("metrics.csv") if (p.parent / "config.json").exists()}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_failures_are_named_and_the_others_run_and_a_rerun_finishes_them(tiny_data: Path, tmp_path: Path) -> None:
-    result = sweep(tiny_data, tmp_path, "training.learning_rate=1e-3,1e30", "seed=0,1")
+    steps = "training.num_steps=6", "training.val_interval=3"
+    result = sweep(tiny_data, tmp_path, "training.learning_rate=1e-3,1e30", "seed=0,1", *steps)
     assert result.returncode == 2
     assert "2 of 4 runs failed" in result.stderr
     assert "training.learning_rate=1e" in result.stderr
@@ -38,14 +39,14 @@ def test_failures_are_named_and_the_others_run_and_a_rerun_finishes_them(tiny_da
     assert "Traceback" not in result.stderr
     before = finished(tmp_path)
     assert len(before) == 2
-    again = sweep(tiny_data, tmp_path, "training.learning_rate=1e-3", "seed=0,1")
+    again = sweep(tiny_data, tmp_path, "training.learning_rate=1e-3", "seed=0,1", *steps)
     assert again.returncode == 0, again.stderr
     assert "2/2 done" in again.stdout
     assert finished(tmp_path) == before  # finished runs are left as they are
     assert (tmp_path / "sweep" / "table.md").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_wrong_configuration_is_said_once(tiny_data: Path, tmp_path: Path) -> None:
     result = sweep(tiny_data, tmp_path, "training.learning_rate=-1", "seed=0,1,2,3")
     assert result.returncode == 2
@@ -53,7 +54,7 @@ def test_a_wrong_configuration_is_said_once(tiny_data: Path, tmp_path: Path) -> 
     assert "training.learning_rate=-1" in result.stderr and "greater than 0" in result.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("launcher", "settings"), [("processes", []), ("slurm", ["hydra.launcher.cluster=local"]), ("ray", ["hydra.launcher.num_cpus=1"])]
 )
@@ -78,7 +79,9 @@ def test_parts_of_a_data_set_are_generated_by_any_launcher(tiny_data: Path, tmp_
     assert result.returncode == 0, result.stdout + result.stderr
     assert "2/2 done" in result.stdout
     folder, whole = tmp_path / "sand" / "tiny", tiny_data / "sand" / "tiny"
-    assert json.loads((folder / "statistics.json").read_text()) == pytest.approx(json.loads((whole / "statistics.json").read_text()))
+    found, expected = (json.loads((f / "statistics.json").read_text()) for f in (folder, whole))
+    del found["sha256"], expected["sha256"]  # sums over other shards round otherwise
+    assert found == pytest.approx(expected)
     assert sorted(p.name for p in (folder / "train").glob("*.h5")) == ["shard-00000.h5", "shard-00001.h5"]
     for split in ("train", "val", "test", "test_unseen"):
         for part, there in zip(iter_trajectories(folder, split), iter_trajectories(whole, split), strict=True):
@@ -86,7 +89,7 @@ def test_parts_of_a_data_set_are_generated_by_any_launcher(tiny_data: Path, tmp_
     assert len([*(tmp_path / "jobs").rglob("output.log")]) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_optuna_searches_with_any_launcher(tiny_data: Path, tmp_path: Path) -> None:
     pytest.importorskip("optuna")
     search = ["experiment=search", "evaluation.num_trajectories=1", "hydra.sweeper.num_trials=3", "hydra.sweeper.num_at_once=2"]
@@ -102,7 +105,7 @@ def test_optuna_searches_with_any_launcher(tiny_data: Path, tmp_path: Path) -> N
     assert again.returncode == 0 and "runs," not in again.stdout  # nothing is left to try
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_command_with_two_devices_starts_two_processes(tiny_data: Path, tmp_path: Path) -> None:
     steps = ["training.num_steps=4", "training.val_interval=2", "training.warmup_steps=1"]
     command = [sys.executable, "-m", "gpe_pl.fit", *DATA, *RUN, *steps, f"paths.data={tiny_data}", f"paths.runs={tmp_path}"]

@@ -50,7 +50,7 @@ def test_two_rollouts_are_equal_bit_for_bit() -> None:
     assert ends[0] == ends[1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell how much memory is in use")
 def test_memory_of_10000_steps_is_flat() -> None:
     about = scenes.metadata()
@@ -67,7 +67,7 @@ def test_memory_of_10000_steps_is_flat() -> None:
     assert max(used[20:]) - max(used[:20]) < 2 * MEBIBYTE, [u // 1024 for u in used]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system does not tell how much memory is in use")
 def test_memory_of_20_epochs_is_flat(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     windows_per_epoch = 2 * (12 - 2 - 1)  # trajectories of 12 frames with a history of 2
@@ -87,7 +87,7 @@ def test_memory_of_20_epochs_is_flat(tiny_data: Path, tmp_path: Path, monkeypatc
     assert max(used[10:]) - max(used[:10]) < 4 * MEBIBYTE, [u // 1024 for u in used]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_changing_numbers_of_edges_compile_at_most_three_times_again() -> None:
     """Rollouts compile nothing; training, where it compiles, meets as many edges as there are batches."""
     from torch._dynamo.utils import counters

@@ -63,14 +63,14 @@ def bad(faults: list[Fault], folder: Path) -> list[tuple[str, str, Verdict]]:
 # --- what is wrong is refused ---------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.long)])
 def test_damaged_and_wrong_shards(shard: Path, tmp_path: Path, step: int) -> None:
     faults = stores.faults(shard, 16)
     assert len(faults) > 100
     assert not bad(faults[::step], tmp_path)
 
 
-@pytest.mark.parametrize("step", [8, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("step", [8, pytest.param(1, marks=pytest.mark.long)])
 def test_damaged_wrong_and_hostile_checkpoints(checkpoint: Path, tmp_path: Path, step: int) -> None:
     faults = checkpoints.faults(checkpoint, 16)
     assert len(faults) > 100
@@ -166,7 +166,7 @@ def _raises(_: Path) -> Verdict:
     raise KeyError("by mistake")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_hangs_or_dies_costs_only_itself() -> None:
     attacks: dict[str, Callable[[Path], Verdict]] = {
         "refused": _finds,
