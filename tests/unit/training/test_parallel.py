@@ -25,7 +25,7 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import node_code, param_names
-from gpe_pl.training.module import MAX_SKIPPED, TrainingError, TrainingModule
+from gpe_pl.training.module import MAX_IN_ROW, TrainingError, TrainingModule
 from gpe_pl.training.parallel import sum_gradients
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, train
 from gpe_pl.trajectory import StoreError, Trajectory, write_shard
@@ -213,7 +213,7 @@ def test_numbers_that_go_bad_on_one_rank_are_skipped_on_all_and_stop_all(mixed: 
         m._windows = [(3 + rank, 17)]
         m._trainer = SimpleNamespace(global_step=4)  # type: ignore[assignment]
         loss = torch.tensor(float("nan") if rank else 1.0)
-        for _ in range(MAX_SKIPPED):
+        for _ in range(MAX_IN_ROW - 1):
             m._skip("loss", ranks.summed(loss))
         with pytest.raises(TrainingError) as caught:
             m._skip("loss", ranks.summed(loss))
