@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gpe_pl.suites
+from gpe_pl.atomic import replace_text
 from gpe_pl.config import ConfigError, construct, entry_point
 
 if TYPE_CHECKING:
@@ -56,9 +57,7 @@ def benchmark(cfg: DictConfig) -> None:
         figure.savefig(folder / f"{name}.png", dpi=150)
     results = {"environment": environment(), "settings": asdict(settings), "records": records}
     for name, text in (("results.json", json.dumps(results, indent=1)), ("table.md", table + "\n")):
-        temporary = folder / f".{name}.part"
-        temporary.write_text(text)
-        os.replace(temporary, folder / name)
+        replace_text(folder / name, text)
     print(table)
 
 

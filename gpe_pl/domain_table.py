@@ -14,9 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.evaluation import LEARNED
 from gpe_pl.metrics import Interval, bootstrap_interval
-from gpe_pl.report import Run, finished_runs, groups_of, replace_text, table_row, values_by_seed
+from gpe_pl.report import Run, finished_runs, groups_of, table_row, values_by_seed
 
 log = logging.getLogger(__name__)
 
@@ -111,12 +112,10 @@ def _write_csv(path: Path, runs: Sequence[Run]) -> None:
             for split in groups_of(row):
                 groups[domain_of(run), model, seed, split, row.metric, row.horizon].append(row.value)
         lines |= {key: float(np.mean(values)) for key, values in groups.items()}
-    temporary = path.with_suffix(".part")
-    with open(temporary, "w", newline="") as handle:
+    with replacing(path) as part, open(part, "w", newline="") as handle:
         writer = csv.writer(handle)
         writer.writerow(["domain", "model", "seed", "split", "metric", "horizon", "value"])
         writer.writerows([*key, value] for key, value in sorted(lines.items()))
-    temporary.replace(path)
 
 
 def _markdown(domains: list[str], models: list[str], cells: dict[tuple[str, str], Cell], by_cell: dict[tuple[str, str], list[Run]]) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import importlib.util
 import logging
-import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from itertools import islice
@@ -18,6 +17,7 @@ from pydantic import Field
 from torch_geometric.data import Batch
 
 from gpe_pl.approximate import approximate
+from gpe_pl.atomic import replacing
 from gpe_pl.baselines import Ballistic, ConstantVelocity
 from gpe_pl.containment import TOLERANCE, Contained
 from gpe_pl.data.dataset import WindowDataset, open_split
@@ -210,13 +210,10 @@ def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windo
 
 def write_rows(path: Path, rows: list[Row]) -> None:
     """Write rows as CSV, atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".part")
-    with open(temporary, "w", newline="") as handle:
+    with replacing(path) as part, open(part, "w", newline="") as handle:
         writer = csv.DictWriter(handle, fieldnames=list(Row.__dataclass_fields__))
         writer.writeheader()
         writer.writerows(asdict(row) for row in rows)
-    os.replace(temporary, path)
 
 
 class MetricsError(GpeError, ValueError):

@@ -7,7 +7,6 @@ formats, XML part [Kitware, docs.vtk.org]. Nodes of meshes belong to their cells
 from __future__ import annotations
 
 import base64
-import os
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,6 +15,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from jaxtyping import Float
 
+from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.metrics import displacement
 from gpe_pl.trajectory import Trajectory, stored_arrays, stored_attributes, von_mises
 
@@ -40,14 +40,9 @@ def write_npz(path: Path | str, trajectory: Trajectory) -> None:
     path = Path(path)
     if path.suffix != ".npz":
         raise ValueError(f"{path}: a NumPy archive ends in .npz")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part.npz")
     texts = {key: np.array(text) for key, text in stored_attributes(trajectory).items()}
-    try:
-        np.savez_compressed(temporary, allow_pickle=False, **stored_arrays(trajectory), **texts)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as part:
+        np.savez_compressed(part, allow_pickle=False, **stored_arrays(trajectory), **texts)
 
 
 def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory | None = None, stride: int = 1) -> None:
@@ -82,15 +77,15 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     for frame in range(0, trajectory.num_frames, stride):
         name = f"frame_{frame:05d}.vtu"
         points, in_cells = _point_data(trajectory, frame, ground_truth), _cell_data(trajectory, frame, int(is_vertex.sum()))
-        _write(folder / name, _grid(trajectory.pos[frame], cells, types, points, in_cells))
+        replace_text(folder / name, _grid(trajectory.pos[frame], cells, types, points, in_cells))
         time = frame * trajectory.metadata.frame_dt
         entries.append(f'<DataSet timestep="{time:.9g}" part="0" file={quoteattr(f"{folder.name}/{name}")}/>')
     boundary = trajectory.boundary
     if len(boundary.pos):
         data = {"normal": _in_3d(boundary.normal), "friction": boundary.friction, "restitution": boundary.restitution}
         vertices = [np.arange(len(boundary.pos))[:, None]]
-        _write(folder / "boundary.vtu", _grid(boundary.pos, vertices, np.full(len(boundary.pos), VERTEX), data, {}))
-    _write(path, _document("Collection", "<Collection>\n" + "\n".join(entries) + "\n</Collection>"))
+        replace_text(folder / "boundary.vtu", _grid(boundary.pos, vertices, np.full(len(boundary.pos), VERTEX), data, {}))
+    replace_text(path, _document("Collection", "<Collection>\n" + "\n".join(entries) + "\n</Collection>"))
 
 
 def _cells(trajectory: Trajectory) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
@@ -176,12 +171,3 @@ def _array(name: str, values: np.ndarray) -> str:
 def _document(kind: str, content: str) -> str:
     attributes = 'version="1.0" byte_order="LittleEndian" header_type="UInt64" compressor="vtkZLibDataCompressor"'
     return f'<?xml version="1.0"?>\n<VTKFile type="{kind}" {attributes}>\n{content}\n</VTKFile>\n'
-
-
-def _write(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text(text)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -32,6 +32,7 @@ import numpy as np
 from pydantic import Field, InstanceOf
 from pydantic.dataclasses import dataclass
 
+from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, is_intact, shard_moments, with_checksum
 from gpe_pl.errors import GpeError
 from gpe_pl.rollout import Guard, SimulationError, Simulator, rollout
@@ -415,17 +416,13 @@ def generate(
     """
     if num_workers < 1:
         raise ValueError(f"num_workers must be at least 1, got {num_workers}")
-    own = _shards(spec, part)
+    to_do = plan(root, spec, part)
     folder = Path(root) / spec.name / spec.size
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise GenerationError(f"{folder}: cannot be made ({error}); choose another folder with paths.data") from None
     _claim(folder, spec)
-    for split, k in own:
-        for leftover in folder.glob(f"{split}/.{shard_path(folder, split, k).name}.*.part"):
-            leftover.unlink(missing_ok=True)
-    to_do = plan(root, spec, part)
     if not to_do.fits:
         raise GenerationError(
             f"{folder}: {to_do.num_missing} trajectories need up to {to_do.bytes_needed / 2**30:.3g} GiB, the disk has "
@@ -469,12 +466,8 @@ def _draw_contact_sheet(spec: DatasetSpec, path: Path, pool: Executor | None) ->
     index = _most_varied_scene(spec)
     arguments = [(spec, index, label, values) for label, values in rows.items()]
     trajectories = dict(_run(pool, _labelled_trajectory, arguments))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part.png")
-    try:
-        contact_sheet({label: trajectories[label] for label in rows}).savefig(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as part:
+        contact_sheet({label: trajectories[label] for label in rows}).savefig(part)
 
 
 def _most_varied_scene(spec: DatasetSpec) -> int:
@@ -545,12 +538,7 @@ def _differences(stored: Any, wanted: Any, key: str = "") -> list[str]:
 
 
 def _write_json(path: Path, values: dict[str, Any]) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text(json.dumps(values, indent=2, sort_keys=True) + "\n")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    replace_text(path, json.dumps(values, indent=2, sort_keys=True) + "\n")
 
 
 # --- processes -----------------------------------------------------------------------------------------------------------------------------

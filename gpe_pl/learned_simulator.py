@@ -9,7 +9,6 @@ from __future__ import annotations
 import copy
 import importlib
 import inspect
-import os
 import zipfile
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
@@ -21,6 +20,7 @@ from torch import Tensor, nn
 from torch_geometric.data import Batch, HeteroData
 
 from gpe_pl import integrators
+from gpe_pl.atomic import replacing
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig, history_of
@@ -321,12 +321,9 @@ class LearnedSimulator(nn.Module):
 
     def save(self, path: Path | str) -> None:
         """Write weights and description alone, which ``from_checkpoint`` reads, atomically; a training checkpoint also holds the optimiser's state."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
         weights = {f"simulator.{name}": value.detach().cpu().clone() for name, value in self.state_dict().items()}
-        temporary = path.with_suffix(".part")
-        torch.save({"simulator": self.description(), "state_dict": weights}, temporary)
-        os.replace(temporary, path)
+        with replacing(Path(path)) as part:
+            torch.save({"simulator": self.description(), "state_dict": weights}, part)
 
     @classmethod
     def from_checkpoint(cls, path: Path | str, device: Any = "cpu") -> LearnedSimulator:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import copy
 import json
-import os
 import re
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -27,6 +26,7 @@ from torch.export import Dim
 from torch_geometric.data import HeteroData
 
 from gpe_pl import integrators
+from gpe_pl.atomic import replacing
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import boundary_features, edge_features, history_of, material_features, mesh_features, virtual_features
@@ -255,13 +255,8 @@ def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
     shapes = {name: {k: dims[n] for k, n in enumerate(i.shape) if isinstance(n, str)} for name, i in inputs.items()}
     with torch.no_grad():
         program = torch.export.export(step, (example,), dynamic_shapes=(shapes,))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part.pt2")
-    try:
-        torch.export.save(program, temporary, extra_files={DESCRIPTION: json.dumps(_description(simulator, inputs), indent=1)})
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with replacing(path) as part:
+        torch.export.save(program, part, extra_files={DESCRIPTION: json.dumps(_description(simulator, inputs), indent=1)})
 
 
 def _description(simulator: LearnedSimulator, inputs: dict[str, Input]) -> dict[str, Any]:

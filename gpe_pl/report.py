@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import logging
-import os
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.evaluation import LEARNED, Row, read_rows
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import bootstrap_interval
@@ -135,19 +135,10 @@ def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
         if len(steps):
             groups["val", "one_step_nmse", "1"].append(float(losses[-1]))
         lines += [[*key, run.config.get("seed"), *group, float(np.mean(values))] for group, values in sorted(groups.items())]
-    temporary = path.with_suffix(".part")
-    with open(temporary, "w", newline="") as handle:
+    with replacing(path) as part, open(part, "w", newline="") as handle:
         writer = csv.writer(handle)
         writer.writerow([*(_column(a) for a in axes), "seed", "split", "metric", "horizon", "value"])
         writer.writerows(lines)
-    os.replace(temporary, path)
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a file, atomically."""
-    temporary = path.with_suffix(".part")
-    temporary.write_text(text)
-    os.replace(temporary, path)
 
 
 def validation_curve(run_dir: Path) -> tuple[np.ndarray, np.ndarray]:

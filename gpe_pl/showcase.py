@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -19,6 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from gpe_pl.approximate import approximate
+from gpe_pl.atomic import replace_text
 from gpe_pl.containment import TOLERANCE, Contained
 from gpe_pl.geometry import signed_distance
 from gpe_pl.learned_simulator import LearnedSimulator
@@ -105,7 +105,7 @@ def run(
     records = tally.records()
     if outside:
         records.append(Record("share_outside_uncontained", float(np.mean(outside)), "1"))
-    _write(folder / "showcase.json", {"records": [vars(r) for r in records], "stopped": stop})
+    replace_text(folder / "showcase.json", json.dumps({"records": [vars(r) for r in records], "stopped": stop}, indent=1))
     film.write(folder / "showcase")
     return records
 
@@ -199,12 +199,6 @@ class _Film:
         strip.savefig(stem.with_suffix(".png"), dpi=220)
         extension = ".mp4" if find_spec("imageio_ffmpeg") else ".gif"
         write_film(stem.with_suffix(extension), "prediction", trajectory, fps=min(25.0, 1 / self.metadata.frame_dt))
-
-
-def _write(path: Path, values: dict[str, Any]) -> None:
-    temporary = path.with_suffix(".part")
-    temporary.write_text(json.dumps(values, indent=1))
-    os.replace(temporary, path)
 
 
 def summary(records: list[Record]) -> str:

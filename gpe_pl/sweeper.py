@@ -7,7 +7,6 @@ interrupted first. Any launcher runs its trials.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +20,7 @@ from hydra.plugins.sweeper import Sweeper
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig
 
+from gpe_pl.atomic import replace_text
 from gpe_pl.launcher import SweepError, UsageError
 
 JOURNAL = "optuna.log"
@@ -84,7 +84,7 @@ class OptunaSweeper(Sweeper):
         if not study.get_trials(states=[State.COMPLETE]):
             raise SweepError(error)
         best = study.best_trial
-        _write_json(folder / BEST, {"value": best.value, "trial": best.number, "values": best.params})
+        replace_text(folder / BEST, json.dumps({"value": best.value, "trial": best.number, "values": best.params}, indent=1) + "\n")
         print(f"best of {self.num_trials} trials: {best.value:.6g} with {', '.join(f'{k}={_text(v)}' for k, v in best.params.items())}")
 
     def _split(self, arguments: list[str]) -> tuple[list[str], dict[str, Any]]:
@@ -117,12 +117,6 @@ def _distribution(override: Override) -> Any:
 
 def _text(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)  # a folder's name is made of it
-
-
-def _write_json(path: Path, values: dict[str, Any]) -> None:
-    temporary = path.with_suffix(".part")
-    temporary.write_text(json.dumps(values, indent=1) + "\n")
-    os.replace(temporary, path)
 
 
 @dataclass

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -35,6 +34,7 @@ from gpe_pl.arrays import (
     typical_spacing,
     velocities_of,
 )
+from gpe_pl.atomic import replacing
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import Shape, shape_from_dict, shape_to_dict
 from gpe_pl.periodicity import NOWHERE, Periodicity
@@ -551,36 +551,28 @@ def write_shard(path: Path | str, trajectories: Iterable[Trajectory], names: Ite
         ValueError: ``names`` are fewer than the trajectories.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     name_of = iter(names) if names is not None else (f"{k:05d}" for k in range(10**9))
-    try:
-        # track_times off and the libver pinned: equal content gives equal bytes
-        with h5py.File(temporary, "w", libver=("v110", "v110"), track_order=False) as file:
-            file.attrs["schema_version"] = SCHEMA_VERSION
-            _write_text(file, "units", json.dumps({k: f.unit for k, f in FIELDS.items()}, sort_keys=True))
-            count = 0
-            for trajectory in trajectories:
-                name = next(name_of, None)
-                if name is None:
-                    raise ValueError(f"{path}: {count} names for more than {count} trajectories")
-                arrays, attributes = stored_arrays(trajectory), stored_attributes(trajectory)
-                group = file.create_group(name)
-                for key, text in attributes.items():
-                    _write_text(group, key, text)
-                _write_text(group, "sha256", digest(arrays, attributes))
-                for key, array in arrays.items():
-                    empty = array.size == 0
-                    options = {} if empty else {"chunks": _chunks(array, FIELDS[key].dims), "fletcher32": True, **COMPRESSION}
-                    dataset = group.create_dataset(key, data=array, track_times=False, **options)
-                    _write_text(dataset, "unit", FIELDS[key].unit)
-                count += 1
-            file.attrs["num_trajectories"] = count
-        with open(temporary, "rb") as handle:
-            os.fsync(handle.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    # track_times off and the libver pinned: equal content gives equal bytes
+    with replacing(path) as part, h5py.File(part, "w", libver=("v110", "v110"), track_order=False) as file:
+        file.attrs["schema_version"] = SCHEMA_VERSION
+        _write_text(file, "units", json.dumps({k: f.unit for k, f in FIELDS.items()}, sort_keys=True))
+        count = 0
+        for trajectory in trajectories:
+            name = next(name_of, None)
+            if name is None:
+                raise ValueError(f"{path}: {count} names for more than {count} trajectories")
+            arrays, attributes = stored_arrays(trajectory), stored_attributes(trajectory)
+            group = file.create_group(name)
+            for key, text in attributes.items():
+                _write_text(group, key, text)
+            _write_text(group, "sha256", digest(arrays, attributes))
+            for key, array in arrays.items():
+                empty = array.size == 0
+                options = {} if empty else {"chunks": _chunks(array, FIELDS[key].dims), "fletcher32": True, **COMPRESSION}
+                dataset = group.create_dataset(key, data=array, track_times=False, **options)
+                _write_text(dataset, "unit", FIELDS[key].unit)
+            count += 1
+        file.attrs["num_trajectories"] = count
 
 
 def _write_text(owner: h5py.HLObject, key: str, text: str) -> None:

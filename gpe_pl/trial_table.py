@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.domain_table import domain_of, model_of
 from gpe_pl.evaluation import LEARNED
-from gpe_pl.report import Run, axes_of, finished_runs, replace_text, table_row, validation_curve, values_by_seed
+from gpe_pl.report import Run, axes_of, finished_runs, table_row, validation_curve, values_by_seed
 
 TRIALS_CSV, TRIALS_MD = "trials.csv", "trials.md"
 CONSEQUENCES = ("training.num_steps", "training.val_interval", "seed")
@@ -78,8 +79,7 @@ def _cell(runs: list[Run], split: str, error: float, *, is_best: bool) -> str:
 
 
 def _write_csv(path: Path, groups: dict[tuple[str, str], list[Run]], settings: list[str], columns: list[str], splits: list[str]) -> None:
-    temporary = path.with_suffix(".part")
-    with open(temporary, "w", newline="") as handle:
+    with replacing(path) as part, open(part, "w", newline="") as handle:
         writer = csv.writer(handle)
         writer.writerow(["domain", "model", *columns, "num_steps", "seed", "split", "num_trajectories", "num_failed", "rollout_mse"])
         for (domain, model), runs in sorted(groups.items()):
@@ -94,4 +94,3 @@ def _write_csv(path: Path, groups: dict[tuple[str, str], list[Run]], settings: l
                             run.config["seed"],
                         ]
                         writer.writerow([*about, split, len(values), int((~np.isfinite(values)).sum()), float(np.mean(values))])
-    temporary.replace(path)

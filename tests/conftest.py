@@ -104,3 +104,27 @@ def tiny_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tests.runs import generate_tiny
 
     return generate_tiny(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file with two trajectories."""
+    path = tmp_path_factory.mktemp("shard") / "shard-00000.h5"
+    write_shard(path, [make_trajectory(seed) for seed in (0, 1)])
+    return path
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small GPE, as it is shipped."""
+    import torch
+
+    from gpe_pl.learned_simulator import LearnedSimulator
+    from gpe_pl.models.gpe import GPE
+    from tests.scenes import builder
+
+    torch.manual_seed(0)
+    build = builder()
+    path = tmp_path_factory.mktemp("checkpoint") / "sound.ckpt"
+    LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=4), build).save(path)
+    return path

@@ -71,7 +71,7 @@ def started(command: str, arguments: Sequence[str], override: str, must_fail: bo
     """Start a command with one override more."""
     ended = run(command, [*arguments, f"paths.runs={folder}", override], limit)
     verdict = ended.verdict("accepted" if must_fail else "harmless")
-    if verdict.status in ("refused", "harmless") and list(folder.rglob("*.part")):
+    if verdict.status in ("refused", "harmless") and list(folder.rglob("*.part*")):
         return Verdict("half-written", verdict.detail)
     return verdict
 

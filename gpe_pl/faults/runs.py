@@ -56,7 +56,7 @@ class Command:
 def digests(folder: Path) -> dict[str, str]:
     """SHA-256 of what must not depend on how a command was interrupted: data, metrics, tables, weights and the state of the optimiser, bit for bit."""
     found = {}
-    for path in sorted(folder.rglob("*")):
+    for path in _final_files(folder):
         name = str(path.relative_to(folder))
         if path.suffix == ".ckpt":
             stored = load_checkpoint(path)
@@ -93,9 +93,9 @@ def _digest(value: Any) -> str:
 def incomplete(folder: Path) -> list[str]:
     """Files in their final place that cannot be read."""
     found = []
-    for path in sorted(folder.rglob("*")):
+    for path in _final_files(folder):
         try:
-            if path.suffix == ".h5" and not path.name.startswith("."):
+            if path.suffix == ".h5":
                 stores.contents(path)
             elif path.suffix == ".ckpt":
                 load_checkpoint(path)
@@ -109,6 +109,10 @@ def incomplete(folder: Path) -> list[str]:
 def leftovers(folder: Path) -> list[str]:
     """Temporary files."""
     return [path.name for path in folder.rglob("*.part*")]
+
+
+def _final_files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if not path.name.startswith("."))
 
 
 def _finished(command: Command, folder: Path, expected: dict[str, str], limit: float) -> Verdict:

@@ -19,6 +19,7 @@ from gpe_pl.faults.runs import Command
 from gpe_pl.faults.verdict import BAD, GOOD, Fault, Verdict
 from gpe_pl.generation import DatasetSpec
 from gpe_pl.report import table_row
+from gpe_pl.suites.trained import Case
 
 log = logging.getLogger(__name__)
 
@@ -28,13 +29,6 @@ KILLED = "killed"
 
 class PreparationError(GpeError):
     """A command that nothing was done to has failed; the message says how."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """A data set: what ``python -m gpe_pl.simulate`` would be given."""
-
-    overrides: list[str]
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ import logging
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -24,10 +23,11 @@ from gpe_pl.errors import GpeError
 from gpe_pl.generation import DatasetSpec, generate_trajectory, initial_state
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import bootstrap_interval, energy_distance
-from gpe_pl.report import Run, finished_runs, table_row
+from gpe_pl.report import Run, table_row
 from gpe_pl.rollout import SimulationError, Simulator
 from gpe_pl.schema import Split
 from gpe_pl.solvers.resolution import Resolved, coarser, finer
+from gpe_pl.suites.trained import Case, runs_in, trained_on
 from gpe_pl.trajectory import State, Trajectory
 
 if TYPE_CHECKING:
@@ -42,13 +42,6 @@ BALLISTIC = "ballistic"
 
 class ComparisonError(GpeError, ValueError):
     """Nothing can be compared; the message says what is missing."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """A data set: what ``python -m gpe_pl.simulate`` would be given."""
-
-    overrides: list[str]
 
 
 @dataclass(frozen=True)
@@ -107,7 +100,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
     torch.set_num_threads(settings.num_threads)
     records: list[dict[str, Any]] = []
     parts = []
-    finished = [run for folder in settings.runs for run in finished_runs(Path(folder))]
+    finished = runs_in(settings.runs)
     for name, spec in specs.items():
         models = _models(finished, spec)
         if not models:
@@ -123,18 +116,11 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
 
 
 def _models(runs: Sequence[Run], spec: DatasetSpec) -> dict[str, tuple[LearnedSimulator, float]]:
-    """Trained simulators and the seconds of their training, by model and width; the first seed of each."""
-    models: dict[str, tuple[LearnedSimulator, float]] = {}
-    for run in runs:
-        if (run.config["data.name"], run.config["size.name"]) == (spec.name, spec.size):
-            depth = run.config.get("model.num_message_passing_steps", run.config.get("model.num_propagation_steps"))
-            size = f"{depth or run.config.get('model.num_convolutions')} × {run.config['model.hidden_channels']}"
-            label = f"{str(run.config['model._target_']).rpartition('.')[2]} {size}"
-            if label not in models:
-                minutes = run.config.get("size.comparison.budget_minutes")
-                simulator = LearnedSimulator.from_checkpoint(run.folder / "checkpoints" / "best.ckpt")
-                models[label] = simulator, 60 * float(cast(float, minutes)) if minutes is not None else float("nan")
-    return models
+    """Trained simulators and the seconds of their training, by label."""
+    return {
+        label: (simulator, 60 * float(run.config.get("size.comparison.budget_minutes") or "nan"))
+        for label, (simulator, run) in trained_on(spec, runs).items()
+    }
 
 
 def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]], settings: Settings) -> tuple[list[Point], float]:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -21,9 +21,10 @@ from gpe_pl.errors import GpeError
 from gpe_pl.generation import DatasetSpec, generate_trajectory
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.pretrained import checkpoint_path
-from gpe_pl.report import finished_runs, table_row
+from gpe_pl.report import table_row
 from gpe_pl.stability import conservation, geometry, horizon, inputs, invariances, precision
 from gpe_pl.stability.subject import Outcome, StressTest, Subject
+from gpe_pl.suites.trained import Case, runs_in, trained_on
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -42,13 +43,6 @@ GROUPS = {
 
 class NothingToTestError(GpeError, ValueError):
     """No model for a data set; the message says where they were looked for."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """A data set: what ``python -m gpe_pl.simulate`` would be given."""
-
-    overrides: list[str]
 
 
 @dataclass(frozen=True)
@@ -173,29 +167,12 @@ def is_gating(simulator: LearnedSimulator, gating: dict[str, str]) -> bool:
 
 def _models(spec: DatasetSpec, settings: Settings) -> Iterator[tuple[str, LearnedSimulator]]:
     """Simulators by name; one that has the name of another is left out."""
-    seen: set[str] = set()
-    for folder in settings.runs:
-        for finished in finished_runs(Path(folder)):
-            if (finished.config["data.name"], finished.config["size.name"]) == (spec.name, spec.size):
-                simulator = LearnedSimulator.from_checkpoint(finished.folder / "checkpoints" / "best.ckpt")
-                name = _label(simulator)
-                if name not in seen:
-                    seen.add(name)
-                    yield name, simulator
+    yield from ((name, simulator) for name, (simulator, _) in trained_on(spec, runs_in(settings.runs)).items())
     for checkpoint in settings.checkpoints:
         simulator = LearnedSimulator.from_checkpoint(checkpoint_path(checkpoint))
         metadata = simulator.builder.metadata
         if (metadata.dataset, metadata.spacing) == (spec.name, spec.scene.spacing):
             yield Path(checkpoint).stem, simulator
-
-
-def _label(simulator: LearnedSimulator) -> str:
-    """Class, depth, width, and what else is not at its default."""
-    cls, settings = type(simulator.model), dict(simulator.description()["settings"])
-    depth = next((settings.pop(k) for k in ("num_message_passing_steps", "num_propagation_steps", "num_convolutions") if k in settings), "")
-    plain = cast(Any, cls)(simulator.builder.spec).settings
-    other = [str(v) for k, v in settings.items() if k != "hidden_channels" and v != plain.get(k)]
-    return " ".join([f"{cls.__name__} {depth} × {settings['hidden_channels']}", *other])
 
 
 # --- the table ------------------------------------------------------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +18,7 @@ import torch
 from filelock import FileLock
 from torch_geometric.data import Batch
 
+from gpe_pl.atomic import replace_text
 from gpe_pl.data.dataset import BatchSize, WindowDataset
 from gpe_pl.errors import GpeError
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
@@ -87,9 +87,7 @@ def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Cal
         if key not in times:
             times[key] = _measured(settings, measure)
             log.info("%s: %.1f ms per training step", key, 1e3 * times[key])
-            temporary = path.with_suffix(".part")
-            temporary.write_text(json.dumps(times, indent=1))
-            os.replace(temporary, path)
+            replace_text(path, json.dumps(times, indent=1))
     validations = max(1, settings.num_steps // settings.val_interval)
     interval = max(1, int(60 * settings.budget_minutes / times[key] / validations))
     return replace(settings, num_steps=interval * validations, val_interval=interval, budget_minutes=None)

@@ -18,6 +18,7 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
+from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import NoiseKind
 from gpe_pl.errors import GpeError
@@ -106,12 +107,7 @@ def claim(run_dir: Path, config: dict[str, Any]) -> None:
                 f"{run_dir} holds a run with another configuration ({'; '.join(different[:3])}); choose another name=… or delete the folder"
             )
         return
-    temporary = path.with_suffix(f".{os.getpid()}.part")
-    try:
-        temporary.write_text(json.dumps(config, indent=1, sort_keys=True))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)  # of a full disk
+    replace_text(path, json.dumps(config, indent=1, sort_keys=True))
 
 
 def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
@@ -123,9 +119,8 @@ def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
             if not _differences({key: value for key, value in there.items() if key != "evaluation"}, config):
                 log.info("taking the model that was trained in %s", path.parent)
                 own = run_dir / "checkpoints" / "best.ckpt"
-                own.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy(trained, own.with_suffix(".part"))
-                os.replace(own.with_suffix(".part"), own)
+                with replacing(own) as part:
+                    shutil.copy(trained, part)
                 return own
     return None
 

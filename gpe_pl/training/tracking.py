@@ -13,6 +13,8 @@ from urllib.parse import urlparse
 
 from lightning.pytorch.loggers import CSVLogger, Logger
 
+from gpe_pl.atomic import replace_text
+
 log = logging.getLogger(__name__)
 
 WANDB_URL = "https://api.wandb.ai"
@@ -66,11 +68,8 @@ def has_key() -> bool:
 def run_id(run_dir: Path) -> str:
     """An identifier that a resumed run finds again; written once."""
     path = run_dir / RUN_ID
-    run_dir.mkdir(parents=True, exist_ok=True)
     if not path.exists():
-        temporary = path.with_suffix(f".{os.getpid()}.part")
-        temporary.write_text(os.urandom(6).hex())
-        os.replace(temporary, path)
+        replace_text(path, os.urandom(6).hex())
     return path.read_text().strip()
 
 

@@ -1,6 +1,5 @@
 """Animations of a rollout beside the ground truth: GIF always, MP4 where imageio-ffmpeg is installed."""
 
-import os
 from collections.abc import Iterator, Mapping
 from itertools import chain
 from pathlib import Path
@@ -11,6 +10,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
+from gpe_pl.atomic import replacing
 from gpe_pl.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
 from gpe_pl.viz.coloring import COLOR_MAPS, REFERENCE, ColorBy, Coloring
@@ -61,17 +61,12 @@ def _write(
         raise ValueError(f"{path}: an animation ends in .gif or .mp4")
     if len(frames) == 0 or fps <= 0:
         raise ValueError(f"{path}: stride and fps must be positive, and there must be a frame to show")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
-    try:
+    with replacing(path) as part:
         images = _images(rows, frames, Coloring(color, list(rows.values()), frames, truth), panel_pixels)
         if path.suffix == ".gif":
-            _write_gif(temporary, images, fps, _palette(color))
+            _write_gif(part, images, fps, _palette(color))
         else:
-            _write_mp4(temporary, images, fps)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+            _write_mp4(part, images, fps)
 
 
 def _images(rows: dict[str, Trajectory], frames: range, coloring: Coloring, panel_pixels: int) -> Iterator[np.ndarray]:

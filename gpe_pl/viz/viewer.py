@@ -13,7 +13,6 @@ from __future__ import annotations
 import base64
 import html
 import json
-import os
 import re
 import zlib
 from collections.abc import Mapping, Sequence
@@ -25,6 +24,7 @@ import numpy as np
 from jaxtyping import Float, UInt16
 from matplotlib.colors import to_rgb
 
+from gpe_pl.atomic import replace_text
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import Bowl, signed_distance
 from gpe_pl.schema import MATERIALS
@@ -107,13 +107,7 @@ def write_viewer(
         "script": "\n".join((PAGE / name).read_text() for name in ("data.js", "render.js", "viewer.js")),
     }
     page = re.sub(r"\{\{(\w+)\}\}", lambda slot: parts[slot[1]], (PAGE / "viewer.html").read_text())
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        temporary.write_text(page)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    replace_text(path, page)
     return float(scene["rounding"])
 
 

@@ -6,38 +6,16 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
-import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gpe_pl.faults.checkpoints import PAYLOADS, PLACES, load_damaged, load_hostile
 from gpe_pl.faults.stores import content, read_damaged
 from gpe_pl.faults.verdict import GOOD
-from gpe_pl.learned_simulator import LearnedSimulator
-from gpe_pl.models.gpe import GPE
 from gpe_pl.trajectory import Trajectory, read_trajectory, write_shard
-from tests.conftest import make_trajectory
-from tests.scenes import builder
 from tests.strategies import damages, trajectories
 
 same_file = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-@pytest.fixture(scope="module")
-def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("shard") / "shard-00000.h5"
-    write_shard(path, [make_trajectory(seed) for seed in (0, 1)])
-    return path
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.manual_seed(0)
-    build = builder()
-    path = tmp_path_factory.mktemp("checkpoint") / "sound.ckpt"
-    LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=4), build).save(path)
-    return path
 
 
 @given(st.lists(trajectories(), max_size=2))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -19,6 +20,9 @@ ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 MOMENTUM = ROOT / "notebooks" / "momentum_ablation.ipynb"
 MAX_CELLS = 12
+STOPPED = re.compile(
+    r"(val|test|test_unseen) \d+ stopped: \w+, frame \d+: "
+)  # what an evaluation says of a rollout that its watchdog ended
 
 # Everything as small as it goes: every split and both kinds of unseen parameters, few particles, frames and steps.
 DATA = (
@@ -101,7 +105,9 @@ def _outputs(notebook: Any) -> list[Any]:
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda p: p.stem)
 def test_notebook_runs_without_a_warning(path: Path, executed: Callable[[Path], Any]) -> None:
     before = path.read_bytes()
-    assert [output.text for output in _outputs(executed(path)) if output.get("name") == "stderr"] == []
+    errors = "".join(output.text for output in _outputs(executed(path)) if output.get("name") == "stderr")
+    # after four steps of training a rollout may well go wrong, and the evaluation then says so
+    assert [line for line in errors.splitlines() if not STOPPED.match(line)] == []
     assert path.read_bytes() == before
 
 

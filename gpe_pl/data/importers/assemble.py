@@ -5,9 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
-import os
 import re
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
@@ -18,6 +16,7 @@ import numpy as np
 
 from gpe_pl import integrators
 from gpe_pl.arrays import ArrayError
+from gpe_pl.atomic import replacing
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
 from gpe_pl.data.importers.source import NAME, Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments, with_checksum
@@ -109,9 +108,9 @@ def draw_contact_sheet(report: Report) -> Path:
     folder, split = Path(report.folder), next(iter(report.splits))
     shown = islice(iter_trajectories(folder, split), NUM_SHOWN)
     figure = contact_sheet({f"{split} {k}": trajectory for k, trajectory in enumerate(shown)})
-    temporary, path = folder / ".contact_sheet.part.png", folder / "contact_sheet.png"
-    figure.savefig(temporary)
-    os.replace(temporary, path)
+    path = folder / "contact_sheet.png"
+    with replacing(path) as part:
+        figure.savefig(part)
     return path
 
 
@@ -125,8 +124,6 @@ def _free_folder(root: Path, name: str) -> Path:
     folder = root / name / FOLDER
     if folder.exists():
         raise ImportFailure(f"{folder}: exists already, and imported data are never overwritten; delete it, or choose another name=…")
-    for leftover in folder.parent.glob(f".{FOLDER}.*.part"):
-        shutil.rmtree(leftover, ignore_errors=True)
     return folder
 
 
@@ -160,17 +157,12 @@ class _Conversion:
         """Look, decide, write."""
         self._look()
         self._decide()
-        part = self.folder.with_name(f".{FOLDER}.{os.getpid()}.part")
-        shutil.rmtree(part, ignore_errors=True)
-        try:
+        with replacing(self.folder) as part:
             for split in SPLITS:  # train first: what is unseen is told by it
                 if split in self.survey.good:
                     self._write(part, split, self.survey.good[split])
             self._summarize(part)
             self.report.write(part)
-            os.replace(part, self.folder)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
         return self.report
 
     # --- first pass ------------------------------------------------------------------------------------------------------------------------

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from gpe_pl.atomic import replace_text
 from gpe_pl.schema import MATERIALS
 
 REPORT_FILE = "report.json"
@@ -93,9 +93,7 @@ class Report:
     def write(self, folder: Path) -> None:
         """Write both files, atomically."""
         for name, text in ((REPORT_FILE, json.dumps(asdict(self), indent=1) + "\n"), (PAGE_FILE, self.markdown())):
-            temporary = folder / f".{name}.part"
-            temporary.write_text(text)
-            os.replace(temporary, folder / name)
+            replace_text(folder / name, text)
 
     def text(self) -> str:
         """What the command prints."""

@@ -18,29 +18,8 @@ from gpe_pl.faults import checkpoints, configs, scenes, stores
 from gpe_pl.faults.isolation import Ended, verdicts
 from gpe_pl.faults.verdict import GOOD, Fault, Verdict, judge
 from gpe_pl.generation import DatasetSpec
-from gpe_pl.learned_simulator import LearnedSimulator
-from gpe_pl.models.gpe import GPE
 from gpe_pl.simulate import dataset
 from gpe_pl.suites.faults import report
-from gpe_pl.trajectory import write_shard
-from tests.conftest import make_trajectory
-from tests.scenes import builder
-
-
-@pytest.fixture(scope="module")
-def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("shard") / "shard-00000.h5"
-    write_shard(path, [make_trajectory(seed) for seed in (0, 1)])
-    return path
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    torch.manual_seed(0)
-    build = builder()
-    path = tmp_path_factory.mktemp("checkpoint") / "sound.ckpt"
-    LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=4), build).save(path)
-    return path
 
 
 @pytest.fixture(scope="module")

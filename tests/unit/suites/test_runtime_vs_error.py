@@ -15,7 +15,6 @@ from gpe_pl.simulate import dataset_spec
 from gpe_pl.suites import runtime_vs_error as module
 from gpe_pl.suites.runtime_vs_error import (
     DATA,
-    Case,
     ComparisonError,
     Family,
     Point,
@@ -28,6 +27,7 @@ from gpe_pl.suites.runtime_vs_error import (
     hypervolume,
     run,
 )
+from gpe_pl.suites.trained import Case
 from tests.runs import compose
 
 OVERRIDES = ["data=sand", "size=tiny", "data.sizes.tiny.num_frames=24"]

@@ -21,9 +21,9 @@ from gpe_pl.simulate import dataset
 from gpe_pl.stability import conservation, geometry, horizon, inputs, invariances, precision
 from gpe_pl.stability.horizon import energy, growth_rate, separation, valid_steps
 from gpe_pl.stability.subject import Outcome, StressTest, Subject
-from gpe_pl.suites import stability
-from gpe_pl.suites.stability import GROUPS, Case, NothingToTestError, Settings, figures, is_gating, run
+from gpe_pl.suites.stability import GROUPS, NothingToTestError, Settings, figures, is_gating, run
 from gpe_pl.suites.stability import test as run_tests
+from gpe_pl.suites.trained import Case, model_label
 from gpe_pl.trajectory import State, Trajectory
 
 NUM_FRAMES = 16
@@ -199,4 +199,4 @@ def test_what_gates_is_the_shipped_configuration(spec: DatasetSpec, scenes: list
     assert is_gating(subject(spec, scenes, **SHIPPED).simulator, SHIPPED)
     assert not is_gating(subject(spec, scenes).simulator, SHIPPED)
     assert not is_gating(subject(spec, scenes, **SHIPPED).simulator, {})
-    assert stability._label(subject(spec, scenes, **SHIPPED).simulator) == "GPE 2 × 8 geometry angular"
+    assert model_label(subject(spec, scenes, **SHIPPED).simulator) == "GPE 2 × 8 geometry angular"

@@ -1,0 +1,64 @@
+"""Files that appear complete or not at all."""
+
+from __future__ import annotations
+
+import glob
+import os
+import platform
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A path beside ``path`` and with its suffix: what is written there takes its place when the block ends well, and is removed otherwise.
+
+    Makes the folder where there is none, and removes what processes that were killed have left of earlier attempts.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    start, end = f".{path.stem}.{platform.node()}.", f".part{path.suffix}"
+    for leftover in path.parent.glob(f"{glob.escape(start)}*{glob.escape(end)}"):
+        if not _is_running(leftover.name.removeprefix(start).removesuffix(end)):
+            _remove(leftover)
+    part = path.with_name(f"{start}{os.getpid()}{end}")
+    try:
+        yield part
+        _flush(part)
+        os.replace(part, path)
+    finally:
+        _remove(part)
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file."""
+    with replacing(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+def _is_running(pid: str) -> bool:
+    """Whether there is such a process on this machine; on Windows, where asking could end it, always."""
+    if not pid.isdigit() or os.name == "nt":
+        return True
+    try:
+        os.kill(int(pid), 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def _flush(path: Path) -> None:
+    """To the disk, so that a power cut does not leave an empty file under the final name."""
+    if path.is_file():
+        with open(path, "rb") as file:
+            os.fsync(file.fileno())
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
