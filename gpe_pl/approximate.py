@@ -5,6 +5,7 @@ What a rollout has to remember for this travels in ``State.internal``, so it may
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,11 +31,12 @@ def approximate(simulator: LearnedSimulator) -> Simulator:
     return runner if skips.hold == 1 else Holding(runner, dt, skips.hold)
 
 
-class _Batched:
+class _Batched(ABC):
     """``step`` from ``step_all``."""
 
+    @abstractmethod
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        raise NotImplementedError
+        """The states one frame later, or why there is none."""
 
     def step(self, state: State) -> State:
         (after,) = self.step_all([state])
