@@ -380,8 +380,15 @@ def _has_intact_statistics(path: Path) -> bool:
 
 
 def _compile(spec: DatasetSpec) -> None:
-    with contextlib.suppress(SimulationError):  # settings that cannot work are reported by the first trajectory, with its seed
-        spec.solver.compile_kernels()
+    """Compile the solver, or load what was compiled before, which is too quick to be spoken of."""
+    notice = threading.Timer(3.0, log.info, ["compiling the solver, once on this machine: about a minute"])
+    notice.daemon = True
+    notice.start()
+    try:
+        with contextlib.suppress(SimulationError):  # settings that cannot work are reported by the first trajectory, with its seed
+            spec.solver.compile_kernels()
+    finally:
+        notice.cancel()
 
 
 def seconds_per_trajectory(spec: DatasetSpec, budget: float = 10.0) -> float:
@@ -435,7 +442,7 @@ def generate(
     if on_progress is not None:
         on_progress(done, total)
     draws_sheet = part[0] == 0 and not sheet.is_file()
-    if (to_do.missing or draws_sheet) and num_workers > 1:
+    if to_do.missing or draws_sheet:
         _compile(spec)  # once, here: the workers load the compiled kernels from disk
     with _pool(num_workers) as pool:
         if draws_sheet:  # first, so that hours of wrong data are seen within a minute
