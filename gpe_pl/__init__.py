@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from gpe_pl.portable import export_model as export_model
     from gpe_pl.rollout import rollout as roll_out  # noqa: F401
     from gpe_pl.simulate import dataset as dataset
+    from gpe_pl.store import iter_trajectories as iter_trajectories
+    from gpe_pl.store import read_trajectory as read_trajectory
     from gpe_pl.trajectory import Metadata as Metadata
     from gpe_pl.trajectory import State as State
     from gpe_pl.trajectory import Trajectory as Trajectory
-    from gpe_pl.trajectory import iter_trajectories as iter_trajectories
-    from gpe_pl.trajectory import read_trajectory as read_trajectory
     from gpe_pl.viz.figures import rollout_figure as rollout_figure
     from gpe_pl.viz.video import write_animation as write_animation
     from gpe_pl.viz.viewer import write_viewer as write_viewer
@@ -47,8 +47,8 @@ _MODULES = {
     "dataset": "simulate",
     "export_model": "portable",
     "generate_trajectory": "generation",
-    "iter_trajectories": "trajectory",
-    "read_trajectory": "trajectory",
+    "iter_trajectories": "store",
+    "read_trajectory": "store",
     "roll_out": "rollout",
     "rollout_figure": "viz.figures",
     "rollout_metrics": "metrics",

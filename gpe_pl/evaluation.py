@@ -27,7 +27,8 @@ from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
 from gpe_pl.portable import export_model
 from gpe_pl.rollout import Guard, Simulator, Start, rollout, rollouts, share_outside
 from gpe_pl.schema import Split
-from gpe_pl.trajectory import State, Trajectory, iter_trajectories
+from gpe_pl.store import iter_trajectories
+from gpe_pl.trajectory import State, Trajectory
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,8 @@ from jaxtyping import Float
 
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.metrics import displacement
-from gpe_pl.trajectory import Trajectory, stored_arrays, stored_attributes, von_mises
+from gpe_pl.store import stored_arrays, stored_attributes
+from gpe_pl.trajectory import Trajectory, von_mises
 
 VERTEX = 1
 CELL_TYPES = {(2, 3): 5, (2, 4): 9, (3, 3): 5, (3, 4): 10}

@@ -38,7 +38,8 @@ from gpe_pl.errors import GpeError
 from gpe_pl.rollout import Guard, SimulationError, Simulator, rollout
 from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup
 from gpe_pl.solvers.scenes import Scene, describe
-from gpe_pl.trajectory import Metadata, State, StoreError, Trajectory, read_trajectory, trajectory_names, write_shard
+from gpe_pl.store import StoreError, read_trajectory, trajectory_names, write_shard
+from gpe_pl.trajectory import Metadata, State, Trajectory
 
 log = logging.getLogger(__name__)
 

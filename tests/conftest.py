@@ -12,7 +12,8 @@ from hypothesis import settings
 
 from gpe_pl.geometry import Box, domain_walls
 from gpe_pl.schema import node_code
-from gpe_pl.trajectory import Boundary, Metadata, Trajectory, write_shard
+from gpe_pl.store import write_shard
+from gpe_pl.trajectory import Boundary, Metadata, Trajectory
 
 settings.register_profile("fast", max_examples=20, deadline=None, derandomize=True, database=None)
 settings.register_profile("fuzz", max_examples=2000, deadline=None, print_blob=True)  # make fuzz

@@ -18,7 +18,8 @@ from gpe_pl.data.noise import Noise
 from gpe_pl.data.statistics import is_intact
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.trajectory import StoreError, Trajectory, iter_trajectories
+from gpe_pl.store import StoreError, iter_trajectories
+from gpe_pl.trajectory import Trajectory
 
 
 def data_statistics(root: Path | str) -> dict[str, float]:

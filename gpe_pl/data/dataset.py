@@ -20,7 +20,8 @@ from torch_geometric.data import HeteroData
 from gpe_pl import integrators, ranks
 from gpe_pl.data.noise import Noise
 from gpe_pl.graphs.builder import GraphBuilder
-from gpe_pl.trajectory import State, StoreError, Trajectory, open_group, open_shard, read_trajectory, shards
+from gpe_pl.store import StoreError, open_group, open_shard, read_trajectory, shards
+from gpe_pl.trajectory import State, Trajectory
 
 CACHE_BYTES = 2 * 1024**3
 """Splits smaller than this are held in memory; larger ones are read from disk window by window."""

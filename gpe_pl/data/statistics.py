@@ -12,7 +12,8 @@ import numpy as np
 
 from gpe_pl import integrators
 from gpe_pl.schema import MATERIALS
-from gpe_pl.trajectory import Trajectory, read_trajectory, trajectory_names
+from gpe_pl.store import read_trajectory, trajectory_names
+from gpe_pl.trajectory import Trajectory
 
 STATISTICS_FILE = "statistics.json"
 

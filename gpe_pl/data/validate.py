@@ -3,7 +3,7 @@
     python -m gpe_pl.data.validate PATH [PATH ...]     shards, or folders of shards; exit status 1 when anything is violated
     python -m gpe_pl.data.validate --format-page       Markdown, kept in data/README.md
 
-The reader in ``gpe_pl.trajectory`` refuses what it cannot read; this module also looks at the meaning: units, ranges, completeness. Each
+The reader in ``gpe_pl.store`` refuses what it cannot read; this module also looks at the meaning: units, ranges, completeness. Each
 check reports its first offender with frame and node, and how many more there are.
 """
 
@@ -28,8 +28,7 @@ from gpe_pl.geometry import Shape
 from gpe_pl.graphs.islands import Islands, free_since, islands_within
 from gpe_pl.periodicity import PeriodicityError
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup, param_names
-from gpe_pl.trajectory import (
-    Metadata,
+from gpe_pl.store import (
     StoreError,
     digest,
     metadata_of,
@@ -41,6 +40,7 @@ from gpe_pl.trajectory import (
     shapes_of,
     size_conflicts,
 )
+from gpe_pl.trajectory import Metadata
 
 Finding = tuple[str, str]
 """Name of the field or attribute, and what is wrong with it."""

@@ -14,7 +14,8 @@ import numpy as np
 
 from gpe_pl.faults.verdict import Fault, Verdict, judge
 from gpe_pl.schema import FIELDS
-from gpe_pl.trajectory import Trajectory, digest, read_trajectory, stored_arrays, stored_attributes, trajectory_names
+from gpe_pl.store import digest, read_trajectory, stored_arrays, stored_attributes, trajectory_names
+from gpe_pl.trajectory import Trajectory
 
 
 def content(trajectory: Trajectory) -> str:

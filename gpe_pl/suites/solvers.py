@@ -16,7 +16,7 @@ from pydantic import Field
 from gpe_pl.errors import GpeError
 from gpe_pl.generation import DatasetSpec, initial_state, trajectory_metadata
 from gpe_pl.rollout import rollout
-from gpe_pl.trajectory import array_bytes, write_shard
+from gpe_pl.store import array_bytes, write_shard
 
 
 class BenchmarkError(GpeError):

@@ -52,6 +52,7 @@ def test_data_can_be_read_and_made_without_torch() -> None:
         "gpe_pl.schema",
         "gpe_pl.geometry",
         "gpe_pl.trajectory",
+        "gpe_pl.store",
         "gpe_pl.rollout",
         "gpe_pl.containment",
         "gpe_pl.data.validate",

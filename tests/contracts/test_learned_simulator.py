@@ -21,7 +21,8 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import CHECKPOINT_FORMAT, CheckpointError, LearnedSimulator, SceneError, UnknownModelError, model_class
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout import Guard, SimulationError, rollout
-from gpe_pl.trajectory import State, Trajectory, iter_trajectories, write_shard
+from gpe_pl.store import iter_trajectories, write_shard
+from gpe_pl.trajectory import State, Trajectory
 from tests import scenes
 
 HISTORIES = (1, 2, 5)

@@ -27,7 +27,8 @@ from gpe_pl.models.gpe import GPE
 from gpe_pl.periodicity import NOWHERE, Periodicity, PeriodicityError
 from gpe_pl.rollout import rollout
 from gpe_pl.schema import BOUNDARY
-from gpe_pl.trajectory import Boundary, State, Trajectory, iter_trajectories, write_shard
+from gpe_pl.store import iter_trajectories, write_shard
+from gpe_pl.trajectory import Boundary, State, Trajectory
 from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.panel import Panel
 from tests import scenes

@@ -12,7 +12,7 @@ from gpe_pl.fit import fit
 from tests.runs import compose, first_choices, tiny
 
 EXPERIMENTS = sorted(p.stem for p in (CONF / "experiment").glob("*.yaml"))
-QUICK = {"smoke", "sand", "ablation_momentum", "table1"}
+QUICK = {"smoke", "table1"}
 """These run with the fast tests, all others with the slow ones."""
 
 
@@ -45,6 +45,7 @@ def test_the_ablation_sweeps_every_interaction_over_seeds() -> None:
     assert len(str(hydra.sweeper.params.seed).split(",")) >= 2
 
 
+@pytest.mark.slow
 def test_a_learned_stress_is_drawn_and_compared(tiny_data: Path, tmp_path: Path) -> None:
     cfg = tiny(tiny_data, tmp_path, "experiment=fem_stress", "evaluation.splits=[test]", "evaluation.num_pictures=1")
     fit(cfg)

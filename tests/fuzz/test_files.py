@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from gpe_pl.faults.checkpoints import PAYLOADS, PLACES, load_damaged, load_hostile
 from gpe_pl.faults.stores import content, read_damaged
 from gpe_pl.faults.verdict import GOOD
-from gpe_pl.trajectory import Trajectory, read_trajectory, write_shard
+from gpe_pl.store import read_trajectory, write_shard
+from gpe_pl.trajectory import Trajectory
 from tests.strategies import damages, trajectories
 
 same_file = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -179,6 +179,7 @@ def test_the_help_names_every_setting() -> None:
     assert not missing
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path: Path, lagrangebench: Path) -> None:
     command = [sys.executable, "-m", "gpe_pl.convert", "format=lagrangebench", f"paths.data={tmp_path}"]
     done = subprocess.run([*command, f"source={lagrangebench}"], capture_output=True, text=True, cwd=ROOT, check=False)

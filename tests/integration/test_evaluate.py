@@ -103,6 +103,7 @@ def of_rollouts(rows: list[Row], model: str = "learned") -> dict[tuple[int, str,
     return {(r.trajectory, r.metric, r.horizon): r.value for r in rows if r.model == model and r.trajectory >= 0}
 
 
+@pytest.mark.slow
 def test_levels_of_skipping_change_nothing_or_are_reported_with_what_they_cost(tiny_data: Path, tmp_path: Path) -> None:
     fit(tiny(tiny_data, tmp_path))
     checkpoint = tmp_path / "fit" / "checkpoints" / "best.ckpt"
@@ -121,6 +122,7 @@ def test_levels_of_skipping_change_nothing_or_are_reported_with_what_they_cost(t
     assert not any(metric in ("skipping_mse", "share_asleep", "lost_impulse") for _, metric, _ in usual)
 
 
+@pytest.mark.slow
 def test_only_the_split_that_is_asked_for_is_generated(tiny_data: Path, tmp_path: Path) -> None:
     fit(tiny(tiny_data, tmp_path))
     checkpoint = tmp_path / "fit" / "checkpoints" / "best.ckpt"

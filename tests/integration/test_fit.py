@@ -21,9 +21,9 @@ from gpe_pl.evaluation import read_rows
 from gpe_pl.fit import fit
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.report import report_sweep, validation_curve
+from gpe_pl.store import StoreError
 from gpe_pl.training.module import TrainingError, TrainingModule
 from gpe_pl.training.run import RunError, claim
-from gpe_pl.trajectory import StoreError
 from tests.runs import tiny
 
 STEPS = ("training.num_steps=6", "training.val_interval=2", "training.warmup_steps=2")
@@ -85,7 +85,7 @@ def assert_equal(a: Any, b: Any, path: str = "") -> None:
 STATE = ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers", "global_step", "simulator")
 
 
-@pytest.mark.parametrize("killed_at", [1, 5])
+@pytest.mark.parametrize("killed_at", [pytest.param(1, marks=pytest.mark.slow), 5])
 def test_a_resumed_run_equals_an_uninterrupted_one(tiny_data: Path, tmp_path: Path, losses: dict[int, list[float]], killed_at: int) -> None:
     whole = tiny(tiny_data, tmp_path, "name=whole", *STEPS)
     value = fit(whole)
@@ -123,6 +123,7 @@ def test_worker_processes_change_no_weight(tiny_data: Path, tmp_path: Path) -> N
     assert_equal(*(checkpoint(cfg)["state_dict"] for cfg in configs))
 
 
+@pytest.mark.slow
 def test_the_seed_matters_and_nothing_else_is_random(tiny_data: Path, tmp_path: Path) -> None:
     configs = [tiny(tiny_data, tmp_path, f"name=run{k}", f"seed={seed}") for k, seed in enumerate((0, 0, 1))]
     values = [fit(cfg) for cfg in configs]
@@ -324,6 +325,7 @@ def test_a_trained_checkpoint_holds_the_averaged_weights(tiny_data: Path, tmp_pa
     assert float(simulator.acceleration_std) != 1.0
 
 
+@pytest.mark.slow
 def test_a_sweep_ends_with_table_and_plot(tiny_data: Path, tmp_path: Path) -> None:
     for interaction in ("negated", "odd"):
         for seed in (0, 1):

@@ -13,7 +13,7 @@ import pytest
 
 from gpe_pl.evaluation import read_rows
 from gpe_pl.launcher import ProcessLauncher, default_processes
-from gpe_pl.trajectory import iter_trajectories
+from gpe_pl.store import iter_trajectories
 from tests.runs import DATA, RUN
 
 

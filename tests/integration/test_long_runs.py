@@ -110,6 +110,7 @@ def test_changing_numbers_of_edges_compile_at_most_three_times_again() -> None:
     assert 1 <= counters["stats"]["unique_graphs"] <= 4
 
 
+@pytest.mark.slow
 def test_two_runs_train_the_same_weights(tiny_data: Path, tmp_path: Path) -> None:
     ends = []
     for name in ("one", "two"):

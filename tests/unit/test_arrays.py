@@ -15,7 +15,8 @@ from gpe_pl.data.validate import validate
 from gpe_pl.geometry import domain_walls
 from gpe_pl.periodicity import Periodicity, PeriodicityError
 from gpe_pl.schema import STICKY, node_code
-from gpe_pl.trajectory import Boundary, Trajectory, iter_trajectories, read_trajectory
+from gpe_pl.store import iter_trajectories, read_trajectory
+from gpe_pl.trajectory import Boundary, Trajectory
 from tests.sources import DT, motion
 
 BOX = ((0.0, 1.0), (0.0, 1.0))

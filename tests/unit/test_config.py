@@ -296,7 +296,10 @@ def test_without_hydra_the_output_lies_under_runs(tmp_path: Path) -> None:
             ["-m", "model.interation=odd,negated", "seed=0,1"],
             "error: model.interation: unknown key 'interation'; valid keys of model: ",
         ),
-        ("fit", ["experiment=ablation_momentum", "training.num_steps=-1"], "error: training.num_steps=-1: input should be greater"),
+        pytest.param(
+            *("fit", ["training.num_steps=-1"], "error: training.num_steps=-1: input should be greater"),
+            marks=pytest.mark.slow,
+        ),
         ("simulate", ["num_workers=0"], "error: num_workers=0: must be null (one per core) or an integer of at least 1"),
         pytest.param(
             *("benchmark", ["suite.num_rounds=none"], "error: suite.num_rounds='none': input should be a valid integer"),

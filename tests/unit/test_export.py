@@ -11,7 +11,8 @@ from pydantic import TypeAdapter
 
 from gpe_pl.export import write_npz, write_vtk
 from gpe_pl.schema import FIELDS, node_code
-from gpe_pl.trajectory import Metadata, Stress, Trajectory, stored_arrays
+from gpe_pl.store import stored_arrays
+from gpe_pl.trajectory import Metadata, Stress, Trajectory
 from tests.unit.viz.conftest import falling, falling_mesh
 
 meshio = pytest.importorskip("meshio", reason="meshio, another reader of VTK files, is not installed")

@@ -39,7 +39,7 @@ from gpe_pl.schema import SPLITS
 from gpe_pl.simulate import dataset_spec
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.scenes import BodyScene
-from gpe_pl.trajectory import iter_trajectories, read_trajectory
+from gpe_pl.store import iter_trajectories, read_trajectory
 from tests.runs import compose
 
 DENSITY = {"sand": 1600.0, "snow": 400.0, "elastomer": 1000.0}
@@ -139,6 +139,7 @@ def test_nothing_of_another_data_set_is_discarded(folder, tmp_path):
     assert shard.exists()
 
 
+@pytest.mark.slow
 def test_killed_run_resumes(folder, tmp_path):
     """SIGKILL in the middle, then again: the same bytes as an uninterrupted run."""
     script = (

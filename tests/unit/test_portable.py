@@ -129,6 +129,7 @@ assert not {"gpe_pl", "torch_geometric", "numba", "lightning"} & {name.partition
 """
 
 
+@pytest.mark.slow
 def test_a_rollout_in_a_process_without_this_package(tmp_path: Path) -> None:
     """More nodes and edges than in the example from which the program was made, and other numbers of edges in every frame."""
     learned, num_steps = simulator(config={"history": 2}), 6

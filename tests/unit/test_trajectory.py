@@ -15,18 +15,8 @@ import numpy as np
 import pytest
 
 from gpe_pl.schema import NODE_TYPES, SCHEMA_VERSION
-from gpe_pl.trajectory import (
-    StoreError,
-    Stress,
-    Trajectory,
-    iter_trajectories,
-    read_metadata,
-    read_trajectory,
-    shards,
-    trajectory_names,
-    von_mises,
-    write_shard,
-)
+from gpe_pl.store import StoreError, iter_trajectories, read_metadata, read_trajectory, shards, trajectory_names, write_shard
+from gpe_pl.trajectory import Stress, Trajectory, von_mises
 
 New = Callable[..., Trajectory]
 
@@ -257,7 +247,7 @@ _FLIP = """
 import sys
 from pathlib import Path
 import numpy as np
-from gpe_pl.trajectory import StoreError, read_trajectory, trajectory_names
+from gpe_pl.store import StoreError, read_trajectory, trajectory_names
 
 path, seed, count = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
 content = path.read_bytes()
@@ -285,6 +275,7 @@ print(detected)
 """
 
 
+@pytest.mark.slow
 def test_every_flipped_bit_is_detected_or_harmless(shard: Path) -> None:
     """A file that still reads after one bit flipped has the same content: the bit belonged to unused space or to a unit's text."""
     count = 600

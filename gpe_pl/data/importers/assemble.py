@@ -23,7 +23,8 @@ from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments, wit
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.periodicity import PeriodicityError
 from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup, node_code, param_names
-from gpe_pl.trajectory import Trajectory, iter_trajectories, write_shard
+from gpe_pl.store import iter_trajectories, write_shard
+from gpe_pl.trajectory import Trajectory
 
 FOLDER = "imported"
 """Folder of imported data in that of a data set, where generated data have their size."""

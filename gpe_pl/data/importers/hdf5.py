@@ -11,7 +11,7 @@ import numpy as np
 
 from gpe_pl.data.importers.source import ImportFailure, Refusal
 from gpe_pl.errors import GpeError
-from gpe_pl.trajectory import LARGEST_DEFLATE_RATIO
+from gpe_pl.store import LARGEST_DEFLATE_RATIO
 
 
 @contextmanager

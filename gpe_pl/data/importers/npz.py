@@ -13,7 +13,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from gpe_pl.data.importers.source import ImportFailure, Refusal
-from gpe_pl.trajectory import LARGEST_DEFLATE_RATIO
+from gpe_pl.store import LARGEST_DEFLATE_RATIO
 
 HEADERS: dict[tuple[int, int], Any] = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 

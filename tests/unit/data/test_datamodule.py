@@ -15,7 +15,7 @@ from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.dataset import BatchSize
 from gpe_pl.data.noise import Noise
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.trajectory import StoreError
+from gpe_pl.store import StoreError
 
 
 @pytest.fixture

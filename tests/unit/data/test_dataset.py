@@ -19,7 +19,8 @@ from gpe_pl.data.dataset import BatchSize, StepSampler, StoredTrajectory, Window
 from gpe_pl.data.noise import Noise
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.trajectory import StoreError, Trajectory, read_trajectory, write_shard
+from gpe_pl.store import StoreError, read_trajectory, write_shard
+from gpe_pl.trajectory import Trajectory
 from tests.scenes import assert_equal_graphs
 
 NOISE = Noise("velocity", 0.5)

@@ -17,7 +17,8 @@ import pytest
 from gpe_pl.data.validate import disturbed_islands, format_page, main, validate
 from gpe_pl.geometry import Sphere
 from gpe_pl.schema import node_code
-from gpe_pl.trajectory import Trajectory, read_trajectory, write_shard
+from gpe_pl.store import read_trajectory, write_shard
+from gpe_pl.trajectory import Trajectory
 
 ROOT = Path(__file__).parents[3]
 Edit = Callable[[Trajectory], Trajectory]
@@ -295,7 +296,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from gpe_pl.data.validate import validate
-from gpe_pl.trajectory import read_trajectory
+from gpe_pl.store import read_trajectory
 
 content, damaged, rng = Path(sys.argv[1]).read_bytes(), Path(sys.argv[2]), np.random.default_rng(int(sys.argv[3]))
 for _ in range(40):

@@ -25,10 +25,11 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import node_code, param_names
+from gpe_pl.store import StoreError, write_shard
 from gpe_pl.training.module import MAX_IN_ROW, TrainingError, TrainingModule
 from gpe_pl.training.parallel import sum_gradients
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, train
-from gpe_pl.trajectory import StoreError, Trajectory, write_shard
+from gpe_pl.trajectory import Trajectory
 from tests import scenes
 from tests.ranks import as_launched, on_ranks
 

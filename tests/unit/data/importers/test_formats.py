@@ -13,7 +13,8 @@ from scipy.spatial import Delaunay
 from gpe_pl.data.importers import ImportSettings, Report, import_dataset
 from gpe_pl.data.validate import validate
 from gpe_pl.schema import STICKY, node_code
-from gpe_pl.trajectory import Trajectory, iter_trajectories
+from gpe_pl.store import iter_trajectories
+from gpe_pl.trajectory import Trajectory
 from tests import sources
 from tests.sources import DT, SPACING, motion
 

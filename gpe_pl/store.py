@@ -1,0 +1,328 @@
+"""Trajectories on disk.
+
+A shard is one HDF5 file with a group per trajectory. It is written under a temporary name and renamed, so a reader never sees half of one.
+Every array is chunked with a fletcher32 checksum, and each group carries a SHA-256 digest of all its arrays and attributes. Text is stored
+with a fixed length: HDF5 keeps text of variable length outside its checksums, where one flipped bit can hang the library.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from gpe_pl.atomic import replacing
+from gpe_pl.errors import GpeError
+from gpe_pl.geometry import Shape, shape_from_dict, shape_to_dict
+from gpe_pl.schema import FIELDS, NODE_TYPES, SCHEMA_VERSION, node_code
+from gpe_pl.trajectory import Boundary, Metadata, Stress, Trajectory
+
+
+class StoreError(GpeError, ValueError):
+    """A file of the store is missing, damaged or of another schema; the message names file, trajectory and field."""
+
+
+def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    """The arrays of a trajectory by the names, and with the types, of ``schema.FIELDS``."""
+    b = trajectory.boundary
+    arrays: dict[str, Any] = {
+        "pos": trajectory.pos,
+        "vel": trajectory.vel,
+        "node_type": trajectory.node_type,
+        "mass": trajectory.mass,
+        "material_params": trajectory.material_params,
+        "boundary_pos": b.pos[None],
+        "boundary_vel": b.vel[None],
+        "boundary_normal": b.normal[None],
+        "boundary_friction": b.friction,
+        "boundary_restitution": b.restitution,
+        "rest_pos": trajectory.rest_pos,
+        "cells": trajectory.cells,
+    }
+    if trajectory.stress is not None:
+        for part in ("node", "cell"):
+            arrays[f"{part}_stress"] = getattr(trajectory.stress, part)
+            arrays[f"{part}_von_mises"] = getattr(trajectory.stress, f"{part}_von_mises")
+    return {k: np.ascontiguousarray(v, dtype=FIELDS[k].dtype) for k, v in arrays.items() if v is not None}
+
+
+def array_bytes(trajectory: Trajectory) -> int:
+    """Bytes of what is stored of a trajectory, uncompressed."""
+    return sum(array.nbytes for array in stored_arrays(trajectory).values())
+
+
+def stored_attributes(trajectory: Trajectory) -> dict[str, str]:
+    """What else is stored of a trajectory, as JSON: its metadata, the shapes of its boundary, and the names behind ``node_type``."""
+    m = trajectory.metadata
+    meta = json.dumps(asdict(m), sort_keys=True)
+    shapes = json.dumps([shape_to_dict(s) for s in trajectory.boundary.shapes], sort_keys=True)
+    return {"metadata": meta, "shapes": shapes, "node_types": json.dumps(NODE_TYPES)}
+
+
+def digest(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
+    """SHA-256 over names, shapes, types and bytes of all arrays and attributes of a trajectory."""
+    sha = hashlib.sha256()
+    for name, text in sorted(attributes.items()):
+        sha.update(f"{name}={text};".encode())
+    for name, array in sorted(arrays.items()):
+        sha.update(f"{name}:{array.dtype.str}:{array.shape};".encode())
+        sha.update(np.ascontiguousarray(array).tobytes())
+    return sha.hexdigest()
+
+
+COMPRESSION = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
+"""Lossless: a quarter less disk for particles, more for meshes; higher levels save a per cent."""
+
+LARGEST_DEFLATE_RATIO = 1032
+"""Deflate cannot compress better than this (RFC 1951: 258 bytes by two bits)."""
+
+
+def _chunks(array: np.ndarray, dims: tuple[str, ...]) -> tuple[int, ...]:
+    """Whole arrays in one chunk, except that frames are cut into chunks of about 256 kB."""
+    if dims[0] != "frame":
+        return tuple(max(1, n) for n in array.shape)
+    frame_bytes = max(1, array[:1].nbytes)
+    return (max(1, min(array.shape[0], 2**18 // frame_bytes)), *(max(1, n) for n in array.shape[1:]))
+
+
+def write_shard(path: Path | str, trajectories: Iterable[Trajectory], names: Iterable[str] | None = None) -> None:
+    """Write trajectories into one file, atomically: the file appears complete or not at all.
+
+    Args:
+        path: target file; an existing one is replaced.
+        trajectories: consumed one by one.
+        names: group names; by default ``00000, 00001, …``.
+
+    Raises:
+        ValueError: ``names`` are fewer than the trajectories.
+    """
+    path = Path(path)
+    name_of = iter(names) if names is not None else (f"{k:05d}" for k in range(10**9))
+    # track_times off and the libver pinned: equal content gives equal bytes
+    with replacing(path) as part, h5py.File(part, "w", libver=("v110", "v110"), track_order=False) as file:
+        file.attrs["schema_version"] = SCHEMA_VERSION
+        _write_text(file, "units", json.dumps({k: f.unit for k, f in FIELDS.items()}, sort_keys=True))
+        count = 0
+        for trajectory in trajectories:
+            name = next(name_of, None)
+            if name is None:
+                raise ValueError(f"{path}: {count} names for more than {count} trajectories")
+            arrays, attributes = stored_arrays(trajectory), stored_attributes(trajectory)
+            group = file.create_group(name)
+            for key, text in attributes.items():
+                _write_text(group, key, text)
+            _write_text(group, "sha256", digest(arrays, attributes))
+            for key, array in arrays.items():
+                empty = array.size == 0
+                options = {} if empty else {"chunks": _chunks(array, FIELDS[key].dims), "fletcher32": True, **COMPRESSION}
+                dataset = group.create_dataset(key, data=array, track_times=False, **options)
+                _write_text(dataset, "unit", FIELDS[key].unit)
+            count += 1
+        file.attrs["num_trajectories"] = count
+
+
+def _write_text(owner: h5py.HLObject, key: str, text: str) -> None:
+    owner.attrs.create(key, np.bytes_(text.encode()))
+
+
+@contextmanager
+def open_shard(path: Path | str) -> Iterator[h5py.File]:
+    """Open a shard of this schema version for reading; whatever HDF5 raises on a damaged file becomes a ``StoreError``."""
+    path = Path(path)
+    if not path.is_file():
+        raise StoreError(f"{path}: no such file; generate data with `python -m gpe_pl.simulate`")
+    try:
+        with h5py.File(path, "r") as file:
+            version = file.attrs.get("schema_version")
+            if not isinstance(version, np.integer) or version != SCHEMA_VERSION:
+                raise StoreError(
+                    f"{path}: schema version {version}, this version of gpe_pl reads {SCHEMA_VERSION}; regenerate or convert the data"
+                )
+            yield file
+    except StoreError:
+        raise
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:  # all of these come out of HDF5 and h5py
+        raise StoreError(f"{path}: not a readable HDF5 file (damaged or truncated: {error}); delete it and run simulate again") from error
+
+
+def _where(group: h5py.Group) -> str:
+    return f"{group.file.filename}:{group.name.lstrip('/')}"
+
+
+def open_group(file: h5py.File, name: str) -> h5py.Group:
+    """The group of one trajectory."""
+    if name not in file:
+        raise StoreError(f"{file.filename}: no trajectory {name!r}; it has {len(file)} trajectories")
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink) or not isinstance(file[name], h5py.Group):
+        raise StoreError(f"{file.filename}: {name!r} is not a trajectory of this file; delete the shard and run simulate again")
+    return file[name]
+
+
+def read_text(group: h5py.Group, key: str) -> str:
+    """A text attribute of a trajectory."""
+    if key not in group.attrs:
+        raise StoreError(f"{_where(group)}: attribute {key!r} is missing; delete the shard and run simulate again")
+    stored = group.attrs.get_id(key)
+    if stored.shape != () or stored.dtype.kind != "S":  # text of variable length has kind "O" and is not safe to read from a damaged file
+        raise StoreError(f"{_where(group)}: attribute {key!r} is {stored.dtype}{list(stored.shape)}, expected text of fixed length")
+    return group.attrs[key].decode()
+
+
+def read_field(group: h5py.Group, key: str, frames: slice | None = None) -> np.ndarray:
+    """One stored array, compared with ``schema.FIELDS`` before any of it is read; only ``frames`` of it where it has frames."""
+    spec, where = FIELDS[key], f"{_where(group)}: field {key!r}"
+    if key not in group:
+        raise StoreError(f"{where} is missing; delete the shard and run simulate again")
+    dataset = group[key] if isinstance(group.get(key, getlink=True), h5py.HardLink) else None
+    if not isinstance(dataset, h5py.Dataset) or dataset.is_virtual or dataset.external:
+        raise StoreError(f"{where} is not an array inside this file; a shard must not refer to other files")
+    if dataset.shape is None or len(dataset.shape) != len(spec.dims) or dataset.dtype != np.dtype(spec.dtype):
+        raise StoreError(f"{where} is {dataset.dtype}{list(dataset.shape or ())}, expected {spec.dtype} [{', '.join(spec.dims)}]")
+    if dataset.id.get_storage_size() * LARGEST_DEFLATE_RATIO < dataset.nbytes:  # a huge shape without data must not fill the memory
+        raise StoreError(f"{where} declares {dataset.nbytes} bytes but the file holds {dataset.id.get_storage_size()}, compressed")
+    try:
+        return dataset[frames] if frames is not None and spec.dims[0] == "frame" else dataset[()]
+    except (OSError, RuntimeError):
+        raise StoreError(f"{where} is damaged (checksum mismatch); delete the shard and run simulate again") from None
+
+
+def size_conflicts(arrays: dict[str, np.ndarray], metadata: Metadata) -> list[str]:
+    """Fields whose shape contradicts the metadata or an earlier field; one sentence each."""
+    sizes = {"one": 1, "dim": metadata.dim, "param": len(metadata.param_names)}
+    conflicts = []
+    for key, array in arrays.items():
+        for axis, size in zip(FIELDS[key].dims, array.shape, strict=True):
+            if sizes.setdefault(axis, size) != size:
+                conflicts.append(f"field {key!r} has size {size} along {axis!r}, expected {sizes[axis]}")
+    return conflicts
+
+
+def trajectory_names(path: Path | str) -> list[str]:
+    """Group names of a shard, in order."""
+    with open_shard(path) as file:
+        return sorted(file)
+
+
+def read_metadata(path: Path | str, name: str) -> Metadata:
+    """Only the metadata of one trajectory."""
+    with open_shard(path) as file:
+        return metadata_of(open_group(file, name))
+
+
+def metadata_of(group: h5py.Group) -> Metadata:
+    """The metadata of a trajectory's group; every key must be there with the right type, and no other."""
+    try:
+        text = read_text(group, "metadata")
+        values = json.loads(text)
+        known = {f.name for f in fields(Metadata)}
+        if not isinstance(values, dict) or set(values) != known:
+            raise ValueError(f"keys {sorted(set(values) ^ known)} missing or unknown")
+        return TypeAdapter(Metadata).validate_json(text, strict=True)
+    except StoreError:
+        raise
+    except ValidationError as error:
+        wrong = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        raise StoreError(f"{_where(group)}: metadata unreadable: {wrong}") from None
+    except (ValueError, TypeError, RecursionError) as error:
+        raise StoreError(f"{_where(group)}: metadata unreadable: {error}") from None
+
+
+def shapes_of(group: h5py.Group) -> tuple[Shape, ...]:
+    """The obstacle and wall geometry of a trajectory's group."""
+    try:
+        return tuple(shape_from_dict(s) for s in json.loads(read_text(group, "shapes")))
+    except StoreError:
+        raise
+    except (ValueError, TypeError, RecursionError) as error:
+        raise StoreError(f"{_where(group)}: attribute 'shapes' is unreadable: {error}") from None
+
+
+def node_types_of(group: h5py.Group) -> tuple[str, ...]:
+    """The names behind the integers of ``node_type`` in a trajectory's group; all of them are in ``schema.NODE_TYPES``."""
+    try:
+        names = tuple(json.loads(read_text(group, "node_types")))
+    except StoreError:
+        raise
+    except (ValueError, TypeError, RecursionError) as error:
+        raise StoreError(f"{_where(group)}: attribute 'node_types' is unreadable: {error}") from None
+    unknown = [name for name in names if name not in NODE_TYPES]
+    if unknown:
+        raise StoreError(f"{_where(group)}: attribute 'node_types' names {unknown}; known: {', '.join(NODE_TYPES)}")
+    return names
+
+
+def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: slice | None = None) -> Trajectory:
+    """Read one trajectory.
+
+    Args:
+        path: shard.
+        name: group name.
+        frames: only these frames, without reading the others; not together with ``verify``.
+        verify: recompute the SHA-256 digest (HDF5's own checksums are always verified).
+
+    Raises:
+        StoreError: file, group or field missing, wrong shape or type, or a checksum that does not match.
+    """
+    if verify and frames is not None:
+        raise ValueError("the digest covers all frames: pass verify or frames, not both")
+    with open_shard(path) as file:
+        group = open_group(file, name)
+        metadata = metadata_of(group)
+        arrays = {key: read_field(group, key, frames) for key, spec in FIELDS.items() if spec.required or key in group}
+        if verify:
+            attributes = {key: read_text(group, key) for key in ("metadata", "shapes", "node_types")}
+            if digest(arrays, attributes) != read_text(group, "sha256"):
+                raise StoreError(f"{path}:{name}: SHA-256 digest does not match the content; delete the shard and run simulate again")
+        if ("node_stress" in arrays) != ("cell_stress" in arrays):
+            raise StoreError(f"{path}:{name}: has only one of the fields 'node_stress' and 'cell_stress'")
+        for conflict in size_conflicts(arrays, metadata):
+            raise StoreError(f"{path}:{name}: {conflict}")
+        shapes, names = shapes_of(group), node_types_of(group)
+    codes = arrays["node_type"]
+    if codes.size and codes.max() >= len(names):
+        raise StoreError(f"{path}:{name}: node {codes.argmax()} has node_type {codes.max()}, but there are {len(names)} node types")
+    boundary = Boundary(
+        arrays["boundary_pos"][0],
+        arrays["boundary_vel"][0],
+        arrays["boundary_normal"][0],
+        arrays["boundary_friction"],
+        arrays["boundary_restitution"],
+        shapes,
+    )
+    return Trajectory(
+        metadata,
+        arrays["pos"],
+        arrays["vel"],
+        np.array([node_code(n) for n in names], dtype=np.uint8)[codes],
+        arrays["mass"],
+        arrays["material_params"],
+        boundary,
+        rest_pos=arrays.get("rest_pos"),
+        cells=arrays.get("cells"),
+        stress=Stress(arrays["node_stress"], arrays["cell_stress"]) if "node_stress" in arrays else None,
+    )
+
+
+def shards(root: Path | str, split: str) -> list[Path]:
+    """Shard files of a split under a data set's folder, in order; raises ``StoreError`` when there is none."""
+    found = sorted((Path(root) / split).glob("shard-*.h5"))
+    if not found:
+        raise StoreError(
+            f"{root}: no shards of split {split!r}; generate them with `python -m gpe_pl.simulate`, or import data that have it"
+        )
+    return found
+
+
+def iter_trajectories(root: Path | str, split: str) -> Iterator[Trajectory]:
+    """All trajectories of a split, one at a time."""
+    for path in shards(root, split):
+        for name in trajectory_names(path):
+            yield read_trajectory(path, name)
