@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import subprocess
 import sys
 import time
@@ -83,14 +82,16 @@ def test_runs_end_with_their_sweep(data: Path, tmp_path: Path) -> None:
     arguments = [*SUITE["data"], *SUITE["commands"]["fit"]["arguments"], f"paths.data={data}", f"paths.runs={tmp_path}"]
     endless = [a for a in arguments if "num_steps" not in a] + ["training.num_steps=1000000", "hydra.mode=MULTIRUN", "seed=0", "name=sweep"]
     sweep = subprocess.Popen([sys.executable, "-m", "gpe_pl.fit", *endless], stdout=subprocess.DEVNULL, cwd=CONF.parent)
-    run = tmp_path / "sweep" / "seed=0"
     deadline = time.monotonic() + 500
-    while not (run / "checkpoints" / "last.ckpt").exists():
-        assert sweep.poll() is None and time.monotonic() < deadline
-        time.sleep(0.1)
-    sweep.send_signal(signal.SIGKILL)
-    sweep.wait()
-    while _running(str(run)):
+    try:
+        while not list(tmp_path.rglob("last.ckpt")):
+            assert sweep.poll() is None and time.monotonic() < deadline
+            time.sleep(0.1)
+        assert len(_running(str(tmp_path))) == 2
+    finally:
+        sweep.kill()
+        sweep.wait()
+    while _running(str(tmp_path)):
         assert time.monotonic() < deadline
         time.sleep(0.1)
 
