@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
 def fit(cfg: DictConfig) -> float:
     """Generate what data is missing, train or resume, evaluate; returns the mean full-length rollout MSE [m²] on the first split evaluated."""
-    from dataclasses import asdict
     from functools import cache
 
     import lightning as L
@@ -21,13 +20,13 @@ def fit(cfg: DictConfig) -> float:
     from omegaconf import OmegaConf
 
     from gpe_pl.data.datamodule import TrajectoryDataModule
-    from gpe_pl.data.dataset import BatchSize
     from gpe_pl.data.noise import Noise
+    from gpe_pl.data.sampling import BatchSize
     from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
     from gpe_pl.simulate import ensure_data, evaluated_config
-    from gpe_pl.training.budget import digest, step_time, within_budget
+    from gpe_pl.training.budget import digest, mean_step_time, within_budget
     from gpe_pl.training.module import TrainingModule
     from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, claim, set_up, train
     from gpe_pl.training.tracking import LoggerSettings, publish
@@ -55,7 +54,9 @@ def fit(cfg: DictConfig) -> float:
     @cache
     def data() -> TrajectoryDataModule:
         stress = bool(cfg.model.get("stress", False))
-        return TrajectoryDataModule(root, graph, noise, batch_size, cfg.seed, trainer.num_workers, stress=stress)
+        return TrajectoryDataModule(
+            root, graph, noise, batch_size, cfg.seed, trainer.num_workers, stress=stress, sampling=training.sampling
+        )
 
     def new_module(training: TrainingSettings) -> TrainingModule:
         L.seed_everything(cfg.seed, verbose=False)
@@ -70,15 +71,16 @@ def fit(cfg: DictConfig) -> float:
         dataset = {k: v for k, v in settings["data"].items() if k != "comparison"}
         parts = {k: settings[k] for k in ("graph", "model")} | {"data": dataset, "batch_size": training.batch_size, "device": device}
         parts |= unusual
+        parts |= {"push_forward": [training.push_share, training.push_steps]} if training.push_share else {}
         key = f"{cfg.data.name} {cfg.size.name} {cfg.model._target_.rpartition('.')[2]} {digest(parts)}"
         times = Path(cfg.paths.runs) / (cfg.reuse or cfg.name) / "step_times.json"
         training = within_budget(
             training,
             times,
             key,
-            lambda settings: step_time(new_module(settings).to(device), data().train_set, batch_size, settings.gradient_clip),
+            lambda settings: mean_step_time(new_module(settings).to(device), data().train_set, batch_size, settings),
         )
-    settings["training"] = asdict(training)
+    settings["training"] = training.as_dict()
     trained = {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training")} | unusual
     config = trained | {"evaluation": settings["evaluation"]}
     claim(run_dir, config)

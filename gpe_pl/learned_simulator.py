@@ -251,6 +251,10 @@ class LearnedSimulator(nn.Module):
     @torch.inference_mode()
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
         """``step`` of several scenes in one pass of the model; a scene that has no graph any more is answered with the reason."""
+        return self.next_states(states)
+
+    def next_states(self, states: list[State]) -> list[State | SimulationError]:
+        """``step_all`` with tensors that may take part in training."""
         graphs = [self._graph(state) for state in states]
         sound = [k for k, graph in enumerate(graphs) if not isinstance(graph, SimulationError)]
         new: list[Any] = list(graphs)

@@ -134,10 +134,11 @@ def graph(materials: tuple[str, ...] = ("sand",), dtype: torch.dtype = torch.flo
     return to_dtype(builder(materials)(state(materials=materials, **settings).to_torch()), dtype)  # type: ignore[arg-type]
 
 
-def assert_equal_graphs(a: HeteroData, b: HeteroData) -> None:
-    """Equal stores with equal values, bit for bit."""
+def assert_equal_graphs(a: HeteroData, b: HeteroData, rtol: float = 0.0, atol: float = 0.0) -> None:
+    """Equal stores with equal values, bit for bit unless tolerances are given."""
     assert (a.node_types, a.edge_types) == (b.node_types, b.edge_types)
     for store, other in zip(a.stores, b.stores, strict=True):
         assert set(store.keys()) == set(other.keys())
         for key, value in store.items():
-            assert torch.equal(torch.as_tensor(value), torch.as_tensor(other[key])), key
+            values = torch.as_tensor(value), torch.as_tensor(other[key])
+            assert torch.equal(*values) or (rtol + atol > 0 and torch.allclose(*values, rtol=rtol, atol=atol)), key

@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import lightning as L
 import numpy as np
 import torch
+from torch.utils.data import DataLoader
 from torch_geometric.data import HeteroData
-from torch_geometric.loader import DataLoader
 
 from gpe_pl import ranks
-from gpe_pl.data.dataset import BatchSampler, BatchSize, WindowDataset, open_split
+from gpe_pl.data.dataset import WindowDataset, collated, open_split
 from gpe_pl.data.noise import Noise
+from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling, probabilities
 from gpe_pl.data.statistics import is_intact
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
@@ -46,6 +48,10 @@ class TrajectoryDataModule(L.LightningDataModule):
         num_workers: processes that build graphs; 0 builds them in the training process.
         num_val_windows: windows of the one-step validation loss, evenly spread over the ``val`` split.
         stress: samples also hold the stress; see ``WindowDataset``.
+        sampling: how often each training window is drawn.
+
+    Attributes:
+        push_forward: when batches are starts for own steps of the model rather than graphs; None: never.
     """
 
     def __init__(
@@ -58,10 +64,12 @@ class TrajectoryDataModule(L.LightningDataModule):
         num_workers: int = 0,
         num_val_windows: int = 256,
         stress: bool = False,
+        sampling: Sampling = "uniform",
     ) -> None:
         super().__init__()
         self.root, self.noise, self.batch_size, self.seed = Path(root), noise, batch_size, seed
         self.num_workers, self.num_val_windows = num_workers, num_val_windows
+        self.push_forward: PushForward | None = None
         train = open_split(root, "train")
         val = open_split(root, "val")
         self.metadata = train[0].window(0, 1).metadata
@@ -69,11 +77,15 @@ class TrajectoryDataModule(L.LightningDataModule):
         unit = data_statistics(root)["acceleration_std"] * self.metadata.frame_dt
         self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress)
         self.val_set = WindowDataset(val, self.builder, stress=stress)
+        if sampling == "activity":
+            self.train_set.probability = probabilities(self.train_set.activity())
 
     def statistics_sample(self, num_windows: int = 256) -> Iterator[HeteroData]:
         """Training graphs, noise included, evenly spread over the split; for the standardisation of features."""
         for window in _spread(len(self.train_set), num_windows):
-            yield self.train_set[int(window)]
+            graph = self.train_set[int(window)]
+            assert isinstance(graph, HeteroData)
+            yield graph
 
     def val_trajectories(self, count: int) -> list[Trajectory]:
         """The first ``count`` trajectories of the ``val`` split."""
@@ -84,7 +96,8 @@ class TrajectoryDataModule(L.LightningDataModule):
         assert trainer is not None
         return DataLoader(
             self.train_set,
-            batch_sampler=BatchSampler(self.train_set, self.batch_size, self.seed, step=lambda: trainer.global_step),
+            batch_sampler=BatchSampler(self.train_set, self.batch_size, self.seed, lambda: trainer.global_step, self.push_forward),
+            collate_fn=collated,
             num_workers=self.num_workers,
             persistent_workers=self.num_workers > 0,
             prefetch_factor=4 if self.num_workers else None,
@@ -95,7 +108,8 @@ class TrajectoryDataModule(L.LightningDataModule):
         windows = [int(w) for w in _spread(len(self.val_set), self.num_val_windows)]
         if len(windows) < ranks.num_ranks():
             raise StoreError(f"{self.root}: split 'val' has {len(windows)} windows, too few for {ranks.num_ranks()} processes")
-        return DataLoader([self.val_set[w] for w in windows[ranks.rank() :: ranks.num_ranks()]], batch_size=8)
+        own: Any = [self.val_set[w] for w in windows[ranks.rank() :: ranks.num_ranks()]]
+        return DataLoader(own, batch_size=8, collate_fn=collated)
 
 
 def _spread(length: int, count: int) -> np.ndarray:

@@ -5,23 +5,24 @@ A sample is a pure function of (split, seed, sample number): runs resume exactly
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Any, TypeAlias, overload
 
 import numpy as np
 import torch
-from pydantic import Field
-from torch.utils.data import Dataset, Sampler
-from torch_geometric.data import HeteroData
+from torch import Tensor
+from torch.utils.data import Dataset
+from torch_geometric.data import Batch, HeteroData
 
-from gpe_pl import integrators, ranks
+from gpe_pl import integrators
 from gpe_pl.data.noise import Noise
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.store import StoreError, open_group, open_shard, read_trajectory, shards
 from gpe_pl.trajectory import State, Trajectory
+
+Key = int | tuple[int, int] | tuple[int, int, int]
+"""A window's number; or sample number and window; or these and the model's own steps from there."""
 
 CACHE_BYTES = 2 * 1024**3
 """Splits smaller than this are held in memory; larger ones are read from disk window by window."""
@@ -66,7 +67,70 @@ def _read_only(trajectory: Trajectory) -> Trajectory:
     return trajectory
 
 
-class WindowDataset(Dataset[HeteroData]):
+@dataclass(frozen=True)
+class Start:
+    """A state for a model to start from, and what truly follows.
+
+    Attributes:
+        state: with noise, as float64 tensors.
+        truth: positions [own_steps + 2, node, dim] of the frames from the state's on [m].
+        stress: true Cauchy stress [own_steps + 1, node, component] of the frames after the state's [Pa], where it is asked for.
+        correction: share of the distance from the true position that the target takes back within a step; see ``Noise``.
+        about: trajectory and frame, and the weight in the loss if there is one.
+    """
+
+    state: State
+    truth: Tensor
+    stress: Tensor | None
+    correction: float
+    about: dict[str, Any]
+
+    @property
+    def own_steps(self) -> int:
+        """How many steps a model is to make by itself."""
+        return self.truth.shape[0] - 2
+
+    def to(self, device: Any) -> Start:
+        """The same on a device."""
+        stress = None if self.stress is None else self.stress.to(device)
+        return replace(self, state=self.state.to_torch(device), truth=self.truth.to(device), stress=stress)
+
+    def graph(self, builder: GraphBuilder, state: State, step: int) -> HeteroData:
+        """The training graph of the state that a model has come to in so many steps.
+
+        Its target leads to the velocity that the true motion has then, and takes back ``correction`` of the distance from the true position.
+        """
+        dt, where = builder.metadata.frame_dt, state.periodicity
+        vel = integrators.velocities(self.truth[step : step + 2], dt, where)[0]
+        astray = integrators.velocities(torch.stack([self.truth[step], state.pos]), dt, where)[0]
+        target = integrators.acceleration(vel - self.correction * astray, state.vel, dt) - state.gravity
+        return training_graph(builder, state, target, None if self.stress is None else self.stress[step], self.about)
+
+
+def training_graph(builder: GraphBuilder, state: State, target: Tensor, stress: Tensor | None, about: dict[str, Any]) -> HeteroData:
+    """The graph of a state with what is to be predicted for each node: ``target`` [m/s²], and ``stress_target`` [Pa] where it is known."""
+    data = builder(state)
+    for material in builder.spec.materials:
+        data[material].target = target.float()[data[material].node_id]
+    if stress is not None:
+        for material in builder.spec.stress_channels:
+            data[material].stress_target = stress.float()[data[material].node_id]
+    for name, value in about.items():
+        data[name] = value
+    return data
+
+
+Samples: TypeAlias = HeteroData | list[Start]
+"""What an optimiser step takes: graphs as one, or starts for own steps of the model."""
+
+
+def collated(samples: list[HeteroData | Start]) -> Samples:
+    """Samples of one kind together."""
+    starts = [sample for sample in samples if isinstance(sample, Start)]
+    return starts or Batch.from_data_list(samples)
+
+
+class WindowDataset(Dataset[HeteroData | Start]):
     """Windows x[t−H … t+1] of a split as graphs at frame t.
 
     Every material's store has ``target`` [node, dim]: the acceleration from t to t+1 without gravity [m/s²], from float64 differences. The graph carries
@@ -79,6 +143,9 @@ class WindowDataset(Dataset[HeteroData]):
         velocity_unit: acceleration std × frame interval [m/s], the unit of velocity noise.
         seed: of the noise.
         stress: also give the Cauchy stress at t+1, ``stress_target`` [node, component] in Pa, of materials that have one.
+
+    Attributes:
+        probability: of each window to be drawn, where they are not drawn alike; graphs then carry ``weight``, its inverse over that of equal chances.
 
     Raises:
         StoreError: no trajectory is long enough, or a window holds a position that is not finite.
@@ -95,6 +162,7 @@ class WindowDataset(Dataset[HeteroData]):
     ) -> None:
         self.trajectories, self.builder, self.noise, self.stress = trajectories, builder, noise, stress
         self.velocity_unit, self.seed = velocity_unit, seed
+        self.probability: np.ndarray | None = None
         history = builder.config.history
         counts = [max(0, t.num_frames - history - 1) for t in trajectories]
         self.ends = np.cumsum(counts)
@@ -115,24 +183,43 @@ class WindowDataset(Dataset[HeteroData]):
         """Nodes of a window, without those of the boundary and of coarser levels."""
         return self.trajectories[self.locate(window)[0]].num_nodes
 
-    def __getitem__(self, key: int | tuple[int, int]) -> HeteroData:
-        """The graph of a window; ``key`` is its number, or (sample number, window number) where the sample number seeds the noise."""
-        sample, window = key if isinstance(key, tuple) else (key, key)
+    def activity(self) -> np.ndarray:
+        """Root mean square of the acceleration without gravity [m/s²] in each window; reads the whole split."""
+        values = []
+        for stored in self.trajectories:
+            trajectory = stored.window(0, stored.num_frames)
+            metadata = trajectory.metadata
+            velocities = integrators.velocities(trajectory.pos.astype(np.float64), metadata.frame_dt, metadata.periodicity)
+            acc = integrators.acceleration(velocities[1:], velocities[:-1], metadata.frame_dt) - np.asarray(metadata.gravity)
+            values.append(np.sqrt(np.mean(acc**2, axis=(1, 2)))[self.builder.config.history - 1 :])
+        return np.concatenate(values)
+
+    @overload
+    def __getitem__(self, key: int | tuple[int, int]) -> HeteroData: ...
+
+    @overload
+    def __getitem__(self, key: tuple[int, int, int]) -> Start: ...
+
+    def __getitem__(self, key: Key) -> HeteroData | Start:
+        """The graph of a window, or where own steps are asked for, a start for them: as many as the trajectory is long enough for."""
+        sample, window, own_steps = (key, key, None) if isinstance(key, int) else (*key, None)[:3]
         number, frame = self.locate(window)
         history = self.builder.config.history
-        trajectory = self.trajectories[number].window(frame - history, frame + 2)
+        stored = self.trajectories[number]
+        ahead = 0 if own_steps is None else min(own_steps, stored.num_frames - 2 - frame)
+        trajectory = stored.window(frame - history, frame + 2 + ahead)
         dt = trajectory.metadata.frame_dt
-        pos = trajectory.pos.astype(np.float64)
-        if not np.isfinite(pos).all():
-            bad, node = np.argwhere(~np.isfinite(pos))[0, :2]
-            where = f"{self.trajectories[number].path}:{self.trajectories[number].name}: frame {frame - history + bad}, node {node}"
+        truth = trajectory.pos.astype(np.float64)
+        if not np.isfinite(truth).all():
+            bad, node = np.argwhere(~np.isfinite(truth))[0, :2]
+            where = f"{stored.path}:{stored.name}: frame {frame - history + bad}, node {node}"
             raise StoreError(f"{where}: the position is not finite; see `python -m gpe_pl.data.validate`")
+        pos = truth[: history + 2]
         if self.noise is not None:
             rng = np.random.default_rng((self.seed, sample))
             pos = self.noise.apply(pos, self.velocity_unit, dt, rng)
         velocities = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
         gravity = np.asarray(trajectory.metadata.gravity)
-        target = integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity
         past = np.ascontiguousarray(velocities[:-1].swapaxes(0, 1))
         state = State(
             pos[-2],
@@ -147,107 +234,15 @@ class WindowDataset(Dataset[HeteroData]):
             trajectory.rest_pos,
             trajectory.cells,
             periodicity=trajectory.metadata.periodicity,
-        )
-        data = self.builder(state.to_torch())
-        target_tensor = torch.from_numpy(target).float()
-        for material in self.builder.spec.materials:
-            data[material].target = target_tensor[data[material].node_id]
+        ).to_torch()
+        stress = None
         if self.stress and trajectory.stress is not None:
-            stress = torch.from_numpy(np.array(trajectory.stress.node[-1], dtype=np.float32))
-            for material in self.builder.spec.stress_channels:
-                data[material].stress_target = stress[data[material].node_id]
-        data.trajectory, data.frame = number, frame
-        return data
-
-
-class StepSampler(Sampler[tuple[int, int]]):
-    """Endless shuffled passes over a data set as (sample number, window), starting at any sample number.
-
-    Args:
-        num_windows: size of the data set.
-        seed: of the order; every pass has its own.
-        start: called when iteration begins; the number of samples already consumed.
-    """
-
-    def __init__(self, num_windows: int, seed: int, start: Callable[[], int] = lambda: 0) -> None:
-        self.num_windows, self.seed, self.start = num_windows, seed, start
-
-    def __iter__(self) -> Iterator[tuple[int, int]]:
-        sample = self.start()
-        while True:
-            epoch, offset = divmod(sample, self.num_windows)
-            order = np.random.default_rng((self.seed, epoch)).permutation(self.num_windows)
-            for window in order[offset:]:
-                yield sample, int(window)
-                sample += 1
-
-
-@dataclass(frozen=True)
-class BatchSize:
-    """How many samples an optimiser step takes, all ranks together.
-
-    Attributes:
-        num_graphs: so many.
-        max_nodes: if given, instead: the next ones in the order whose nodes (see ``WindowDataset.num_nodes``) are at most so many together, at least one.
-    """
-
-    num_graphs: Annotated[int, Field(ge=1)]
-    max_nodes: Annotated[int, Field(ge=1)] | None = None
-
-    def batches(self, data: WindowDataset, seed: int, step: int) -> Iterator[list[tuple[int, int]]]:
-        """The samples of each optimiser step, from a step on, without end."""
-        if self.max_nodes is None:
-            samples = iter(StepSampler(len(data), seed, start=lambda: step * self.num_graphs))
-            while True:
-                yield list(islice(samples, self.num_graphs))
-        else:
-            yield from islice(self._packed(data, iter(StepSampler(len(data), seed)), self.max_nodes), step, None)
-
-    @staticmethod
-    def _packed(data: WindowDataset, samples: Iterator[tuple[int, int]], max_nodes: int) -> Iterator[list[tuple[int, int]]]:
-        batch, total = [next(samples)], 0
-        for sample in samples:
-            total += data.num_nodes(batch[-1][1])
-            if total + data.num_nodes(sample[1]) > max_nodes:
-                yield batch
-                batch, total = [], 0
-            batch.append(sample)
-
-
-class BatchSampler(Sampler[list[tuple[int, int]]]):
-    """What this rank takes of the samples of each optimiser step. The order is one for all ranks, and the same as that of a single process.
-
-    Args:
-        data: training windows.
-        size: of the batches.
-        seed: of the order.
-        step: called when iteration begins; the number of optimiser steps already taken.
-
-    Raises:
-        StoreError: batches may have fewer samples than there are ranks.
-    """
-
-    def __init__(self, data: WindowDataset, size: BatchSize, seed: int, step: Callable[[], int]) -> None:
-        self.data, self.size, self.seed, self.step = data, size, seed, step
-        largest = max(t.num_nodes for t in data.trajectories)
-        fewest = size.num_graphs if size.max_nodes is None else size.max_nodes // largest
-        if fewest < ranks.num_ranks() > 1:
-            what = f"training.batch_size={size.num_graphs}" if size.max_nodes is None else f"batching.max_nodes={size.max_nodes}"
-            nodes = "" if size.max_nodes is None else f" of up to {largest} nodes"
-            raise StoreError(f"{what}: too small for {ranks.num_ranks()} processes, each of which takes at least one graph{nodes}")
-
-    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
-        for batch in self.size.batches(self.data, self.seed, self.step()):
-            yield batch if ranks.num_ranks() == 1 else self._part(batch)
-
-    def _part(self, batch: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Samples dealt by their nodes, the largest first, each to the rank that has the fewest so far."""
-        nodes = {sample: self.data.num_nodes(window) for sample, window in batch}
-        load = [0] * ranks.num_ranks()
-        own = set()
-        for sample in sorted(nodes, key=lambda sample: -nodes[sample]):
-            fewest = load.index(min(load))
-            load[fewest] += nodes[sample]
-            if fewest == ranks.rank():
-                own.add(sample)
-        return [(sample, window) for sample, window in batch if sample in own]
+            stress = torch.from_numpy(np.array(trajectory.stress.node[history + 1 :], dtype=np.float32))
+        about: dict[str, Any] = {"trajectory": number, "frame": frame}
+        if self.probability is not None:
+            about["weight"] = 1 / (len(self) * float(self.probability[window]))
+        if own_steps is not None:
+            correction = self.noise.correction if self.noise is not None and self.noise.kind == "velocity" else 0.0
+            return Start(state, torch.from_numpy(truth[history:]), stress, correction, about)
+        target = integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity
+        return training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[-1], about)

@@ -16,10 +16,10 @@ from typing import Any
 
 import torch
 from filelock import FileLock
-from torch_geometric.data import Batch
 
 from gpe_pl.atomic import replace_text
-from gpe_pl.data.dataset import BatchSize, WindowDataset
+from gpe_pl.data.dataset import Samples, WindowDataset, collated
+from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
 from gpe_pl.training.run import TrainingSettings
@@ -40,7 +40,18 @@ class BudgetError(GpeError, ValueError):
     """The file of measured step times cannot be used; names it and what to do."""
 
 
-def step_time(module: TrainingModule, data: WindowDataset, size: BatchSize, gradient_clip: float) -> float:
+def mean_step_time(module: TrainingModule, data: WindowDataset, size: BatchSize, settings: TrainingSettings) -> float:
+    """Seconds per optimiser step, over a run that begins without own steps of the model and may end with them."""
+    plain = step_time(module, data, size, settings.gradient_clip)
+    if not settings.push_share:
+        return plain
+    late = step_time(module, data, size, settings.gradient_clip, PushForward(0, settings.push_steps))
+    return (1 - settings.push_share) * plain + settings.push_share * late
+
+
+def step_time(
+    module: TrainingModule, data: WindowDataset, size: BatchSize, gradient_clip: float, push_forward: PushForward | None = None
+) -> float:
     """Seconds per optimiser step, the building of its graphs included: processor time, or on a GPU wall time, in the fastest of several rounds.
 
     Other processes can only lengthen it, through shared caches and memory even where processor time is counted.
@@ -48,13 +59,14 @@ def step_time(module: TrainingModule, data: WindowDataset, size: BatchSize, grad
     on_gpu = next(module.parameters()).is_cuda
     clock = time.perf_counter if on_gpu else time.process_time
     optimizer = torch.optim.Adam(module.parameters(), lr=0.0, fused=True)
-    batches = (Batch.from_data_list([data[sample] for sample in batch]) for batch in size.batches(data, seed=0, step=0))
+    numbers = BatchSampler(data, size, 0, lambda: 0, push_forward)
+    batches = (module.graphs(_on(module.device, collated([data[key] for key in keys]))) for keys in numbers)
 
     def steps(count: int) -> float:
         start = clock()
         for _ in range(count):
             optimizer.zero_grad()
-            module.loss(next(batches).to(module.device)).backward()
+            module.loss(next(batches)).backward()
             torch.nn.utils.clip_grad_norm_(module.parameters(), gradient_clip)
             optimizer.step()
         if on_gpu:
@@ -64,6 +76,10 @@ def step_time(module: TrainingModule, data: WindowDataset, size: BatchSize, grad
     with module.compiled():
         steps(WARM_UP_STEPS)
         return min(steps(MEASURED_STEPS) for _ in range(ROUNDS)) / MEASURED_STEPS
+
+
+def _on(device: torch.device, samples: Samples) -> Samples:
+    return [start.to(device) for start in samples] if isinstance(samples, list) else samples.to(device)
 
 
 def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Callable[[TrainingSettings], float]) -> TrainingSettings:

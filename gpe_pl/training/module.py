@@ -6,7 +6,7 @@ import logging
 import math
 import shutil
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Annotated, Any, Literal
 
@@ -18,9 +18,11 @@ from torch.utils._pytree import tree_leaves
 from torch_geometric.data import HeteroData
 
 from gpe_pl import ranks
+from gpe_pl.data.dataset import Samples
 from gpe_pl.errors import GpeError
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE
+from gpe_pl.training.push_forward import pushed
 
 Schedule = Literal["cosine", "exponential"]
 Compile = Literal["auto", "on", "off"]
@@ -144,13 +146,22 @@ class TrainingModule(L.LightningModule):
         """Mean squared error of the normalised accelerations, and of the normalised stress where there is one; of several ranks, the part of this one."""
         predicted = self.simulator(batch)
         std = self.simulator.stress_std.float()
-        acceleration = [(a - self._normalized(batch[m].target)).square() for m, a in predicted.acceleration.items()]
-        stress = [(s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]
+        weights = self._weights(batch)
+        acceleration = [weights(m) * (a - self._normalized(batch[m].target)).square() for m, a in predicted.acceleration.items()]
+        stress = [weights(m) * (s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]
         shares = self._shares(acceleration, stress)
         loss = torch.cat(acceleration).mean() * shares[0]
         if stress:
             loss = loss + self.stress_weight * torch.cat(stress).mean() * shares[1]
         return loss
+
+    @staticmethod
+    def _weights(batch: HeteroData) -> Callable[[str], Tensor | float]:
+        """Weights [node, 1] of the nodes of a material, those of their graphs."""
+        if "weight" not in batch:
+            return lambda material: 1.0
+        weight = batch.weight.float()
+        return lambda material: weight[batch[material].batch][:, None]
 
     def _shares(self, *errors: list[Tensor]) -> list[float]:
         """How many of all ranks' errors of each kind are on this one. The ranks exchange it also where this one has none of a kind."""
@@ -159,10 +170,15 @@ class TrainingModule(L.LightningModule):
         here = torch.tensor([sum(e.numel() for e in kind) for kind in errors], device=self.device)
         return [n / max(1, total) for n, total in zip(here.tolist(), ranks.summed(here).tolist(), strict=True)]
 
-    def training_step(self, batch: HeteroData, batch_idx: int) -> Tensor | None:
+    def graphs(self, samples: Samples) -> HeteroData:
+        """Samples of an optimiser step as graphs, after the own steps of those that ask for some."""
+        return pushed(self.simulator, samples) if isinstance(samples, list) else samples
+
+    def training_step(self, batch: Samples, batch_idx: int) -> Tensor | None:
         """The loss, or None where it is not finite: then this step changes nothing."""
-        loss = self.loss(batch)
-        self._windows = list(zip(batch.trajectory.tolist(), batch.frame.tolist(), strict=True))
+        graphs = self.graphs(batch)
+        loss = self.loss(graphs)
+        self._windows = list(zip(graphs.trajectory.tolist(), graphs.frame.tolist(), strict=True))
         total = ranks.summed(loss.detach())
         if not torch.isfinite(total):
             self._skip("loss", total)

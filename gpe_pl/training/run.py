@@ -7,7 +7,7 @@ import logging
 import os
 import shutil
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -21,6 +21,7 @@ from pydantic import Field
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import NoiseKind
+from gpe_pl.data.sampling import PushForward, Sampling
 from gpe_pl.errors import GpeError
 from gpe_pl.training.callbacks import RolloutValidation, WarmAverage
 from gpe_pl.training.checkpoints import AtomicCheckpoints
@@ -36,9 +37,10 @@ class RunError(GpeError, RuntimeError):
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """Everything about the optimisation; see ``TrainingModule``, ``TrajectoryDataModule`` and ``data.noise`` for the meaning of each value.
+    """Everything about the optimisation; see ``TrainingModule``, ``TrajectoryDataModule``, ``data.noise`` and ``data.sampling`` for the meaning of each value.
 
-    ``budget_minutes``, of one core or GPU, replaces ``num_steps`` (see ``training.budget``).
+    ``budget_minutes``, of one core or GPU, replaces ``num_steps`` (see ``training.budget``). The last ``push_share`` of the steps start where the model has
+    come to in up to ``push_steps`` steps of its own.
     """
 
     num_steps: Annotated[int, Field(ge=1)]
@@ -53,6 +55,9 @@ class TrainingSettings:
     noise: NoiseKind = "velocity"
     noise_std: Annotated[float, Field(ge=0, le=100)] = 0.3
     noise_correction: Annotated[float, Field(ge=0, le=1)] = 0.0
+    sampling: Sampling = "uniform"
+    push_share: Annotated[float, Field(ge=0, le=1)] = 0.0
+    push_steps: Annotated[int, Field(ge=1)] = 12
     stress_weight: Annotated[float, Field(gt=0)] = 1.0
     compile: Compile = "auto"
     val_interval: Annotated[int, Field(ge=1)] = 1000
@@ -64,6 +69,21 @@ class TrainingSettings:
             raise ValueError(
                 f"val_interval={self.val_interval} must divide num_steps={self.num_steps}: the last steps would be neither validated nor saved"
             )
+
+    def as_dict(self) -> dict[str, Any]:
+        """For a run's ``config.json``: without what runs did not have once, where it is not used, so that those are known again."""
+        values = asdict(self)
+        for key in ("sampling", "push_share"):
+            if values[key] == type(self).__dataclass_fields__[key].default:
+                del values[key]
+        if not self.push_share:
+            del values["push_steps"]
+        return values
+
+    @property
+    def push_forward(self) -> PushForward | None:
+        """When samples begin with own steps of the model."""
+        return PushForward(round((1 - self.push_share) * self.num_steps), self.push_steps) if self.push_share else None
 
 
 @dataclass(frozen=True)
@@ -151,6 +171,7 @@ def train(
     Of several processes only the first returns, the others end. Unless something else starts them (``torchrun``, Slurm), each runs the command that is
     running.
     """
+    datamodule.push_forward = training.push_forward  # known only now, as a budget of time has become a number of steps
     folder = run_dir / "checkpoints"
     last = folder / "last.ckpt"
     options: dict[str, Any] = {"save_top_k": 1, "save_on_train_epoch_end": False, "enable_version_counter": False}

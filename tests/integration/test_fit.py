@@ -27,6 +27,7 @@ from gpe_pl.training.run import RunError, claim
 from tests.runs import tiny
 
 STEPS = ("training.num_steps=6", "training.val_interval=2", "training.warmup_steps=2")
+LATE = ("training.sampling=activity", "training.push_share=0.5", "training.push_steps=3")
 
 
 class Killed(BaseException):
@@ -85,15 +86,19 @@ def assert_equal(a: Any, b: Any, path: str = "") -> None:
 STATE = ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers", "global_step", "simulator")
 
 
-@pytest.mark.parametrize("killed_at", [pytest.param(1, marks=pytest.mark.slow), 5])
-def test_a_resumed_run_equals_an_uninterrupted_one(tiny_data: Path, tmp_path: Path, losses: dict[int, list[float]], killed_at: int) -> None:
-    whole = tiny(tiny_data, tmp_path, "name=whole", *STEPS)
+@pytest.mark.parametrize(
+    ("killed_at", "late"), [pytest.param(1, (), marks=pytest.mark.slow), (5, ()), pytest.param(5, LATE, marks=pytest.mark.slow)]
+)
+def test_a_resumed_run_equals_an_uninterrupted_one(
+    tiny_data: Path, tmp_path: Path, losses: dict[int, list[float]], killed_at: int, late: tuple[str, ...]
+) -> None:
+    whole = tiny(tiny_data, tmp_path, "name=whole", *STEPS, *late)
     value = fit(whole)
     expected = {step: taken[0] for step, taken in losses.items()}
     assert sorted(expected) == list(range(6))
     losses.clear()
 
-    parts = tiny(tiny_data, tmp_path, "name=parts", *STEPS)
+    parts = tiny(tiny_data, tmp_path, "name=parts", *STEPS, *late)
     with pytest.MonkeyPatch.context() as patch:
         interrupt(patch, killed_at, Killed)
         with pytest.raises(Killed):

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from gpe_pl.data.datamodule import TrajectoryDataModule
-from gpe_pl.data.dataset import BatchSize
 from gpe_pl.data.noise import Noise
+from gpe_pl.data.sampling import BatchSize
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.store import StoreError
 

@@ -15,8 +15,9 @@ import pytest
 import torch
 
 from gpe_pl import integrators
-from gpe_pl.data.dataset import BatchSize, StepSampler, StoredTrajectory, WindowDataset, open_split
+from gpe_pl.data.dataset import StoredTrajectory, WindowDataset, collated, open_split
 from gpe_pl.data.noise import Noise
+from gpe_pl.data.sampling import UNIFORM_SHARE, BatchSampler, BatchSize, PushForward, StepSampler, probabilities
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.store import StoreError, read_trajectory, write_shard
@@ -210,3 +211,70 @@ def test_a_split_that_is_not_held_takes_the_memory_of_a_window(tmp_path: Path, n
     assert peak < size
     data = dataset(tmp_path)  # held: reading it takes more, which the test could not see otherwise
     assert sum(t.held.pos.nbytes for t in data.trajectories if t.held is not None) == size
+
+
+# --- what is drawn, and where samples start ---------------------------------------------------------------------------------------------
+
+
+def test_activity_is_the_size_of_the_targets(store: Path) -> None:
+    data = dataset(store, noise=None)
+    targets = [torch.cat([data[k]["sand"].target.double()]) for k in range(len(data))]
+    assert data.activity() == pytest.approx([float(t.square().mean().sqrt()) for t in targets], rel=1e-5)
+
+
+def test_windows_are_drawn_by_their_probability_and_weighed_by_its_inverse(store: Path) -> None:
+    data = dataset(store)
+    assert "weight" not in data[0]
+    activity = np.arange(len(data), dtype=float)
+    data.probability = probabilities(activity)
+    assert data.probability.sum() == pytest.approx(1)
+    assert data.probability[-1] / data.probability[1] > 2
+    drawn = [w for batch in itertools.islice(BatchSize(4).batches(data, seed=0, step=0), 2500) for _, w in batch]
+    share = np.bincount(drawn, minlength=len(data)) / len(drawn)
+    assert share == pytest.approx(data.probability, abs=0.02)
+    weights = np.array([data[0, k].weight for k in range(len(data))])
+    assert (data.probability * weights).sum() == pytest.approx(1)
+    assert weights.max() <= 1 / UNIFORM_SHARE
+    later = list(itertools.islice(BatchSize(4).batches(data, seed=0, step=3), 20))
+    assert later == list(itertools.islice(BatchSize(4).batches(data, seed=0, step=0), 23))[3:]
+
+
+def test_where_nothing_happens_all_windows_are_drawn_alike() -> None:
+    assert probabilities(np.zeros(4)) == pytest.approx(np.full(4, 0.25))
+
+
+@pytest.mark.parametrize("noise", [None, Noise("velocity", 0.5, 0.3), Noise("paper", 0.01)])
+def test_a_start_without_own_steps_is_the_usual_sample(store: Path, noise: Noise | None) -> None:
+    data = dataset(store, noise=noise)
+    start = data[5, 1, 0]
+    assert start.own_steps == 0
+    graph, usual = start.graph(data.builder, start.state, 0), data[5, 1]
+    assert torch.allclose(graph["sand"].target, usual["sand"].target, rtol=1e-5, atol=1e-3)
+    graph["sand"].target = usual["sand"].target
+    assert_equal_graphs(graph, usual)
+
+
+def test_the_target_after_own_steps_leads_back(store: Path) -> None:
+    """To the true velocity of that frame, and by the share of the correction to the true position."""
+    data = dataset(store, noise=Noise("velocity", 0.5, 0.25))
+    start, dt = data[5, 0, 2], data.builder.metadata.frame_dt
+    assert start.own_steps == 2 == data[5, 0, 9].own_steps  # the trajectory ends there
+    state = start.state
+    astray = replace(state, pos=start.truth[2] + 0.01, vel=state.vel + 1.0)
+    target = start.graph(data.builder, astray, 2)["sand"].target.double()
+    truth = (start.truth[3] - start.truth[2]) / dt
+    next_vel = astray.vel + (target + astray.gravity) * dt
+    assert torch.allclose(next_vel, truth - 0.25 * 0.01 / dt, atol=1e-5)
+
+
+def test_late_batches_ask_for_own_steps(store: Path) -> None:
+    data = dataset(store)
+    push = PushForward(3, 4)
+    keys = list(itertools.islice(BatchSampler(data, BatchSize(2), 0, lambda: 0, push), 60))
+    plain = list(itertools.islice(BatchSampler(data, BatchSize(2), 0, lambda: 0), 60))
+    assert keys[:3] == plain[:3]
+    assert [[key[:2] for key in batch] for batch in keys[3:]] == plain[3:]  # type: ignore[index]
+    assert {key[2] for batch in keys[3:] for key in batch} == {1, 2, 3, 4}  # type: ignore[misc, index]
+    assert list(itertools.islice(BatchSampler(data, BatchSize(2), 0, lambda: 17, push), 10)) == keys[17:27]
+    starts = collated([data[key] for key in keys[5]])
+    assert isinstance(starts, list) and len(starts) == 2

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
-from gpe_pl.data.dataset import BatchSize, WindowDataset, open_split
+from gpe_pl.data.dataset import WindowDataset, open_split
+from gpe_pl.data.sampling import BatchSize, PushForward
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
@@ -87,4 +89,11 @@ def test_measuring_trains_nothing(tiny_data: Path, monkeypatch: pytest.MonkeyPat
     module = TrainingModule(LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder), num_steps=10)
     before = {k: v.clone() for k, v in module.state_dict().items()}
     assert step_time(module, WindowDataset(stored, builder), BatchSize(2), gradient_clip=1.0) > 0
+    assert step_time(module, WindowDataset(stored, builder), BatchSize(2), 1.0, PushForward(0, 3)) > 0
     assert all(torch.equal(v, before[k]) for k, v in module.state_dict().items())
+
+    monkeypatch.setattr(budget, "step_time", lambda *arguments: 0.1 if len(arguments) == 4 else 0.5)
+    times = [
+        budget.mean_step_time(module, WindowDataset(stored, builder), BatchSize(2), replace(SETTINGS, push_share=s)) for s in (0.0, 0.25)
+    ]
+    assert times == pytest.approx([0.1, 0.2])

@@ -19,8 +19,8 @@ from torch_geometric.data import Batch, HeteroData
 
 from gpe_pl import ranks
 from gpe_pl.data.datamodule import TrajectoryDataModule
-from gpe_pl.data.dataset import BatchSize
 from gpe_pl.data.noise import Noise
+from gpe_pl.data.sampling import BatchSize
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE

@@ -1,0 +1,161 @@
+"""Which windows an optimiser step takes: an endless order that starts anywhere, and is the same whatever the number of processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+from torch.utils.data import Sampler
+
+from gpe_pl import ranks
+from gpe_pl.data.dataset import Key, WindowDataset
+from gpe_pl.store import StoreError
+
+Sampling = Literal["uniform", "activity"]
+"""How often each window is drawn: all alike, or the more often the more happens in it."""
+
+UNIFORM_SHARE = 0.2
+"""Of ``activity``: the share that is drawn from all windows alike, which limits their weights to five."""
+
+
+def probabilities(activity: np.ndarray) -> np.ndarray:
+    """Probability of each window under ``activity`` sampling.
+
+    The gradient of a squared error grows with the error, and that with what there is to predict: to draw in proportion to it, and to weigh by the
+    inverse, scatters least and leaves the expected gradient as it is [importance sampling, Katharopoulos and Fleuret 2018, arXiv 1803.00942].
+    """
+    total = activity.sum()
+    if not total > 0:
+        return np.full(len(activity), 1 / len(activity))
+    return UNIFORM_SHARE / len(activity) + (1 - UNIFORM_SHARE) * activity / total
+
+
+@dataclass(frozen=True)
+class PushForward:
+    """Late in training a sample starts where the model itself has come to from a true state, in up to ``max_steps`` steps of its own, which the gradient does
+    not see [the push-forward trick of Brandstetter et al. 2022, section 3.1].
+
+    Attributes:
+        first_step: of the optimiser from which this is done.
+        max_steps: own steps, of which each sample makes a random number, at least one.
+    """
+
+    first_step: Annotated[int, Field(ge=0)]
+    max_steps: Annotated[int, Field(ge=1)]
+
+    def keys(self, step: int, samples: list[tuple[int, int]], seed: int) -> list[Key]:
+        """The samples of an optimiser step with their numbers of own steps."""
+        if step < self.first_step:
+            return [*samples]
+        return [
+            (*sample, int(np.random.default_rng((seed, sample[0], self.max_steps)).integers(1, self.max_steps + 1))) for sample in samples
+        ]
+
+
+class StepSampler(Sampler[tuple[int, int]]):
+    """Endless shuffled passes over a data set as (sample number, window), starting at any sample number.
+
+    Args:
+        num_windows: size of the data set.
+        seed: of the order; every pass has its own.
+        start: called when iteration begins; the number of samples already consumed.
+        probability: of each window; a pass is then as many independent draws. None: a pass has every window once.
+    """
+
+    def __init__(self, num_windows: int, seed: int, start: Callable[[], int] = lambda: 0, probability: np.ndarray | None = None) -> None:
+        self.num_windows, self.seed, self.start, self.probability = num_windows, seed, start, probability
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        sample = self.start()
+        while True:
+            epoch, offset = divmod(sample, self.num_windows)
+            rng = np.random.default_rng((self.seed, epoch))
+            if self.probability is None:
+                order = rng.permutation(self.num_windows)
+            else:
+                order = rng.choice(self.num_windows, size=self.num_windows, p=self.probability)
+            for window in order[offset:]:
+                yield sample, int(window)
+                sample += 1
+
+
+@dataclass(frozen=True)
+class BatchSize:
+    """How many samples an optimiser step takes, all ranks together.
+
+    Attributes:
+        num_graphs: so many.
+        max_nodes: if given, instead: the next ones in the order whose nodes (see ``WindowDataset.num_nodes``) are at most so many together, at least one.
+    """
+
+    num_graphs: Annotated[int, Field(ge=1)]
+    max_nodes: Annotated[int, Field(ge=1)] | None = None
+
+    def batches(self, data: WindowDataset, seed: int, step: int) -> Iterator[list[tuple[int, int]]]:
+        """The samples of each optimiser step, from a step on, without end."""
+        if self.max_nodes is None:
+            samples = iter(StepSampler(len(data), seed, lambda: step * self.num_graphs, data.probability))
+            while True:
+                yield list(islice(samples, self.num_graphs))
+        else:
+            yield from islice(
+                self._packed(data, iter(StepSampler(len(data), seed, probability=data.probability)), self.max_nodes), step, None
+            )
+
+    @staticmethod
+    def _packed(data: WindowDataset, samples: Iterator[tuple[int, int]], max_nodes: int) -> Iterator[list[tuple[int, int]]]:
+        batch, total = [next(samples)], 0
+        for sample in samples:
+            total += data.num_nodes(batch[-1][1])
+            if total + data.num_nodes(sample[1]) > max_nodes:
+                yield batch
+                batch, total = [], 0
+            batch.append(sample)
+
+
+class BatchSampler(Sampler[list[Key]]):
+    """What this rank takes of the samples of each optimiser step. The order is one for all ranks, and the same as that of a single process.
+
+    Args:
+        data: training windows.
+        size: of the batches.
+        seed: of the order.
+        step: called when iteration begins; the number of optimiser steps already taken.
+        push_forward: from which step on samples have own steps of the model.
+
+    Raises:
+        StoreError: batches may have fewer samples than there are ranks.
+    """
+
+    def __init__(
+        self, data: WindowDataset, size: BatchSize, seed: int, step: Callable[[], int], push_forward: PushForward | None = None
+    ) -> None:
+        self.data, self.size, self.seed, self.step, self.push_forward = data, size, seed, step, push_forward
+        largest = max(t.num_nodes for t in data.trajectories)
+        fewest = size.num_graphs if size.max_nodes is None else size.max_nodes // largest
+        if fewest < ranks.num_ranks() > 1:
+            what = f"training.batch_size={size.num_graphs}" if size.max_nodes is None else f"batching.max_nodes={size.max_nodes}"
+            nodes = "" if size.max_nodes is None else f" of up to {largest} nodes"
+            raise StoreError(f"{what}: too small for {ranks.num_ranks()} processes, each of which takes at least one graph{nodes}")
+
+    def __iter__(self) -> Iterator[list[Key]]:
+        first = self.step()
+        for step, batch in enumerate(self.size.batches(self.data, self.seed, first), start=first):
+            own = batch if ranks.num_ranks() == 1 else self._part(batch)
+            yield [*own] if self.push_forward is None else self.push_forward.keys(step, own, self.seed)
+
+    def _part(self, batch: list[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Samples dealt by their nodes, the largest first, each to the rank that has the fewest so far."""
+        nodes = {sample: self.data.num_nodes(window) for sample, window in batch}
+        load = [0] * ranks.num_ranks()
+        own = set()
+        for sample in sorted(nodes, key=lambda sample: -nodes[sample]):
+            fewest = load.index(min(load))
+            load[fewest] += nodes[sample]
+            if fewest == ranks.rank():
+                own.add(sample)
+        return [(sample, window) for sample, window in batch if sample in own]
