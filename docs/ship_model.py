@@ -1,13 +1,12 @@
 """Make a trained run one of the models that come with the package.
 
-``python docs/ship_model.py RUN_FOLDER NAME 'COMMAND'`` writes weights without the optimiser's state, and a model card whose numbers are the run's own, to
-``gpe_pl/pretrained``. COMMAND is what trained it.
+``python docs/ship_model.py RUN_FOLDER NAME COMMIT 'COMMAND'`` writes weights without the optimiser's state, and a model card whose numbers are the run's
+own, to ``gpe_pl/pretrained``. COMMAND is what trained it, with the code of COMMIT.
 """
 
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -56,9 +55,8 @@ def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows
 
 def main(arguments: list[str]) -> int:
     """Write checkpoint and card; the exit status."""
-    run, name, command = Path(arguments[0]), arguments[1], arguments[2]
+    run, (name, commit, command) = Path(arguments[0]), arguments[1:]
     simulator = LearnedSimulator.from_checkpoint(run / "checkpoints" / "best.ckpt")
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
     settings = json.loads((run / "config.json").read_text())
     simulator.save(FOLDER / f"{name}.ckpt")
     (FOLDER / f"{name}.md").write_text(card(name, command, commit, simulator, list(read_rows(run / "metrics.csv")), settings))

@@ -3,7 +3,7 @@
 What most programs need can be imported from here: a trained model on a scene with a parameter that it never saw, beside the ground truth::
 
     from gpe_pl import LearnedSimulator, dataset, generate_trajectory, roll_out, rollout_figure
-    simulator = LearnedSimulator.from_checkpoint("runs/sand/checkpoints/best.ckpt")
+    simulator = LearnedSimulator.from_checkpoint("sand")  # comes with the package; or a checkpoint's path
     truth = generate_trajectory(dataset("data=sand", "size=small"), split="test", index=0, values={"sand": 27.5})
     prediction = roll_out(simulator, simulator.initial_state(truth, frame=5), num_steps=100, metadata=truth.metadata)
     rollout_figure(truth.frames(5, 106), {"GPE": prediction}).savefig("rollout.png")

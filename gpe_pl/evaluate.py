@@ -17,7 +17,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     """Roll a trained model out on one split of a data set, and in the scene's showcase if it has one; numbers and pictures go to ``{paths.runs}/{name}``."""
     from gpe_pl.evaluation import EvaluationSettings, evaluate
     from gpe_pl.learned_simulator import LearnedSimulator
-    from gpe_pl.pretrained import checkpoint_path, names
+    from gpe_pl.pretrained import names
     from gpe_pl.report import summary
     from gpe_pl.simulate import ensure_split, evaluated_config
     from gpe_pl.skips import Skips
@@ -30,7 +30,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
         EvaluationSettings, {**{k: v for k, v in cfg.evaluation.items() if k != "data"}, "splits": [cfg.split]}, "evaluation"
     )
     device = set_up(construct(TrainerSettings, cfg.trainer, "trainer"))
-    simulator = LearnedSimulator.from_checkpoint(checkpoint_path(cfg.checkpoint), device)
+    simulator = LearnedSimulator.from_checkpoint(cfg.checkpoint, device)
     simulator.skips = construct(Skips, cfg.rollout, "rollout")
     root = ensure_split(evaluated_config(cfg), cfg.split)
     folder = Path(cfg.paths.runs) / cfg.name

@@ -26,6 +26,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import Standardize
+from gpe_pl.pretrained import checkpoint_path
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, EdgeType, FeatureSpec, node_code, role
 from gpe_pl.signatures import checked
@@ -333,9 +334,14 @@ class LearnedSimulator(nn.Module):
     def from_checkpoint(cls, path: Path | str, device: Any = "cpu") -> LearnedSimulator:
         """Load a training checkpoint (averaged weights if the run averaged them), in evaluation mode. Only tensors and plain values are unpickled.
 
+        Args:
+            path: of the file; or the name of a model that comes with the package.
+            device: where to.
+
         Raises:
             CheckpointError: not a readable checkpoint of gpe_pl, damaged, or one of another model.
         """
+        path = checkpoint_path(path)
         checkpoint = load_checkpoint(path, device)
         try:
             simulator = cls.from_description(checkpoint["simulator"])

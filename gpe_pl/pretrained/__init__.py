@@ -13,6 +13,6 @@ def names() -> list[str]:
     return sorted(path.stem for path in FOLDER.glob(f"*{SUFFIX}"))
 
 
-def checkpoint_path(checkpoint: str) -> Path:
+def checkpoint_path(checkpoint: Path | str) -> Path:
     """The file of a shipped model, or the path itself if it is none of their names."""
-    return FOLDER / f"{checkpoint}{SUFFIX}" if checkpoint in names() else Path(checkpoint)
+    return FOLDER / f"{checkpoint}{SUFFIX}" if str(checkpoint) in names() else Path(checkpoint)

@@ -20,7 +20,6 @@ from pydantic import Field
 from gpe_pl.errors import GpeError
 from gpe_pl.generation import DatasetSpec, generate_trajectory
 from gpe_pl.learned_simulator import LearnedSimulator
-from gpe_pl.pretrained import checkpoint_path
 from gpe_pl.report import table_row
 from gpe_pl.stability import conservation, geometry, horizon, inputs, invariances, precision
 from gpe_pl.stability.subject import Outcome, StressTest, Subject
@@ -169,7 +168,7 @@ def _models(spec: DatasetSpec, settings: Settings) -> Iterator[tuple[str, Learne
     """Simulators by name; one that has the name of another is left out."""
     yield from ((name, simulator) for name, (simulator, _) in trained_on(spec, runs_in(settings.runs)).items())
     for checkpoint in settings.checkpoints:
-        simulator = LearnedSimulator.from_checkpoint(checkpoint_path(checkpoint))
+        simulator = LearnedSimulator.from_checkpoint(checkpoint)
         metadata = simulator.builder.metadata
         if (metadata.dataset, metadata.spacing) == (spec.name, spec.scene.spacing):
             yield Path(checkpoint).stem, simulator
