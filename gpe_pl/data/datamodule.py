@@ -83,9 +83,7 @@ class TrajectoryDataModule(L.LightningDataModule):
     def statistics_sample(self, num_windows: int = 256) -> Iterator[HeteroData]:
         """Training graphs, noise included, evenly spread over the split; for the standardisation of features."""
         for window in _spread(len(self.train_set), num_windows):
-            graph = self.train_set[int(window)]
-            assert isinstance(graph, HeteroData)
-            yield graph
+            yield self.train_set[int(window)]
 
     def val_trajectories(self, count: int) -> list[Trajectory]:
         """The first ``count`` trajectories of the ``val`` split."""
@@ -108,8 +106,8 @@ class TrajectoryDataModule(L.LightningDataModule):
         windows = [int(w) for w in _spread(len(self.val_set), self.num_val_windows)]
         if len(windows) < ranks.num_ranks():
             raise StoreError(f"{self.root}: split 'val' has {len(windows)} windows, too few for {ranks.num_ranks()} processes")
-        own: Any = [self.val_set[w] for w in windows[ranks.rank() :: ranks.num_ranks()]]
-        return DataLoader(own, batch_size=8, collate_fn=collated)
+        graphs: Any = [self.val_set[w] for w in windows[ranks.rank() :: ranks.num_ranks()]]  # built once; a list will do as a data set
+        return DataLoader(graphs, batch_size=8, collate_fn=collated)
 
 
 def _spread(length: int, count: int) -> np.ndarray:

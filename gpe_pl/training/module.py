@@ -6,7 +6,7 @@ import logging
 import math
 import shutil
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Annotated, Any, Literal
 
@@ -146,9 +146,11 @@ class TrainingModule(L.LightningModule):
         """Mean squared error of the normalised accelerations, and of the normalised stress where there is one; of several ranks, the part of this one."""
         predicted = self.simulator(batch)
         std = self.simulator.stress_std.float()
-        weights = self._weights(batch)
-        acceleration = [weights(m) * (a - self._normalized(batch[m].target)).square() for m, a in predicted.acceleration.items()]
-        stress = [weights(m) * (s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]
+        acceleration = [(a - self._normalized(batch[m].target)).square() for m, a in predicted.acceleration.items()]
+        stress = [(s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]
+        if "weight" in batch:
+            acceleration = self._weighted(batch, predicted.acceleration, acceleration)
+            stress = self._weighted(batch, predicted.stress, stress)
         shares = self._shares(acceleration, stress)
         loss = torch.cat(acceleration).mean() * shares[0]
         if stress:
@@ -156,12 +158,10 @@ class TrainingModule(L.LightningModule):
         return loss
 
     @staticmethod
-    def _weights(batch: HeteroData) -> Callable[[str], Tensor | float]:
-        """Weights [node, 1] of the nodes of a material, those of their graphs."""
-        if "weight" not in batch:
-            return lambda material: 1.0
+    def _weighted(batch: HeteroData, materials: Iterable[str], errors: list[Tensor]) -> list[Tensor]:
+        """Errors [node, …] of each material, times the weights of their graphs."""
         weight = batch.weight.float()
-        return lambda material: weight[batch[material].batch][:, None]
+        return [weight[batch[m].batch][:, None] * error for m, error in zip(materials, errors, strict=True)]
 
     def _shares(self, *errors: list[Tensor]) -> list[float]:
         """How many of all ranks' errors of each kind are on this one. The ranks exchange it also where this one has none of a kind."""
