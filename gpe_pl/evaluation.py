@@ -55,6 +55,7 @@ class EvaluationSettings:
         num_trajectories: per split, from its start; None takes all.
         containment: put particles that cross a wall back on its surface.
         num_uncontained: trajectories per split that are also rolled out without containment, to see what it corrects; None takes all.
+        hold_parameters: takes material parameters outside the trained range for the nearest trained value.
         num_pictures: trajectories per split that get a figure, an animation and a viewer.
         export: what to write for other programs: those trajectories as ``vtk`` series, ``npz`` and ``mp4``, and the ``model`` (see ``portable``).
     """
@@ -64,6 +65,7 @@ class EvaluationSettings:
     num_trajectories: Annotated[int, Field(ge=1)] | None = None
     containment: bool = True
     num_uncontained: Annotated[int, Field(ge=0)] | None = None
+    hold_parameters: bool = True
     num_pictures: Annotated[int, Field(ge=0)] = 2
     export: list[Export] = field(default_factory=list)
 
@@ -90,7 +92,8 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     """Roll out every trajectory of the splits; writes ``metrics.csv``, ``error_curve_*.png``, ``rollout_*.png``, ``rollout_*.gif``
     and ``rollout_*.html`` (a viewer) of some, and their ``stress_*.png`` where the model decodes a stress.
 
-    All rollouts start at the first frame with enough history and run to the end of the ground truth. Share outside with containment off is reported as
+    All rollouts start at the first frame with enough history and run to the end of the ground truth; ``simulator`` is left with
+    ``settings.hold_parameters``. Share outside with containment off is reported as
     ``share_outside_uncontained``, where it was asked for, the share of corrected particle-steps as ``share_corrected``.
 
     Where ``simulator.skips`` has approximate levels, the rollout without them is evaluated beside, and what they cost is reported: ``skipping_mse`` [m²] is
@@ -104,6 +107,7 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
         raise ExportError(
             "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
         )
+    simulator.holds_parameters = settings.hold_parameters
     run_dir.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     for split in settings.splits:
@@ -146,7 +150,8 @@ def _predict(
     truths = [trajectory.frames(history) for trajectory in trajectories]
     starts = [_start(simulator, *pair) for pair in zip(trajectories, truths, strict=True)]
     for line in sorted({line for start in starts for line in simulator.untrained_parameters(start.state)}):
-        log.warning("outside the training data: %s", line)
+        held = "; taken for the nearest trained value" if simulator.holds_parameters else ""
+        log.warning("outside the training data: %s%s", line, held)
     totals = [{"num_corrected": 0.0, "num_asleep": 0.0, "lost_impulse": 0.0} for _ in starts]
 
     def count(scene: int, _: int, state: State) -> None:

@@ -91,8 +91,14 @@ class GraphStandardizer(nn.Module):
         if sum(len(x) for x in mass):
             self.mass.copy_(torch.cat(mass).double().mean())
 
-    def forward(self, data: HeteroData, skip_absent: bool = True) -> HeteroData:
-        """A graph with standardised features, on request also those that it has no rows of; the input is left as it is."""
+    def forward(self, data: HeteroData, skip_absent: bool = True, limits: dict[str, Tensor] | None = None) -> HeteroData:
+        """A graph with standardised features; the input is left as it is.
+
+        Args:
+            data: with features in SI units.
+            skip_absent: leaves out features that the graph has no rows of.
+            limits: lowest and highest value [2, param] of each material's parameters; values beyond are taken for these.
+        """
 
         def wanted(values: Tensor) -> bool:
             return not skip_absent or values.shape[0] > 0
@@ -103,7 +109,10 @@ class GraphStandardizer(nn.Module):
                 out[t].x = self.node[role(t)](data[t].x)
         for m in self.spec.materials:
             if wanted(data[m].x):
-                out[m].material_params = self.params[m](self._material_scale(m, data[m].material_params))
+                params = data[m].material_params
+                if limits is not None:
+                    params = params.clamp(*limits[m].to(params.dtype))
+                out[m].material_params = self.params[m](self._material_scale(m, params))
                 out[m].mass = data[m].mass / self.mass
         for relation in self.spec.relations:
             if wanted(data[relation].odd):
@@ -120,11 +129,16 @@ class LearnedSimulator(nn.Module):
         builder: makes the graphs.
 
     Attributes:
-        skips: what steps leave out; may be changed at any time and is no part of a checkpoint.
+        skips: what steps leave out.
+        holds_parameters: material parameters outside the range of the training data are taken for the nearest trained value, which a network is more to be
+            trusted with than with its own continuation.
+
+    Both attributes may be changed at any time and are no part of a checkpoint.
     """
 
     acceleration_std: Tensor
     stress_std: Tensor
+    holds_parameters: bool = True
 
     def __init__(self, model: nn.Module, builder: GraphBuilder) -> None:
         super().__init__()
@@ -193,7 +207,8 @@ class LearnedSimulator(nn.Module):
 
     def forward(self, data: HeteroData) -> Prediction:
         """Accelerations without gravity per material, in units of ``acceleration_std``."""
-        return self.model(self.standardizer(data, self.skips.absent_types))
+        limits = dict(self._trained_ranges()) if self.holds_parameters else None
+        return self.model(self.standardizer(data, self.skips.absent_types, limits))
 
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
         """The state at a frame with the velocity history that the graph needs, on this model's device.

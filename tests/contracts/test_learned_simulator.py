@@ -445,3 +445,31 @@ def test_material_parameters_outside_the_training_data_are_named() -> None:
     again = LearnedSimulator.from_description(simulator.description())
     again.load_state_dict(simulator.state_dict())
     assert again.untrained_parameters(replace(state, material_params=params)) == [line]
+
+
+def test_material_parameters_outside_the_training_data_are_taken_for_the_nearest_trained_value() -> None:
+    build = scenes.builder(("sand", "snow"), history=1)
+    simulator = learned(build).eval()
+    state = scenes.state(40, ("sand", "snow")).to_torch()
+    graph = build(state)
+    for material in ("sand", "snow"):
+        graph[material].target = torch.ones(graph[material].num_nodes, 2)
+    simulator.fit_statistics([graph])
+    trained = graph["sand"].material_params
+    sand = (state.node_type == 0).nonzero().flatten()
+
+    def moved(friction_angle: float) -> torch.Tensor:
+        params = state.material_params.clone()
+        params[sand[0], 0] = friction_angle
+        return simulator.step(replace(state, material_params=params)).pos
+
+    for beyond, nearest in ((80.0, trained.max()), (1.0, trained.min())):
+        assert torch.equal(moved(beyond), moved(float(nearest)))
+    within = 0.5 * float(trained.min() + trained.max())
+    assert not torch.equal(moved(within), moved(80.0))
+    held = moved(80.0)
+    simulator.holds_parameters = False
+    assert not torch.equal(held, moved(80.0))
+    free = simulator.step(state).pos
+    simulator.holds_parameters = True
+    assert torch.equal(simulator.step(state).pos, free)  # nothing in this scene lies beyond
