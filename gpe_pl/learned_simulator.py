@@ -288,11 +288,17 @@ class LearnedSimulator(nn.Module):
     def _advance_all(self, states: list[State], graphs: list[HeteroData]) -> list[State]:
         data = graphs[0] if len(graphs) == 1 else Batch.from_data_list(graphs)
         predicted = self(data)
-        acc = [state.gravity.expand_as(state.pos).clone() for state in states]
-        for scene, rows, part in _per_scene(predicted.acceleration, graphs):
-            acc[scene][rows] += part.double() * self.acceleration_std
-        new = [self.advance(state, a) for state, a in zip(states, acc, strict=True)]
+        new = self.moved(states, graphs, predicted.acceleration)
         return self._with_stress(new, predicted.stress, graphs) if predicted.stress else new
+
+    def moved(self, states: list[State], graphs: list[HeteroData], acceleration: dict[str, Tensor]) -> list[State]:
+        """The next states under what the model predicts for a batch of their graphs: accelerations without gravity per material, in units of
+        ``acceleration_std``.
+        """
+        acc = [state.gravity.expand_as(state.pos).clone() for state in states]
+        for scene, rows, part in _per_scene(acceleration, graphs):
+            acc[scene][rows] += part.double() * self.acceleration_std
+        return [self.advance(state, a) for state, a in zip(states, acc, strict=True)]
 
     def _with_stress(self, states: list[State], predicted: dict[str, Tensor], graphs: list[HeteroData]) -> list[State]:
         components = next(iter(self.builder.spec.stress_channels.values()))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias, overload
+from typing import Any, NamedTuple, TypeAlias, overload
 
 import numpy as np
 import torch
@@ -21,8 +21,18 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.store import StoreError, open_group, open_shard, read_trajectory, shards
 from gpe_pl.trajectory import State, Trajectory
 
-Key = int | tuple[int, int] | tuple[int, int, int]
-"""A window's number; or sample number and window; or these and the model's own steps from there."""
+
+class StartKey(NamedTuple):
+    """A window to start from for steps of the model's own; batches of the same ``lane`` go on where the last one has come to."""
+
+    sample: int
+    window: int
+    own_steps: int
+    lane: int = 0
+
+
+Key = int | tuple[int, int] | StartKey
+"""A window's number; or sample number and window; or a start."""
 
 CACHE_BYTES = 2 * 1024**3
 """Splits smaller than this are held in memory; larger ones are read from disk window by window."""
@@ -77,6 +87,7 @@ class Start:
         stress: true Cauchy stress [own_steps + 1, node, component] of the frames after the state's [Pa], where it is asked for.
         correction: share of the distance from the true position that the target takes back within a step; see ``Noise``.
         about: trajectory and frame, and the weight in the loss if there is one.
+        sample, lane: as in the key.
     """
 
     state: State
@@ -84,6 +95,8 @@ class Start:
     stress: Tensor | None
     correction: float
     about: dict[str, Any]
+    sample: int
+    lane: int
 
     @property
     def own_steps(self) -> int:
@@ -198,15 +211,16 @@ class WindowDataset(Dataset[HeteroData | Start]):
     def __getitem__(self, key: int | tuple[int, int]) -> HeteroData: ...
 
     @overload
-    def __getitem__(self, key: tuple[int, int, int]) -> Start: ...
+    def __getitem__(self, key: StartKey) -> Start: ...
 
     def __getitem__(self, key: Key) -> HeteroData | Start:
         """The graph of a window, or where own steps are asked for, a start for them: as many as the trajectory is long enough for."""
-        sample, window, own_steps = (key, key, None) if isinstance(key, int) else (*key, None)[:3]
+        start = key if isinstance(key, StartKey) else None
+        sample, window = (key, key) if isinstance(key, int) else key[:2]
         number, frame = self.locate(window)
         history = self.builder.config.history
         stored = self.trajectories[number]
-        ahead = 0 if own_steps is None else min(own_steps, stored.num_frames - 2 - frame)
+        ahead = 0 if start is None else min(start.own_steps, stored.num_frames - 2 - frame)
         trajectory = stored.window(frame - history, frame + 2 + ahead)
         dt = trajectory.metadata.frame_dt
         truth = trajectory.pos.astype(np.float64)
@@ -241,8 +255,8 @@ class WindowDataset(Dataset[HeteroData | Start]):
         about: dict[str, Any] = {"trajectory": number, "frame": frame}
         if self.probability is not None:
             about["weight"] = 1 / (len(self) * float(self.probability[window]))
-        if own_steps is not None:
+        if start is not None:
             correction = self.noise.correction if self.noise is not None and self.noise.kind == "velocity" else 0.0
-            return Start(state, torch.from_numpy(truth[history:]), stress, correction, about)
+            return Start(state, torch.from_numpy(truth[history:]), stress, correction, about, sample, start.lane)
         target = integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity
         return training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[-1], about)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import islice
+from itertools import count, islice
 from typing import Annotated, Literal
 
 import numpy as np
@@ -12,7 +12,7 @@ from pydantic import Field
 from torch.utils.data import Sampler
 
 from gpe_pl import ranks
-from gpe_pl.data.dataset import Key, WindowDataset
+from gpe_pl.data.dataset import Key, StartKey, WindowDataset
 from gpe_pl.store import StoreError
 
 Sampling = Literal["uniform", "activity"]
@@ -34,26 +34,35 @@ def probabilities(activity: np.ndarray) -> np.ndarray:
     return UNIFORM_SHARE / len(activity) + (1 - UNIFORM_SHARE) * activity / total
 
 
+NUM_LANES = 16
+"""Batches that are under way at a time. Steps of the optimiser that follow on each other take them in turn, so that they are about different scenes."""
+
+
 @dataclass(frozen=True)
 class PushForward:
-    """Late in training a sample starts where the model itself has come to from a true state, in up to ``max_steps`` steps of its own, which the gradient does
-    not see [the push-forward trick of Brandstetter et al. 2022, section 3.1].
+    """Late in training samples are states that the model itself has come to from a true state, in up to ``max_steps`` steps of its own, which the gradient
+    does not see [the push-forward trick of Brandstetter et al. 2022, section 3.1].
 
     Attributes:
         first_step: of the optimiser from which this is done.
-        max_steps: own steps, of which each sample makes a random number, at least one.
+        max_steps: own steps. A batch is trained on at its true state and after each of these steps, then the next one takes its lane.
     """
 
     first_step: Annotated[int, Field(ge=0)]
     max_steps: Annotated[int, Field(ge=1)]
 
-    def keys(self, step: int, samples: list[tuple[int, int]], seed: int) -> list[Key]:
-        """The samples of an optimiser step with their numbers of own steps."""
-        if step < self.first_step:
-            return [*samples]
-        return [
-            (*sample, int(np.random.default_rng((seed, sample[0], self.max_steps)).integers(1, self.max_steps + 1))) for sample in samples
-        ]
+    def starts(self, batches: Iterator[list[tuple[int, int]]]) -> Iterator[list[StartKey]]:
+        """The starts of each optimiser step from ``first_step`` on. The lanes begin with different numbers of own steps, so that all numbers are about as
+        frequent at any time.
+        """
+        num_visits = self.max_steps + 1
+        lanes = [next(batches) for _ in range(NUM_LANES)]
+        for turn in count():
+            for lane in range(NUM_LANES):
+                own_steps = (turn + lane * num_visits // NUM_LANES) % num_visits
+                if turn and not own_steps:
+                    lanes[lane] = next(batches)
+                yield [StartKey(sample, window, own_steps, lane) for sample, window in lanes[lane]]
 
 
 class StepSampler(Sampler[tuple[int, int]]):
@@ -143,13 +152,19 @@ class BatchSampler(Sampler[list[Key]]):
             raise StoreError(f"{what}: too small for {ranks.num_ranks()} processes, each of which takes at least one graph{nodes}")
 
     def __iter__(self) -> Iterator[list[Key]]:
-        first = self.step()
-        for step, batch in enumerate(self.size.batches(self.data, self.seed, first), start=first):
-            own = batch if ranks.num_ranks() == 1 else self._part(batch)
-            yield [*own] if self.push_forward is None else self.push_forward.keys(step, own, self.seed)
+        first, push = self.step(), self.push_forward
+        num_plain = None if push is None else max(0, push.first_step - first)
+        batches = map(self._part, self.size.batches(self.data, self.seed, first if push is None else min(first, push.first_step)))
+        for batch in islice(batches, num_plain):
+            yield [*batch]
+        if push is not None:
+            for starts in islice(push.starts(batches), max(0, first - push.first_step), None):
+                yield [*starts]
 
     def _part(self, batch: list[tuple[int, int]]) -> list[tuple[int, int]]:
         """Samples dealt by their nodes, the largest first, each to the rank that has the fewest so far."""
+        if ranks.num_ranks() == 1:
+            return batch
         nodes = {sample: self.data.num_nodes(window) for sample, window in batch}
         load = [0] * ranks.num_ranks()
         own = set()

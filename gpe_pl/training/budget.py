@@ -19,14 +19,14 @@ from filelock import FileLock
 
 from gpe_pl.atomic import replace_text
 from gpe_pl.data.dataset import Samples, WindowDataset, collated
-from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward
+from gpe_pl.data.sampling import NUM_LANES, BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
 from gpe_pl.training.run import TrainingSettings
 
 log = logging.getLogger(__name__)
 
-WARM_UP_STEPS = 15
+WARM_UP_STEPS = NUM_LANES
 MEASURED_STEPS = 25
 ROUNDS = 5
 
@@ -60,7 +60,7 @@ def step_time(
     clock = time.perf_counter if on_gpu else time.process_time
     optimizer = torch.optim.Adam(module.parameters(), lr=0.0, fused=True)
     numbers = BatchSampler(data, size, 0, lambda: 0, push_forward)
-    batches = (module.graphs(_on(module.device, collated([data[key] for key in keys]))) for keys in numbers)
+    batches = (_on(module.device, collated([data[key] for key in keys])) for keys in numbers)
 
     def steps(count: int) -> float:
         start = clock()

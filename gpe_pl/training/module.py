@@ -22,7 +22,7 @@ from gpe_pl.data.dataset import Samples
 from gpe_pl.errors import GpeError
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE
-from gpe_pl.training.push_forward import pushed
+from gpe_pl.training.push_forward import Excursions
 
 Schedule = Literal["cosine", "exponential"]
 Compile = Literal["auto", "on", "off"]
@@ -81,6 +81,7 @@ class TrainingModule(L.LightningModule):
         self.stress_weight = stress_weight
         self.compile_mode: Compile = compile
         self.val_nmse = OneStepNMSE()
+        self._excursions = Excursions()
         self._compilation = ExitStack()
         self._windows: list[tuple[int, int]] = []  # (trajectory, frame) of the current batch
         self._skipped: deque[int] = deque(maxlen=MAX_SKIPPED)  # the last steps without an update
@@ -142,9 +143,17 @@ class TrainingModule(L.LightningModule):
         finally:
             del model.compute  # back to the class's own
 
-    def loss(self, batch: HeteroData) -> Tensor:
-        """Mean squared error of the normalised accelerations, and of the normalised stress where there is one; of several ranks, the part of this one."""
+    def loss(self, samples: Samples) -> Tensor:
+        """Mean squared error of the normalised accelerations, and of the normalised stress where there is one; of several ranks, the part of this one.
+
+        Starts are taken where the simulator has come to from them, and what it predicts there moves them on.
+        """
+        batch = self._excursions.graphs(self.simulator, samples) if isinstance(samples, list) else samples
         predicted = self.simulator(batch)
+        if isinstance(samples, list):
+            self._excursions.move_on(self.simulator, samples[0].lane, predicted.acceleration)
+        if "trajectory" in batch:
+            self._windows = list(zip(batch.trajectory.tolist(), batch.frame.tolist(), strict=True))
         std = self.simulator.stress_std.float()
         acceleration = [(a - self._normalized(batch[m].target)).square() for m, a in predicted.acceleration.items()]
         stress = [(s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]
@@ -170,15 +179,9 @@ class TrainingModule(L.LightningModule):
         here = torch.tensor([sum(e.numel() for e in kind) for kind in errors], device=self.device)
         return [n / max(1, total) for n, total in zip(here.tolist(), ranks.summed(here).tolist(), strict=True)]
 
-    def graphs(self, samples: Samples) -> HeteroData:
-        """Samples of an optimiser step as graphs, after the own steps of those that ask for some."""
-        return pushed(self.simulator, samples) if isinstance(samples, list) else samples
-
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor | None:
         """The loss, or None where it is not finite: then this step changes nothing."""
-        graphs = self.graphs(batch)
-        loss = self.loss(graphs)
-        self._windows = list(zip(graphs.trajectory.tolist(), graphs.frame.tolist(), strict=True))
+        loss = self.loss(batch)
         total = ranks.summed(loss.detach())
         if not torch.isfinite(total):
             self._skip("loss", total)
@@ -226,6 +229,7 @@ class TrainingModule(L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["simulator"] = self.simulator.description()
+        self._excursions.clear()  # a resumed run has none either
 
     def _normalized(self, target: Tensor) -> Tensor:
         return target / self.simulator.acceleration_std.to(target.dtype)

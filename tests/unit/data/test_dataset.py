@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import collections
 import copy
+import functools
 import hashlib
 import itertools
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
 import torch
 
 from gpe_pl import integrators
-from gpe_pl.data.dataset import StoredTrajectory, WindowDataset, collated, open_split
+from gpe_pl.data.dataset import StartKey, StoredTrajectory, WindowDataset, collated, open_split
 from gpe_pl.data.noise import Noise
-from gpe_pl.data.sampling import UNIFORM_SHARE, BatchSampler, BatchSize, PushForward, StepSampler, probabilities
+from gpe_pl.data.sampling import NUM_LANES, UNIFORM_SHARE, BatchSampler, BatchSize, PushForward, StepSampler, probabilities
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.store import StoreError, read_trajectory, write_shard
@@ -246,7 +249,7 @@ def test_where_nothing_happens_all_windows_are_drawn_alike() -> None:
 @pytest.mark.parametrize("noise", [None, Noise("velocity", 0.5, 0.3), Noise("paper", 0.01)])
 def test_a_start_without_own_steps_is_the_usual_sample(store: Path, noise: Noise | None) -> None:
     data = dataset(store, noise=noise)
-    start = data[5, 1, 0]
+    start = data[StartKey(5, 1, 0)]
     assert start.own_steps == 0
     graph, usual = start.graph(data.builder, start.state, 0), data[5, 1]
     assert torch.allclose(graph["sand"].target, usual["sand"].target, rtol=1e-5, atol=1e-3)
@@ -257,8 +260,8 @@ def test_a_start_without_own_steps_is_the_usual_sample(store: Path, noise: Noise
 def test_the_target_after_own_steps_leads_back(store: Path) -> None:
     """To the true velocity of that frame, and by the share of the correction to the true position."""
     data = dataset(store, noise=Noise("velocity", 0.5, 0.25))
-    start, dt = data[5, 0, 2], data.builder.metadata.frame_dt
-    assert start.own_steps == 2 == data[5, 0, 9].own_steps  # the trajectory ends there
+    start, dt = data[StartKey(5, 0, 2)], data.builder.metadata.frame_dt
+    assert start.own_steps == 2 == data[StartKey(5, 0, 9)].own_steps  # the trajectory ends there
     state = start.state
     astray = replace(state, pos=start.truth[2] + 0.01, vel=state.vel + 1.0)
     target = start.graph(data.builder, astray, 2)["sand"].target.double()
@@ -270,11 +273,21 @@ def test_the_target_after_own_steps_leads_back(store: Path) -> None:
 def test_late_batches_ask_for_own_steps(store: Path) -> None:
     data = dataset(store)
     push = PushForward(3, 4)
-    keys = list(itertools.islice(BatchSampler(data, BatchSize(2), 0, lambda: 0, push), 60))
+    keys = list(itertools.islice(BatchSampler(data, BatchSize(2), 0, lambda: 0, push), 3 + 6 * NUM_LANES))
     plain = list(itertools.islice(BatchSampler(data, BatchSize(2), 0, lambda: 0), 60))
     assert keys[:3] == plain[:3]
-    assert [[key[:2] for key in batch] for batch in keys[3:]] == plain[3:]  # type: ignore[index]
-    assert {key[2] for batch in keys[3:] for key in batch} == {1, 2, 3, 4}  # type: ignore[misc, index]
-    assert list(itertools.islice(BatchSampler(data, BatchSize(2), 0, lambda: 17, push), 10)) == keys[17:27]
+    late = cast(list[list[StartKey]], keys[3:])
+    assert [[key[:2] for key in batch] for batch in late[:NUM_LANES]] == plain[3 : 3 + NUM_LANES]
+    assert collections.Counter(batch[0].own_steps for batch in late[: 5 * NUM_LANES]) == dict.fromkeys(range(5), NUM_LANES)
+    following = iter(cast(list[tuple[int, int]], batch) for batch in plain[3 + NUM_LANES :])
+    for before, after in zip(late, late[NUM_LANES:], strict=False):  # of the same lane
+        assert {key.lane for key in (*before, *after)} == {before[0].lane}
+        if before[0].own_steps == push.max_steps:
+            assert [key[:3] for key in after] == [(sample, window, 0) for sample, window in next(following)]
+        else:
+            assert after == [key._replace(own_steps=key.own_steps + 1) for key in before]
+    for first in (2, 3, 4, 17, 60):
+        resumed = BatchSampler(data, BatchSize(2), 0, functools.partial(int, first), push)
+        assert list(itertools.islice(resumed, 10)) == keys[first : first + 10]
     starts = collated([data[key] for key in keys[5]])
     assert isinstance(starts, list) and len(starts) == 2

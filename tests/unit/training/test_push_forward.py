@@ -1,14 +1,15 @@
-"""Where a simulator comes to by itself, training goes on from there; what it did on the way gets no gradient."""
+"""Where a simulator has come to by itself, training goes on; what it did on the way gets no gradient."""
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import pytest
 import torch
-from torch_geometric.data import Batch
+from torch_geometric.data import Batch, HeteroData
 
-from gpe_pl.data.dataset import Start, WindowDataset, open_split
+from gpe_pl.data.dataset import Start, StartKey, WindowDataset, open_split
 from gpe_pl.data.sampling import PushForward
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
@@ -16,7 +17,7 @@ from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout import SimulationError
 from gpe_pl.training.module import TrainingModule
-from gpe_pl.training.push_forward import pushed
+from gpe_pl.training.push_forward import walked
 from gpe_pl.training.run import TrainingSettings
 from gpe_pl.trajectory import State
 from tests.scenes import assert_equal_graphs
@@ -34,23 +35,95 @@ def simulator(data: WindowDataset) -> LearnedSimulator:
     return LearnedSimulator(GPE(data.builder.spec, num_message_passing_steps=1, hidden_channels=8), data.builder)
 
 
-def test_it_is_the_simulators_own_rollout(data: WindowDataset, simulator: LearnedSimulator) -> None:
-    starts = [data[0, 0, 2], data[1, 3, 1]]
-    graphs = []
-    for start in starts:
-        state = start.state
-        for _ in range(start.own_steps):
-            state = simulator.step(state)
-        graphs.append(start.graph(data.builder, state, start.own_steps))
+def test_a_walk_is_the_simulators_own_rollout(data: WindowDataset, simulator: LearnedSimulator) -> None:
+    starts = [data[StartKey(0, 0, 2)], data[StartKey(1, 3, 1)]]
     simulator.train()
-    assert_equal_graphs(pushed(simulator, starts), Batch.from_data_list(graphs), rtol=1e-5, atol=1e-5)
-    assert simulator.training
+    states, steps = walked(simulator, starts)
+    assert steps == [2, 1] and simulator.training
+    for start, state in zip(starts, states, strict=True):
+        expected = start.state
+        for _ in range(start.own_steps):
+            expected = simulator.step(expected)
+        assert torch.allclose(state.pos, expected.pos, rtol=0, atol=1e-9)
 
 
-def test_its_loss_has_a_gradient_of_one_step(data: WindowDataset, simulator: LearnedSimulator) -> None:
+def test_a_scene_that_falls_apart_on_the_way_ends_where_it_was_whole(
+    data: WindowDataset, simulator: LearnedSimulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usual, first = simulator.next_states, data[StartKey(0, 0, 2)]
+
+    def fails_later(states: list[State]) -> list[State | SimulationError]:
+        return [SimulationError("no") if state.time > first.state.time else new for state, new in zip(states, usual(states), strict=True)]
+
+    monkeypatch.setattr(simulator, "next_states", fails_later)
+    (state,), steps = walked(simulator, [first])
+    assert steps == [1] and torch.equal(state.pos, simulator.step(first.state).pos)
+
+
+def visits(data: WindowDataset, samples: list[tuple[int, int]], lane: int, num_visits: int) -> list[list[Start]]:
+    return [[data[StartKey(sample, window, step, lane)] for sample, window in samples] for step in range(num_visits)]
+
+
+def test_steps_of_training_move_the_states_on(data: WindowDataset, simulator: LearnedSimulator) -> None:
+    """With weights that stay, they are where the simulator's rollout is; other lanes have no part in it."""
     module = TrainingModule(simulator, num_steps=10)
-    starts = [data[0, 0, 2]]
-    graph = module.graphs(starts)
+    lanes = [visits(data, [(0, 0), (1, 3)], 0, 3), visits(data, [(2, 3), (3, 0)], 1, 3)]
+    for step in range(3):
+        for turn in lanes:
+            excursions = copy.deepcopy(module._excursions)
+            graph = excursions.graphs(simulator, turn[step])
+            states, steps = walked(simulator, turn[step])
+            assert steps == [step, step]
+            expected = [start.graph(data.builder, state, step) for start, state in zip(turn[step], states, strict=True)]
+            assert_equal_graphs(graph, Batch.from_data_list(expected), rtol=1e-4, atol=1e-4)
+            module.loss(turn[step])
+
+
+def test_at_the_end_of_the_truth_and_after_falling_apart_a_sample_is_at_its_start_again(
+    data: WindowDataset, simulator: LearnedSimulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module, last = TrainingModule(simulator, num_steps=10), len(data) - 2
+    turns = visits(data, [(0, last)], 0, 4)
+    assert turns[3][0].own_steps == 1  # as far as the trajectory goes
+    usual = Batch.from_data_list([turns[0][0].graph(data.builder, turns[0][0].state, 0)])
+    for starts in turns[:2]:
+        module.loss(starts)
+    assert_equal_graphs(module._excursions.graphs(simulator, turns[2]), usual)
+
+    module._excursions.clear()
+    module.loss(turns[0])
+    built = Start.graph
+
+    def fails_under_way(self: Start, builder: GraphBuilder, state: State, step: int) -> HeteroData:
+        if step:
+            raise SimulationError("no")
+        return built(self, builder, state, step)
+
+    monkeypatch.setattr(Start, "graph", fails_under_way)
+    assert_equal_graphs(module._excursions.graphs(simulator, turns[1]), usual)
+
+
+def test_a_checkpoint_ends_all_excursions(data: WindowDataset, simulator: LearnedSimulator) -> None:
+    """A resumed run has none, so one that goes on may have none either."""
+    module = TrainingModule(simulator, num_steps=10)
+    turns = visits(data, [(0, 0)], 0, 3)
+    module.loss(turns[0])
+    optimizer = torch.optim.SGD(module.parameters(), lr=1e-3)
+    module.loss(turns[1]).backward()
+    optimizer.step()
+    (state,), _ = walked(simulator, turns[2])
+    expected = Batch.from_data_list([turns[2][0].graph(data.builder, state, 2)])
+    going_on = copy.deepcopy(module._excursions).graphs(simulator, turns[2])
+    assert not torch.equal(going_on["sand"].target, expected["sand"].target)
+    module.on_save_checkpoint({})
+    assert_equal_graphs(module._excursions.graphs(simulator, turns[2]), expected)
+
+
+def test_own_steps_get_no_gradient(data: WindowDataset, simulator: LearnedSimulator) -> None:
+    module = TrainingModule(simulator, num_steps=10)
+    starts = [data[StartKey(0, 0, 2)]]
+    graph = module._excursions.graphs(simulator, starts)
+    module._excursions.clear()
     module.training_step(starts, 0).backward()  # type: ignore[union-attr]
     gradients = [p.grad.clone() for p in module.parameters() if p.grad is not None]
     module.zero_grad()
@@ -58,19 +131,6 @@ def test_its_loss_has_a_gradient_of_one_step(data: WindowDataset, simulator: Lea
     assert len(gradients) > 5
     for a, b in zip(gradients, (p.grad for p in module.parameters() if p.grad is not None), strict=True):
         assert torch.equal(a, b)
-
-
-def test_a_scene_that_falls_apart_on_the_way_ends_where_it_was_whole(
-    data: WindowDataset, simulator: LearnedSimulator, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    usual, first = simulator.next_states, data[0, 0, 2]
-
-    def fails_later(states: list[State]) -> list[State | SimulationError]:
-        return [SimulationError("no") if state.time > first.state.time else new for state, new in zip(states, usual(states), strict=True)]
-
-    monkeypatch.setattr(simulator, "next_states", fails_later)
-    after = first.graph(data.builder, simulator.step(first.state), 1)
-    assert_equal_graphs(pushed(simulator, [first]), Batch.from_data_list([after]), rtol=1e-5, atol=1e-5)
 
 
 def test_weights_of_graphs_weigh_their_nodes(data: WindowDataset, simulator: LearnedSimulator) -> None:
@@ -83,8 +143,9 @@ def test_weights_of_graphs_weigh_their_nodes(data: WindowDataset, simulator: Lea
 
 
 def test_a_start_can_be_moved(data: WindowDataset) -> None:
-    moved: Start = data[0, 0, 2].to("cpu")
-    assert moved.own_steps == 2 and torch.equal(moved.truth, data[0, 0, 2].truth)
+    start = data[StartKey(0, 0, 2)]
+    moved = start.to("cpu")
+    assert moved.own_steps == 2 and torch.equal(moved.truth, start.truth)
 
 
 def test_settings_of_older_runs_are_known_again() -> None:
