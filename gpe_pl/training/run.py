@@ -57,7 +57,7 @@ class TrainingSettings:
     noise_correction: Annotated[float, Field(ge=0, le=1)] = 0.0
     sampling: Sampling = "uniform"
     push_share: Annotated[float, Field(ge=0, le=1)] = 0.0
-    push_steps: Annotated[int, Field(ge=1)] = 12
+    push_steps: Annotated[int, Field(ge=1)] = 20
     stress_weight: Annotated[float, Field(gt=0)] = 1.0
     compile: Compile = "auto"
     val_interval: Annotated[int, Field(ge=1)] = 1000
