@@ -18,9 +18,11 @@ from torch import nn
 from torch_geometric.data import Batch, HeteroData
 
 from gpe_pl import ranks
+from gpe_pl.data import sampling
 from gpe_pl.data.datamodule import TrajectoryDataModule
+from gpe_pl.data.dataset import Samples
 from gpe_pl.data.noise import Noise
-from gpe_pl.data.sampling import BatchSize
+from gpe_pl.data.sampling import BatchSize, Sampling
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
@@ -137,22 +139,27 @@ class Recorded(TrainingModule):
         self.steps: list[tuple[list[tuple[int, int]], dict[str, int]]] = []
         self.losses: list[float] = []
 
-    def training_step(self, batch: HeteroData, batch_idx: int) -> torch.Tensor | None:
+    def training_step(self, batch: Samples, batch_idx: int) -> torch.Tensor | None:
         loss = super().training_step(batch, batch_idx)
         assert loss is not None
-        self.steps.append((list(self._windows), {m: batch[m].x.shape[0] for m in MATERIALS}))
+        if isinstance(batch, list):
+            num_nodes = {m: sum(int((start.state.node_type == node_code(m)).sum()) for start in batch) for m in MATERIALS}
+        else:
+            num_nodes = {m: batch[m].x.shape[0] for m in MATERIALS}
+        self.steps.append((list(self._windows), num_nodes))
         self.losses.append(float(ranks.summed(loss.detach())))
         return loss
 
 
-def trained(root: Path, run: Path, rank: int, num_ranks: int, size: BatchSize, num_steps: int = 20) -> dict[str, Any]:
+def trained(root: Path, run: Path, rank: int, num_ranks: int, size: BatchSize, num_steps: int = 20, late: bool = False) -> dict[str, Any]:
     """Weights, and what each step of this rank was given."""
-    data = TrajectoryDataModule(root, GraphConfig(history=2), Noise("velocity", 0.1), size, seed=1)
+    kind: Sampling = "activity" if late else "uniform"
+    data = TrajectoryDataModule(root, GraphConfig(history=2), Noise("velocity", 0.1), size, seed=1, sampling=kind)
     torch.manual_seed(5 + rank)  # ranks start from the weights of the first
     simulator = LearnedSimulator(GPE(data.builder.spec, num_message_passing_steps=2, hidden_channels=8), data.builder)
     simulator.fit_statistics(data.statistics_sample())
     module = Recorded(simulator, SETTINGS.num_steps, warmup_steps=SETTINGS.warmup_steps, compile="off")
-    settings = replace(SETTINGS, num_steps=num_steps)
+    settings = replace(SETTINGS, num_steps=num_steps, push_share=0.5 if late else 0.0, push_steps=3)
     run.mkdir(exist_ok=True)
     seen: dict[str, Any] = {"steps": module.steps, "losses": module.losses}
     try:
@@ -163,8 +170,8 @@ def trained(root: Path, run: Path, rank: int, num_ranks: int, size: BatchSize, n
     return seen
 
 
-def trained_on_ranks(root: Path, run: Path, size: BatchSize, num_steps: int = 20) -> list[dict[str, Any]]:
-    as_launched(run / "ranks", lambda rank: trained(root, run, rank, 2, size, num_steps))
+def trained_on_ranks(root: Path, run: Path, size: BatchSize, num_steps: int = 20, late: bool = False) -> list[dict[str, Any]]:
+    as_launched(run / "ranks", lambda rank: trained(root, run, rank, 2, size, num_steps, late))
     return [pickle.loads((run / f"seen_{rank}.pickle").read_bytes()) for rank in range(2)]
 
 
@@ -172,10 +179,22 @@ def checkpoint(run: Path, name: str) -> dict[str, Any]:
     return torch.load(run / "checkpoints" / f"{name}.ckpt", weights_only=True)
 
 
-@pytest.mark.parametrize("size", [BatchSize(3), pytest.param(BatchSize(3, max_nodes=64), marks=pytest.mark.slow)])
-def test_two_processes_train_like_one(mixed: Path, tmp_path: Path, size: BatchSize) -> None:
-    one = trained(mixed, tmp_path / "one", 0, 1, size)
-    two = trained_on_ranks(mixed, tmp_path / "two", size)
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    ("size", "late"),
+    [
+        (BatchSize(3), False),
+        pytest.param(BatchSize(3, max_nodes=64), False, marks=SLOW),
+        pytest.param(BatchSize(3), True, marks=SLOW, id="push-forward"),
+        pytest.param(BatchSize(3, max_nodes=64), True, marks=SLOW, id="push-forward by nodes"),
+    ],
+)
+def test_two_processes_train_like_one(mixed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size: BatchSize, late: bool) -> None:
+    monkeypatch.setattr(sampling, "NUM_LANES", 2)
+    one = trained(mixed, tmp_path / "one", 0, 1, size, late=late)
+    two = trained_on_ranks(mixed, tmp_path / "two", size, late=late)
     nodes = np.array([[sum(count.values()) for _, count in rank["steps"]] for rank in two])
     assert nodes.shape == (2, 20) and (nodes[0] != nodes[1]).any()
     snow = np.array([[count["snow"] for _, count in rank["steps"]] for rank in two])
