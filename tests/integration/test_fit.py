@@ -28,6 +28,7 @@ from gpe_pl.training.run import RunError, claim
 from tests.runs import tiny
 
 STEPS = ("training.num_steps=6", "training.val_interval=2", "training.warmup_steps=2")
+PLAIN = ("training.push_share=0",)
 LATE = ("training.sampling=activity", "training.push_share=0.5", "training.push_steps=3")
 
 
@@ -88,7 +89,7 @@ STATE = ("state_dict", "current_model_state", "averaging_state", "optimizer_stat
 
 
 @pytest.mark.parametrize(
-    ("killed_at", "late"), [pytest.param(1, (), marks=pytest.mark.slow), (5, ()), pytest.param(5, LATE, marks=pytest.mark.slow)]
+    ("killed_at", "late"), [pytest.param(1, PLAIN, marks=pytest.mark.slow), (5, LATE), pytest.param(5, PLAIN, marks=pytest.mark.slow)]
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(
     tiny_data: Path, tmp_path: Path, losses: dict[int, list[float]], monkeypatch: pytest.MonkeyPatch, killed_at: int, late: tuple[str, ...]
@@ -235,8 +236,9 @@ def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(
     assert not (tmp_path / "fit" / "metrics.csv").exists()
 
 
+@pytest.mark.parametrize("push_share", [0.0, 0.6])
 def test_one_corrupted_batch_does_not_end_a_run(
-    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, push_share: float
 ) -> None:
     """It is named and changes nothing: weights and moments are those of the step before."""
     plain = TrainingModule.training_step
@@ -245,12 +247,15 @@ def test_one_corrupted_batch_does_not_end_a_run(
     def training_step(self: TrainingModule, batch: Any, batch_idx: int) -> Any:
         weights[self.global_step] = [p.detach().clone() for p in self.parameters()]
         if self.global_step == 4:
-            for material in self.simulator.builder.spec.materials:
-                batch[material].target[0] = torch.nan
+            if push_share:
+                batch[0].truth[-1] = torch.nan
+            else:
+                for material in self.simulator.builder.spec.materials:
+                    batch[material].target[0] = torch.nan
         return plain(self, batch, batch_idx)
 
     monkeypatch.setattr(TrainingModule, "training_step", training_step)
-    fit(tiny(tiny_data, tmp_path, *STEPS))
+    fit(tiny(tiny_data, tmp_path, *STEPS, f"training.push_share={push_share}"))
     (warning,) = [r.message for r in caplog.records if "without this batch" in r.message]
     assert re.match(r"step 4: the loss is nan for \(trajectory, frame\) = \(\d+, \d+\), ", warning)
     assert all(torch.equal(a, b) for a, b in zip(weights[4], weights[5], strict=True))
