@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 from pydantic import Field
-from torch_geometric.data import Batch
 
 from gpe_pl.approximate import approximate
 from gpe_pl.atomic import replacing
@@ -22,6 +21,7 @@ from gpe_pl.baselines import Ballistic, ConstantVelocity
 from gpe_pl.containment import TOLERANCE, Contained
 from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.errors import GpeError
+from gpe_pl.graphs.batching import batched
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
 from gpe_pl.portable import export_model
@@ -208,7 +208,7 @@ def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windo
     metric = OneStepNMSE()
     with torch.inference_mode():
         for chosen in np.array_split(windows, -(-len(windows) // SCENES_AT_ONCE)):
-            data = Batch.from_data_list([dataset[int(window)] for window in chosen])
+            data = batched([dataset[int(window)] for window in chosen])
             for material, value in simulator(data).acceleration.items():
                 metric.update(value, data[material].target / simulator.acceleration_std.float())
     return float(metric.compute())

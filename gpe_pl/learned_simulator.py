@@ -17,11 +17,12 @@ from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
-from torch_geometric.data import Batch, HeteroData
+from torch_geometric.data import HeteroData
 
 from gpe_pl import integrators
 from gpe_pl.atomic import replacing
 from gpe_pl.errors import GpeError
+from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.models.base import Prediction
@@ -286,7 +287,7 @@ class LearnedSimulator(nn.Module):
             return error
 
     def _advance_all(self, states: list[State], graphs: list[HeteroData]) -> list[State]:
-        data = graphs[0] if len(graphs) == 1 else Batch.from_data_list(graphs)
+        data = graphs[0] if len(graphs) == 1 else batched(graphs)
         predicted = self(data)
         new = self.moved(states, graphs, predicted.acceleration)
         return self._with_stress(new, predicted.stress, graphs) if predicted.stress else new

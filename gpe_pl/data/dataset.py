@@ -13,10 +13,11 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
-from torch_geometric.data import Batch, HeteroData
+from torch_geometric.data import HeteroData
 
 from gpe_pl import integrators
 from gpe_pl.data.noise import Noise
+from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.store import StoreError, open_group, open_shard, read_trajectory, shards
 from gpe_pl.trajectory import State, Trajectory
@@ -140,7 +141,7 @@ Samples: TypeAlias = HeteroData | list[Start]
 def collated(samples: list[HeteroData | Start]) -> Samples:
     """Samples of one kind together."""
     starts = [sample for sample in samples if isinstance(sample, Start)]
-    return starts or Batch.from_data_list(samples)
+    return starts or batched(samples)
 
 
 class WindowDataset(Dataset[HeteroData | Start]):

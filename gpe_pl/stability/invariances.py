@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 from torch import Tensor
-from torch_geometric.data import Batch, HeteroData
+from torch_geometric.data import HeteroData
 
+from gpe_pl.graphs.batching import batched
 from gpe_pl.schema import FeatureSpec, is_symmetric
 from gpe_pl.stability.subject import (
     Outcome,
@@ -166,7 +167,7 @@ def independence(subject: Subject) -> Outcome:
     graphs = [simulator.builder(s) for s in states]
     alone = [output(simulator, g, s.num_nodes) for g, s in zip(graphs, states, strict=True)]
     with torch.no_grad():
-        batch = Batch.from_data_list(graphs)
+        batch = batched(graphs)
         predicted = simulator(batch).acceleration
     change = 0.0
     for k, (graph, single) in enumerate(zip(graphs, alone, strict=True)):

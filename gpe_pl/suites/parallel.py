@@ -18,10 +18,10 @@ import numpy as np
 import torch
 import torch.distributed as dist
 from pydantic import Field
-from torch_geometric.data import Batch
 
 from gpe_pl import ranks
 from gpe_pl.errors import GpeError
+from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.lattice import lattice_scene
 from gpe_pl.models.gpe import GPE
@@ -124,7 +124,7 @@ def _times_on_rank(settings: Settings, rank: int, num_processes: int, meeting: s
         dist.barrier()
         start = now()
         optimizer.zero_grad()
-        graphs = Batch.from_data_list([builder(state) for builder, state in scenes]).to(device)
+        graphs = batched([builder(state) for builder, state in scenes]).to(device)
         squares = model(graphs).acceleration[SAND].square()
         (squares.sum() / ranks.summed(torch.tensor(float(squares.numel()), device=device))).backward()
         middle = now()

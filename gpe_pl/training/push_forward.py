@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch_geometric.data import Batch, HeteroData
+from torch_geometric.data import HeteroData
 
 from gpe_pl.data.dataset import Start
+from gpe_pl.graphs.batching import batched
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.rollout import SimulationError
 from gpe_pl.trajectory import State
@@ -42,7 +43,7 @@ class Excursions:
     def clear(self) -> None:
         self._lanes.clear()
 
-    def graphs(self, simulator: LearnedSimulator, starts: Sequence[Start]) -> Batch:
+    def graphs(self, simulator: LearnedSimulator, starts: Sequence[Start]) -> HeteroData:
         """Graphs of the states after each start's own steps. A scene that has come to nothing, or to the end of the truth, is at its start again."""
         samples = [start.sample for start in starts]
         under_way = self._lanes.get(starts[0].lane)
@@ -56,7 +57,7 @@ class Excursions:
                 graph = start.graph(simulator.builder, start.state, 0)
             under_way.graphs.append(graph)
         self._lanes[starts[0].lane] = under_way
-        return Batch.from_data_list(under_way.graphs)
+        return batched(under_way.graphs)
 
     @torch.no_grad()
     def move_on(self, simulator: LearnedSimulator, lane: int, acceleration: dict[str, Tensor]) -> None:

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch_geometric.data import Batch, HeteroData
+from torch_geometric.data import HeteroData
 
 from gpe_pl.data.dataset import Start, StartKey, WindowDataset, open_split
 from gpe_pl.data.sampling import PushForward
+from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
@@ -75,7 +76,7 @@ def test_steps_of_training_move_the_states_on(data: WindowDataset, simulator: Le
             states, steps = walked(simulator, turn[step])
             assert steps == [step, step]
             expected = [start.graph(data.builder, state, step) for start, state in zip(turn[step], states, strict=True)]
-            assert_equal_graphs(graph, Batch.from_data_list(expected), rtol=1e-4, atol=1e-4)
+            assert_equal_graphs(graph, batched(expected), rtol=1e-4, atol=1e-4)
             module.loss(turn[step])
 
 
@@ -85,7 +86,7 @@ def test_at_the_end_of_the_truth_and_after_falling_apart_a_sample_is_at_its_star
     module, last = TrainingModule(simulator, num_steps=10), len(data) - 2
     turns = visits(data, [(0, last)], 0, 4)
     assert turns[3][0].own_steps == 1  # as far as the trajectory goes
-    usual = Batch.from_data_list([turns[0][0].graph(data.builder, turns[0][0].state, 0)])
+    usual = batched([turns[0][0].graph(data.builder, turns[0][0].state, 0)])
     for starts in turns[:2]:
         module.loss(starts)
     assert_equal_graphs(module._excursions.graphs(simulator, turns[2]), usual)
@@ -112,7 +113,7 @@ def test_a_checkpoint_ends_all_excursions(data: WindowDataset, simulator: Learne
     module.loss(turns[1]).backward()
     optimizer.step()
     (state,), _ = walked(simulator, turns[2])
-    expected = Batch.from_data_list([turns[2][0].graph(data.builder, state, 2)])
+    expected = batched([turns[2][0].graph(data.builder, state, 2)])
     going_on = copy.deepcopy(module._excursions).graphs(simulator, turns[2])
     assert not torch.equal(going_on["sand"].target, expected["sand"].target)
     module.on_save_checkpoint({})
@@ -136,10 +137,10 @@ def test_own_steps_get_no_gradient(data: WindowDataset, simulator: LearnedSimula
 def test_weights_of_graphs_weigh_their_nodes(data: WindowDataset, simulator: LearnedSimulator) -> None:
     module = TrainingModule(simulator, num_steps=10)
     graphs = [data[0], data[3]]
-    losses = [module.loss(Batch.from_data_list([g])) for g in graphs]
+    losses = [module.loss(batched([g])) for g in graphs]
     for graph, weight in zip(graphs, (0.5, 3.0), strict=True):
         graph.weight = weight
-    assert float(module.loss(Batch.from_data_list(graphs))) == pytest.approx(float(0.5 * losses[0] + 3.0 * losses[1]) / 2, rel=1e-5)
+    assert float(module.loss(batched(graphs))) == pytest.approx(float(0.5 * losses[0] + 3.0 * losses[1]) / 2, rel=1e-5)
 
 
 def test_a_start_can_be_moved(data: WindowDataset) -> None:

@@ -1,0 +1,42 @@
+"""Several graphs as one, which a model computes in one pass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch_geometric.data import HeteroData
+
+
+def batched(graphs: Sequence[HeteroData]) -> HeteroData:
+    """The disjoint union of graphs with the same types and attributes; node stores say in ``batch`` which graph a row is of.
+
+    The same values as ``torch_geometric.data.Batch.from_data_list``, whose collation for any kind of data takes longer than a small graph's edges.
+    """
+    out, first = HeteroData(), graphs[0]
+    offsets: dict[str, list[int]] = {}
+    for node_type in first.node_types:
+        stores = [graph[node_type] for graph in graphs]
+        for key, _ in stores[0].items():
+            out[node_type][key] = torch.cat([store[key] for store in stores])
+        sizes = [store.x.shape[0] for store in stores]
+        offsets[node_type] = [sum(sizes[:k]) for k in range(len(sizes))]
+        number = torch.arange(len(graphs), device=stores[0].x.device)
+        out[node_type].batch = torch.repeat_interleave(number, torch.tensor(sizes, device=number.device))
+    for edge_type in first.edge_types:
+        edges, (source, _, target) = [graph[edge_type] for graph in graphs], edge_type
+        for key, _ in edges[0].items():
+            parts = [store[key] for store in edges]
+            if key == "edge_index":
+                parts = [_shifted(*part) for part in zip(parts, offsets[source], offsets[target], strict=True)]
+            out[edge_type][key] = torch.cat(parts, dim=1 if key == "edge_index" else 0)
+    for key, value in first.stores[0].items():
+        values = [graph[key] for graph in graphs]
+        out[key] = torch.cat(values) if isinstance(value, Tensor) else torch.tensor(values)
+    return out
+
+
+def _shifted(edge_index: Tensor, source: int, target: int) -> Tensor:
+    """Edges of a graph whose nodes begin at these rows."""
+    return edge_index + torch.tensor([[source], [target]], device=edge_index.device)
