@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.export import Dim
@@ -27,11 +28,11 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl import integrators
 from gpe_pl.atomic import replacing
-from gpe_pl.errors import GpeError
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import boundary_features, edge_features, history_of, material_features, mesh_features, virtual_features
+from gpe_pl.graphs.islands import unwrapped
 from gpe_pl.learned_simulator import LearnedSimulator
-from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, RADIUS, EdgeType, grid, level_of
+from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, RADIUS, EdgeType, FeatureSpec, grid, level_of
 from gpe_pl.skips import Skips
 from gpe_pl.trajectory import Boundary, State
 
@@ -42,10 +43,6 @@ DESCRIPTION = "description.json"
 EVERYTHING = Skips(absent_types=False, isolated_nodes=False, edges_at_once=None)
 """What a program computes cannot depend on the values in its scene."""
 BOUNDARY_FIELDS = ("pos", "vel", "normal", "friction", "restitution")
-
-
-class PortableError(GpeError, ValueError):
-    """A simulator that cannot leave this package, or a file that cannot be written."""
 
 
 @dataclass(frozen=True)
@@ -70,18 +67,13 @@ class PortableStep(nn.Module):
 
     Args:
         simulator: with any model of this package.
-
-    Raises:
-        PortableError: the data set is periodic.
     """
 
     def __init__(self, simulator: LearnedSimulator) -> None:
         super().__init__()
         metadata = simulator.builder.metadata
-        if any(metadata.periodic):
-            raise PortableError(f"the data set {metadata.dataset!r} has periodic axes, which an exported model does not support")
         self.simulator, self.spec, self.scales = simulator, simulator.builder.spec, simulator.builder.scales
-        self.frame_dt, self.features = metadata.frame_dt, simulator.builder.config.features
+        self.frame_dt, self.periodicity, self.features = metadata.frame_dt, metadata.periodicity, simulator.builder.config.features
 
     def forward(self, scene: Scene) -> tuple[Scene, Scene]:
         """The next positions and velocity history; acceleration [m/s²], gravity included, and stress [Pa] at nodes where the model has one."""
@@ -107,7 +99,8 @@ class PortableStep(nn.Module):
             store.x = material_features(scene[f"velocity_history.{material}"], scene["gravity"], self.scales)
             store.material_params, store.mass = scene[f"material_params.{material}"].float(), scene[f"mass.{material}"].float()
             if self.spec.islands:
-                store.pos, store.island = scene[f"pos.{material}"].float(), scene[f"island.{material}"]
+                arms = scene[f"{'arm' if self.periodicity else 'pos'}.{material}"]
+                store.pos, store.island = arms.float(), scene[f"island.{material}"]
         if self.spec.islands:
             data.island_is_free = scene["island_is_free"]
             data.num_islands = torch.full((1,), scene["island_is_free"].shape[0])
@@ -130,7 +123,8 @@ class PortableStep(nn.Module):
                 continue
             store = data[relation]
             j, i = store.edge_index = self._edges(scene, relation)
-            displacement, relative_velocity = pos[target][i] - pos[source][j], vel[target][i] - vel[source][j]
+            displacement = self.periodicity.shortest(pos[target][i] - pos[source][j])
+            relative_velocity = vel[target][i] - vel[source][j]
             normal = boundary.normal[j] if source == BOUNDARY else None
             store.odd, store.even = edge_features(self.features, displacement, relative_velocity, normal, self.scales)
             store.offset = store.odd[:, : self.spec.dim]
@@ -174,10 +168,12 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
     history = builder.config.history
     inputs = {"gravity": Input((dim,), "float64", "m/s^2", "external acceleration")}
     meshes = {r[2] for r in spec.relations if r[1] == CELL}
+    is_periodic = bool(builder.metadata.periodicity)
+    positions = "positions; not folded into the domain, so that the nodes of a mesh stay together" if is_periodic else "positions"
     for m in spec.materials:
         parameter = MATERIALS[m]
         inputs |= {
-            f"pos.{m}": Input((m, dim), "float64", "m", "positions"),
+            f"pos.{m}": Input((m, dim), "float64", "m", positions),
             f"velocity_history.{m}": Input(
                 (m, history, dim), "float64", "m/s", "differences of the last positions by frame_dt, oldest first"
             ),
@@ -187,10 +183,13 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
         if m in meshes:
             inputs[f"rest_pos.{m}"] = Input((m, dim), "float64", "m", "undeformed positions")
         if spec.islands:
-            doc = "number of the connected group, within the data set's radius or a mesh"
+            doc = "number of the group of nodes that the edges between materials connect"
             inputs[f"island.{m}"] = Input((m,), "int64", "1", doc)
+        if spec.islands and is_periodic:
+            doc = "position relative to the mean of its group, as the edges lead there; 0 in a group that reaches around the domain"
+            inputs[f"arm.{m}"] = Input((m, dim), "float64", "m", doc)
     if spec.islands:
-        doc = "whether nothing of a group is tied to the boundary, now and in the frame before"
+        doc = "whether no edge ties a group to the boundary"
         inputs["island_is_free"] = Input(("island",), "bool", "1", doc)
     vector: tuple[int | str, ...] = (BOUNDARY, dim)
     inputs |= {
@@ -216,19 +215,19 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
     """The tensors that a program of this simulator takes, for a state with velocity history."""
     builder, spec = simulator.builder, simulator.builder.spec
     graph = GraphBuilder(replace(builder.config, trim_boundary=False), builder.metadata)(state)
-    rest_pos = state.pos if state.rest_pos is None else state.rest_pos
+    pos, rest_pos = _kept_together(state, graph, spec), state.pos if state.rest_pos is None else state.rest_pos
     scene: Scene = {"gravity": state.gravity} | {f"boundary.{name}": getattr(state.boundary, name) for name in BOUNDARY_FIELDS}
     for m in spec.materials:
         rows, column = graph[m].node_id, builder.metadata.param_names.index(MATERIALS[m].name)
         values = {
-            "pos": state.pos[rows],
+            "pos": pos[rows],
             "velocity_history": history_of(state)[rows],
             "material_params": state.material_params[rows, column : column + 1],
             "mass": state.mass[rows],
             "rest_pos": rest_pos[rows],
         }
         if spec.islands:
-            values["island"] = graph[m].island
+            values |= {"island": graph[m].island, "arm": graph[m].pos.double()}
         scene |= {f"{name}.{m}": value for name, value in values.items()}
     if spec.islands:
         scene["island_is_free"] = graph.island_is_free
@@ -237,11 +236,20 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
     return {name: scene[name] for name in describe(simulator)}
 
 
+def _kept_together(state: State, graph: HeteroData, spec: FeatureSpec) -> Tensor:
+    """Positions that do not tear meshes apart at the seams of a periodic domain."""
+    if not state.periodicity:
+        return state.pos
+    along_cells = [graph[r[2]].node_id[graph[r].edge_index] for r in spec.relations if r[1] == CELL]
+    edges = torch.cat([torch.empty(2, 0, dtype=torch.int64, device=state.pos.device), *along_cells], dim=1)
+    images, _ = unwrapped(np.ascontiguousarray(state.pos.cpu().numpy()), edges.cpu().numpy(), state.periodicity)
+    return torch.from_numpy(images).to(state.pos.device)
+
+
 def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
     """Write a simulator's step as a ``torch.export`` program, atomically; ``path`` ends in ``.pt2``.
 
     Raises:
-        PortableError: the data set is periodic.
         ValueError: another file type.
     """
     path = Path(path)
@@ -268,7 +276,8 @@ def _description(simulator: LearnedSimulator, inputs: dict[str, Input]) -> dict[
         "frame_dt": builder.metadata.frame_dt,
         "spacing": builder.metadata.spacing,
         "connectivity_radius": builder.scales.radius,
-        "island_radius": builder.metadata.connectivity_radius if builder.spec.islands else None,
+        "bounds": builder.metadata.bounds,
+        "periodic": builder.metadata.periodic,
         "inputs": {name: asdict(about) for name, about in inputs.items()},
     }
 

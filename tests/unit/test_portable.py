@@ -21,7 +21,7 @@ from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
-from gpe_pl.portable import DESCRIPTION, PortableError, PortableStep, export_model, scene_of
+from gpe_pl.portable import DESCRIPTION, PortableStep, export_model, scene_of
 from gpe_pl.rollout import rollout
 from gpe_pl.trajectory import State
 from tests import scenes
@@ -35,10 +35,16 @@ SMALL: dict[Any, dict[str, Any]] = {
 
 
 def simulator(
-    model: Any = GPE, materials: tuple[str, ...] = ("sand",), dim: int = 2, config: dict[str, Any] | None = None, **settings: Any
-):
+    model: Any = GPE,
+    materials: tuple[str, ...] = ("sand",),
+    dim: int = 2,
+    config: dict[str, Any] | None = None,
+    periodic: tuple[bool, ...] = (),
+    **settings: Any,
+) -> LearnedSimulator:
     """A simulator with random weights whose accelerations are of the order of gravity."""
     build = scenes.builder(materials, dim, **{"islands": False, **(config or {})})
+    build = GraphBuilder(build.config, replace(build.metadata, periodic=periodic))
     torch.manual_seed(0)
     made = LearnedSimulator(model(build.spec, **{**SMALL[model], **settings}), build).eval()
     made.acceleration_std.fill_(30.0)
@@ -52,13 +58,21 @@ def assert_same_step(step: Any, learned: LearnedSimulator, state: State, atol: f
         result, further = step(scene)
     for material, rows in {m: learned.builder(state)[m].node_id for m in learned.builder.spec.materials}.items():
         if len(rows):
-            torch.testing.assert_close(result[f"pos.{material}"], expected.pos[rows], rtol=0, atol=atol)
+            apart = state.periodicity.shortest(result[f"pos.{material}"] - expected.pos[rows])
+            torch.testing.assert_close(apart, torch.zeros_like(apart), rtol=0, atol=atol)
             assert expected.velocity_history is not None
             torch.testing.assert_close(result[f"velocity_history.{material}"], expected.velocity_history[rows], rtol=0, atol=200 * atol)
             if f"stress.{material}" in further:
                 assert expected.stress is not None
                 torch.testing.assert_close(further[f"stress.{material}"], expected.stress.node[rows], rtol=1e-5, atol=1.0)
-    assert float((expected.pos - state.pos).abs().max()) > 1e4 * atol
+    assert float(state.periodicity.shortest(expected.pos - state.pos).abs().max()) > 1e4 * atol
+
+
+def at_the_seam(state: State, learned: LearnedSimulator) -> State:
+    """The same in a domain that repeats, moved so that what lies near its lower corner lies on both sides of the seam."""
+    space = learned.builder.metadata.periodicity
+    moved = [0.8 if repeats else 0.0 for repeats in space.periodic]
+    return replace(state, pos=space.wrapped(state.pos + moved), periodicity=space)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -84,14 +98,28 @@ def test_islands_keep_their_momentum(dim: int) -> None:
     assert_same_step(PortableStep(learned), learned, scenes.state(materials=("sand",), dim=dim, low=0.1, high=0.9).to_torch())
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("model", SMALL)
+def test_periodic_clouds(model: Any, dim: int) -> None:
+    settings = {"island_momentum": "angular"} if model is GPE else {}
+    learned = simulator(model, ("sand", "snow"), dim, {"islands": model is GPE}, (True, True, False)[-dim:], **settings)
+    state = at_the_seam(scenes.state(materials=("sand", "snow"), dim=dim, walls=False), learned)
+    assert_same_step(PortableStep(learned), learned, state.to_torch())
+
+
+@pytest.mark.parametrize("kind", ["triangles", "lattice", "tetrahedra"])
+def test_periodic_meshes(kind: Any) -> None:
+    materials, dim = ("sand", "solid"), 3 if kind == "tetrahedra" else 2
+    config = {"mesh": True, "num_levels": 2, "islands": True}
+    learned = simulator(GPE, materials, dim, config, (True,) * dim, stress=True, island_momentum="angular")
+    state = at_the_seam(scenes.mesh_state(kind, materials, walls=False), learned)
+    assert_same_step(PortableStep(learned), learned, state.to_torch())
+
+
 def test_what_a_file_cannot_be_is_refused(tmp_path: Path) -> None:
     learned = simulator()
     with pytest.raises(ValueError, match=r"an exported program ends in \.pt2"):
         export_model(learned, tmp_path / "model.pt")
-    periodic = LearnedSimulator(learned.model, learned.builder)
-    object.__setattr__(periodic.builder, "metadata", replace(learned.builder.metadata, periodic=(True, False)))
-    with pytest.raises(PortableError, match="data set 'test' has periodic axes"):
-        export_model(periodic, tmp_path / "model.pt2")
     assert not [*tmp_path.iterdir()]
 
 
@@ -108,6 +136,8 @@ def exported(learned: LearnedSimulator, path: Path) -> Path:
 ELSEWHERE = """
 import json, sys
 import numpy as np, torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 path, start, stop, num_steps = *sys.argv[1:4], int(sys.argv[4])
@@ -118,9 +148,13 @@ scene = {name: torch.from_numpy(values) for name, values in np.load(start).items
 for _ in range(num_steps):
     pos, boundary = scene["pos.sand"].numpy(), scene["boundary.pos"].numpy()
     tree = cKDTree(pos)
-    scene["edges.sand.radius.sand"] = torch.from_numpy(tree.query_pairs(radius, output_type="ndarray").T.astype(np.int64))
+    pairs = tree.query_pairs(radius, output_type="ndarray").T.astype(np.int64)
+    scene["edges.sand.radius.sand"] = torch.from_numpy(pairs)
     near = cKDTree(boundary).sparse_distance_matrix(tree, radius, output_type="ndarray")
     scene["edges.boundary.radius.sand"] = torch.from_numpy(np.stack([near["i"], near["j"]]).astype(np.int64))
+    count, island = connected_components(coo_array((np.ones(pairs.shape[1]), tuple(pairs)), shape=(len(pos), len(pos))), directed=False)
+    scene["island.sand"] = torch.from_numpy(island.astype(np.int64))
+    scene["island_is_free"] = torch.from_numpy(~np.isin(np.arange(count), island[near["j"]]))
     with torch.inference_mode():
         moved, predicted = program(scene)
     scene |= moved
@@ -132,8 +166,8 @@ assert not {"gpe_pl", "torch_geometric", "numba", "lightning"} & {name.partition
 @pytest.mark.slow
 def test_a_rollout_in_a_process_without_this_package(tmp_path: Path) -> None:
     """More nodes and edges than in the example from which the program was made, and other numbers of edges in every frame."""
-    learned, num_steps = simulator(config={"history": 2}), 6
-    state = scenes.state(history=2).to_torch()
+    learned, num_steps = simulator(config={"history": 2, "islands": True}, island_momentum="angular"), 6
+    state = scenes.state(history=2, low=0.03, high=0.9).to_torch()  # sparse enough for islands that fly
     exported(learned, tmp_path / "model.pt2")
     start: dict[str, Any] = {name: values.numpy() for name, values in scene_of(learned, state).items()}
     np.savez(tmp_path / "start.npz", **start)
@@ -149,6 +183,8 @@ def test_a_rollout_in_a_process_without_this_package(tmp_path: Path) -> None:
     expected = rollout(learned, state, num_steps, learned.builder.metadata)
     np.testing.assert_allclose(np.load(tmp_path / "stop.npz")["pos.sand"], expected.pos[-1], rtol=0, atol=1e-7)
     assert np.abs(expected.pos[-1] - expected.pos[0]).max() > 0.01
+    stop = np.load(tmp_path / "stop.npz")
+    assert 0 < stop["island_is_free"].sum() < len(stop["island_is_free"])
 
 
 @pytest.mark.slow
@@ -163,6 +199,20 @@ def test_a_program_serves_any_numbers_of_nodes_and_edges(tmp_path: Path) -> None
     assert description["connectivity_radius"] == learned.builder.scales.radius
     assert description["inputs"]["velocity_history.sand"]["shape"] == ["sand", 1, 2]
     assert set(description["inputs"]) == set(scene_of(learned, state.to_torch()))
+
+
+@pytest.mark.slow
+def test_a_program_of_a_periodic_domain(tmp_path: Path) -> None:
+    learned = simulator(
+        materials=("sand", "solid"), config={"mesh": True, "islands": True}, periodic=(True, True), island_momentum="angular"
+    )
+    files = {DESCRIPTION: ""}
+    program = torch.export.load(exported(learned, tmp_path / "model.pt2"), extra_files=files).module()
+    for seed in (0, 1):
+        state = at_the_seam(scenes.mesh_state("triangles", ("sand", "solid"), walls=False, seed=seed), learned)
+        assert_same_step(program, learned, state.to_torch())
+    description = json.loads(files[DESCRIPTION])
+    assert (description["bounds"], description["periodic"]) == ([[0.0, 1.0], [0.0, 1.0]], [True, True])
 
 
 @pytest.mark.slow
