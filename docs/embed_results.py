@@ -1,6 +1,7 @@
 """Copy results of runs into ``docs/results`` and the tables there into the README, so that no number is typed by hand.
 
-``python docs/embed_results.py RUN_FOLDER NAME`` takes the table, the figures and the first animation of a finished run or sweep;
+``python docs/embed_results.py RUN_FOLDER NAME`` takes the table, the figures and the first animation of a finished run or sweep, and of a table 1 what its
+finished runs are known by and were evaluated to; copied back into a folder of runs, these are not run again.
 ``python docs/embed_results.py`` only renews the README; ``--check`` fails if the README differs from ``docs/results``.
 """
 
@@ -34,6 +35,13 @@ def collect(run: Path, name: str) -> None:
     for pattern in FILES:
         for path in sorted(run.glob(pattern)):
             shutil.copy(path, target / path.name)
+    if (run / "table1.csv").exists():  # takes many hours: whoever has these files goes on from them
+        for metrics in sorted(run.glob("*/**/metrics.csv")):
+            if (metrics.parent / "config.json").exists():
+                kept = target / "runs" / metrics.parent.relative_to(run)
+                kept.mkdir(parents=True, exist_ok=True)
+                shutil.copy(metrics, kept)
+                shutil.copy(metrics.parent / "config.json", kept)
 
 
 def main(arguments: list[str]) -> int:
