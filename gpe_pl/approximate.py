@@ -17,6 +17,7 @@ from gpe_pl import integrators
 from gpe_pl.graphs.features import history_of
 from gpe_pl.graphs.islands import islands_within
 from gpe_pl.graphs.multiscale import cell_edges
+from gpe_pl.graphs.neighbors import radius_between
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.rollout import SimulationError, Simulator, step_all
 from gpe_pl.trajectory import State, Stress, search_tree
@@ -53,7 +54,7 @@ class _Rest:
 
 
 class Sleeping(_Batched):
-    """Islands at rest stand still and are not computed, until something that is not at rest comes within the graph's radius of them.
+    """Islands at rest stand still and are not computed, until something that is not at rest, a wall included, comes within the graph's radius of them.
 
     An island (``graphs.islands``, by the radius of the graph) sleeps when all its nodes have been slower and less accelerated than
     ``Skips.rest_speed`` and ``Skips.rest_acceleration`` in the last ``Skips.sleep_after`` predictions. No pair that pushes each other is thus ever frozen at
@@ -87,6 +88,7 @@ class Sleeping(_Batched):
             everything = torch.ones(state.num_nodes, dtype=torch.bool, device=state.pos.device)
             return everything, everything
         pos = np.ascontiguousarray(state.pos.cpu().numpy())
+        is_calm &= ~self._are_near_a_moving_wall(state, pos)
         cells = np.empty((0, 2), np.int64) if state.cells is None else state.cells.cpu().numpy()
         edges, space = cell_edges(cells, len(pos)), state.periodicity
         islands = islands_within(self.radius, pos, state.boundary.tree(space), edges, space)
@@ -100,6 +102,15 @@ class Sleeping(_Batched):
             if len(cells):  # a mesh is seen as a whole
                 seen = _in_the_same_island(seen, islands.label)
         return torch.from_numpy(awake).to(state.pos.device), torch.from_numpy(seen).to(state.pos.device)
+
+    def _are_near_a_moving_wall(self, state: State, pos: np.ndarray) -> np.ndarray:
+        """Nodes [node] that a wall which moves in a prescribed way may push."""
+        near = np.zeros(len(pos), dtype=bool)
+        if state.boundary.motion is not None:
+            moves = (state.boundary.vel != 0).any(dim=1)
+            walls = np.ascontiguousarray(state.boundary.pos[moves].cpu().numpy())
+            near[radius_between(walls, pos, self.radius, state.periodicity)[1]] = True
+        return near
 
     def _combined(self, state: State, after: State, awake: Tensor, seen: Tensor) -> State:
         """The state with awake nodes as they are afterwards; the others stand where they are."""
@@ -119,6 +130,7 @@ class Sleeping(_Batched):
             num_asleep=int((~awake).sum()),
             lost_impulse=float((state.mass * state.vel.norm(dim=1))[~awake].sum()),
             internal=_Rest(count),
+            boundary=state.boundary.at(1),
         )
 
 
@@ -202,4 +214,5 @@ class Holding(_Batched):
             time=state.time + self.dt,
             lost_impulse=0.0,
             internal=replace(held, frames=held.frames - 1),
+            boundary=state.boundary.at(1),
         )

@@ -13,6 +13,10 @@ TOUCH = 1e-6
 NUM_BISECTIONS = 30
 
 
+def _later(state: State, dt: float, pos: Array, vel: Array) -> State:
+    return replace(state, pos=pos, vel=vel, velocity_history=None, time=state.time + dt, stress=None, boundary=state.boundary.at(1))
+
+
 @dataclass(frozen=True)
 class ConstantVelocity:
     """Every node keeps its velocity and ignores walls."""
@@ -21,7 +25,7 @@ class ConstantVelocity:
 
     def step(self, state: State) -> State:
         pos = state.periodicity.wrapped(state.pos + state.vel * self.dt)
-        return replace(state, pos=pos, velocity_history=None, time=state.time + self.dt, stress=None)
+        return _later(state, self.dt, pos, state.vel)
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class Ballistic:
             pos = xp.where(hit[:, None], self._touchdown(state, pos), pos)
         pos = xp.where(stuck[:, None], state.pos, pos)
         vel = xp.where((hit | stuck)[:, None], xp.zeros_like(vel), vel)
-        return replace(state, pos=state.periodicity.wrapped(pos), vel=vel, velocity_history=None, time=state.time + self.dt, stress=None)
+        return _later(state, self.dt, state.periodicity.wrapped(pos), vel)
 
     @staticmethod
     def _touchdown(state: State, end: Array) -> Array:

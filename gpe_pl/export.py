@@ -51,7 +51,8 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
 
     Points carry ``velocity`` [m/s], ``material`` (index into ``schema.NODE_TYPES``), ``mass`` [kg], the material parameters by their names and, where
     they are known, ``displacement`` from rest [m], ``error`` (distance from the ground truth [m]), and ``stress`` and ``von_mises`` [Pa]; cells carry the
-    last two as well, NaN on particles. ``boundary.vtu`` has the boundary nodes with ``normal``, ``friction`` and ``restitution``.
+    last two as well, NaN on particles. Boundary nodes that move are points like others; ``boundary.vtu`` has the rest, with ``normal``, ``friction`` and
+    ``restitution``.
 
     Args:
         path: ends in ``.pvd``.
@@ -71,6 +72,8 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
         raise ValueError(
             f"{path}: the ground truth has {ground_truth.pos.shape[:2]} frames and nodes, the trajectory {trajectory.pos.shape[:2]}"
         )
+    trajectory = trajectory.with_moving_boundary()
+    ground_truth = None if ground_truth is None else ground_truth.with_moving_boundary()
     folder = path.with_suffix("")
     folder.mkdir(parents=True, exist_ok=True)
     cells, types, is_vertex = _cells(trajectory)

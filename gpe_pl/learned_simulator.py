@@ -316,7 +316,15 @@ class LearnedSimulator(nn.Module):
         dt = self.builder.metadata.frame_dt
         pos, vel = integrators.advance(state.pos, state.vel, acc, dt)
         history = torch.cat([history_of(state)[:, 1:], vel[:, None]], dim=1)
-        return replace(state, pos=state.periodicity.wrapped(pos), vel=vel, velocity_history=history, time=state.time + dt, stress=None)
+        return replace(
+            state,
+            pos=state.periodicity.wrapped(pos),
+            vel=vel,
+            velocity_history=history,
+            time=state.time + dt,
+            stress=None,
+            boundary=state.boundary.at(1),
+        )
 
     def _check_finite(self) -> None:
         for name, values in self.state_dict().items():

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -16,7 +16,7 @@ from array_api_compat import array_namespace
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import signed_distance
 from gpe_pl.schema import MATERIALS, node_code
-from gpe_pl.trajectory import Metadata, State, Stress, Termination, Trajectory
+from gpe_pl.trajectory import Metadata, Motion, State, Stress, Termination, Trajectory
 
 
 @runtime_checkable
@@ -257,6 +257,7 @@ class _Recording:
         self.pos: list[np.ndarray] = []
         self.vel: list[np.ndarray] = []
         self.stress: list[Stress | None] = []
+        self.motion: list[Motion] = []
         self.termination: Termination | None = None
         self.add(start.state)
 
@@ -266,12 +267,16 @@ class _Recording:
             return
         self.pos.append(_numpy(item.pos))
         self.vel.append(_numpy(item.vel))
+        if self.start.state.boundary.motion is not None:
+            b = item.boundary
+            self.motion.append(Motion(*(np.array(_numpy(x), dtype=np.float32) for x in (b.pos, b.vel, b.normal))))
         self.stress.append(None if item.stress is None else Stress(_numpy(item.stress.node), _numpy(item.stress.cell)))
 
     def trajectory(self) -> Trajectory:
         state = self.start.state
         known = [stress for stress in self.stress if stress is not None]
         has_stress = len(known) == len(self.stress)
+        motion = Motion(*(np.stack([getattr(m, name) for m in self.motion]) for name in ("pos", "vel", "normal"))) if self.motion else None
         return Trajectory(
             self.start.metadata,
             np.stack(self.pos),
@@ -279,7 +284,7 @@ class _Recording:
             _numpy(state.node_type),
             _numpy(state.mass),
             _numpy(state.material_params),
-            state.boundary.to_numpy(),
+            replace(state.boundary.to_numpy(), motion=motion),
             rest_pos=None if state.rest_pos is None else _numpy(state.rest_pos),
             cells=None if state.cells is None else _numpy(state.cells),
             stress=Stress(np.stack([s.node for s in known]), np.stack([s.cell for s in known])) if has_stress else None,

@@ -121,15 +121,18 @@ class Field:
 
 STRESS_COMPONENTS = "xx, xy, yy, zz in plane strain; xx, xy, xz, yy, yz, zz in 3D"
 
+MOTION = "one or frame"
+"""Axis of what stands still, then of length 1, or moves in a prescribed way."""
+
 FIELDS: dict[str, Field] = {
     "pos": Field(("frame", "node", "dim"), "float32", "m", "positions of the dynamic nodes"),
     "vel": Field(("frame", "node", "dim"), "float32", "m/s", "velocities of the dynamic nodes as the solver has them at that frame"),
     "node_type": Field(("node",), "uint8", "1", "index into the attribute node_types"),
     "mass": Field(("node",), "float32", "kg", "mass (per metre of depth in 2D)"),
     "material_params": Field(("node", "param"), "float32", "per column", "columns as in param_names; NaN where one does not apply"),
-    "boundary_pos": Field(("one", "boundary_node", "dim"), "float32", "m", "positions of the boundary nodes"),
-    "boundary_vel": Field(("one", "boundary_node", "dim"), "float32", "m/s", "velocities of the boundary nodes"),
-    "boundary_normal": Field(("one", "boundary_node", "dim"), "float32", "1", "unit normals that point into free space"),
+    "boundary_pos": Field((MOTION, "boundary_node", "dim"), "float32", "m", "positions of the boundary nodes"),
+    "boundary_vel": Field((MOTION, "boundary_node", "dim"), "float32", "m/s", "velocities of the boundary nodes, to the next frame"),
+    "boundary_normal": Field((MOTION, "boundary_node", "dim"), "float32", "1", "unit normals that point into free space"),
     "boundary_friction": Field(("boundary_node",), "float32", "1", f"Coulomb coefficient; {STICKY:g} or more is no-slip"),
     "boundary_restitution": Field(("boundary_node",), "float32", "1", "fraction of the normal velocity that a bounce returns"),
     "rest_pos": Field(("node", "dim"), "float32", "m", "undeformed positions of mesh nodes", required=False),

@@ -22,8 +22,8 @@ from pydantic import TypeAdapter, ValidationError
 from gpe_pl.atomic import replacing
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import Shape, shape_from_dict, shape_to_dict
-from gpe_pl.schema import FIELDS, NODE_TYPES, SCHEMA_VERSION, node_code
-from gpe_pl.trajectory import Boundary, Metadata, Stress, Trajectory
+from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, SCHEMA_VERSION, node_code
+from gpe_pl.trajectory import Boundary, Metadata, Motion, Stress, Trajectory
 
 
 class StoreError(GpeError, ValueError):
@@ -39,9 +39,9 @@ def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
         "node_type": trajectory.node_type,
         "mass": trajectory.mass,
         "material_params": trajectory.material_params,
-        "boundary_pos": b.pos[None],
-        "boundary_vel": b.vel[None],
-        "boundary_normal": b.normal[None],
+        "boundary_pos": b.pos[None] if b.motion is None else b.motion.pos,
+        "boundary_vel": b.vel[None] if b.motion is None else b.motion.vel,
+        "boundary_normal": b.normal[None] if b.motion is None else b.motion.normal,
         "boundary_friction": b.friction,
         "boundary_restitution": b.restitution,
         "rest_pos": trajectory.rest_pos,
@@ -87,7 +87,7 @@ LARGEST_DEFLATE_RATIO = 1032
 
 def _chunks(array: np.ndarray, dims: tuple[str, ...]) -> tuple[int, ...]:
     """Whole arrays in one chunk, except that frames are cut into chunks of about 256 kB."""
-    if dims[0] != "frame":
+    if dims[0] != "frame" and not (dims[0] == MOTION and len(array) > 1):
         return tuple(max(1, n) for n in array.shape)
     frame_bytes = max(1, array[:1].nbytes)
     return (max(1, min(array.shape[0], 2**18 // frame_bytes)), *(max(1, n) for n in array.shape[1:]))
@@ -189,17 +189,25 @@ def read_field(group: h5py.Group, key: str, frames: slice | None = None) -> np.n
     if dataset.id.get_storage_size() * LARGEST_DEFLATE_RATIO < dataset.nbytes:  # a huge shape without data must not fill the memory
         raise StoreError(f"{where} declares {dataset.nbytes} bytes but the file holds {dataset.id.get_storage_size()}, compressed")
     try:
-        return dataset[frames] if frames is not None and spec.dims[0] == "frame" else dataset[()]
+        has_frames = spec.dims[0] == "frame" or (spec.dims[0] == MOTION and dataset.shape[0] > 1)
+        return dataset[frames] if frames is not None and has_frames else dataset[()]
     except (OSError, RuntimeError):
         raise StoreError(f"{where} is damaged (checksum mismatch); delete the shard and run simulate again") from None
 
 
 def size_conflicts(arrays: dict[str, np.ndarray], metadata: Metadata) -> list[str]:
     """Fields whose shape contradicts the metadata or an earlier field; one sentence each."""
-    sizes = {"one": 1, "dim": metadata.dim, "param": len(metadata.param_names)}
+    sizes = {"dim": metadata.dim, "param": len(metadata.param_names)}
     conflicts = []
     for key, array in arrays.items():
         for axis, size in zip(FIELDS[key].dims, array.shape, strict=True):
+            if axis == MOTION:
+                first = len(arrays.get("boundary_pos", array))
+                if size != first or size not in (1, sizes.get("frame", size)):
+                    conflicts.append(
+                        f"field {key!r} has size {size} along {axis!r}, expected 1 or, for all three fields of a motion, the number of frames"
+                    )
+                continue
             if sizes.setdefault(axis, size) != size:
                 conflicts.append(f"field {key!r} has size {size} along {axis!r}, expected {sizes[axis]}")
     return conflicts
@@ -289,13 +297,15 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
     codes = arrays["node_type"]
     if codes.size and codes.max() >= len(names):
         raise StoreError(f"{path}:{name}: node {codes.argmax()} has node_type {codes.max()}, but there are {len(names)} node types")
+    motion = Motion(arrays["boundary_pos"], arrays["boundary_vel"], arrays["boundary_normal"])
     boundary = Boundary(
-        arrays["boundary_pos"][0],
-        arrays["boundary_vel"][0],
-        arrays["boundary_normal"][0],
+        motion.pos[0],
+        motion.vel[0],
+        motion.normal[0],
         arrays["boundary_friction"],
         arrays["boundary_restitution"],
         shapes,
+        None if motion.num_frames == 1 else motion,
     )
     return Trajectory(
         metadata,

@@ -14,6 +14,7 @@ from gpe_pl import integrators
 from gpe_pl.arrays import (
     RADIUS_SPACINGS,
     ArrayError,
+    carried_along,
     checked_bounds,
     checked_cells,
     checked_materials,
@@ -25,10 +26,33 @@ from gpe_pl.arrays import (
 )
 from gpe_pl.geometry import Shape
 from gpe_pl.periodicity import NOWHERE, Periodicity
-from gpe_pl.schema import STICKY, param_names
+from gpe_pl.schema import BOUNDARY, STICKY, node_code, param_names
 
 Array = Any
 """A NumPy array or a torch tensor."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Prescribed motion of boundary nodes, from the present frame on: NumPy arrays [frame, boundary_node, dim].
+
+    Attributes:
+        pos: positions in m.
+        vel: velocities in m/s with which the nodes go on to the next frame.
+        normal: unit normals into free space.
+    """
+
+    pos: np.ndarray
+    vel: np.ndarray
+    normal: np.ndarray
+
+    @property
+    def num_frames(self) -> int:
+        return len(self.pos)
+
+    def frames(self, start: int, stop: int | None = None) -> Motion:
+        """That of the frames ``start:stop``."""
+        return Motion(self.pos[start:stop], self.vel[start:stop], self.normal[start:stop])
 
 
 @dataclass(frozen=True)
@@ -42,6 +66,7 @@ class Boundary:
         friction: Coulomb coefficient [boundary_node]; ``schema.STICKY`` or more is no-slip.
         restitution: fraction of the normal velocity that a bounce returns [boundary_node].
         shapes: analytic geometry, for signed distances.
+        motion: where the nodes go, if they move; its first frame is what ``pos``, ``vel`` and ``normal`` say.
     """
 
     pos: Array
@@ -50,6 +75,7 @@ class Boundary:
     friction: Array
     restitution: Array
     shapes: tuple[Shape, ...] = ()
+    motion: Motion | None = None
 
     @classmethod
     def sample(cls, shapes: tuple[Shape, ...], spacing: float, dim: int) -> Boundary:
@@ -109,15 +135,62 @@ class Boundary:
         )
         return cls(pos, vel, (normal / length[:, None]).astype(np.float32), friction, restitution, shapes)
 
+    @classmethod
+    def moving(
+        cls,
+        pos: Array,
+        normal: Array,
+        frame_dt: float | int,
+        *,
+        friction: Array = STICKY,
+        restitution: Array = 0.0,
+        periodicity: Periodicity = NOWHERE,
+    ) -> Boundary:
+        """Walls and obstacles that move in a prescribed way, as grippers, pistons and paddles do, in the first of their frames.
+
+        Args:
+            pos: positions [frame, boundary_node, dim] in m, of as many frames as the trajectory.
+            normal: directions into free space in the first frame [boundary_node, dim], of any length; they turn as the nodes around do.
+            frame_dt: seconds between frames.
+            friction, restitution: as in ``from_numpy``.
+            periodicity: where space repeats.
+
+        Raises:
+            ArrayError: as ``from_numpy``.
+        """
+        pos = numbers("boundary pos", pos, {"frame": None, "boundary_node": None, "dim": None})
+        first = cls.from_numpy(periodicity.wrapped(pos[0].astype(np.float64)), normal, friction=friction, restitution=restitution)
+        steps = periodicity.shortest(np.diff(pos.astype(np.float64), axis=0))
+        path = np.concatenate([first.pos[None], first.pos + np.cumsum(steps, axis=0)])  # continuous, also across seams
+        vel = np.concatenate([steps, steps[-1:]]) / positive("frame_dt", frame_dt, "seconds")
+        normals = carried_along(path, np.asarray(first.normal, np.float64))
+        inside = np.stack([periodicity.wrapped(frame) for frame in path])
+        return replace(first, motion=Motion(*(x.astype(np.float32) for x in (inside, vel, normals)))).at(0)
+
     def to_numpy(self) -> Boundary:
         """The same with NumPy arrays of its own."""
         pos, vel, normal, friction, restitution = (
             np.array(_numpy(x)) for x in (self.pos, self.vel, self.normal, self.friction, self.restitution)
         )
-        return Boundary(pos, vel, normal, friction, restitution, self.shapes)
+        return Boundary(pos, vel, normal, friction, restitution, self.shapes, self.motion)
+
+    def at(self, frame: int, stop: int | None = None) -> Boundary:
+        """The boundary so many frames later, with its motion up to the frame ``stop``; the same object if it does not move.
+
+        Where its motion ends it stays and is still.
+        """
+        if self.motion is None:
+            return self
+        xp, motion = array_namespace(self.pos), self.motion.frames(min(frame, self.motion.num_frames - 1), stop)
+
+        def like(x: np.ndarray) -> Array:
+            return x if isinstance(self.pos, np.ndarray) else xp.asarray(np.array(x), dtype=self.pos.dtype, device=self.pos.device)
+
+        now = replace(self, pos=like(motion.pos[0]), vel=like(motion.vel[0]), normal=like(motion.normal[0]), motion=motion)
+        return now if frame < self.motion.num_frames else replace(now, vel=0.0 * now.vel, motion=None)
 
     def tree(self, periodicity: Periodicity) -> Any:
-        """``search_tree`` of the positions, built once: a boundary stays where it is."""
+        """``search_tree`` of the positions, built once: a boundary stays where it is, or becomes another one in the next frame."""
         kept: dict[Periodicity, Any] = self.__dict__.setdefault("_trees", {})  # no field: no part of equality or of what is stored
         if periodicity not in kept:
             kept[periodicity] = search_tree(self.pos, periodicity)
@@ -315,7 +388,7 @@ class Trajectory:
         pos, vel: [frame, node, dim] in m and m/s.
         node_type, mass: [node].
         material_params: [node, param].
-        boundary: static boundary nodes.
+        boundary: boundary nodes in the first frame; those that move have a motion of as many frames.
         rest_pos, cells: reference configuration of meshes, as in ``State``.
         stress: of the mesh in every frame.
         termination: set when a rollout stopped before its last frame.
@@ -386,7 +459,10 @@ class Trajectory:
         boundary = Boundary.empty(dim) if boundary is None else boundary
         if boundary.pos.shape[1:] != (dim,):
             raise ArrayError(f"boundary: its positions are {list(boundary.pos.shape)}, expected [boundary_node, {dim}]")
-        bounds = checked_bounds(bounds, periodic, pos, boundary.pos)
+        if boundary.motion is not None and boundary.motion.num_frames != num_frames:
+            raise ArrayError(f"boundary: its motion has {boundary.motion.num_frames} frames, pos has {num_frames}")
+        way = boundary.pos if boundary.motion is None else boundary.motion.pos.reshape(-1, dim)
+        bounds = checked_bounds(bounds, periodic, pos, way)
         periodicity = Periodicity(bounds, tuple(map(bool, periodic)) if periodic is not None else (False,) * dim)
         if periodicity:
             pos = np.stack([periodicity.wrapped(frame.astype(np.float64)).astype(np.float32) for frame in pos])
@@ -446,11 +522,43 @@ class Trajectory:
         rest_pos = None if self.rest_pos is None else self.rest_pos.astype(np.float64)
         stress = None if self.stress is None else Stress(self.stress.node[frame], self.stress.cell[frame])
         return State(
-            pos, vel, self.node_type, self.mass, self.material_params, self.boundary, gravity, past, frame * self.metadata.frame_dt,
+            pos, vel, self.node_type, self.mass, self.material_params, self.boundary.at(frame), gravity, past, frame * self.metadata.frame_dt,
             rest_pos, self.cells, stress, periodicity=self.metadata.periodicity,
         )  # fmt: skip
 
     def frames(self, start: int, stop: int | None = None) -> Trajectory:
         """The frames ``start:stop`` as a trajectory of their own."""
         stress = None if self.stress is None else Stress(self.stress.node[start:stop], self.stress.cell[start:stop])
-        return replace(self, pos=self.pos[start:stop], vel=self.vel[start:stop], stress=stress)
+        return replace(self, pos=self.pos[start:stop], vel=self.vel[start:stop], boundary=self.boundary.at(start, stop), stress=stress)
+
+    def with_moving_boundary(self) -> Trajectory:
+        """For pictures and other programs: boundary nodes that move in a prescribed way as further nodes, of type ``boundary``, after the others.
+
+        The same object if none does.
+        """
+        motion = self.boundary.motion
+        if motion is None:
+            return self
+        moves = (motion.pos != motion.pos[0]).any(axis=(0, 2))
+        count, still = int(moves.sum()), ~moves
+
+        def extended(values: np.ndarray, more: Any) -> np.ndarray:
+            return np.concatenate([values, np.broadcast_to(more, (count, *values.shape[1:])).astype(values.dtype)])
+
+        def of(part: np.ndarray, rows: np.ndarray) -> np.ndarray:
+            return part[: self.num_frames, rows]
+
+        b, stress = self.boundary, self.stress
+        if stress is not None:
+            stress = Stress(np.pad(stress.node, ((0, 0), (0, count), (0, 0))), stress.cell)
+        return replace(
+            self,
+            pos=np.concatenate([self.pos, of(motion.pos, moves).astype(self.pos.dtype)], axis=1),
+            vel=np.concatenate([self.vel, of(motion.vel, moves).astype(self.vel.dtype)], axis=1),
+            node_type=extended(self.node_type, node_code(BOUNDARY)),
+            mass=extended(self.mass, 0.0),
+            material_params=extended(self.material_params, np.nan),
+            boundary=Boundary(b.pos[still], b.vel[still], b.normal[still], b.friction[still], b.restitution[still], b.shapes),
+            rest_pos=None if self.rest_pos is None else np.concatenate([self.rest_pos, motion.pos[0, moves].astype(self.rest_pos.dtype)]),
+            stress=stress,
+        )

@@ -72,7 +72,8 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
 
 def _read_only(trajectory: Trajectory) -> Trajectory:
     """The same trajectory; writing to its arrays raises."""
-    for array in (*vars(trajectory).values(), *vars(trajectory.boundary).values()):
+    parts = (trajectory, trajectory.boundary, *([motion] if (motion := trajectory.boundary.motion) else []))
+    for array in (value for part in parts for value in vars(part).values()):
         if isinstance(array, np.ndarray):
             array.setflags(write=False)
     return trajectory
@@ -242,7 +243,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
             trajectory.node_type,
             trajectory.mass,
             trajectory.material_params,
-            trajectory.boundary,
+            trajectory.boundary.at(history),
             gravity,
             past,
             frame * dt,

@@ -27,7 +27,7 @@ from pydantic import TypeAdapter, ValidationError
 from gpe_pl.geometry import Shape
 from gpe_pl.graphs.islands import Islands, free_since, islands_within
 from gpe_pl.periodicity import PeriodicityError
-from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup, param_names
+from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup, param_names
 from gpe_pl.store import (
     StoreError,
     digest,
@@ -136,12 +136,12 @@ def disturbed_islands(metadata: Metadata, arrays: dict[str, np.ndarray]) -> Iter
     gravity, dt, radius = np.asarray(metadata.gravity), metadata.frame_dt, metadata.connectivity_radius
     tolerance = FREE_FALL_TOLERANCE * (float(np.linalg.norm(gravity)) or 9.81)
     resolution = 4 * 2.0**-24 * float(np.max(np.abs(pos), initial=0.0)) / dt**2
-    boundary = arrays["boundary_pos"][0].astype(np.float64)
+    boundary = arrays["boundary_pos"].astype(np.float64)
     cells = arrays.get("cells", np.empty((0, 2), np.int64)).astype(np.int64)
     mesh = np.concatenate([np.stack([cells[:, 0], cells[:, k]]) for k in range(1, cells.shape[1])], axis=1)
 
     def islands_of(frame: int) -> Islands:
-        return islands_within(radius, pos[frame], boundary, mesh, metadata.periodicity)
+        return islands_within(radius, pos[frame], boundary[min(frame, len(boundary) - 1)], mesh, metadata.periodicity)
 
     for frame in np.unique(np.linspace(1, len(pos) - 2, min(len(pos) - 2, ISLAND_FRAMES)).astype(int)).tolist():
         before, islands = islands_of(frame - 1), islands_of(frame)
@@ -305,7 +305,11 @@ def _offenders(key: str, bad: np.ndarray) -> str | None:
     if not bad.any():
         return None
     place = np.argwhere(bad)[0]
-    axes = [f"{axis} {i}" for axis, i in zip(FIELDS[key].dims, place, strict=False) if axis != "one"]
+    axes = [
+        f"{'frame' if axis == MOTION else axis} {i}"
+        for axis, i in zip(FIELDS[key].dims, place, strict=False)
+        if not (axis == MOTION and bad.shape[0] == 1)
+    ]
     more = int(bad.sum()) - 1
     return ", ".join(axes) + (f" and {more} more" if more else "")
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from matplotlib.colors import Colormap, LinearSegmentedColormap, ListedColormap, Normalize
 
 from gpe_pl.metrics import displacement
-from gpe_pl.schema import MATERIALS
+from gpe_pl.schema import BOUNDARY, MATERIALS, node_code
 from gpe_pl.trajectory import Trajectory, von_mises
 from gpe_pl.viz.camera import vertical_axis
 
@@ -19,7 +19,7 @@ PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 MATERIAL_COLORS = {"sand": "#E69F00", "snow": "#56B4E9", "fluid": "#0072B2", "elastomer": "#D55E00", "solid": "#009E73"}
 
 REFERENCE = "#7A8B99"
-"""What has no value of its own: particles of the ground truth where colour means error, particles outside of meshes where it means stress."""
+"""What has no value of its own: particles of the ground truth where colour means error, particles outside of meshes where it means stress, walls that move."""
 
 ColorBy = Literal["error", "height", "material", "speed", "von_mises"]
 
@@ -108,6 +108,7 @@ class Coloring:
         else:
             assert self._truth is not None
             nodes = unknown if trajectory is self._truth else position_error(trajectory, self._truth, frame)
+        nodes = np.where(trajectory.node_type == node_code(BOUNDARY), np.nan, nodes)
         return nodes, nodes[cells].mean(axis=1)
 
     def __call__(self, trajectory: Trajectory, frame: int) -> tuple[Float[np.ndarray, "node 4"], Float[np.ndarray, "cell 4"]]:

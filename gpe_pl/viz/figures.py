@@ -37,9 +37,9 @@ def rollout_figure(
     Raises:
         ValueError: ``num_columns`` is not positive, or no trajectory has what ``color`` needs.
     """
-    rows = {"ground truth": ground_truth, **predictions}
+    rows = {name: trajectory.with_moving_boundary() for name, trajectory in {"ground truth": ground_truth, **predictions}.items()}
     frames = evenly_spaced_frames(ground_truth.num_frames, num_columns)
-    coloring = Coloring(color, list(rows.values()), frames, ground_truth)
+    coloring = Coloring(color, list(rows.values()), frames, rows["ground truth"])
     # A row may be lower than its name is long.
     return film_strip([(name.replace(" ", "\n"), trajectory) for name, trajectory in rows.items()], frames, coloring)
 

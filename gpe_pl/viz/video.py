@@ -46,12 +46,13 @@ def write_animation(
         ModuleNotFoundError: MP4 without imageio-ffmpeg.
     """
     frames = range(0, ground_truth.num_frames, stride) if stride >= 1 else range(0)
-    _write(Path(path), {"ground truth": ground_truth, **predictions}, frames, fps, color, ground_truth, PANEL_PIXELS)
+    rows = {name: trajectory.with_moving_boundary() for name, trajectory in {"ground truth": ground_truth, **predictions}.items()}
+    _write(Path(path), rows, frames, fps, color, rows["ground truth"], PANEL_PIXELS)
 
 
 def write_film(path: Path | str, name: str, trajectory: Trajectory, fps: int | float = 25, color: ColorBy = "height") -> None:
     """``write_animation`` of a single trajectory, larger, under a name."""
-    _write(Path(path), {name: trajectory}, range(trajectory.num_frames), fps, color, None, FILM_PIXELS)
+    _write(Path(path), {name: trajectory.with_moving_boundary()}, range(trajectory.num_frames), fps, color, None, FILM_PIXELS)
 
 
 def _write(

@@ -27,7 +27,7 @@ from matplotlib.colors import to_rgb
 from gpe_pl.atomic import replace_text
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import Bowl, signed_distance
-from gpe_pl.schema import MATERIALS
+from gpe_pl.schema import BOUNDARY, NODE_TYPES, node_code
 from gpe_pl.trajectory import Trajectory
 from gpe_pl.viz.camera import AZIMUTH, ELEVATION, vertical_axis
 from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, ColorBy, Coloring, position_error
@@ -98,7 +98,7 @@ def write_viewer(
             )
     about = ground_truth.metadata
     title = title or " ".join(word for word in (about.dataset, about.split) if word)
-    scene, arrays = _scene(trajectories, stride)
+    scene, arrays = _scene({name: trajectory.with_moving_boundary() for name, trajectory in trajectories.items()}, stride)
     parts = {
         "title": html.escape(title),
         "style": (PAGE / "viewer.css").read_text(),
@@ -124,7 +124,6 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
     colorings = {by: Coloring(by, [*shown.values()], frames, shown["ground truth"]) for by in _colors(shown)}
     steps = {by: _step(by, colorings[by], shown, frames) for by in ("speed", "von_mises") if by in colorings}
     codes = np.unique(truth.node_type).tolist()
-    names = list(MATERIALS)
     vertical = vertical_axis(truth)
     scene = {
         "dim": about.dim,
@@ -141,8 +140,8 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
         "azimuth": AZIMUTH,
         "elevation": ELEVATION,
         "neutral": to_rgb(REFERENCE),
-        "materials": [{"name": names[code], "color": MATERIAL_COLORS[names[code]]} for code in codes],
-        "nodeMaterials": names,
+        "materials": [{"name": NODE_TYPES[code], "color": MATERIAL_COLORS.get(NODE_TYPES[code], REFERENCE)} for code in codes],
+        "nodeMaterials": list(NODE_TYPES),
         "colors": [_color(by, coloring) for by, coloring in colorings.items()],
         "steps": steps,
         "trajectories": [],
@@ -246,7 +245,11 @@ def _levels(values: Float[np.ndarray, "frame node"], step: float) -> UInt16[np.n
 
 def _rmse(prediction: Trajectory, truth: Trajectory, frames: Sequence[int]) -> list[float | None]:
     """Root mean square of the position error [m] in each frame, or None where there is no prediction."""
-    errors = [np.sqrt(np.mean(position_error(prediction, truth, f) ** 2)) if f < prediction.num_frames else np.nan for f in frames]
+    free = truth.node_type != node_code(BOUNDARY)
+    known = [f for f in frames if f < prediction.num_frames]
+    errors = [float(np.sqrt(np.mean(position_error(prediction, truth, f)[free] ** 2))) for f in known] + [np.nan] * (
+        len(frames) - len(known)
+    )
     return [float(e) if np.isfinite(e) else None for e in errors]
 
 

@@ -87,7 +87,7 @@ def test_particles(model: Any, features: str, dim: int) -> None:
 @pytest.mark.parametrize("model", [GPE, GNS, DPINet])
 def test_meshes(model: Any, kind: Any) -> None:
     materials, dim = ("sand", "solid", "elastomer"), 3 if kind == "tetrahedra" else 2
-    settings = {"stress": True, "level_weights": "separate"} if model is GPE else {}
+    settings: dict[str, Any] = {"stress": True, "level_weights": "separate"} if model is GPE else {}
     learned = simulator(model, materials, dim, {"mesh": True, "num_levels": 3}, **settings)
     assert_same_step(PortableStep(learned), learned, scenes.mesh_state(kind, materials, num_bodies=3).to_torch())
 
@@ -101,7 +101,7 @@ def test_islands_keep_their_momentum(dim: int) -> None:
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("model", SMALL)
 def test_periodic_clouds(model: Any, dim: int) -> None:
-    settings = {"island_momentum": "angular"} if model is GPE else {}
+    settings: dict[str, Any] = {"island_momentum": "angular"} if model is GPE else {}
     learned = simulator(model, ("sand", "snow"), dim, {"islands": model is GPE}, (True, True, False)[-dim:], **settings)
     state = at_the_seam(scenes.state(materials=("sand", "snow"), dim=dim, walls=False), learned)
     assert_same_step(PortableStep(learned), learned, state.to_torch())
@@ -222,7 +222,7 @@ def test_every_model_becomes_a_program(model: Any, kind: str, tmp_path: Path) ->
     if kind == "mesh" and model is ContinuousConvNet:
         pytest.skip("continuous convolutions know no meshes")
     config = {"mesh": True, "num_levels": 2, "islands": model is GPE} if kind == "mesh" else {}
-    settings = {"stress": True, "island_momentum": "angular"} if config and model is GPE else {}
+    settings: dict[str, Any] = {"stress": True, "island_momentum": "angular"} if config and model is GPE else {}
     materials, dim = (("sand", "solid"), 3) if config else (("sand",), 2)
     learned = simulator(model, materials, dim, config, **settings)
     program = torch.export.load(exported(learned, tmp_path / "model.pt2")).module()

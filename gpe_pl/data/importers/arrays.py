@@ -5,8 +5,9 @@
     np.savez("train/00.npz", pos=pos, frame_dt=0.01, materials="fluid", params_fluid=1e-3, bounds=bounds, periodic=[True, False])
 
 Keys are the arguments of ``Trajectory.from_numpy``, which documents them; ``params_{material}`` stands for ``params[material]``, and ``boundary_pos``,
-``boundary_normal``, ``boundary_vel``, ``boundary_friction`` and ``boundary_restitution`` for those of ``Boundary.from_numpy``. Without ``boundary_normal``
-normals are estimated. Needed are ``pos``, ``frame_dt``, ``materials`` and ``params_…``; the settings of the command override what the files say.
+``boundary_normal``, ``boundary_vel``, ``boundary_friction`` and ``boundary_restitution`` for those of ``Boundary.from_numpy``, or of ``Boundary.moving`` if
+``boundary_pos`` is [frame, boundary_node, dim]. Without ``boundary_normal`` normals are estimated. Needed are ``pos``, ``frame_dt``, ``materials`` and
+``params_…``; the settings of the command override what the files say.
 """
 
 from __future__ import annotations
@@ -94,10 +95,16 @@ def _load(path: Path, facts: Facts) -> Loaded:
     if wall:
         if "pos" not in wall:
             raise Refusal("has boundary arrays but no 'boundary_pos'")
+        moves = wall["pos"].ndim == 3
         if "normal" not in wall:
-            wall["normal"] = estimated_normals(wall["pos"], values["pos"], facts.periodicity)
+            points, visited = (wall["pos"][0], values["pos"][0]) if moves else (wall["pos"], values["pos"])
+            wall["normal"] = estimated_normals(points, visited, facts.periodicity)
             notes.append("normals of boundary nodes are estimated: they point to where the other nodes have been")
-        values["boundary"] = Boundary.from_numpy(wall.pop("pos"), wall.pop("normal"), **wall)
+        if moves:
+            wall.pop("vel", None)  # follows from the positions
+            wall |= {"frame_dt": values["frame_dt"], "periodicity": facts.periodicity}
+        make = Boundary.moving if moves else Boundary.from_numpy
+        values["boundary"] = make(wall.pop("pos"), wall.pop("normal"), **wall)
     if facts.walls:
         dim = numbers("pos", values["pos"], {"frame": None, "node": None, "dim": None}).shape[2]
         bounds = None

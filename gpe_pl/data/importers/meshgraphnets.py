@@ -5,9 +5,9 @@ bytes) or ``.h5`` (a group per trajectory with a data set per field). ``meta.jso
 ``features`` its ``type`` (``static`` has one frame, ``dynamic`` all, ``dynamic_varlen`` another number of nodes in each), ``dtype`` and ``shape``. Read are
 ``world_pos`` [frame, node, 3], ``mesh_pos`` [1, node, 2 or 3], ``cells`` [1, cell, corner] and ``node_type`` [1, node, 1].
 
-Types are 0 normal, 1 obstacle, 3 handle and 6 wall. Normal nodes become an ``elastomer``, the others boundary nodes, which must be still: cells with such
-nodes are left out, and the neighbour radius connects a handle to its cloth. Without ``world_pos`` the mesh is still and a field moves on it (``cylinder_flow``,
-``airfoil``), which is no trajectory of nodes. The source's ``stress`` is von Mises' only, which does not give a stress tensor: left out.
+Types are 0 normal, 1 obstacle, 3 handle and 6 wall. Normal nodes become an ``elastomer``, the others boundary nodes, still or moving as the source has
+them: cells with such nodes are left out, and the neighbour radius connects a handle to its cloth. Without ``world_pos`` the mesh is still and a field moves on
+it (``cylinder_flow``, ``airfoil``), which is no trajectory of nodes. The source's ``stress`` is von Mises' only, which does not give a stress tensor: left out.
 
 Source: Pfaff et al. 2021, and the layout of github.com/google-deepmind/deepmind-research, meshgraphnets.
 """

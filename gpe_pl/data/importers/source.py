@@ -17,7 +17,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.geometry import domain_walls
 from gpe_pl.periodicity import NOWHERE, Periodicity
 from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES
-from gpe_pl.trajectory import Boundary, Trajectory
+from gpe_pl.trajectory import Boundary, Motion, Trajectory
 
 Format = Literal["gns", "lagrangebench", "meshgraphnets", "dpinet", "dmcf", "arrays"]
 
@@ -201,7 +201,7 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
     """The trajectory of a source's arrays, with boundary nodes apart, and parameters and normals assumed where the source has none.
 
     Raises:
-        Refusal: boundary nodes move, or nothing else does.
+        Refusal: there are only boundary nodes.
         ArrayError: see ``Trajectory.from_numpy``.
     """
     if facts.frame_dt is None:
@@ -277,9 +277,17 @@ def _boundary(nodes: Nodes, visited: np.ndarray, facts: Facts) -> tuple[Boundary
     notes: list[str] = []
     fixed = np.flatnonzero(nodes.kind == BOUNDARY)
     if len(fixed):
-        vel = _sliding_velocity(nodes.pos[:, fixed], fixed, facts, repairs)
+        vel, moves = _sliding(nodes.pos[:, fixed], facts, repairs)
         pos = facts.periodicity.wrapped(nodes.pos[0, fixed].astype(np.float64))
-        parts.append(Boundary.from_numpy(pos, estimated_normals(pos, visited, facts.periodicity), vel=vel, friction=nodes.friction))
+        if not moves.all():
+            normal = estimated_normals(pos[~moves], visited, facts.periodicity)
+            parts.append(Boundary.from_numpy(pos[~moves], normal, vel=vel[~moves], friction=nodes.friction))
+        if moves.any():
+            assert facts.frame_dt is not None
+            normal, space = estimated_normals(pos[moves], visited[0], facts.periodicity), facts.periodicity
+            way = nodes.pos[:, fixed[moves]]
+            parts.append(Boundary.moving(way, normal, facts.frame_dt, friction=nodes.friction, periodicity=space))
+            notes.append(f"{int(moves.sum())} boundary nodes move; a simulator is told where they go, whatever they meet")
         notes.append("normals of boundary nodes are estimated: they point to where the other nodes have been")
     if nodes.walls is not None:
         parts.append(Boundary.from_numpy(*nodes.walls, friction=nodes.friction))
@@ -299,36 +307,43 @@ def walls_at_bounds(facts: Facts, dim: int) -> Boundary:
 
 
 def joined(dim: int, *parts: Boundary) -> Boundary:
-    """All boundary nodes of several boundaries."""
+    """All boundary nodes of several boundaries, of which those that move have motions of equally many frames."""
     parts = (Boundary.empty(dim), *parts)
     pos, vel, normal, friction, restitution = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("pos", "vel", "normal", "friction", "restitution")
     )
-    return Boundary(pos, vel, normal, friction, restitution, tuple(shape for part in parts for shape in part.shapes))
+    motion, num_frames = None, max((part.motion.num_frames for part in parts if part.motion is not None), default=0)
+    if num_frames:
+
+        def way(part: Boundary, name: str) -> np.ndarray:
+            now = np.asarray(getattr(part, name), np.float32)
+            return np.broadcast_to(now, (num_frames, *now.shape)) if part.motion is None else getattr(part.motion, name)
+
+        motion = Motion(*(np.concatenate([way(part, name) for part in parts], axis=1) for name in ("pos", "vel", "normal")))
+    return Boundary(pos, vel, normal, friction, restitution, tuple(shape for part in parts for shape in part.shapes), motion)
 
 
-def _sliding_velocity(pos: np.ndarray, nodes: np.ndarray, facts: Facts, repairs: list[Repair]) -> Any:
-    """Velocity of boundary nodes [frame, boundary_node, dim] that are still, or slide steadily along periodic axes as a lid does."""
+def _sliding(pos: np.ndarray, facts: Facts, repairs: list[Repair]) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity [boundary_node, dim] of boundary nodes, and which of them [boundary_node] neither are still nor slide steadily along a periodic axis, as a lid.
+
+    Args:
+        pos: their positions [frame, boundary_node, dim].
+        facts: of the data set.
+        repairs: what slides is added to these.
+    """
     assert facts.frame_dt is not None
     path = np.cumsum(facts.periodicity.shortest(np.diff(pos.astype(np.float64), axis=0)), axis=0)
     mean = path[-1] / len(path)
     mean[:, [axis for axis in range(pos.shape[2]) if axis not in facts.periodicity.axes]] = 0.0
     tolerance = STILL * (facts.spacing or float(np.ptp(pos[0], axis=0).max()) / 50)
     unsteady = np.abs(path - mean * np.arange(1, len(path) + 1)[:, None, None]).max(axis=2) > tolerance
-    if unsteady.any():
-        frame, node = np.argwhere(unsteady)[0]
-        raise Refusal(
-            f"boundary node {nodes[node]} moves; boundaries are still, or slide steadily along a periodic axis. Where nodes of its type belong to "
-            "what is simulated, name their material with materials={type: material}",
-            int(frame) + 1,
+    moves = unsteady.any(axis=0)
+    slides = ~moves & (np.abs(mean).max(axis=1) * len(path) > tolerance)
+    if slides.any():
+        repairs.append(
+            Repair(f"{int(slides.sum())} boundary nodes slide along a periodic axis: stored where they are in frame 0, with their velocity")
         )
-    slides = np.abs(mean).max(axis=1) * len(path) > tolerance
-    if not slides.any():
-        return 0.0
-    repairs.append(
-        Repair(f"{int(slides.sum())} boundary nodes slide along a periodic axis: stored where they are in frame 0, with their velocity")
-    )
-    return np.where(slides[:, None], mean / facts.frame_dt, 0.0)
+    return np.where(slides[:, None], mean / facts.frame_dt, 0.0), moves
 
 
 def typed(pos: np.ndarray, types: np.ndarray, table: Mapping[int, str], settings: ImportSettings, **arrays: Any) -> Nodes:

@@ -392,7 +392,7 @@ class Viewer {
   }
 
   #describe(node) {
-    const lines = [`node ${node} (${scene.nodeMaterials[this.arrays.all_material[node]]})`];
+    const lines = [`node ${node} (${scene.nodeMaterials[this.arrays.all_material[node]] ?? scene.nodeMaterials.at(-1)})`];
     for (const of of this.prediction ? [this.truth, this.prediction] : [this.truth]) {
       const pos = of.at(this.frame, node);
       lines.push(`${of.name}: ${pos ? `(${pos.slice(0, scene.dim).map((p) => p.toFixed(4)).join(", ")}) m` : "not shown"}`);

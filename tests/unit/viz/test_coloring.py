@@ -9,7 +9,7 @@ from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, Coloring
 
 
 def test_materials_have_their_colours_and_a_legend(ground_truth):
-    types = np.array([node_code("sand")] * 20 + [node_code("solid")] * 5, np.uint8)
+    types = np.array([node_code("sand")] * 20 + [node_code("solid")] * (ground_truth.num_nodes - 20), np.uint8)
     mixed = replace(ground_truth, node_type=types, cells=np.array([[20, 21, 22], [0, 1, 2]]))
     coloring = Coloring("material", [mixed], [0])
     nodes, cells = coloring(mixed, 0)

@@ -265,6 +265,38 @@ def test_a_mesh_of_tetrahedra(tmp_path: Path) -> None:
     assert "stress of the source is von Mises' only: left out" in report.notes
 
 
+def test_a_plate_that_an_actuator_deforms(tmp_path: Path) -> None:
+    """As in deforming_plate: an obstacle moves in a prescribed way, handles stand still."""
+    points = np.argwhere(np.ones((4, 4, 2))).astype(float)
+    cells, press = Delaunay(points + np.random.default_rng(0).uniform(-0.1, 0.1, points.shape)).simplices, np.linspace(0, 0.3, 8)
+    kind = np.where(points[:, 0] == 0, 3, 0)
+    obstacle = np.array([[1.5, 1.5, 3.0], [2.5, 1.5, 3.0], [1.5, 2.5, 3.0], [2.5, 2.5, 3.0]])
+    rest = SPACING * np.concatenate([points, obstacle])
+    for k in range(3):
+        world = np.repeat(rest[None], 8, axis=0)
+        world[:, len(points) :, 2] -= SPACING * (1 + k) * press[:, None]
+        world[:, : len(points), 2] -= 0.2 * (1 + k) * SPACING * press[:, None] * (kind == 0)
+        fields = {
+            "world_pos": world.astype(np.float32),
+            "mesh_pos": rest[None].astype(np.float32),
+            "cells": cells[None].astype(np.int32),
+            "node_type": np.concatenate([kind, np.ones(4, int)])[None, :, None].astype(np.int32),
+        }
+        sources.mgn_meta(tmp_path / "raw", fields, dt=0)
+        sources.mgn_tfrecord(tmp_path / "raw" / f"{SPLITS[k]}.tfrecord", [fields])
+    report, stored = imported(tmp_path, tmp_path / "raw", "meshgraphnets", frame_dt=0.1)
+    assert not report.refusals and any("4 boundary nodes move" in note for note in report.notes)
+    for k, (trajectory,) in enumerate(stored.values()):
+        assert len(trajectory.boundary.pos) == 8 + 4
+        for frame in (0, 3, 7):
+            boundary = trajectory.state(frame).boundary
+            lowered = obstacle * SPACING - [0, 0, SPACING * (1 + k) * press[frame]]
+            assert all(np.abs(boundary.pos - point).sum(axis=1).min() < 1e-6 for point in lowered)
+            driven = np.abs(boundary.vel).max(axis=1) > 0
+            assert driven.sum() == 4 and (boundary.normal[driven, 2] < 0).all()
+            np.testing.assert_allclose(boundary.vel[driven, 2], -SPACING * (1 + k) * press[1] / 0.1, rtol=1e-4)
+
+
 # --- DPI-Net -------------------------------------------------------------------------------------------------------------------------------
 
 

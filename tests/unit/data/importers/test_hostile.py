@@ -186,22 +186,6 @@ def test_nan_beside_a_boundary(tmp_path: Path, records: list[bytes], node: int) 
     assert unreadable(tmp_path, "gns") == f"train, record 3, frame 4: pos: frame 4, node {node} is inf"
 
 
-def test_a_wall_that_creeps_is_refused(tmp_path: Path, records: list[bytes]) -> None:
-    pos, types = motion(seed=9), np.where(np.arange(20) < 4, 3, 5)
-    pos[:, :4] = pos[0, :4] + np.float32(3e-5) * np.arange(10, dtype=np.float32)[:, None, None]
-    write(tmp_path, *records[:3], sources.record(sources.gns_record(pos, types)))
-    assert "boundary node 0 moves" in unreadable(tmp_path, "gns")
-    assert "frame 1: " not in unreadable(tmp_path, "gns")
-
-
-def test_boundary_nodes_that_move_are_refused(tmp_path: Path, records: list[bytes]) -> None:
-    types = np.where(np.arange(20) < 4, 3, 5)
-    write(tmp_path, *records[:3], sources.record(sources.gns_record(motion(seed=5), types)))
-    text = only_refusal(convert(tmp_path, "gns"))
-    assert "frame 1: boundary node 0 moves" in text
-    assert "materials={type: material}" in text
-
-
 def test_when_nothing_is_left_the_first_reasons_are_given(tmp_path: Path, records: list[bytes]) -> None:
     write(tmp_path, records[0][:50])
     refused(tmp_path, "gns", "no trajectory can be used: train, record 0: .*truncated")
