@@ -89,6 +89,14 @@ def test_von_mises_error_is_reported_where_both_have_a_stress():
     assert "von_mises_error" not in {r.metric for r in rollout_metrics(replace(wrong, stress=None), truth, (2,))}
 
 
+def test_stress_is_judged_by_what_the_impact_will_bring():
+    truth, late = trajectory(np.zeros((5, 2, 2))), np.zeros((5, 2, 4), np.float32)
+    late[3:, :, 0] = 2.0  # von Mises stress 2 in two of four frames: root mean square √2
+    truth = replace(truth, stress=Stress(late, late[:, :1]))
+    noisy = replace(truth, stress=Stress(late + np.array([0.1, 0, 0, 0], np.float32), late[:, :1]))
+    assert value(rollout_metrics(noisy, truth, (2,)), "von_mises_error", 2) == pytest.approx(0.1 / np.sqrt(2), rel=1e-5)
+
+
 def test_an_early_stop_is_infinitely_wrong_beyond_its_last_good_frame(ground_truth):
     stopped = replace(ground_truth.frames(0, 6), termination=Termination("nan", 6, 0, ""))
     error = per_frame_mse(stopped, ground_truth)
