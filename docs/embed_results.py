@@ -42,6 +42,8 @@ def collect(run: Path, name: str) -> None:
                 kept.mkdir(parents=True, exist_ok=True)
                 shutil.copy(metrics, kept)
                 shutil.copy(metrics.parent / "config.json", kept)
+        for picture in sorted(run.glob("data=*/model=gpe_tuned/seed=0/rollout_test_unseen_00.png")):
+            shutil.copy(picture, target / f"rollout_{picture.parts[-4].removeprefix('data=')}.png")
 
 
 def main(arguments: list[str]) -> int:
