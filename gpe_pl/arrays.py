@@ -16,6 +16,9 @@ from gpe_pl.schema import MATERIALS, MESH_MATERIALS, NODE_TYPES, node_code, para
 RADIUS_SPACINGS = 2.0
 """Neighbour radius in rest spacings where none is given: about 12 neighbours in the plane and 32 in space."""
 
+LARGEST = np.sqrt(np.float64(np.finfo(np.float32).max))
+"""Squares of larger numbers overflow float32, in which data are stored and trained on."""
+
 FRAMES_AT_ONCE = 256
 NEIGHBOURS = 16
 MAX_VISITED = 50_000
@@ -31,7 +34,7 @@ class ArrayError(GpeError, ValueError):
 
 
 def numbers(name: str, values: Any, axes: Mapping[str, int | None]) -> np.ndarray:
-    """Finite real numbers of a given shape.
+    """Finite real numbers of a given shape, of magnitudes up to ``LARGEST``.
 
     Args:
         name: of the argument, for messages.
@@ -50,12 +53,12 @@ def numbers(name: str, values: Any, axes: Mapping[str, int | None]) -> np.ndarra
     wanted = ", ".join(axis if size is None else f"{axis} {size}" for axis, size in axes.items())
     if array.ndim != len(axes) or any(size is not None and size != n for size, n in zip(axes.values(), array.shape, strict=True)):
         raise ArrayError(f"{name}: has shape {list(array.shape)}, expected [{wanted}]")
-    finite = np.isfinite(array)
-    if not finite.all():
-        place = np.argwhere(~finite)[0]
-        where = ", ".join(f"{axis} {i}" for axis, i in zip(axes, place, strict=True) if axis != "dim")
-        frame = int(place[0]) if next(iter(axes)) == "frame" else -1
-        raise ArrayError(f"{name}: {where or f'component {place[0]}'} is {array[tuple(place)]}", frame)
+    for wrong, reason in ((~np.isfinite(array), ""), (np.abs(array) > LARGEST, f", too large to be stored (at most {LARGEST:.2g})")):
+        if wrong.any():
+            place = np.argwhere(wrong)[0]
+            where = ", ".join(f"{axis} {i}" for axis, i in zip(axes, place, strict=True) if axis != "dim")
+            frame = int(place[0]) if next(iter(axes)) == "frame" else -1
+            raise ArrayError(f"{name}: {where or f'component {place[0]}'} is {array[tuple(place)]}{reason}", frame)
     return array
 
 
@@ -101,7 +104,8 @@ def checked_bounds(bounds: Any, periodic: Any, pos: np.ndarray, boundary_pos: np
     except ValueError as error:
         raise ArrayError(str(error)) from None
     for axis, (low, high) in enumerate(checked):
-        slack = 1e-5 * max(abs(low), abs(high), high - low)
+        far = max(abs(low), abs(high)) if pos.dtype == np.float32 else 0.0  # where rounding can lead out
+        slack = 1e-5 * max(far, high - low)
         outside = (pos[..., axis] < low - slack) | (pos[..., axis] > high + slack)
         if not (periodic is not None and periodic[axis]) and outside.any():
             frame, node = np.argwhere(outside)[0]

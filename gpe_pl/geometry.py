@@ -439,6 +439,15 @@ def shape_from_dict(values: dict[str, Any]) -> Shape:
         raise ValueError(f"shape {kind!r}: {error}") from None
 
 
+def moved(shape: Shape, by: np.ndarray) -> Shape:
+    """The shape displaced by ``by`` [dim] in m."""
+    values = shape_to_dict(shape)
+    values |= {name: (values[name] + by).tolist() for name in ("center", "low", "high", "vertices", "origin") if name in values}
+    if isinstance(shape, Wall):
+        values["offset"] += float(np.dot(shape.normal, by))
+    return shape_from_dict(values)
+
+
 def signed_distance(shapes: tuple[Shape, ...], points: Array) -> Array:
     """Distance [m] to the nearest of several shapes, negative inside any of them; +inf without shapes."""
     xp = array_namespace(points)

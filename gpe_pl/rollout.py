@@ -269,7 +269,7 @@ class _Recording:
         self.vel.append(_numpy(item.vel))
         if self.start.state.boundary.motion is not None:
             b = item.boundary
-            self.motion.append(Motion(*(np.array(_numpy(x), dtype=np.float32) for x in (b.pos, b.vel, b.normal))))
+            self.motion.append(Motion(*(np.array(_numpy(x)) for x in (b.pos, b.vel, b.normal))))
         self.stress.append(None if item.stress is None else Stress(_numpy(item.stress.node), _numpy(item.stress.cell)))
 
     def trajectory(self) -> Trajectory:

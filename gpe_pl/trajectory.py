@@ -24,7 +24,7 @@ from gpe_pl.arrays import (
     typical_spacing,
     velocities_of,
 )
-from gpe_pl.geometry import Shape
+from gpe_pl.geometry import Shape, moved
 from gpe_pl.periodicity import NOWHERE, Periodicity
 from gpe_pl.schema import BOUNDARY, STICKY, node_code, param_names
 
@@ -165,7 +165,7 @@ class Boundary:
         vel = np.concatenate([steps, steps[-1:]]) / positive("frame_dt", frame_dt, "seconds")
         normals = carried_along(path, np.asarray(first.normal, np.float64))
         inside = np.stack([periodicity.wrapped(frame) for frame in path])
-        return replace(first, motion=Motion(*(x.astype(np.float32) for x in (inside, vel, normals)))).at(0)
+        return replace(first, motion=Motion(inside, vel, normals)).at(0)
 
     def to_numpy(self) -> Boundary:
         """The same with NumPy arrays of its own."""
@@ -432,7 +432,8 @@ class Trajectory:
         ``data.importers.save_dataset`` writes many of them as a data set that ``python -m gpe_pl.fit data=imported`` trains on.
 
         Args:
-            pos: positions [frame, node, dim] in m of at least 3 frames. Along periodic axes they are folded into the domain.
+            pos: positions [frame, node, dim] in m of at least 3 frames. Along periodic axes they are folded into the domain. What is not float32 or
+                float16 stays in double precision until it is stored.
             frame_dt: time between frames [s].
             materials: material of all nodes, or of each; names of ``schema.MATERIALS``.
             params: the parameter of each material that occurs, in the unit that ``schema.MATERIALS`` gives it: one value, or one per node of the trajectory.
@@ -452,6 +453,7 @@ class Trajectory:
             ArrayError: an argument that does not fit; names it, and frame and node where there is one.
         """
         pos = numbers("pos", pos, {"frame": None, "node": None, "dim": None})
+        pos = pos.astype(np.float32 if pos.dtype in (np.float16, np.float32) else np.float64, copy=False)
         num_frames, num_nodes, dim = pos.shape
         if num_frames < 3 or num_nodes < 1 or dim not in (2, 3):
             raise ArrayError(f"pos [frame, node, dim] is {list(pos.shape)}: at least 3 frames, 1 node, and 2 or 3 dimensions are needed")
@@ -465,8 +467,7 @@ class Trajectory:
         bounds = checked_bounds(bounds, periodic, pos, way)
         periodicity = Periodicity(bounds, tuple(map(bool, periodic)) if periodic is not None else (False,) * dim)
         if periodicity:
-            pos = np.stack([periodicity.wrapped(frame.astype(np.float64)).astype(np.float32) for frame in pos])
-        pos = pos.astype(np.float32, copy=False)
+            pos = np.stack([periodicity.wrapped(frame.astype(np.float64)).astype(pos.dtype) for frame in pos])
         codes, columns, names = checked_materials(materials, params, num_nodes)
         spacing = positive("spacing", typical_spacing(pos[0].astype(np.float64), periodicity) if spacing is None else spacing, "m")
         radius = positive("connectivity_radius", RADIUS_SPACINGS * spacing if connectivity_radius is None else connectivity_radius, "m")
@@ -476,7 +477,7 @@ class Trajectory:
         gravity = numbers("gravity", np.zeros(dim) if gravity is None else gravity, {"dim": dim})
         if cells is not None:
             cells = checked_cells(cells, codes)
-            rest_pos = numbers("rest_pos", pos[0] if rest_pos is None else rest_pos, {"node": num_nodes, "dim": dim}).astype(np.float32)
+            rest_pos = numbers("rest_pos", pos[0] if rest_pos is None else rest_pos, {"node": num_nodes, "dim": dim}).astype(pos.dtype)
         elif rest_pos is not None:
             raise ArrayError("rest_pos: only meshes have rest positions; pass cells too, or leave it out")
         return cls(
@@ -525,6 +526,17 @@ class Trajectory:
             pos, vel, self.node_type, self.mass, self.material_params, self.boundary.at(frame), gravity, past, frame * self.metadata.frame_dt,
             rest_pos, self.cells, stress, periodicity=self.metadata.periodicity,
         )  # fmt: skip
+
+    def seen_from(self, origin: np.ndarray) -> Trajectory:
+        """The same in coordinates whose origin is at ``origin`` [dim] in m; stored positions should be near theirs, since float32 is fine near 0 only."""
+        b, m = self.boundary, self.metadata
+        rest_pos = self.rest_pos
+        if rest_pos is not None:  # only their differences matter, so they may have an origin of their own already
+            rest_pos = np.where(np.abs(rest_pos - origin).max(axis=0) < np.abs(rest_pos).max(axis=0), rest_pos - origin, rest_pos)
+        bounds = tuple((low - x, high - x) for (low, high), x in zip(m.bounds, origin.tolist(), strict=True))
+        motion = None if b.motion is None else replace(b.motion, pos=b.motion.pos - origin)
+        boundary = replace(b, pos=b.pos - origin, shapes=tuple(moved(shape, -origin) for shape in b.shapes), motion=motion)
+        return replace(self, metadata=replace(m, bounds=bounds), pos=self.pos - origin, boundary=boundary, rest_pos=rest_pos)
 
     def frames(self, start: int, stop: int | None = None) -> Trajectory:
         """The frames ``start:stop`` as a trajectory of their own."""

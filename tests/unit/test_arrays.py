@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import weakref
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 
 from gpe_pl.arrays import ArrayError, estimated_normals, typical_spacing
-from gpe_pl.data.importers import ImportFailure, save_dataset
+from gpe_pl.data.importers import ImportFailure, assemble, save_dataset
 from gpe_pl.data.validate import validate
 from gpe_pl.geometry import domain_walls
 from gpe_pl.periodicity import Periodicity, PeriodicityError
@@ -221,6 +223,50 @@ def test_a_data_set_of_trajectories(tmp_path: Path) -> None:
     statistics = json.loads((folder / "statistics.json").read_text())
     assert statistics["num_trajectories"] == 4
     assert statistics["acceleration_std"] > 0
+
+
+def test_trajectories_are_made_when_they_are_asked_for(tmp_path: Path) -> None:
+    """A data set that does not fit into memory."""
+
+    class Scenes(Sequence[Trajectory]):
+        made: list[weakref.ref[Trajectory]] = []  # noqa: RUF012
+
+        def __len__(self) -> int:
+            return 12
+
+        def __getitem__(self, k: Any) -> Any:
+            assert sum(ref() is not None for ref in self.made) < 3
+            found = trajectory(seed=k)
+            self.made.append(weakref.ref(found))
+            return found
+
+    report = save_dataset(tmp_path, "mine", train=Scenes())
+    assert report.splits["train"].trajectories == 10
+    generated = save_dataset(tmp_path, "other", train=(trajectory(seed=k) for k in range(3)))
+    assert generated.splits["train"].trajectories == 1
+
+
+def test_a_trajectory_that_cannot_be_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is wrong in the second pass costs no other trajectory either, unless it was the last of its split."""
+    decided: list[None] = []
+    decide = assemble._Conversion._decide
+
+    class Scenes(Sequence[Trajectory]):
+        def __len__(self) -> int:
+            return 3
+
+        def __getitem__(self, k: Any) -> Any:
+            if k == 1 and decided:
+                raise KeyError("gone")
+            return trajectory(seed=k)
+
+    monkeypatch.setattr(assemble._Conversion, "_decide", lambda self: decided.append(decide(self)))
+    report = save_dataset(tmp_path, "mine", train=Scenes(), holdout=0.0)
+    assert [str(e) for e in report.refusals] == ["train, train[1]: cannot be read (KeyError: 'gone')"]
+    assert report.splits["train"].trajectories == 2
+    decided.clear()
+    with pytest.raises(ImportFailure, match=r"no trajectory of test can be used: test, train\[1\]: cannot be read"):
+        save_dataset(tmp_path, "other", train=Scenes())
 
 
 def test_what_is_missing_is_taken_from_the_end_of_train(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from gpe_pl.geometry import (
     Sphere,
     Wall,
     domain_walls,
+    moved,
     outward_normal,
     shape_from_dict,
     shape_to_dict,
@@ -189,6 +190,18 @@ def test_dictionary_round_trip(shape: Any) -> None:
     assert len({shape, shape_from_dict(shape_to_dict(shape))}) == 1
     assert isinstance(shape, Shape)
     assert SHAPES[shape.kind] is type(shape)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [*SOLIDS.values(), *domain_walls(((0.0, 1.0), (0.0, 2.0)), 0.1), DistanceGrid.from_values((0.1, 0.2), 0.5, np.eye(3), 0.3)],
+    ids=lambda s: s.kind,
+)
+def test_a_moved_shape_has_its_distances_elsewhere(shape: Any) -> None:
+    dim = dimension(shape) if not isinstance(shape, DistanceGrid) else 2
+    by, points = np.array([0.3, -7.0, 2.0])[:dim], random_points(dim)
+    np.testing.assert_allclose(moved(shape, by).signed_distance(points + by), shape.signed_distance(points), atol=1e-12)
+    np.testing.assert_allclose(moved(shape, by).sample(0.1)[0], shape.sample(0.1)[0] + by, atol=1e-12)
 
 
 def test_wrong_shapes_are_refused() -> None:

@@ -31,6 +31,7 @@ from gpe_pl.data.importers.source import (
     Refusal,
     Source,
     joined,
+    natural,
     walls_at_bounds,
 )
 from gpe_pl.trajectory import Boundary, Trajectory
@@ -58,7 +59,8 @@ SCALARS = ("frame_dt", "spacing", "connectivity_radius")
 def open_source(path: Path, settings: ImportSettings) -> Source:
     """A data set in this format; raises ``ImportFailure``."""
     folders = {split: path / name for name, split in SPLIT_NAMES.items() if (path / name).is_dir()} or {"train": path}
-    splits = {split: [Item(f.name, partial(_load, f)) for f in sorted(folder.glob("*.npz"))] for split, folder in folders.items()}
+    files = {split: sorted(folder.glob("*.npz"), key=lambda file: natural(file.name)) for split, folder in folders.items()}
+    splits = {split: [Item(file.name, partial(_load, file)) for file in found] for split, found in files.items()}
     splits = {split: items for split, items in splits.items() if items}
     if not splits:
         raise ImportFailure(f"{path}: {'no such folder' if not path.is_dir() else 'holds no *.npz'}")
@@ -68,6 +70,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
 def _load(path: Path, facts: Facts) -> Loaded:
     try:
         names = npz.names(path)
+        values: dict[str, Any] = {name: npz.read(path, name) for name in names if name in KEYS or name.startswith("params_")}
     except ImportFailure as failure:
         raise Refusal(str(failure)) from None
     wrong = [name for name in names if name not in KEYS and not name.startswith("params_")]
@@ -76,7 +79,6 @@ def _load(path: Path, facts: Facts) -> Loaded:
         raise Refusal(
             f"has {f'an unknown key {wrong[0]!r}' if wrong else f'no {missing[0]!r}'}; keys are params_MATERIAL, {', '.join(KEYS)}"
         )
-    values: dict[str, Any] = {name: npz.read(path, name) for name in names}
     for name in SCALARS:
         if name in values:
             if values[name].size != 1:

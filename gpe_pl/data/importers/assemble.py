@@ -17,9 +17,11 @@ import numpy as np
 from gpe_pl import integrators
 from gpe_pl.arrays import ArrayError
 from gpe_pl.atomic import replacing
+from gpe_pl.data.importers.motion import Motion, better_origin, motion_of
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
 from gpe_pl.data.importers.source import NAME, Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments, with_checksum
+from gpe_pl.errors import GpeError
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.periodicity import PeriodicityError
 from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup, node_code, param_names
@@ -43,6 +45,8 @@ VELOCITY_RATIO = 1.25
 """Positions and velocities of a source disagree about time beyond this ratio, …"""
 FRAMES_COMPARED = 200
 """… in these first frames."""
+ROUNDING_SHARE = 0.1
+"""Share of the accelerations that rounding may be: a hundredth of their variance, which no model can learn."""
 TYPED = ("gns", "lagrangebench", "meshgraphnets")
 """Formats with types of nodes."""
 
@@ -86,18 +90,19 @@ def save_dataset(root: Path | str, name: str, holdout: float = 0.1, **splits: It
         root: folder of all data sets, ``data`` unless the command gets another ``paths.data``.
         name: of the data set.
         holdout: share of ``train`` that becomes ``val`` and ``test`` where these are not given.
-        splits: ``train=[…]``, ``val=[…]``, ``test=[…]`` and ``test_unseen=[…]``; see ``Trajectory.from_numpy``.
+        splits: ``train=[…]``, ``val=[…]``, ``test=[…]`` and ``test_unseen=[…]``; see ``Trajectory.from_numpy``. Each trajectory is asked for twice. A
+            sequence that makes its trajectories when they are asked for is never in memory as a whole; other iterables become lists first.
 
     Raises:
         ImportFailure: nothing to train on, or the data set exists already.
     """
-    given = {split: list(trajectories) for split, trajectories in splits.items()}
+    given = {split: trajectories if isinstance(trajectories, Sequence) else list(trajectories) for split, trajectories in splits.items()}
     unknown = sorted(set(given) - {"train", "val", "test", "test_unseen"})
     if unknown or not given.get("train"):
         raise ImportFailure(
             f"splits: {unknown[0] if unknown else 'train'} {'is none of' if unknown else 'is missing; of'} train, val, test, test_unseen"
         )
-    items = {split: [_held(f"{split}[{k}]", t) for k, t in enumerate(trajectories)] for split, trajectories in given.items()}
+    items = {split: [_member(split, trajectories, k) for k in range(len(trajectories))] for split, trajectories in given.items()}
     about = {"format": "arrays", "source": "memory", "settings": {}}
     return _Conversion(name, _free_folder(Path(root), name), Source(Facts(), items), holdout, about).run()
 
@@ -115,8 +120,8 @@ def draw_contact_sheet(report: Report) -> Path:
     return path
 
 
-def _held(name: str, trajectory: Trajectory) -> Item:
-    return Item(name, lambda _: Loaded(trajectory))
+def _member(split: str, trajectories: Sequence[Trajectory], k: int) -> Item:
+    return Item(f"{split}[{k}]", lambda _: Loaded(trajectories[k]))
 
 
 def _free_folder(root: Path, name: str) -> Path:
@@ -139,6 +144,8 @@ class _Survey:
     radii: list[float] = field(default_factory=list)
     velocity_ratios: list[float] = field(default_factory=list)
     scenes: dict[bytes, str] = field(default_factory=dict)
+    motions: list[tuple[str, str, Motion]] = field(default_factory=list)
+    suspects: list[Event] = field(default_factory=list)
     common: tuple[float, int, tuple[bool, ...]] | None = None
 
 
@@ -149,9 +156,10 @@ class _Conversion:
         self, name: str, folder: Path, source: Source, holdout: float, about: dict[str, Any], on_progress: Progress | None = None
     ) -> None:
         self.source, self.facts, self.holdout, self.folder, self.about = source, source.facts, holdout, folder, about
-        self.report = Report(name, about["format"], about["source"], str(folder))
+        self.report = Report(name, about["format"], about["source"], str(folder), warnings=list(source.warnings))
         self.survey = _Survey()
         self.trained: dict[str, tuple[float, float]] = {}
+        self.origin = np.zeros(0)
         self.on_progress, self.num_read = on_progress, 0
 
     def run(self) -> Report:
@@ -163,6 +171,7 @@ class _Conversion:
                 if split in self.survey.good:
                     self._write(part, split, self.survey.good[split])
             self._summarize(part)
+            self.report.warnings += [str(suspect) for suspect in self.survey.suspects]
             self.report.write(part)
         return self.report
 
@@ -174,14 +183,13 @@ class _Conversion:
             for item in items:
                 try:
                     loaded = self._load(item)
-                    self._accept(f"{split}, {item.name}", loaded.trajectory)
+                    self._accept(split, item.name, loaded.trajectory)
                 except (Refusal, ArrayError) as refusal:
-                    self.report.refusals.append(Event(split, item.name, getattr(refusal, "frame", -1), str(refusal)))
+                    self.report.refusals.append(Event(split, item.name, refusal.frame, str(refusal)))
                     continue
-                except PeriodicityError as error:  # not the fault of one trajectory
-                    raise ImportFailure(f"{error} (connectivity_radius=…)") from None
                 self.survey.good.setdefault(split, []).append(item)
                 self.report.repairs += [Event(split, item.name, repair.frame, repair.what) for repair in loaded.repairs]
+                self.survey.suspects += [Event(split, item.name, -1, warning) for warning in loaded.warnings]
                 self.report.notes += [note for note in loaded.notes if note not in self.report.notes]
         self.report.notes = [*self.facts.notes, *self.report.notes]
 
@@ -189,11 +197,18 @@ class _Conversion:
         if self.on_progress is not None:
             self.num_read += 1
             self.on_progress(self.num_read, 2 * sum(map(len, self.source.splits.values())))
-        return item.load(self.facts)
+        try:
+            return item.load(self.facts)
+        except PeriodicityError as error:
+            raise Refusal(f"{error} (connectivity_radius=…)") from None
+        except GpeError:
+            raise
+        except (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError) as error:  # what no reader has foreseen
+            raise Refusal(f"cannot be read ({type(error).__name__}: {error})") from error
 
-    def _accept(self, where: str, trajectory: Trajectory) -> None:
+    def _accept(self, split: str, name: str, trajectory: Trajectory) -> None:
         """Add a trajectory to what is known; raises ``Refusal`` where it does not fit the others."""
-        survey, m = self.survey, trajectory.metadata
+        survey, m, where = self.survey, trajectory.metadata, f"{split}, {name}"
         common = (m.frame_dt, m.dim, m.periodic)
         if survey.common is None:
             survey.common = common
@@ -206,6 +221,7 @@ class _Conversion:
         digest = hashlib.sha256(trajectory.pos.tobytes()).digest()
         if survey.scenes.setdefault(digest, where) != where:
             raise Refusal(f"has exactly the positions of {survey.scenes[digest]}: the same scene twice")
+        survey.motions.append((split, name, motion_of(trajectory)))
         survey.materials |= set(m.materials)
         survey.bounds.append(m.bounds)
         if len(survey.spacings) < NUM_SAMPLED:
@@ -242,14 +258,46 @@ class _Conversion:
             bounds = tuple(zip(every[..., 0].min(axis=0).tolist(), every[..., 1].max(axis=0).tolist(), strict=True))
             report.notes.append("bounds are the extremes of all positions, unless trajectories say otherwise (bounds=…)")
         self.facts = replace(facts, frame_dt=frame_dt, periodic=periodic, spacing=spacing, connectivity_radius=radius, bounds=bounds)
+        self._compare_with_rounding()
+        self._look_for_jumps(radius)
         self._hold_out()
         report.dim, report.frame_dt, report.periodic = dim, frame_dt, list(periodic)
-        report.spacing, report.connectivity_radius = spacing, radius
+        report.spacing, report.connectivity_radius, report.origin = spacing, radius, self.origin.tolist()
         ratio = float(np.median(survey.velocity_ratios)) if survey.velocity_ratios else 1.0
         if not 1 / VELOCITY_RATIO < ratio < VELOCITY_RATIO:
             report.warnings.append(
                 f"nodes move {ratio:.3g} times as far per frame as their velocities say: frame_dt may be {frame_dt * ratio:.3g} s rather than {frame_dt:g} s"
             )
+
+    def _compare_with_rounding(self) -> None:
+        """Choose the origin that float32 needs, and name the trajectories whose accelerations are rounding all the same."""
+        report, suspects, motions = self.report, self.survey.suspects, self.survey.motions
+        typical = float(np.median([motion.acceleration for _, _, motion in motions]))
+        nowhere = np.zeros_like(motions[0][2].low)
+        self.origin = better_origin([motion for _, _, motion in motions], ROUNDING_SHARE * typical)
+        if self.origin.any():
+            lost = max(motion.rounding(np.float32, nowhere).max() for _, _, motion in motions)
+            where = ", ".join(f"{x:.12g}" for x in self.origin)
+            what = f"float32 would round accelerations by {lost:.3g} m/s² so far from 0, those of the data are {typical:.3g} m/s² rms"
+            report.repairs.append(Event("all splits", "all trajectories", -1, f"the origin was moved to ({where}) m: {what}"))
+            self.about["origin"] = self.origin.tolist()
+        for split, name, motion in motions:
+            for precision, origin, remedy in (
+                (motion.precision, nowhere, "write them with more digits"),
+                (np.float32, self.origin, "take a larger time step, or a smaller domain"),
+            ):
+                lost = motion.rounding(precision, origin).max()
+                if lost > ROUNDING_SHARE * typical:
+                    what = f"positions in {precision.__name__} round accelerations by {lost:.3g} m/s², those of the data are {typical:.3g} m/s² rms"
+                    suspects.append(Event(split, name, -1, f"{what}: {remedy}"))
+                    break
+
+    def _look_for_jumps(self, radius: float) -> None:
+        """Name the nodes that get farther than a model can see."""
+        for split, name, motion in self.survey.motions:
+            if motion.step > radius:
+                what = f"node {motion.node} moves by {motion.step:.4g} m in one frame, farther than the connectivity radius {radius:.4g} m"
+                self.survey.suspects.append(Event(split, name, motion.frame, f"{what}: a fault of the source, or too few frames"))
 
     def _hold_out(self) -> None:
         """Take ``val`` and ``test`` from the end of the training trajectories where the source has none."""
@@ -261,7 +309,8 @@ class _Conversion:
             for split in missing:
                 good["train"], good[split] = good["train"][:-count], good["train"][-count:]
                 moved = {item.name for item in good[split]}
-                report.repairs = [replace(e, split=split) if e.split == "train" and e.trajectory in moved else e for e in report.repairs]
+                for events in (report.repairs, self.survey.suspects):
+                    events[:] = [replace(e, split=split) if e.split == "train" and e.trajectory in moved else e for e in events]
                 report.notes.append(f"the source has no usable {split}: the last {count} training trajectories were taken")
         elif missing:
             report.warnings.append(f"there is no split {' and no split '.join(missing)}; fit needs train, val and test")
@@ -273,7 +322,11 @@ class _Conversion:
 
         def stored(part: Sequence[Item]) -> Iterator[Trajectory]:
             for item in part:
-                trajectory = self._unified(self._load(item).trajectory, split)
+                try:
+                    trajectory = self._unified(self._load(item).trajectory, split)
+                except (Refusal, ArrayError) as refusal:  # which the facts of the whole data set have shown
+                    self.report.refusals.append(Event(split, item.name, refusal.frame, str(refusal)))
+                    continue
                 counts.add(trajectory.num_frames, trajectory.num_nodes, len(trajectory.boundary.pos))
                 self._count(trajectory, split)
                 yield trajectory
@@ -281,9 +334,13 @@ class _Conversion:
         for k, start in enumerate(range(0, len(items), TRAJECTORIES_PER_SHARD)):
             part = items[start : start + TRAJECTORIES_PER_SHARD]
             write_shard(folder / split / f"shard-{k:05d}.h5", stored(part), (f"{start + i:05d}" for i in range(len(part))))
+        if not counts.trajectories:
+            raise ImportFailure(f"{self.report.source}: no trajectory of {split} can be used: {self.report.refusals[-1]}")
 
     def _unified(self, trajectory: Trajectory, split: str) -> Trajectory:
         """With the metadata and material columns of the whole data set."""
+        if self.origin.any():
+            trajectory = trajectory.seen_from(self.origin)
         facts, m = self.facts, trajectory.metadata
         assert facts.spacing is not None and facts.connectivity_radius is not None
         materials = tuple(name for name in MATERIALS if name in self.survey.materials)

@@ -34,13 +34,18 @@ from gpe_pl.data.importers.source import (
     Repair,
     Source,
     build,
+    natural,
 )
+from gpe_pl.store import LARGEST_DEFLATE_RATIO
 
 ENDING = ".msgpack.zst"
 FRAME_DT = 0.02
 GRAVITY = -9.81
 MAX_BYTES = 2**32
-"""Of one file, unpacked."""
+"""Of one file, unpacked; and no more than ``LARGEST_DEFLATE_RATIO`` times its size, which zstandard exceeds with constants only."""
+BYTES_AT_ONCE = 2**20
+MOST = {"max_array_len": 2**16, "max_map_len": 2**10, "max_str_len": 2**16, "max_ext_len": 0}
+"""Frames of a file, entries of a frame, text in one: lists that claim more would be allocated before they are read."""
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
@@ -74,7 +79,7 @@ def _scene_of(path: Path) -> str:
 def _scenes(folder: Path) -> list[list[Path]]:
     """Files of each scene, in order of their parts."""
     scenes: dict[str, list[Path]] = {}
-    for path in sorted(folder.glob(f"*{ENDING}")):
+    for path in sorted(folder.glob(f"*{ENDING}"), key=lambda file: natural(file.name)):
         scenes.setdefault(_scene_of(path), []).append(path)
     return list(scenes.values())
 
@@ -85,7 +90,7 @@ def _load(parts: list[Path], facts: Facts) -> Loaded:
     for k, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise Refusal(f"is {type(frame).__name__}, expected a map", k)
-        if "frame_id" in frame and int(_array(frame, "frame_id", k)) != int(_array(frames[0], "frame_id", 0)) + k:
+        if "frame_id" in frame and _number(frame, "frame_id", k) != _number(frames[0], "frame_id", 0) + k:
             raise Refusal("frame_id does not follow that of the frame before: a part is missing, or parts are of several scenes", k)
         for name, arrays in columns.items():
             arrays.append(_array(frame, name, k))
@@ -108,6 +113,7 @@ def _load(parts: list[Path], facts: Facts) -> Loaded:
             values = _array(first, name, 0)
             if values.shape not in ((count,), ()):
                 raise Refusal(f"{name} is {list(values.shape)}, expected [{count}]", 0)
+            _require_constant(frames, name, values)
             if name == "m":
                 nodes.mass = values
             else:
@@ -115,8 +121,7 @@ def _load(parts: list[Path], facts: Facts) -> Loaded:
     gravity = np.array([0.0, GRAVITY, 0.0])
     if "grav" in first:
         gravity = _array(first, "grav", 0).astype(np.float64).ravel()
-        if any("grav" in frame and not np.allclose(_array(frame, "grav", k).ravel(), gravity) for k, frame in enumerate(frames)):
-            raise Refusal("grav changes with time; the store keeps one gravity per trajectory")
+        _require_constant(frames, "grav", gravity)
         if gravity.shape != (3,):
             raise Refusal(f"grav has {gravity.size} components, expected 3", 0)
     elif facts.gravity is None:
@@ -130,20 +135,31 @@ def _load(parts: list[Path], facts: Facts) -> Loaded:
     return build(nodes, facts if facts.gravity is not None else replace(facts, gravity=tuple(gravity.tolist())))
 
 
+def _require_constant(frames: list[dict[str, Any]], name: str, first: np.ndarray) -> None:
+    for k, frame in enumerate(frames):
+        if name in frame:
+            values = _array(frame, name, k)
+            if values.size != first.size or not np.allclose(values.ravel(), first.ravel()):
+                raise Refusal(f"{name} changes with time; the store keeps the same for all frames of a trajectory", k)
+
+
 # --- msgpack -------------------------------------------------------------------------------------------------------------------------------
 
 
 def _frames(path: Path) -> list[Any]:
     msgpack, zstandard = _libraries()
+    data = bytearray()
     try:
+        most = min(MAX_BYTES, path.stat().st_size * LARGEST_DEFLATE_RATIO)
         with (
             open(path, "rb") as file,
             zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(file, read_across_frames=True) as stream,
         ):
-            data = stream.read(MAX_BYTES + 1)
-        if len(data) > MAX_BYTES:
-            raise Refusal(f"{path.name}: unpacks to more than {MAX_BYTES} bytes")
-        frames = msgpack.unpackb(data)
+            while part := stream.read(BYTES_AT_ONCE):
+                data += part
+                if len(data) > most:
+                    raise Refusal(f"{path.name}: unpacks to more than {most} bytes")
+        frames = msgpack.unpackb(data, **MOST)
     except Refusal:
         raise
     except (OSError, ValueError, MemoryError, RecursionError, zstandard.ZstdError, msgpack.UnpackException) as error:
@@ -151,6 +167,13 @@ def _frames(path: Path) -> list[Any]:
     if not isinstance(frames, list):
         raise Refusal(f"{path.name}: holds {type(frames).__name__}, expected a list of frames")
     return frames
+
+
+def _number(frame: dict[str, Any], name: str, number: int) -> float:
+    value = _array(frame, name, number)
+    if value.size != 1 or not np.isfinite(value).all():
+        raise Refusal(f"{name} is {value.tolist()!r:.50}, expected a number", number)
+    return float(value.item())
 
 
 def _array(frame: dict[str, Any], name: str, number: int) -> np.ndarray:

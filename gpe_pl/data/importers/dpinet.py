@@ -18,7 +18,19 @@ from pathlib import Path
 import numpy as np
 
 from gpe_pl.data.importers import hdf5
-from gpe_pl.data.importers.source import SPLIT_NAMES, Facts, ImportFailure, ImportSettings, Item, Loaded, Nodes, Refusal, Source, build
+from gpe_pl.data.importers.source import (
+    SPLIT_NAMES,
+    Facts,
+    ImportFailure,
+    ImportSettings,
+    Item,
+    Loaded,
+    Nodes,
+    Refusal,
+    Source,
+    build,
+    natural,
+)
 
 FRAME_DT = 1 / 60
 NUM_RIGID = 64
@@ -51,8 +63,8 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
 
 def _numbered(folder: Path, ending: str) -> list[Path]:
     """What has a number as name, in order of the numbers."""
-    found = [p for p in folder.iterdir() if re.fullmatch(rf"\d+{re.escape(ending)}", p.name)]
-    return sorted(found, key=lambda p: int(p.name.removesuffix(ending)))
+    found = [p for p in folder.iterdir() if re.fullmatch(rf"[0-9]+{re.escape(ending)}", p.name)]
+    return sorted(found, key=lambda p: natural(p.name))
 
 
 def _has_clusters(rollout: Path) -> bool:

@@ -7,8 +7,8 @@
   tuples. These are pickles: they are read with ``allow_pickle=true`` only;
 - ``.h5``: a group per trajectory with ``positions``, ``particle_type`` and ``material_property``.
 
-``metadata.json`` has ``bounds``, ``dt``, ``default_connectivity_radius`` and ``sequence_length``, which is the number of frames, or one less. Its
-``vel_mean`` … are per frame and not used: the project computes its own statistics from the train split.
+``metadata.json`` has ``bounds``, ``dt``, ``default_connectivity_radius``, ``dim`` and ``sequence_length``, which is the number of frames, or one less; the
+positions themselves say how many there are. Its ``vel_mean`` … are per frame and not used: the project computes its own statistics from the train split.
 
 Types are 0 rigid, 3 boundary, 5 water, 6 sand and 7 goop, which is plastic and becomes ``snow``. Bounds are walls. The property of sand is tan φ.
 Gravity is not in these files.
@@ -36,6 +36,8 @@ from gpe_pl.data.importers.source import (
     Source,
     bounds_in,
     build,
+    count_in,
+    length_warning,
     number,
     read_json,
     split_files,
@@ -68,24 +70,25 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         walls=walls,
         notes=tuple(notes),
     ).overridden(settings)
-    length = values.get("sequence_length")
-    if length is not None and not isinstance(length, int):
-        raise ImportFailure(f"{described}: sequence_length = {length!r}, expected an integer")
+    length, dim = (count_in(values, key, described) for key in ("sequence_length", "dim"))
+    warnings = (
+        () if dim in (None, len(bounds)) else (f"dim = {dim} in {described.name}, but bounds have {len(bounds)} axes, which were taken",)
+    )
     readers = {".tfrecord": _in_records, ".npz": _in_archive, ".h5": _in_hdf5}
-    return Source(facts, {split: readers[file.suffix](file, len(bounds), length, settings) for split, file in files.items()})
+    return Source(facts, {split: readers[file.suffix](file, len(bounds), length, settings) for split, file in files.items()}, warnings)
 
 
 def _loaded(
     pos: np.ndarray, types: np.ndarray, value: np.ndarray | None, length: int | None, settings: ImportSettings, facts: Facts
 ) -> Loaded:
-    if length is not None and len(pos) not in (length, length + 1):
-        raise Refusal(f"has {len(pos)} frames; sequence_length = {length} in metadata.json stands for {length} or {length + 1}")
     if types.size == 1:
         types = np.full(pos.shape[1], types.item())
     if types.shape != (pos.shape[1],):
         raise Refusal(f"particle_type has shape {list(types.shape)} for {pos.shape[1]} nodes")
-    nodes = typed(pos, types, TYPES, settings)
+    nodes = typed(pos, types, TYPES, settings, warnings=length_warning(len(pos), "sequence_length", length))
     if value is not None:
+        if value.size != 1 and value.shape != types.shape:
+            raise Refusal(f"material_property has shape {list(value.shape)} for {pos.shape[1]} nodes")
         if "sand" in set(nodes.kind.tolist()):
             nodes.parameters = {"sand": np.degrees(np.arctan(np.broadcast_to(np.asarray(value, np.float64).ravel(), pos.shape[1])))}
         else:
@@ -121,9 +124,13 @@ def _buffer(feature: tfrecord.Feature | None, name: str, dtype: str) -> np.ndarr
 def _in_archive(path: Path, dim: int, length: int | None, settings: ImportSettings) -> list[Item]:
     names = npz.names(path)
     if names == [PACKED]:
-        packed = npz.read(path, PACKED, settings.allow_pickle)
-        parts: list[Any] = list(packed)
-        return [Item(f"{PACKED}[{k}]", partial(_from_parts, part, dim, length, settings)) for k, part in enumerate(parts)]
+        try:
+            packed = npz.read(path, PACKED, settings.allow_pickle)
+        except Refusal as refusal:
+            raise ImportFailure(f"{path}: {refusal}") from None
+        if packed.ndim == 0:
+            raise ImportFailure(f"{path}: {PACKED} is a single {type(packed.item()).__name__}, expected an array of trajectories")
+        return [Item(f"{PACKED}[{k}]", partial(_from_parts, part, dim, length, settings)) for k, part in enumerate(packed)]
 
     def load(name: str, facts: Facts) -> Loaded:
         return _from_parts(npz.read(path, name, settings.allow_pickle), dim, length, settings, facts)

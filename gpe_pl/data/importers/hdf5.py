@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from gpe_pl.data.importers.source import ImportFailure, Refusal
+from gpe_pl.data.importers.source import ImportFailure, Refusal, natural
 from gpe_pl.errors import GpeError
 from gpe_pl.store import LARGEST_DEFLATE_RATIO
 
@@ -37,12 +37,12 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 
 def groups(path: Path) -> list[str]:
-    """Names of a file's groups, in order; raises ``ImportFailure``."""
+    """Names of a file's groups, by their numbers; raises ``ImportFailure``."""
     try:
         with opened(path) as file:
             names = [
                 name
-                for name in sorted(file)
+                for name in sorted(file, key=natural)
                 if isinstance(file.get(name, getlink=True), h5py.HardLink) and isinstance(file[name], h5py.Group)
             ]
     except Refusal as refusal:

@@ -27,6 +27,8 @@ from gpe_pl.data.importers.source import (
     Source,
     bounds_in,
     build,
+    count_in,
+    length_warning,
     number,
     read_json,
     split_files,
@@ -78,16 +80,29 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     ).overridden(settings)
     friction = 0.0 if values.get("free_slip") else STICKY
 
-    def load(file: Path, name: str, facts: Facts) -> Loaded:
+    lengths = {split: count_in(values, f"sequence_length_{split}", described) for split in ("train", "test")}
+    most = count_in(values, "num_particles_max", described)
+
+    def load(split: str, file: Path, name: str, facts: Facts) -> Loaded:
         with hdf5.opened(file) as opened:
             pos = hdf5.array(opened[name], "position", "frame, node, dim", "f")
             types = hdf5.array(opened[name], "particle_type", "node", "iu")
         if pos.shape[1:] != (len(types), dim):
             raise Refusal(f"position is {list(pos.shape)} for {len(types)} particle types in {dim}D")
         real = types != PADDING
-        nodes = typed(pos[:, real], types[real], TYPES, settings, friction=friction)
+        warnings = length_warning(len(pos), f"sequence_length_{split}", lengths.get(split))
+        if most is not None and real.sum() > most:
+            warnings.append(f"has {real.sum()} nodes, num_particles_max = {most}")
+        nodes = typed(pos[:, real], types[real], TYPES, settings, friction=friction, warnings=warnings)
         if not real.all():
             nodes.repairs.append(Repair(f"{int((~real).sum())} padding nodes left out"))
         return build(nodes, facts)
 
-    return Source(facts, {split: [Item(name, partial(load, file, name)) for name in hdf5.groups(file)] for split, file in files.items()})
+    splits = {split: [Item(name, partial(load, split, file, name)) for name in hdf5.groups(file)] for split, file in files.items()}
+    counts = {f"num_trajs_{split}": len(splits[split]) for split in ("train", "test") if split in splits}
+    warnings = [
+        f"{key} = {stated} in {described.name}, but the file holds {found} trajectories: is it complete?"
+        for key, found in counts.items()
+        if (stated := count_in(values, key, described)) not in (None, found)
+    ]
+    return Source(facts, splits, tuple(warnings))

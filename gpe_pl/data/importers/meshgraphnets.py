@@ -31,6 +31,7 @@ from gpe_pl.data.importers.source import (
     Refusal,
     Source,
     build,
+    length_warning,
     number,
     read_json,
     split_files,
@@ -76,7 +77,15 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
 
     def from_record(record: tfrecord.Record, facts: Facts) -> Loaded:
         stored = tfrecord.example(record.read())
-        return _loaded({name: _decoded(stored.get(name), name, features[name], length) for name in NEEDED}, length, settings, facts)
+        fields = {name: _decoded(stored.get(name), name, features[name]) for name in NEEDED if name != "world_pos"}
+        num_nodes = fields["node_type"].shape[1]
+        fields["world_pos"] = _decoded(stored.get("world_pos"), "world_pos", features["world_pos"], num_nodes)
+        if len(fields["world_pos"]) in (2 * length, length / 2):
+            raise Refusal(
+                f"world_pos has {len(fields['world_pos'])} frames of {features['world_pos']['dtype']}, trajectory_length = {length}: by a factor of 2 the "
+                "type may be the wrong one; correct meta.json"
+            )
+        return _loaded(fields, length, settings, facts)
 
     def from_group(file: Path, name: str, facts: Facts) -> Loaded:
         with hdf5.opened(file) as opened:
@@ -92,8 +101,8 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     return Source(facts, splits)
 
 
-def _decoded(stored: tfrecord.Feature | None, name: str, feature: Mapping[str, Any], length: int) -> np.ndarray:
-    """A field [frame, row, component] from its bytes, by the type and shape that ``meta.json`` gives."""
+def _decoded(stored: tfrecord.Feature | None, name: str, feature: Mapping[str, Any], num_nodes: int | None = None) -> np.ndarray:
+    """A field [frame, row, component] from its bytes, by the type and shape that ``meta.json`` gives: one frame, or as many as there are of all nodes."""
     if not isinstance(stored, list) or len(stored) != 1:
         raise Refusal(f"{name} is {'missing' if stored is None else 'not one string of bytes'}")
     data = stored[0]
@@ -106,28 +115,26 @@ def _decoded(stored: tfrecord.Feature | None, name: str, feature: Mapping[str, A
         or shape[-1] < 1
     ):
         raise Refusal(f"{name}: meta.json says dtype {kind!r} and shape {shape!r}")
-    dtype, frames = np.dtype(kind).newbyteorder("<"), 1 if feature.get("type") == "static" else length
-    row_bytes = frames * shape[-1] * dtype.itemsize
-    if len(data) == 0 or len(data) % row_bytes:
-        raise Refusal(
-            f"{name} has {len(data)} bytes, which is no whole number of rows of {frames} frames × {shape[-1]} × {dtype.itemsize} bytes"
-        )
-    rows = shape[1] if len(shape) == 3 and type(shape[1]) is int else -1
-    if rows > 0 and len(data) != row_bytes * rows:
-        raise Refusal(f"{name} has {len(data)} bytes, meta.json says {kind}{[frames, *shape[1:]]}")
-    return np.frombuffer(data, dtype).reshape(frames, -1, shape[-1])
+    dtype = np.dtype(kind).newbyteorder("<")
+    rows = num_nodes or 1
+    if len(data) == 0 or len(data) % (rows * shape[-1] * dtype.itemsize):
+        raise Refusal(f"{name} has {len(data)} bytes, which is no whole number of {rows} × {shape[-1]} × {dtype.itemsize} bytes")
+    array = np.frombuffer(data, dtype).reshape(*((-1, rows) if num_nodes else (1, -1)), shape[-1])
+    stated = shape[1] if len(shape) == 3 and type(shape[1]) is int else -1
+    if stated > 0 and stated != array.shape[1]:
+        raise Refusal(f"{name} is {kind}{list(array.shape)}, meta.json says {stated} in the place of {array.shape[1]}")
+    return array
 
 
 def _loaded(fields: Mapping[str, np.ndarray], length: int, settings: ImportSettings, facts: Facts) -> Loaded:
     pos, rest, cells, types = (fields[name] for name in NEEDED)
-    if len(pos) != length:
-        raise Refusal(f"world_pos has {len(pos)} frames, trajectory_length is {length}")
     for name in ("mesh_pos", "cells", "node_type"):
         if any(not np.array_equal(frame, fields[name][0]) for frame in fields[name][1:]):
             raise Refusal(f"{name} changes with time (remeshing); gpe_pl needs the same nodes in all frames")
     num_nodes, dim = pos.shape[1:]
     if rest.shape[1] != num_nodes or types.shape[1:] != (num_nodes, 1) or not 1 <= rest.shape[2] <= dim:
         raise Refusal(f"world_pos, mesh_pos and node_type are {list(pos.shape)}, {list(rest.shape)} and {list(types.shape)}")
+    warnings = length_warning(len(pos), "trajectory_length", length)
     flat = np.zeros((num_nodes, dim), np.float64)  # a sheet lies in a plane when at rest
     flat[:, : rest.shape[2]] = rest[0]
-    return build(typed(pos, types[0, :, 0], TYPES, settings, cells=cells[0], rest_pos=flat), facts)
+    return build(typed(pos, types[0, :, 0], TYPES, settings, cells=cells[0], rest_pos=flat, warnings=warnings), facts)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from gpe_pl.schema import MATERIALS
 REPORT_FILE = "report.json"
 PAGE_FILE = "report.md"
 MAX_LISTED = 20
-"""Repairs or refusals that are printed; the JSON file has all of them."""
+"""Warnings, repairs or refusals that are printed; the JSON file has all of them."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,8 @@ class Report:
         mean_acceleration: of the train split, per axis [m/s²]: what falls freely shows its gravity here.
         step_in_spacings: the farthest that a node moves in a frame.
         notes: what was assumed or left out, for the whole data set.
-        warnings: what looks wrong, and what to do.
+        warnings: what looks wrong, and what to do; about the whole data set first, then by trajectory.
+        origin: where the origin of stored positions lies in the source's coordinates [m].
         repairs, refusals: by trajectory.
     """
 
@@ -87,6 +89,7 @@ class Report:
     step_in_spacings: float = 0.0
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+    origin: list[float] = field(default_factory=list)
     repairs: list[Event] = field(default_factory=list)
     refusals: list[Event] = field(default_factory=list)
 
@@ -155,12 +158,12 @@ class Report:
         return rows
 
     def _lists(self) -> list[tuple[str, list[str]]]:
-        def first(events: list[Event]) -> list[str]:
+        def first(events: Sequence[Event | str]) -> list[str]:
             more = len(events) - MAX_LISTED
-            return [str(e) for e in events[:MAX_LISTED]] + ([f"… and {more} more in {REPORT_FILE}"] if more > 0 else [])
+            return [printable(str(e)) for e in events[:MAX_LISTED]] + ([f"… and {more} more in {REPORT_FILE}"] if more > 0 else [])
 
         return [
-            ("Warnings", [printable(text) for text in self.warnings]),
+            ("Warnings", first(self.warnings)),
             ("Assumed or left out", [printable(text) for text in self.notes]),
             ("Repaired", first(self.repairs)),
             ("Refused", first(self.refusals)),

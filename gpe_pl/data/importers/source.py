@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -144,11 +145,12 @@ class Repair:
 
 @dataclass(frozen=True)
 class Loaded:
-    """A trajectory with what was changed in it, and what was assumed about the whole data set."""
+    """A trajectory with what was changed in it, what was assumed about the whole data set, and what looks wrong about the trajectory."""
 
     trajectory: Trajectory
     repairs: tuple[Repair, ...] = ()
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -161,10 +163,11 @@ class Item:
 
 @dataclass(frozen=True)
 class Source:
-    """A data set in a public format: what is known about it, and the trajectories of each split that it has."""
+    """A data set in a public format: what is known about it, the trajectories of each split that it has, and what looks wrong about all of it."""
 
     facts: Facts
     splits: Mapping[str, Sequence[Item]]
+    warnings: tuple[str, ...] = ()
 
 
 # --- what several formats share ------------------------------------------------------------------------------------------------------------
@@ -195,20 +198,21 @@ class Nodes:
     friction: float = ASSUMED_FRICTION
     repairs: list[Repair] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
 
 
 def build(nodes: Nodes, facts: Facts) -> Loaded:
     """The trajectory of a source's arrays, with boundary nodes apart, and parameters and normals assumed where the source has none.
 
     Raises:
-        Refusal: there are only boundary nodes.
+        Refusal: there are only boundary nodes, or the facts have other axes.
         ArrayError: see ``Trajectory.from_numpy``.
     """
     if facts.frame_dt is None:
         raise ImportFailure("frame_dt: the source does not say how much time passes between frames; pass frame_dt=… [s]")
     for name, axes in (("bounds", facts.bounds), ("periodic", facts.periodic)):
         if axes is not None and len(axes) != nodes.pos.shape[2]:
-            raise ImportFailure(f"{name} = {axes}: has {len(axes)} axes, the data have {nodes.pos.shape[2]}")
+            raise Refusal(f"{name} = {axes}: has {len(axes)} axes, the data have {nodes.pos.shape[2]}")
     numbers("pos", nodes.pos, {"frame": None, "node": None, "dim": None})
     moving = np.flatnonzero(nodes.kind != BOUNDARY)
     if not len(moving):
@@ -247,6 +251,7 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
         ),
         (*repairs, *wall_repairs),
         (*notes, *wall_notes),
+        tuple(nodes.warnings),
     )
 
 
@@ -402,6 +407,27 @@ def bounds_in(values: Mapping[str, Any], path: Path) -> tuple[tuple[float, float
     if array.shape not in ((2, 2), (3, 2)) or not np.isfinite(array).all() or (array[:, 0] >= array[:, 1]).any():
         raise ImportFailure(f"{path}: bounds = {rows!r}, expected [low, high] of 2 or 3 axes")
     return tuple((float(low), float(high)) for low, high in array)
+
+
+def length_warning(num_frames: int, key: str, length: int | None) -> list[str]:
+    """What to say of a trajectory whose frames are neither as many as the source's description says nor one more, which is how some formats count."""
+    if length is None or num_frames in (length, length + 1):
+        return []
+    return [f"has {num_frames} frames, which were taken; {key} = {length} stands for {length} or {length + 1}"]
+
+
+def count_in(values: Mapping[str, Any], key: str, path: Path) -> int | None:
+    """A number of things in a JSON object, None where it is not said; raises ``ImportFailure``."""
+    value = values.get(key)
+    if value is not None and (type(value) is not int or value < 0):
+        raise ImportFailure(f"{path}: {key} = {value!r}, expected an integer")
+    return value
+
+
+def natural(name: str) -> tuple[Any, ...]:
+    """Sorting key by which ``traj2`` comes before ``traj10``."""
+    parts = re.split(r"([0-9]+)", name)  # text and digits in turn; digits compare by length first, however many there are
+    return tuple((len(digits := part.lstrip("0")), digits) if k % 2 else part for k, part in enumerate(parts)), name
 
 
 def split_files(path: Path, endings: Sequence[str]) -> dict[str, Path]:

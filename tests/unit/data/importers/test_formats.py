@@ -6,11 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
 from gpe_pl.data.importers import ImportSettings, Report, import_dataset
+from gpe_pl.data.importers.source import natural
 from gpe_pl.data.validate import validate
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.store import iter_trajectories
@@ -96,8 +98,6 @@ def test_gns_archives(tmp_path: Path, particles: list[tuple[np.ndarray, np.ndarr
 
 
 def test_gns_hdf5_and_its_friction(tmp_path: Path) -> None:
-    import h5py
-
     angles = (20.0, 30.0, 40.0)
     sources.gns_metadata(tmp_path / "raw", motion())
     for k, name in enumerate(SPLITS):
@@ -352,6 +352,43 @@ def test_dmcf_in_parts(tmp_path: Path) -> None:
         np.testing.assert_allclose(trajectory.material_params, 0.01, rtol=1e-6)
         assert trajectory.metadata.gravity == pytest.approx((0.0, -5.0 if k == 0 else -9.81, 0.0))
     assert not any("velocities say" in w for w in report.warnings)
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+def test_parts_are_joined_by_number(tmp_path: Path, numbered: bool) -> None:
+    """16 of them: as text, 10 comes before 2."""
+    scenes = [motion(num_frames=32, dim=3, seed=k) for k in range(12)]
+    for k, pos in enumerate(scenes):
+        vel = np.gradient(pos, 0.02, axis=0)
+        for part in range(16):
+            frames = sources.dmcf_frames(pos[2 * part : 2 * part + 2], vel[2 * part : 2 * part + 2], 2 * part)
+            for frame in frames if not numbered else []:
+                del frame["frame_id"]
+            sources.dmcf(tmp_path / "raw" / f"sim_{k}_{part}.msgpack.zst", frames)
+    report, stored = imported(tmp_path, tmp_path / "raw", "dmcf", holdout=0.0)
+    for trajectory, pos in zip(stored["train"], scenes, strict=True):
+        np.testing.assert_array_equal(trajectory.pos, pos)
+    assert not report.refusals
+
+
+def test_trajectories_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for folder in ("arrays", "groups"):
+        (tmp_path / folder).mkdir()
+    sources.gns_metadata(tmp_path / "groups", motion())
+    with h5py.File(tmp_path / "groups" / "train.h5", "w") as file:
+        for k in range(12):
+            file[f"traj{k}/positions"], file[f"traj{k}/particle_type"] = motion(seed=k), np.full(20, 6)
+            np.savez(tmp_path / "arrays" / f"{k}.npz", pos=motion(seed=k), frame_dt=DT, materials="sand", params_sand=30.0)
+    for source, format in (("arrays", "arrays"), ("groups", "gns")):
+        _, stored = imported(tmp_path / f"{source}_out", tmp_path / source, format, holdout=0.0)
+        for k, trajectory in enumerate(stored["train"]):
+            np.testing.assert_array_equal(trajectory.pos, motion(seed=k))
+
+
+def test_natural_order() -> None:
+    names = ["10", "9", "a", "a2b10", "a2b9", "traj1", "traj01", f"traj{'9' * 5000}", "traj10", "²", ""]
+    ordered = sorted(names, key=natural)
+    assert ordered == ["", "9", "10", "a", "a2b9", "a2b10", "traj01", "traj1", "traj10", f"traj{'9' * 5000}", "²"]
 
 
 def test_a_wrong_frame_dt_is_noticed(tmp_path: Path) -> None:
