@@ -429,7 +429,11 @@ def test_the_canyon(tmp_path: Path) -> None:
     np.testing.assert_allclose(trajectory.material_params, 0.01, rtol=1e-6)
     assert report.spacing == pytest.approx(0.05, rel=1e-3)  # the cube of which is the mass of water
     assert report.frame_dt == 0.02
-    assert report.warnings == ["there is no split val and no split test; fit needs train, val and test"]
+    assert report.warnings[0] == "there is no split val and no split test; fit needs train, val and test"
+    assert report.warnings[1].startswith(
+        "train, canyon, frame 12: node 130 moves by 0.1146 m in one frame, farther than"
+    )  # water that falls fast
+    assert len(report.warnings) == 2
     falling = trajectory.pos[:6].mean(axis=1)
     np.testing.assert_allclose(np.diff(falling, 2, axis=0)[:, 1] / 0.02**2, -9.81, rtol=0.03)  # so the time step is right
 
