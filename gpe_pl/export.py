@@ -55,8 +55,8 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     they are known, ``displacement`` from rest [m], ``error`` (distance from the ground truth [m]), and ``stress`` and ``von_mises`` [Pa]; cells carry the
     last two as well, NaN on particles. ``boundary.vtu`` has the boundary nodes with ``normal``, ``friction`` and ``restitution``.
 
-    In a periodic domain a mesh is drawn where its first node is, so that its cells stay whole at the seam (all but one ring of those of a mesh that reaches
-    around the domain), and ``displacement`` follows the way that nodes have gone.
+    In a periodic domain a mesh is drawn where its first node is, so that its cells stay whole at the seam, unless it reaches around the domain;
+    ``displacement`` follows the way that nodes have gone.
 
     Args:
         path: ends in ``.pvd``.
