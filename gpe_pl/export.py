@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gpe_pl.atomic import replace_text, replacing
+from gpe_pl.graphs.islands import unwrapped
+from gpe_pl.graphs.multiscale import cell_edges
 from gpe_pl.metrics import displacement
 from gpe_pl.store import stored_arrays, stored_attributes
 from gpe_pl.trajectory import Trajectory, von_mises
@@ -54,6 +56,9 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     last two as well, NaN on particles. Boundary nodes that move are points like others; ``boundary.vtu`` has the rest, with ``normal``, ``friction`` and
     ``restitution``.
 
+    In a periodic domain a mesh is drawn where its first node is, so that its cells stay whole at the seam, unless it reaches around the domain;
+    ``displacement`` follows the way that nodes have gone.
+
     Args:
         path: ends in ``.pvd``.
         trajectory: a ground truth or a prediction.
@@ -77,11 +82,16 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     folder = path.with_suffix("")
     folder.mkdir(parents=True, exist_ok=True)
     cells, types, is_vertex = _cells(trajectory)
+    edges = cell_edges(cells[0].astype(np.int64), trajectory.num_nodes)
+    moved = _displacements(trajectory, edges)
     entries = []
     for frame in range(0, trajectory.num_frames, stride):
         name = f"frame_{frame:05d}.vtu"
         points, in_cells = _point_data(trajectory, frame, ground_truth), _cell_data(trajectory, frame, int(is_vertex.sum()))
-        replace_text(folder / name, _grid(trajectory.pos[frame], cells, types, points, in_cells))
+        if moved is not None:
+            points["displacement"] = _in_3d(moved[frame])
+        pos, _ = unwrapped(trajectory.pos[frame].astype(np.float64), edges, trajectory.metadata.periodicity)
+        replace_text(folder / name, _grid(pos.astype(trajectory.pos.dtype), cells, types, points, in_cells))
         time = frame * trajectory.metadata.frame_dt
         entries.append(f'<DataSet timestep="{time:.9g}" part="0" file={quoteattr(f"{folder.name}/{name}")}/>')
     boundary = trajectory.boundary
@@ -103,6 +113,18 @@ def _cells(trajectory: Trajectory) -> tuple[list[np.ndarray], np.ndarray, np.nda
     return [mesh, loose], types, is_vertex
 
 
+def _displacements(trajectory: Trajectory, edges: np.ndarray) -> np.ndarray | None:
+    """From rest [frame, node, dim] in m; in a periodic domain the sum of the shortest ways from frame to frame, with one start for all nodes of a mesh."""
+    if trajectory.rest_pos is None:
+        return None
+    where = trajectory.metadata.periodicity
+    moved = trajectory.pos.astype(np.float64) - trajectory.rest_pos
+    moved[0] = unwrapped(where.shortest(moved[0]), edges, where)[0]
+    for axis in where.axes:
+        moved[..., axis] = np.unwrap(moved[..., axis], axis=0, period=where.period[axis])
+    return moved.astype(trajectory.pos.dtype)
+
+
 def _point_data(trajectory: Trajectory, frame: int, ground_truth: Trajectory | None) -> dict[str, np.ndarray]:
     data = {
         "velocity": _in_3d(trajectory.vel[frame]),
@@ -110,8 +132,6 @@ def _point_data(trajectory: Trajectory, frame: int, ground_truth: Trajectory | N
         "mass": trajectory.mass,
         **{name: trajectory.material_params[:, k] for k, name in enumerate(trajectory.metadata.param_names)},
     }
-    if trajectory.rest_pos is not None:
-        data["displacement"] = _in_3d(trajectory.pos[frame] - trajectory.rest_pos)
     if ground_truth is not None:
         data["error"] = np.linalg.norm(displacement(trajectory.pos[frame], ground_truth.pos[frame], trajectory.metadata), axis=-1)
     if trajectory.stress is not None:

@@ -29,7 +29,6 @@ from hydra.core.utils import JobReturn, JobStatus, setup_globals
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
-from rich.console import Console
 
 from gpe_pl.errors import GpeError
 
@@ -135,6 +134,8 @@ class CommandLauncher(Launcher):
         Raises:
             UsageError: a run's configuration is wrong; the rest are not run.
         """
+        from rich.console import Console
+
         setup_globals()
         jobs = [self._job(initial_job_idx + k, overrides) for k, overrides in enumerate(job_overrides)]
         module = sys.modules["__main__"].__spec__

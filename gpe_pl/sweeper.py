@@ -7,6 +7,7 @@ interrupted first. Any launcher runs its trials.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,14 +32,14 @@ class OptunaSweeper(Sweeper):
     """Tries values that a tree-structured Parzen estimator proposes [Bergstra et al. 2011], in batches.
 
     Args:
-        num_trials: in all, those that failed and those of earlier starts included.
+        num_trials: in all, those that failed or returned no finite number and those of earlier starts included.
         num_at_once: trials that are proposed together, to run side by side.
         seed: of the proposals.
         params: values by key, in Hydra's syntax: ``interval(1e-4, 1e-2)``, ``tag(log, interval(1e-4, 1e-2))``, ``int(interval(1, 8))``, ``choice(a, b)`` or
             ``a,b``, ``range(1, 5)``; a key given on the command line takes the place of the one here.
 
     Raises:
-        SweepError: all trials failed.
+        SweepError: no trial returned a finite number.
     """
 
     def __init__(self, num_trials: int = 20, num_at_once: int = 1, seed: int = 0, params: Mapping[str, Any] | None = None) -> None:
@@ -70,17 +71,19 @@ class OptunaSweeper(Sweeper):
         for left_over in study.get_trials(states=[State.RUNNING]):  # of a sweep that was killed: their folders know how far they are
             study.enqueue_trial(left_over.params)
             study.tell(left_over.number, state=State.FAIL)
-        error = "no trial has succeeded"
+        error = "no trial has returned a finite number"
         while (left := self.num_trials - len(study.get_trials(states=[State.COMPLETE, State.PRUNED]))) > 0:
             study.sampler = optuna.samplers.TPESampler(seed=self.seed + len(study.trials))
             trials = [study.ask(space) for _ in range(min(left, self.num_at_once))]
             overrides = [[*fixed, *(f"{key}={_text(value)}" for key, value in trial.params.items())] for trial in trials]
             for trial, outcome in zip(trials, self.launcher.launch(overrides, initial_job_idx=trials[0].number), strict=True):
-                if outcome.status is JobStatus.COMPLETED:
-                    study.tell(trial, float(outcome.return_value))
-                else:
-                    error = str(outcome._return_value)
-                    study.tell(trial, state=State.PRUNED)  # which the estimator avoids
+                value = outcome._return_value
+                if outcome.status is JobStatus.COMPLETED and value is not None and math.isfinite(value):
+                    study.tell(trial, float(value))
+                    continue
+                if outcome.status is JobStatus.FAILED:
+                    error = str(value)
+                study.tell(trial, state=State.PRUNED)  # which the estimator avoids; Optuna would ask again for one that is not a number
         if not study.get_trials(states=[State.COMPLETE]):
             raise SweepError(error)
         best = study.best_trial

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,9 +22,15 @@ settings.load_profile("fast")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--all-extras", action="store_true", help="a test that lacks a package fails, instead of being skipped")
     parser.addoption(
         "--physics-page", metavar="FILE", help="write every measured value of tests/physics to FILE (Markdown) and beside it as CSV"
     )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--all-extras"):
+        pytest.importorskip = lambda name, *_, **__: importlib.import_module(name)  # type: ignore[assignment]
 
 
 def make_trajectory(seed: int = 0, num_frames: int = 6, num_nodes: int = 12, **metadata: object) -> Trajectory:

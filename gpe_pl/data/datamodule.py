@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import lightning as L
 import numpy as np
@@ -14,7 +13,7 @@ from torch.utils.data import DataLoader
 from torch_geometric.data import HeteroData
 
 from gpe_pl import ranks
-from gpe_pl.data.dataset import WindowDataset, collated, open_split
+from gpe_pl.data.dataset import HeldGraphs, WindowDataset, collated, open_split
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling, probabilities
 from gpe_pl.data.statistics import is_intact
@@ -22,6 +21,9 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.store import StoreError, iter_trajectories
 from gpe_pl.trajectory import Trajectory
+
+NUM_VAL_GRAPHS = 8
+"""In a validation batch, where no number of nodes limits it. The error is a quotient of sums over all nodes, whatever the batches."""
 
 
 def data_statistics(root: Path | str) -> dict[str, float]:
@@ -43,7 +45,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         root: folder of the data set.
         graph: how states become graphs.
         noise: on training inputs.
-        batch_size: samples per step, all ranks together.
+        batch_size: samples per step, all ranks together; its nodes are also the most in a batch of validation windows.
         seed: of order and noise.
         num_workers: processes that build graphs; 0 builds them in the training process.
         num_val_windows: windows of the one-step validation loss, evenly spread over the ``val`` split.
@@ -106,8 +108,10 @@ class TrajectoryDataModule(L.LightningDataModule):
         windows = [int(w) for w in _spread(len(self.val_set), self.num_val_windows)]
         if len(windows) < ranks.num_ranks():
             raise StoreError(f"{self.root}: split 'val' has {len(windows)} windows, too few for {ranks.num_ranks()} processes")
-        graphs: Any = [self.val_set[w] for w in windows[ranks.rank() :: ranks.num_ranks()]]  # built once; a list will do as a data set
-        return DataLoader(graphs, batch_size=8, collate_fn=collated)
+        max_nodes = self.batch_size.max_nodes
+        size = BatchSize(NUM_VAL_GRAPHS, None if max_nodes is None else max(1, max_nodes // ranks.num_ranks()))
+        batches = size.once(self.val_set, windows[ranks.rank() :: ranks.num_ranks()])
+        return DataLoader(HeldGraphs(self.val_set), batch_sampler=batches, collate_fn=collated)
 
 
 def _spread(length: int, count: int) -> np.ndarray:

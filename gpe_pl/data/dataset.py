@@ -36,7 +36,7 @@ Key = int | tuple[int, int] | StartKey
 """A window's number; or sample number and window; or a start."""
 
 CACHE_BYTES = 2 * 1024**3
-"""Splits smaller than this are held in memory; larger ones are read from disk window by window."""
+"""Splits smaller than this are held in memory; larger ones are read from disk window by window. Graphs that are needed again are held up to as much."""
 
 
 @dataclass(frozen=True)
@@ -262,3 +262,26 @@ class WindowDataset(Dataset[HeteroData | Start]):
             return Start(state, torch.from_numpy(truth[history:]), stress, correction, about, sample, start.lane)
         target = integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity
         return training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[-1], about)
+
+
+class HeldGraphs(Dataset[HeteroData]):
+    """Windows of a data set as graphs that are built when they are first asked for.
+
+    Args:
+        windows: their data set.
+        cache_bytes: of the graphs that are held in memory; those that come when it is used up are built every time.
+    """
+
+    def __init__(self, windows: WindowDataset, cache_bytes: int = CACHE_BYTES) -> None:
+        self.windows, self.free_bytes = windows, cache_bytes
+        self.held: dict[int, HeteroData] = {}
+
+    def __getitem__(self, window: int) -> HeteroData:
+        if window in self.held:
+            return self.held[window]
+        graph = self.windows[window]
+        size = sum(value.nbytes for store in graph.stores for value in store.values() if isinstance(value, Tensor))
+        if size <= self.free_bytes:
+            self.free_bytes -= size
+            self.held[window] = graph
+        return graph

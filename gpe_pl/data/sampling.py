@@ -115,6 +115,12 @@ class BatchSize:
                 self._packed(data, iter(StepSampler(len(data), seed, probability=data.probability)), self.max_nodes), step, None
             )
 
+    def once(self, data: WindowDataset, windows: list[int]) -> list[list[int]]:
+        """Batches that take each of these windows once, in their order."""
+        if self.max_nodes is None:
+            return [windows[k : k + self.num_graphs] for k in range(0, len(windows), self.num_graphs)]
+        return [[window for _, window in batch] for batch in self._packed(data, enumerate(windows), self.max_nodes)]
+
     @staticmethod
     def _packed(data: WindowDataset, samples: Iterator[tuple[int, int]], max_nodes: int) -> Iterator[list[tuple[int, int]]]:
         batch, total = [next(samples)], 0
@@ -124,6 +130,7 @@ class BatchSize:
                 yield batch
                 batch, total = [], 0
             batch.append(sample)
+        yield batch
 
 
 class BatchSampler(Sampler[list[Key]]):

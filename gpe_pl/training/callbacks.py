@@ -56,7 +56,7 @@ class RolloutValidation(Callback):
         simulator.eval()
         value = self._mse(simulator)
         simulator.train(was_training)
-        pl_module.log("val/rollout_mse", value)
+        pl_module.log("val/rollout_mse", value, sync_dist=True)  # of all ranks already; Lightning advises it if not told
 
     def _mse(self, simulator: LearnedSimulator) -> float:
         history = simulator.builder.config.history

@@ -224,7 +224,7 @@ class TrainingModule(L.LightningModule):
             self.val_nmse.update(value, self._normalized(batch[material].target))
 
     def on_validation_epoch_end(self) -> None:
-        self.log("val/one_step_nmse", self.val_nmse.compute())
+        self.log("val/one_step_nmse", self.val_nmse.compute(), sync_dist=True)  # of all ranks already; Lightning advises it if not told
         self.val_nmse.reset()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

@@ -9,8 +9,11 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from tests.conftest import pytest_configure
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -61,12 +64,12 @@ def test_data_can_be_read_and_made_without_torch() -> None:
     assert {"torch", "torch_geometric", "lightning", "hydra", "matplotlib", "wandb"} & loaded_by(*without, *solvers) == set()
 
 
-HEAVY = {"torch", "torch_geometric", "lightning", "torchmetrics", "numba", "scipy", "h5py", "matplotlib", "pandas", "wandb"}
+HEAVY = {"torch", "torch_geometric", "lightning", "torchmetrics", "numba", "scipy", "h5py", "matplotlib", "pandas", "rich", "wandb"}
 
 
 @pytest.mark.parametrize("command", ["fit", "evaluate"])
 def test_help_of_a_command_loads_nothing_heavy(command: str) -> None:
-    """Which is why it comes within a second."""
+    """So that it takes what Hydra takes to compose a configuration, about a second, and no more."""
     child = subprocess.run(
         [sys.executable, "-X", "importtime", "-m", f"gpe_pl.{command}", "--help"], capture_output=True, text=True, cwd=ROOT
     )
@@ -132,6 +135,20 @@ def test_no_optional_dependency_at_module_level(path: Path) -> None:
     allowed = {IMPORT_NAMES.get(name, name) for name in required} | set(sys.stdlib_module_names) | {"gpe_pl"}
     used = {PARTS_OF_OTHERS.get(name, name) for name in top_level_imports(ast.parse(path.read_text()))}
     assert used <= allowed, f"{dotted(path)} imports {sorted(used - allowed)}, which pyproject.toml does not require"
+
+
+def test_ci_skips_nothing_for_a_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    extras = PROJECT["optional-dependencies"]
+    assert f"gpe_pl[{','.join(sorted(set(extras) - {'dev', 'docs', 'notebooks'}))}]" in extras["dev"]
+    for file in (".ci/run", ".github/workflows/ci.yml"):
+        assert re.search(r"PYTEST_ADDOPTS\W.*--all-extras", (ROOT / file).read_text())
+    own = Path(__file__)
+    assert not [p for p in (ROOT / "tests").rglob("*.py") if p != own and "find_spec" in p.read_text()], "skip by pytest.importorskip"
+    monkeypatch.setattr(pytest, "importorskip", pytest.importorskip)  # restored afterwards
+    pytest_configure(SimpleNamespace(getoption=lambda name: name == "--all-extras"))  # type: ignore[arg-type]
+    assert pytest.importorskip("json") is json
+    with pytest.raises(ModuleNotFoundError):
+        pytest.importorskip("no_such_package", reason="not installed")
 
 
 @pytest.mark.parametrize("path", MODULES, ids=dotted)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -54,14 +53,13 @@ def test_a_wrong_configuration_is_said_once(tiny_data: Path, tmp_path: Path) -> 
     assert "training.learning_rate=-1" in result.stderr and "greater than 0" in result.stderr
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("launcher", "settings"), [("processes", []), ("slurm", ["hydra.launcher.cluster=local"]), ("ray", ["hydra.launcher.num_cpus=1"])]
 )
 def test_parts_of_a_data_set_are_generated_by_any_launcher(tiny_data: Path, tmp_path: Path, launcher: str, settings: list[str]) -> None:
-    module = {"slurm": "submitit"}.get(launcher, launcher)
-    if launcher != "processes" and importlib.util.find_spec(module) is None:
-        pytest.skip(f"{module} is not installed")
+    if launcher != "processes":
+        pytest.importorskip({"slurm": "submitit"}.get(launcher, launcher))
     shards = "++data.sizes.tiny.trajectories_per_shard=1"
     command = [
         sys.executable,
@@ -80,7 +78,9 @@ def test_parts_of_a_data_set_are_generated_by_any_launcher(tiny_data: Path, tmp_
     assert "2/2 done" in result.stdout
     folder, whole = tmp_path / "sand" / "tiny", tiny_data / "sand" / "tiny"
     found, expected = (json.loads((f / "statistics.json").read_text()) for f in (folder, whole))
-    del found["sha256"], expected["sha256"]  # sums over other shards round otherwise
+    for values in (found, expected):
+        del values["sha256"]  # sums over other shards round otherwise
+        values |= values.pop("material_params")["friction_angle"]
     assert found == pytest.approx(expected)
     assert sorted(p.name for p in (folder / "train").glob("*.h5")) == ["shard-00000.h5", "shard-00001.h5"]
     for split in ("train", "val", "test", "test_unseen"):
@@ -105,13 +105,14 @@ def test_optuna_searches_with_any_launcher(tiny_data: Path, tmp_path: Path) -> N
     assert again.returncode == 0 and "runs," not in again.stdout  # nothing is left to try
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_command_with_two_devices_starts_two_processes(tiny_data: Path, tmp_path: Path) -> None:
     steps = ["training.num_steps=4", "training.val_interval=2", "training.warmup_steps=1"]
     command = [sys.executable, "-m", "gpe_pl.fit", *DATA, *RUN, *steps, f"paths.data={tiny_data}", f"paths.runs={tmp_path}"]
     for name, devices in (("one", 1), ("two", 2)):
         result = subprocess.run([*command, f"name={name}", f"trainer.devices={devices}"], capture_output=True, text=True, timeout=500)
         assert result.returncode == 0, result.stdout + result.stderr
+        assert "sync_dist" not in result.stderr  # advice that is not for users
     values = {
         n: {(r.trajectory, r.metric, r.horizon, r.split): r.value for r in read_rows(tmp_path / n / "metrics.csv")} for n in ("one", "two")
     }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -75,8 +74,8 @@ def test_a_sweep_over_parts_and_data_sets(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs hydra-ray-launcher")
 def test_a_sweep_on_ray(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
     done = simulate(tmp_path, "-m", "data=sand,fem", "hydra/launcher=ray")
     assert done.returncode == 0, done.stderr
     for name in ("sand", "fem"):

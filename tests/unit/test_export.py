@@ -13,7 +13,7 @@ from gpe_pl.export import write_npz, write_vtk
 from gpe_pl.schema import FIELDS, node_code
 from gpe_pl.store import stored_arrays
 from gpe_pl.trajectory import Metadata, Stress, Trajectory
-from tests.unit.viz.conftest import falling, falling_mesh
+from tests.unit.viz.conftest import block, falling, falling_mesh
 
 meshio = pytest.importorskip("meshio", reason="meshio, another reader of VTK files, is not installed")
 
@@ -74,6 +74,24 @@ def test_meshes_come_back_with_their_stress(tmp_path: Path, dim: int) -> None:
         np.testing.assert_array_equal(found, expected)
     np.testing.assert_allclose(grid.cell_data["von_mises"][0], mesh.stress.cell_von_mises[3])
     assert np.isnan(grid.cell_data["von_mises"][1]).all()
+
+
+@pytest.mark.parametrize("turns", [0.5, 1.7])
+def test_a_mesh_stays_whole_at_the_seam_and_its_displacement_goes_on(tmp_path: Path, turns: float) -> None:
+    corners, cells = block(2)
+    way = np.linspace(0, turns, 20)[:, None, None] * np.array([1.0, 0.0]) * np.ones((9, 1))
+    way[1:, :, 0] += 0.04 * (-1.0) ** np.arange(9)  # so that some nodes are more than half a period from rest, and others less
+    start = 0.4 + 0.2 * corners
+    mesh = Trajectory.from_numpy(
+        start + way, 0.01, "elastomer", {"elastomer": 1e5}, bounds=[(0, 1), (0, 1)], periodic=[True, False], cells=cells
+    )
+    for first in (0, 18):  # a rollout may start late
+        write_vtk(tmp_path / "a.pvd", mesh.frames(first, mesh.num_frames), stride=2)
+        for frame, (_, grid) in zip(range(first, mesh.num_frames, 2), series(tmp_path / "a.pvd"), strict=True):
+            assert np.ptp(grid.points[grid.cells[0].data], axis=1).max() < 0.2
+            np.testing.assert_allclose(grid.points[:, 0] % 1, mesh.pos[frame, :, 0] % 1, atol=1e-6)
+            moved = way[frame] - np.round(way[first, 0])  # turns before the first frame are not known
+            np.testing.assert_allclose(grid.point_data["displacement"][:, :2], moved, atol=1e-6)
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -57,9 +56,8 @@ LAUNCHERS = {
 
 @pytest.mark.parametrize("name", ["processes", pytest.param("slurm", marks=pytest.mark.slow), pytest.param("ray", marks=pytest.mark.slow)])
 def test_a_job_is_its_command_wherever_it_runs(folder: Path, name: str) -> None:
-    module = {"slurm": "submitit"}.get(name, name)
-    if name != "processes" and importlib.util.find_spec(module) is None:
-        pytest.skip(f"{module} is not installed")
+    if name != "processes":
+        pytest.importorskip({"slurm": "submitit"}.get(name, name))
     found = outcomes(LAUNCHERS[name](), folder, "2", "bad", "wrong", "3")
     assert {k: found[k] for k in ("2", "3")} == {"2": 4.0, "3": 9.0}
     log = folder / "sweep" / "x=bad" / "output.log"
@@ -137,6 +135,6 @@ def test_a_cluster_that_cannot_be_reached_is_named(folder: Path, monkeypatch: py
 def test_wrong_settings_are_named(folder: Path) -> None:
     with pytest.raises(ValueError, match="hydra.launcher.cluster='pbs': must be slurm, local or debug"):
         SlurmLauncher("pbs")
-    if importlib.util.find_spec("submitit") is not None:
-        with pytest.raises(UsageError, match="hydra.launcher.parameters: .*hours"):
-            outcomes(SlurmLauncher("debug", {"hours": 3}), folder, "1")
+    pytest.importorskip("submitit")
+    with pytest.raises(UsageError, match="hydra.launcher.parameters: .*hours"):
+        outcomes(SlurmLauncher("debug", {"hours": 3}), folder, "1")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,10 +21,10 @@ SPACE = {"rate": "tag(log, interval(1e-4, 1e-2))", "model": "gpe,gns", "depth": 
 
 
 class Launcher:
-    """Jobs that return a formula of their overrides; the n-th may be killed, and some models fail."""
+    """Jobs that return a formula of their overrides; the n-th may be killed, and some models fail or return another value."""
 
-    def __init__(self, killed_at: int | None = None, failing: str = "") -> None:
-        self.killed_at, self.failing = killed_at, failing
+    def __init__(self, killed_at: int | None = None, failing: str = "", other: dict[str, float | None] | None = None) -> None:
+        self.killed_at, self.failing, self.other = killed_at, failing, other or {}
         self.jobs: list[list[str]] = []
         self.sizes: list[int] = []
 
@@ -32,6 +33,7 @@ class Launcher:
         returns = []
         for job in overrides:
             self.jobs.append(list(job))
+            assert len(self.jobs) <= 8, "the sweep does not end"
             if len(self.jobs) - 1 == self.killed_at:
                 raise KeyboardInterrupt
             values = dict(o.split("=", 1) for o in job)
@@ -39,7 +41,8 @@ class Launcher:
                 returns.append(JobReturn(job, status=JobStatus.FAILED, _return_value=SweepError("no")))
             else:
                 loss = abs(float(values["rate"]) - 3e-3) + int(values["depth"]) + (values["model"] == "gns")
-                returns.append(JobReturn(job, status=JobStatus.COMPLETED, _return_value=loss))
+                value = self.other.get(values["model"], loss)
+                returns.append(JobReturn(job, status=JobStatus.COMPLETED, _return_value=value))
         return returns
 
 
@@ -92,6 +95,17 @@ def test_failed_trials_are_left_out_and_a_sweep_of_nothing_else_ends(tmp_path: P
     assert len(launcher.jobs) == 8
     with pytest.raises(SweepError, match="no"):
         sweeper(tmp_path / "other", Launcher(failing="gns")).sweep(["model=gns"])
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, None])
+def test_trials_without_a_finite_value_count_and_are_left_out(tmp_path: Path, value: float | None) -> None:
+    launcher = Launcher(other={"gns": value})
+    sweeper(tmp_path, launcher, num_trials=8, num_at_once=4).sweep([])
+    best = json.loads((tmp_path / "best.json").read_text())
+    assert best["values"]["model"] == "gpe" and math.isfinite(best["value"])
+    assert len(launcher.jobs) == 8 and any("model=gns" in job for job in launcher.jobs)
+    with pytest.raises(SweepError, match="no trial has returned a finite number"):
+        sweeper(tmp_path / "other", Launcher(other={"gns": value})).sweep(["model=gns"])
 
 
 def test_wrong_settings_are_named(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from gpe_pl.data.datamodule import TrajectoryDataModule
+from gpe_pl.data.dataset import HeldGraphs, WindowDataset
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
 from gpe_pl.graphs.features import GraphConfig
@@ -64,6 +65,41 @@ def test_validation_windows_are_fixed_and_free_of_noise(root: Path) -> None:
     assert torch.equal(batch["sand"].target, clean)
     few = datamodule(root, num_val_windows=2)
     assert [b.frame.tolist() for b in few.val_dataloader()] == [[2, 4]]
+
+
+def test_validation_batches_keep_the_budget_of_nodes_and_change_no_value(root: Path) -> None:
+    plain = list(datamodule(root).val_dataloader())
+    assert [b["sand"].num_nodes for b in plain] == [36]
+    for max_nodes, sizes in ((30, [24, 12]), (24, [24, 12]), (23, [12] * 3), (5, [12] * 3)):
+        batches = list(datamodule(root, batch_size=BatchSize(2, max_nodes)).val_dataloader())
+        assert [b["sand"].num_nodes for b in batches] == sizes
+        for key in ("x", "target"):
+            assert torch.equal(torch.cat([b["sand"][key] for b in batches]), plain[0]["sand"][key])
+
+
+def test_the_nodes_of_a_validation_batch_are_shared_by_the_ranks(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gpe_pl.ranks.num_ranks", lambda: 2)
+    module = datamodule(root, batch_size=BatchSize(2, 24))
+    assert [b.frame.tolist() for b in module.val_dataloader()] == [[2], [4]]
+    monkeypatch.setattr("gpe_pl.ranks.rank", lambda: 1)
+    assert [b.frame.tolist() for b in module.val_dataloader()] == [[3]]
+
+
+def test_validation_graphs_are_built_when_asked_for_and_held_within_a_limit(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module, built = datamodule(root), []
+    read = WindowDataset.__getitem__
+    monkeypatch.setattr(WindowDataset, "__getitem__", lambda self, window: (built.append(window), read(self, window))[1])
+    loader = module.val_dataloader()
+    assert built == []
+    first, again = list(loader), list(loader)
+    assert built == [0, 1, 2] and torch.equal(first[0]["sand"].x, again[0]["sand"].x)
+    size = sum(v.nbytes for s in module.val_set[0].stores for v in s.values() if isinstance(v, torch.Tensor))
+    built.clear()
+    graphs = HeldGraphs(module.val_set, cache_bytes=size + size // 2)  # room for one of about this size
+    for _ in range(2):
+        for window in (0, 1):
+            assert torch.equal(graphs[window]["sand"].x, first[0]["sand"].x[12 * window : 12 * window + 12])
+    assert built == [0, 1, 1] and graphs.free_bytes >= 0
 
 
 def test_statistics_are_those_of_noisy_inputs(root: Path) -> None:
