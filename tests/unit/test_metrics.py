@@ -209,6 +209,8 @@ def test_share_outside_counts_particle_frames_up_to_the_horizon():
     truth, prediction = (replace(trajectory(p), boundary=walls) for p in (inside, outside))
     records = rollout_metrics(prediction, truth, (2, 3, 4))
     assert [value(records, "share_outside", h) for h in (2, 3, 4)] == pytest.approx([0, 1 / 6, 2 / 8])
+    nodes_only = replace(truth, boundary=replace(walls, shapes=()))
+    assert "share_outside" not in {r.metric for r in rollout_metrics(prediction, nodes_only, (2,))}
 
 
 # --- torchmetrics
