@@ -89,13 +89,24 @@ def save_dataset(root: Path | str, name: str, holdout: float = 0.1, **splits: It
         splits: ``train=[…]``, ``val=[…]``, ``test=[…]`` and ``test_unseen=[…]``; see ``Trajectory.from_numpy``.
 
     Raises:
-        ImportFailure: nothing to train on, or the data set exists already.
+        ImportFailure: nothing to train on, something else than trajectories, or the data set exists already.
     """
-    given = {split: list(trajectories) for split, trajectories in splits.items()}
+    given: dict[str, list[Any]] = {}
+    for split, trajectories in splits.items():
+        if isinstance(trajectories, Trajectory):
+            raise ImportFailure(f"{split}: is one trajectory; give a list of them, {split}=[…]")
+        given[split] = list(trajectories)
+        for k, item in enumerate(given[split]):
+            if not isinstance(item, Trajectory):
+                raise ImportFailure(
+                    f"{split}[{k}]: is of type {type(item).__name__}; make a trajectory of arrays with Trajectory.from_numpy"
+                )
     unknown = sorted(set(given) - {"train", "val", "test", "test_unseen"})
     if unknown or not given.get("train"):
         raise ImportFailure(
-            f"splits: {unknown[0] if unknown else 'train'} {'is none of' if unknown else 'is missing; of'} train, val, test, test_unseen"
+            f"splits: {unknown[0]} is none of train, val, test, test_unseen"
+            if unknown
+            else "train has no trajectories; they are what a model learns from"
         )
     items = {split: [_held(f"{split}[{k}]", t) for k, t in enumerate(trajectories)] for split, trajectories in given.items()}
     about = {"format": "arrays", "source": "memory", "settings": {}}
