@@ -179,14 +179,14 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
                 return hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
             except SweepError as error:
                 _fail(error)
+            except (HydraException, OmegaConfBaseException, ValueError) as error:  # some of Hydra's are an OSError too
+                if verbose or (is_composed and isinstance(error, ValueError)):
+                    raise
+                _fail(ConfigError(explain(error, config_name, sys.argv[1:])))
             except OSError as error:  # before the command itself begins: Hydra makes the folder of the results
                 if verbose:
                     raise
                 _fail(error)
-            except (HydraException, OmegaConfBaseException, ValueError) as error:
-                if verbose or (is_composed and isinstance(error, ValueError)):
-                    raise
-                _fail(ConfigError(explain(error, config_name, sys.argv[1:])))
 
         return main
 
