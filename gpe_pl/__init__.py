@@ -19,10 +19,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gpe_pl.containment import Contained as Contained
+    from gpe_pl.data.importers.assemble import save_dataset as save_dataset
     from gpe_pl.errors import GpeError as GpeError
     from gpe_pl.export import write_npz as write_npz
     from gpe_pl.export import write_vtk as write_vtk
     from gpe_pl.generation import generate_trajectory as generate_trajectory
+    from gpe_pl.geometry import domain_walls as domain_walls
     from gpe_pl.learned_simulator import LearnedSimulator as LearnedSimulator
     from gpe_pl.metrics import rollout_metrics as rollout_metrics
     from gpe_pl.portable import export_model as export_model
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from gpe_pl.simulate import dataset as dataset
     from gpe_pl.store import iter_trajectories as iter_trajectories
     from gpe_pl.store import read_trajectory as read_trajectory
+    from gpe_pl.trajectory import Boundary as Boundary
     from gpe_pl.trajectory import Metadata as Metadata
     from gpe_pl.trajectory import State as State
     from gpe_pl.trajectory import Trajectory as Trajectory
@@ -38,6 +41,7 @@ if TYPE_CHECKING:
     from gpe_pl.viz.viewer import write_viewer as write_viewer
 
 _MODULES = {
+    "Boundary": "trajectory",
     "Contained": "containment",
     "GpeError": "errors",
     "LearnedSimulator": "learned_simulator",
@@ -45,6 +49,7 @@ _MODULES = {
     "State": "trajectory",
     "Trajectory": "trajectory",
     "dataset": "simulate",
+    "domain_walls": "geometry",
     "export_model": "portable",
     "generate_trajectory": "generation",
     "iter_trajectories": "store",
@@ -52,6 +57,7 @@ _MODULES = {
     "roll_out": "rollout",
     "rollout_figure": "viz.figures",
     "rollout_metrics": "metrics",
+    "save_dataset": "data.importers.assemble",
     "write_animation": "viz.video",
     "write_npz": "export",
     "write_viewer": "viz.viewer",

@@ -30,6 +30,7 @@ from pydantic import ValidationError
 from gpe_pl import plugins
 from gpe_pl.errors import GpeError
 from gpe_pl.launcher import RESULT, USAGE_ERROR, SweepError, end_with_sweep
+from gpe_pl.pretrained import model_name
 from gpe_pl.signatures import checked, parameters
 
 WITHOUT_KEY = {"comparison", "experiment", "scene", "solver"}
@@ -45,6 +46,7 @@ def _for_model(values: Mapping[str, Any], target: str) -> Any:
 
 
 OmegaConf.register_new_resolver("for_model", _for_model, replace=True)
+OmegaConf.register_new_resolver("model_name", model_name, replace=True)  # ${model_name:checkpoint,runs}
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
 T = TypeVar("T")
@@ -177,14 +179,14 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
                 return hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
             except SweepError as error:
                 _fail(error)
+            except (HydraException, OmegaConfBaseException, ValueError) as error:  # some of Hydra's are an OSError too
+                if verbose or (is_composed and isinstance(error, ValueError)):
+                    raise
+                _fail(ConfigError(explain(error, config_name, sys.argv[1:])))
             except OSError as error:  # before the command itself begins: Hydra makes the folder of the results
                 if verbose:
                     raise
                 _fail(error)
-            except (HydraException, OmegaConfBaseException, ValueError) as error:
-                if verbose or (is_composed and isinstance(error, ValueError)):
-                    raise
-                _fail(ConfigError(explain(error, config_name, sys.argv[1:])))
 
         return main
 
@@ -281,6 +283,16 @@ class Report(Callback):
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         self._report(Path(config.hydra.sweep.dir), is_sweep=True)
 
+    def _show(self, folder: Path) -> None:
+        """The numbers of a run, and where to look next."""
+        from gpe_pl.evaluation import read_rows
+        from gpe_pl.report import summary
+
+        if (folder / "metrics.csv").exists():
+            print(summary(list(read_rows(folder / "metrics.csv"))))
+            for viewer in sorted(folder.glob("rollout_*_00.html")):
+                print(f"look at {viewer}")
+
     def _report(self, folder: Path, is_sweep: bool) -> None:
         """Ends the process on failure: Hydra turns an exception of a callback into a warning, and the command would seem to have succeeded."""
         try:
@@ -290,6 +302,7 @@ class Report(Callback):
 
             if not is_sweep:
                 report(folder)
+                self._show(folder)
             elif compares_settings(folder):
                 report_trials(folder)
             elif compares_models(folder):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from hashlib import sha256
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from gpe_pl.config import ConfigError, construct, construct_target, entry_point
+from gpe_pl.config import CONF, ConfigError, construct, construct_target, entry_point
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -19,26 +21,65 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     from gpe_pl.learned_simulator import LearnedSimulator
     from gpe_pl.pretrained import names
     from gpe_pl.report import summary
-    from gpe_pl.simulate import ensure_split, evaluated_config
+    from gpe_pl.simulate import ensure_split, evaluated_config, scene_metadata
     from gpe_pl.skips import Skips
-    from gpe_pl.training.run import TrainerSettings, set_up
+    from gpe_pl.training.run import TrainerSettings, claim, release, set_up
 
     if not isinstance(cfg.checkpoint, str):
         shipped = f", or a shipped model: {', '.join(names())}" if names() else ""
-        raise ConfigError(f"checkpoint={cfg.checkpoint!r}: name a checkpoint of a run, such as runs/sand/checkpoints/best.ckpt{shipped}")
+        raise ConfigError(f"checkpoint={cfg.checkpoint!r}: name the folder of a run, such as runs/sand, or a checkpoint{shipped}")
     settings = construct(
         EvaluationSettings, {**{k: v for k, v in cfg.evaluation.items() if k != "data"}, "splits": [cfg.split]}, "evaluation"
     )
     device = set_up(construct(TrainerSettings, cfg.trainer, "trainer"))
     simulator = LearnedSimulator.from_checkpoint(cfg.checkpoint, device)
     simulator.skips = construct(Skips, cfg.rollout, "rollout")
-    root = ensure_split(evaluated_config(cfg), cfg.split)
+    evaluated = evaluated_config(cfg)
+    scene = scene_metadata(evaluated, cfg.split)
+    if not simulator.fits(scene):
+        simulator.check_scene(scene, _own_data(simulator) or "data=… size=…")
     folder = Path(cfg.paths.runs) / cfg.name
-    rows = evaluate(simulator, root, settings, folder)
+    claim(folder, _identity(evaluated), results=["*"])
+    try:
+        rows = evaluate(simulator, ensure_split(evaluated, cfg.split), settings, folder)
+    finally:
+        release(folder)
     print(summary(rows))
     if cfg.data.get("showcase") is not None:
         _show(cfg, simulator, folder)
+    for viewer in sorted(folder.glob("rollout_*_00.html")):
+        print(f"look at {viewer}")
     print(folder)
+
+
+def _identity(cfg: DictConfig) -> dict[str, Any]:
+    """What the numbers of an evaluation depend on, and what they are about."""
+    from omegaconf import OmegaConf
+
+    from gpe_pl.pretrained import checkpoint_path
+
+    values: Any = OmegaConf.to_container(cfg, resolve=True)
+    path = checkpoint_path(cfg.checkpoint)
+    digest = sha256(path.read_bytes()).hexdigest()[:12]
+    without = {"evaluation": ("splits", "data", "num_pictures", "export"), "data": ("comparison",)}  # more pictures may be asked for later
+    parts = {part: {k: v for k, v in values[part].items() if k not in without.get(part, ())} for part in ("data", "evaluation", "rollout")}
+    return {"checkpoint": f"{path if path.stem != cfg.checkpoint else cfg.checkpoint} (sha256 {digest})", "split": cfg.split, **parts}
+
+
+def _own_data(simulator: LearnedSimulator) -> str:
+    """Overrides that choose data like those of the training; empty where none do."""
+    from gpe_pl.generation import trajectory_metadata
+    from gpe_pl.simulate import IMPORTED, dataset
+
+    own = simulator.builder.metadata
+    if own.solver.startswith("import/"):
+        return f"data={IMPORTED} data.name={own.dataset}"
+    groups = sorted(path.stem for path in (CONF / "data").glob("*.yaml") if path.stem != IMPORTED and own.dataset.startswith(path.stem))
+    for group, size, dimension in product(groups, ("tiny", "small", "paper"), ([], [f"dimension={own.dim}"])):
+        overrides = [f"data={group}", f"size={size}", *dimension]
+        if simulator.fits(trajectory_metadata(dataset(*overrides), "train", 0)):
+            return " ".join(overrides)
+    return ""
 
 
 def _show(cfg: DictConfig, simulator: LearnedSimulator, folder: Path) -> None:

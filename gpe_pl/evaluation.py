@@ -94,7 +94,8 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
 
     All rollouts start at the first frame with enough history and run to the end of the ground truth; ``simulator`` is left with
     ``settings.hold_parameters``. Share outside with containment off is reported as
-    ``share_outside_uncontained``, where it was asked for, the share of corrected particle-steps as ``share_corrected``.
+    ``share_outside_uncontained``, where it was asked for, the share of corrected particle-steps as ``share_corrected``; neither where a boundary is known by
+    its nodes only.
 
     Where ``simulator.skips`` has approximate levels, the rollout without them is evaluated beside, and what they cost is reported: ``skipping_mse`` [m²] is
     the distance between the two rollouts, ``share_asleep`` that of particle-steps that were not computed, ``lost_impulse`` [kg m/s] the momentum that
@@ -173,16 +174,15 @@ def _predict(
         for name, baseline in (("ballistic", Ballistic(dt)), ("constant_velocity", ConstantVelocity(dt))):
             predictions[name] = rollout(baseline, trajectory.state(history, history), steps, truth.metadata)
         num_steps = truth.num_nodes * max(1, prediction.num_frames - 1)
-        extra = {
-            "share_outside_at_end": _share_outside(prediction, steps, steps, tolerance=TOLERANCE),
-            "num_good_frames": float(prediction.num_frames - 1),
-            "share_corrected": totals[scene]["num_corrected"] / num_steps,
-        }
+        extra = {"num_good_frames": float(prediction.num_frames - 1)}
+        if truth.boundary.shapes:  # nodes alone have no inside
+            extra["share_outside_at_end"] = _share_outside(prediction, steps, steps, tolerance=TOLERANCE)
+            extra["share_corrected"] = totals[scene]["num_corrected"] / num_steps
+            if scene < len(free):
+                extra["share_outside_uncontained"] = _share_outside(free[scene], 1, steps, tolerance=1e-3 * spacing)
         if exact is not None:
             extra["skipping_mse"] = float(per_frame_mse(prediction, exact[scene])[1:].mean())
             extra["share_asleep"], extra["lost_impulse"] = totals[scene]["num_asleep"] / num_steps, totals[scene]["lost_impulse"]
-        if scene < len(free):
-            extra["share_outside_uncontained"] = _share_outside(free[scene], 1, steps, tolerance=1e-3 * spacing)
         yield predictions, extra
 
 

@@ -27,7 +27,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import Standardize
-from gpe_pl.pretrained import checkpoint_path
+from gpe_pl.pretrained import checkpoint_path, names
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, EdgeType, FeatureSpec, node_code, role
 from gpe_pl.signatures import checked
@@ -218,7 +218,7 @@ class LearnedSimulator(nn.Module):
             IndexError: too few frames before ``frame``.
             SceneError: another frame interval, dimension or material than in training, or a value that is not finite; names the node.
         """
-        self._check_scene(trajectory.metadata)
+        self.check_scene(trajectory.metadata)
         state = trajectory.state(frame, history=self.builder.config.history).to_torch(self.acceleration_std.device)
         return self._checked(state, f"frame {frame}")
 
@@ -228,19 +228,29 @@ class LearnedSimulator(nn.Module):
         Raises:
             SceneError: as ``initial_state``.
         """
-        self._check_scene(scene)
+        self.check_scene(scene)
         state = state.to_torch(self.acceleration_std.device)
         history = state.vel[:, None].expand(-1, self.builder.config.history, -1)
         return self._checked(replace(state, velocity_history=history.clone()), "start")
 
-    def _check_scene(self, scene: Metadata) -> None:
+    def fits(self, scene: Metadata) -> bool:
+        """Whether a scene has the frame interval, spacing, dimension and materials that the model was trained on."""
         own = self.builder.metadata
         same_scales = abs(scene.frame_dt / own.frame_dt - 1) < 1e-6 and abs(scene.spacing / own.spacing - 1) < 0.01
-        if not same_scales or scene.dim != own.dim or scene.param_names != own.param_names:
+        return same_scales and scene.dim == own.dim and scene.param_names == own.param_names
+
+    def check_scene(self, scene: Metadata, choice: str = "data=… size=…") -> None:
+        """Refuse a scene that does not fit; the message recommends a ``choice`` of the data set.
+
+        Raises:
+            SceneError: another frame interval, spacing, dimension or materials than in training.
+        """
+        own = self.builder.metadata
+        if not self.fits(scene):
             raise SceneError(
                 f"the model was trained with frame_dt={own.frame_dt:g} s and spacing={own.spacing:g} m in {own.dim}D on {', '.join(own.materials)}; "
                 f"the scene has frame_dt={scene.frame_dt:g} s and spacing={scene.spacing:g} m in {scene.dim}D and "
-                f"{', '.join(scene.materials)}; choose the data set with data=… size=…"
+                f"{', '.join(scene.materials)}; choose the data set with {choice}"
             )
 
     def _checked(self, state: State, where: str) -> State:
@@ -365,7 +375,7 @@ class LearnedSimulator(nn.Module):
         """Load a training checkpoint (averaged weights if the run averaged them), in evaluation mode. Only tensors and plain values are unpickled.
 
         Args:
-            path: of the file; or the name of a model that comes with the package.
+            path: of the file; or a run's folder, of which the best checkpoint is taken; or the name of a model that comes with the package.
             device: where to.
 
         Raises:
@@ -390,7 +400,8 @@ def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:
         CheckpointError: no such file, damaged, or with anything else in it.
     """
     if not Path(path).is_file():
-        raise CheckpointError(f"{path}: no such checkpoint")
+        shipped = f", or a model that comes with the package: {', '.join(names())}" if names() else ""
+        raise CheckpointError(f"{path}: no such checkpoint; give the folder of a run, the path of a checkpoint{shipped}")
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
@@ -398,7 +409,9 @@ def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:
             raise zipfile.BadZipFile(f"checksum mismatch in {damaged}")
         return torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # zipfile and torch raise many types for damaged or unsafe files
-        raise CheckpointError(f"{path}: not a safe, complete checkpoint ({_reason(error)})") from None
+        raise CheckpointError(
+            f"{path}: not a safe, complete checkpoint ({_reason(error)}); if it was copied, copy it again, or take another of the run, such as last.ckpt"
+        ) from None
 
 
 def _per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterator[tuple[int, Tensor, Tensor]]:

@@ -254,7 +254,7 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     share_outside          1      predicted particle-frames deeper than a thousandth of the spacing in a wall or obstacle
     ====================== ====== ====================================================================================================
 
-    Energy distance and angular momentum are not defined, and left out, in periodic domains.
+    Energy distance and angular momentum are not defined, and left out, in periodic domains; the share outside where a boundary is known by its nodes only.
 
     Args:
         prediction: rollout from frame 0 of the ground truth.
@@ -269,6 +269,8 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     undefined = {"energy_distance", "angular_momentum_error"} if periodic else set()
     if prediction.stress is None or ground_truth.stress is None:
         undefined.add("von_mises_error")
+    if not ground_truth.boundary.shapes:
+        undefined.add("share_outside")
     names = [name for name in UNITS if name not in undefined]
     records = []
     for horizon, steps in _reached(horizons, error, ground_truth):
@@ -278,7 +280,8 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
             values |= {name: motion[name] for name in motion.keys() & values.keys()}
             values["rollout_mse"] = float(error[1 : steps + 1].mean())
             values |= _relative_errors(prediction, ground_truth, steps)
-            values["share_outside"] = share_outside(prediction.frames(1, steps + 1), tolerance=1e-3 * ground_truth.metadata.spacing)
+            if "share_outside" in values:
+                values["share_outside"] = share_outside(prediction.frames(1, steps + 1), tolerance=1e-3 * ground_truth.metadata.spacing)
             if not periodic:
                 values["energy_distance"] = _cloud_distance(prediction, ground_truth, steps)
         records += [Record(name, horizon, value) for name, value in values.items()]

@@ -103,13 +103,13 @@ def summary(rows: list[Row]) -> str:
             for split in groups_of(row):
                 groups[split, row.metric, row.model][row.horizon].append(row.value)
     horizons = sorted({row.horizon for row in rows} - {"1", "full"}, key=int)
-    lines = [f"{'split':25} {'metric':22} {'model':18}" + "".join(f"{h:>11}" for h in (*horizons, "full"))]
-    for (split, metric, model), values in sorted(groups.items()):
+    lines = [(("split", "metric", "model"), "".join(f"{h:>11}" for h in (*horizons, "full")))]
+    for key, values in sorted(groups.items()):
         if "1" in values:  # of one step, or of a rollout as a whole
             values["full"] = values["1"]
-        cells = [f"{np.mean(values[h]):11.4g}" if h in values else " " * 11 for h in (*horizons, "full")]
-        lines.append(f"{split:25} {metric:22} {model:18}" + "".join(cells))
-    return "\n".join(lines)
+        lines.append((key, "".join(f"{np.mean(values[h]):11.4g}" if h in values else " " * 11 for h in (*horizons, "full"))))
+    widths = [max(len(key[column]) for key, _ in lines) for column in range(3)]
+    return "\n".join(" ".join(f"{name:{width}}" for name, width in zip(key, widths, strict=True)) + cells for key, cells in lines)
 
 
 def _column(axis: str) -> str:
@@ -253,17 +253,25 @@ def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]],
             cells = []
             for h in horizons:
                 values = values_by_seed(runs, LEARNED, split, "rollout_mse", h)
-                cells.append(f"{_interval(values, 1e3)} **{trivial[h] / _mean(values):.1f}×**" if values else "–")
+                cells.append(f"{_interval(values, 1e3)} {_factor(trivial[h] / _mean(values))}" if values else "–")
             lines.append(table_row([*(key or (LEARNED,)), split, *cells]))
         for baseline in baselines:
             cells = [_interval(values_by_seed([first], baseline, split, "rollout_mse", h), 1e3) for h in horizons]
             lines.append(table_row([baseline, *[""] * (len(names) - 1), split, *cells]))
     note = (
         "Rollout MSE ×1e-3 [m²] over frames 1 … h, nodes and axes: mean over trajectories and seeds, 95 % bootstrap interval over both (too narrow where "
-        "seeds or trajectories are few), and how many times lower than the best trivial baseline. `test_unseen` holds material parameters that training "
-        "did not have, between the trained ones and outside their range; `table.csv` has these two apart."
+        "seeds or trajectories are few), and how many times lower than the best trivial baseline (bold where it is lower)."
     )
+    if "test_unseen" in splits:
+        note += (
+            " `test_unseen` holds material parameters that training did not have, between the trained ones and outside their range; "
+            "`table.csv` has these two apart."
+        )
     return [*lines, "", note]
+
+
+def _factor(ratio: float) -> str:
+    return f"**{ratio:.1f}×**" if ratio > 1 else f"{ratio:.2g}×"
 
 
 def table_row(cells: list[str]) -> str:

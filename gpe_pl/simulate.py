@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from gpe_pl.generation import DatasetSpec
+    from gpe_pl.trajectory import Metadata
 
 IMPORTED = "imported"
 """Where data that are generated have their size, those that ``convert`` made have this."""
@@ -71,6 +72,16 @@ def ensure_data(cfg: DictConfig) -> Path:
         raise ConfigError(f"{folder}: no data; generate it first with `python -m gpe_pl.simulate data={spec.name} size={spec.size}`")
     with progress_bar(f"{spec.name} {spec.size}") as on_progress:
         return generate(cfg.paths.data, spec, os.cpu_count() or 1, on_progress)
+
+
+def scene_metadata(cfg: DictConfig, split: str) -> Metadata:
+    """What is known of the scenes of a split before any is generated."""
+    from gpe_pl.generation import trajectory_metadata
+    from gpe_pl.store import iter_trajectories
+
+    if cfg.data.size == IMPORTED:
+        return next(iter_trajectories(imported_data(cfg), split)).metadata
+    return trajectory_metadata(dataset_spec(cfg), split, 0)
 
 
 def ensure_split(cfg: DictConfig, split: str) -> Path:

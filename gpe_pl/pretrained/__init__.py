@@ -6,6 +6,8 @@ from pathlib import Path
 
 FOLDER = Path(__file__).parent
 SUFFIX = ".ckpt"
+BEST = Path("checkpoints") / f"best{SUFFIX}"
+"""Of a run, relative to its folder."""
 
 
 def names() -> list[str]:
@@ -14,5 +16,24 @@ def names() -> list[str]:
 
 
 def checkpoint_path(checkpoint: Path | str) -> Path:
-    """The file of a shipped model, or the path itself if it is none of their names."""
-    return FOLDER / f"{checkpoint}{SUFFIX}" if str(checkpoint) in names() else Path(checkpoint)
+    """The file of a shipped model, the best checkpoint of a run's folder, or the path itself if it is neither."""
+    if str(checkpoint) in names():
+        return FOLDER / f"{checkpoint}{SUFFIX}"
+    path = Path(checkpoint)
+    return path / BEST if path.is_dir() else path
+
+
+def model_name(checkpoint: Path | str | None, runs: Path | str) -> str:
+    """What a model is called in the name of a folder: as it is shipped, or as its run below the folder ``runs``, ``_`` for ``/``."""
+    if checkpoint is None or str(checkpoint) in names():
+        return str(checkpoint)
+    path = Path(checkpoint).resolve()
+    if path.suffix != SUFFIX:
+        run, own = path, ""
+    elif path.parent.name != BEST.parent.name:
+        return path.stem
+    else:
+        run, own = path.parent.parent, "" if path.name == BEST.name else path.stem
+    root = Path(runs).resolve()
+    parts = run.relative_to(root).parts if run.is_relative_to(root) else (run.name,)
+    return "_".join(part for part in (*parts, own) if part)

@@ -7,6 +7,8 @@ import logging
 import os
 import shutil
 import sys
+import warnings
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -29,6 +31,8 @@ from gpe_pl.training.module import Compile, Schedule, TrainingModule
 from gpe_pl.training.parallel import SummedGradients
 
 log = logging.getLogger(__name__)
+
+CONFIG = "config.json"
 
 
 class RunError(GpeError, RuntimeError):
@@ -112,16 +116,16 @@ class TrainerSettings:
         return self.devices * self.num_nodes
 
 
-def claim(run_dir: Path, config: dict[str, Any]) -> None:
-    """Take a folder for a run with this configuration; one that has saved nothing yet leaves the folder free.
+def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("checkpoints/last.ckpt", "metrics.csv")) -> None:
+    """Take a folder for a run with this configuration; one without ``results`` (patterns) is free.
 
     Raises:
         RunError: the folder holds a run with another configuration; names the first differing key.
     """
     run_dir.mkdir(parents=True, exist_ok=True)
-    path = run_dir / "config.json"
-    if path.exists() and any((run_dir / name).exists() for name in ("checkpoints/last.ckpt", "metrics.csv")):
-        different = sorted(_differences(_config_in(path), config))
+    path = run_dir / CONFIG
+    if any(found.name != CONFIG for pattern in results for found in run_dir.glob(pattern)):
+        different = sorted(_differences(_config_in(path), config)) if path.exists() else [f"of which there is no {CONFIG}"]
         if different:
             raise RunError(
                 f"{run_dir} holds a run with another configuration ({'; '.join(different[:3])}); choose another name=… or delete the folder"
@@ -130,9 +134,16 @@ def claim(run_dir: Path, config: dict[str, Any]) -> None:
     replace_text(path, json.dumps(config, indent=1, sort_keys=True))
 
 
+def release(run_dir: Path) -> None:
+    """Give a claimed folder back if nothing was written to it."""
+    if [path.name for path in run_dir.iterdir()] == [CONFIG]:
+        (run_dir / CONFIG).unlink()
+        run_dir.rmdir()
+
+
 def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
     """Copy the checkpoint of a finished run below ``folder`` that was trained with the configuration ``config``; None if there is no such run."""
-    for path in sorted(folder.rglob("config.json")):
+    for path in sorted(folder.rglob(CONFIG)):
         trained = path.parent / "checkpoints" / "best.ckpt"
         if (path.parent / "metrics.csv").exists() and trained.exists():
             there = _config_in(path)
@@ -216,6 +227,8 @@ def train(
         raise RunError(f"trainer.accelerator={trainer_settings.accelerator}, trainer.devices={trainer_settings.devices}: {error}") from None
     if last.exists():
         log.info("resuming from %s", last)
+    for known in (r"`isinstance\(treespec, LeafSpec\)` is deprecated", r"Checkpoint directory .* exists and is not empty"):
+        warnings.filterwarnings("ignore", known)  # the first is between Lightning and PyTorch, the second what resuming is
     try:
         trainer.fit(module, datamodule, ckpt_path=str(last) if last.exists() else None, weights_only=True)
     except SystemExit:  # Lightning's answer to Ctrl-C

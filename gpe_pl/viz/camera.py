@@ -50,6 +50,8 @@ class Camera:
                 center, _ = self.project(np.asarray(shape.center, float))
                 low, high = np.maximum(low, center - shape.radius), np.minimum(high, center + shape.radius)
         margin = MARGIN * (high - low).max()
+        if trajectory.metadata.periodicity:  # particles come up to the edge
+            margin = max(margin, 0.5 * trajectory.metadata.spacing)
         self.low, self.high = low - margin, high + margin
         self._depth_range = float(depth.min()), float(depth.max())
 

@@ -4,6 +4,7 @@ Every function returns a ``Figure`` with its own Agg canvas. Nothing touches pyp
 display, and are collected like any other object; save one with ``figure.savefig(path, dpi=300)``.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -17,6 +18,9 @@ from gpe_pl.viz.coloring import PALETTE, ColorBy, Coloring
 from gpe_pl.viz.film_strip import evenly_spaced_frames, film_strip, new_figure
 
 Numbers = Sequence[int | float] | np.ndarray
+
+FIRST_DECADES = 6
+"""An axis of errors reaches this far below the lowest error at the end: free fall starts with 1e-14 m², which is rounding."""
 
 COLUMN_WIDTH = 3.4
 """Width [inch] of a figure in one column of a paper."""
@@ -50,9 +54,10 @@ def error_curve_figure(
     quantiles: tuple[float, float] = (0.1, 0.9),
     label: str = "position MSE [m²]",
 ) -> Figure:
-    """Error against time on a logarithmic axis: median over trajectories, and a band between two quantiles.
+    """Error against time on a logarithmic axis: median over trajectories, and a band between two quantiles, as the legend says.
 
-    Infinite errors (rollouts that failed) leave the top of the axes. Frame 0, the shared start, is not drawn.
+    Infinite errors (rollouts that failed) leave the top of the axes, and errors far below that of every curve's end the bottom. Frame 0, the shared start, is
+    not drawn.
 
     Args:
         curves: per-frame errors of the trajectories (``metrics.per_frame_mse``), by the name of the simulator.
@@ -71,8 +76,12 @@ def error_curve_figure(
             raise ValueError(f"{name}: error curves must exist and have one length, got {sorted({len(e) for e in errors})}")
         table = np.stack([np.asarray(e, float)[1:] for e in errors])
         # Order statistics: interpolation between infinities is not a number.
-        bands[name] = np.quantile(table, [quantiles[0], 0.5, quantiles[1]], axis=0, method="inverted_cdf")
+        low, high = np.quantile(table, quantiles, axis=0, method="inverted_cdf")
+        bands[name] = np.stack([low, np.median(table, axis=0), high])
     ceiling = _set_log_limits(axes, np.concatenate([b.ravel() for b in bands.values()]))
+    ends = [band[1, -1] for band in bands.values() if 0 < band[1, -1] < np.inf]
+    if ends:  # what is rounding at first may be no error to look at
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], 10.0**-FIRST_DECADES * min(ends)))
     for (name, band), (color, dash) in zip(bands.items(), _styles(len(bands)), strict=True):
         time = frame_dt * np.arange(1, band.shape[1] + 1)
         low, middle, high = np.where(band > 0, np.minimum(band, ceiling), np.nan)
@@ -81,7 +90,9 @@ def error_curve_figure(
     axes.set_xlabel("time [s]", fontsize=8)
     axes.set_ylabel(label, fontsize=8)
     axes.set_xlim(left=0)
-    axes.legend(fontsize=7, frameon=False, handlelength=1.4)
+    count = max((len(errors) for errors in curves.values()), default=0)
+    title = f"median and {quantiles[0]:.0%} – {quantiles[1]:.0%}\nof {count} trajectories" if count > 1 else "one trajectory"
+    axes.legend(fontsize=7, frameon=False, handlelength=2.2, title=title, title_fontsize=6.5, alignment="left")
     return figure
 
 
@@ -122,11 +133,12 @@ def _clean(steps: Numbers, values: Numbers) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _styles(count: int) -> list[tuple[str, str]]:
-    """Colour and line style of every curve: colours first, then the same colours dashed and dotted."""
-    styles = [(color, dash) for dash in ("-", "--", ":", "-.") for color in PALETTE]
-    if count > len(styles):
-        raise ValueError(f"{count} curves, but no more than {len(styles)} can be told apart in one figure")
-    return styles[:count]
+    """Colour and line style of every curve; neighbours differ in both, so that both show where they coincide."""
+    dashes = ("-", "--", ":", "-.")
+    most = math.lcm(len(PALETTE), len(dashes))  # no pair comes twice before
+    if count > most:
+        raise ValueError(f"{count} curves, but no more than {most} can be told apart in one figure")
+    return [(PALETTE[k % len(PALETTE)], dashes[k % len(dashes)]) for k in range(count)]
 
 
 def _plain_axes(figure: Figure) -> Axes:

@@ -15,6 +15,9 @@ from gpe_pl.viz.scenery import INK, LIGHT, draw_scenery
 DOT = 1.3
 """Diameter of a particle in rest spacings: neighbours overlap a little."""
 
+APART, APART_SPACING = 0.9, 3.0
+"""Diameter in 2D where neighbours are at least so many points apart on paper: each is seen by itself, with a thin edge."""
+
 DISC = np.stack([np.cos(np.arange(12) * np.pi / 6), np.sin(np.arange(12) * np.pi / 6)], axis=-1)
 
 MAX_FACES = 30_000
@@ -78,11 +81,13 @@ class Panel:
         self.axes.set_axis_off()
         self.axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
         points_per_metre = rectangle[2] * figure.get_figwidth() * 72 / (high[0] - low[0])
-        diameter = max(0.6, DOT * trajectory.metadata.spacing * points_per_metre)
+        spacing = trajectory.metadata.spacing * points_per_metre
+        is_apart = not self._is_3d and spacing >= APART_SPACING
+        diameter = max(0.6, (APART if is_apart else DOT) * spacing)
         self._radius = diameter / 2 / points_per_metre
         many = trajectory.num_nodes > 500
         self.particles: Any = self.axes.scatter(
-            [], [], s=diameter**2, linewidths=0.06 * diameter if self._is_3d else 0, zorder=3, rasterized=many
+            [], [], s=diameter**2, linewidths=0.06 * diameter if self._is_3d or is_apart else 0, zorder=3, rasterized=many
         )
         # Edges as wide as cover the seams between cells; among small cells they must not be darker, or there would be nothing else.
         self._edge = 1 - 0.3 * float(np.clip((diameter - 1.5) / 3, 0.0, 1.0))

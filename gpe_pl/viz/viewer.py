@@ -273,6 +273,8 @@ def _focus(trajectory: Trajectory) -> dict[str, Any]:
     if bowls:
         center, radius = np.asarray(bowls[0].center, float), bowls[0].radius
         low, high = np.maximum(low, center - radius), np.minimum(high, center + radius)
+    if trajectory.metadata.periodicity:  # nodes come up to the edge
+        low, high = low - 0.5 * trajectory.metadata.spacing, high + 0.5 * trajectory.metadata.spacing
     bounds = np.asarray(trajectory.metadata.bounds, float)
     return {
         "focus": {"low": _in_3d(low), "high": _in_3d(high)},
@@ -295,7 +297,7 @@ def _mesh(trajectory: Trajectory) -> dict[str, np.ndarray]:
     }
 
 
-INK_RGB = (0.15, 0.15, 0.15)
+INK_RGB, SEAM_RGB = (0.15, 0.15, 0.15), (0.7, 0.7, 0.7)
 
 
 def _scenery_2d(trajectory: Trajectory) -> tuple[dict[str, Any], Arrays]:
@@ -313,6 +315,12 @@ def _scenery_2d(trajectory: Trajectory) -> tuple[dict[str, Any], Arrays]:
         for x, y in trajectory.boundary.pos:
             for dx, dy in ((arm, 0.0), (0.0, arm)):
                 lines += [(x + sign * dx, y + sign * dy, 0.0, 0.0, 0.0, 0.0, *INK_RGB) for sign in (-1, 1)]
+    low, high = np.asarray(trajectory.metadata.bounds, float).T
+    for axis in trajectory.metadata.periodicity.axes:  # where space repeats
+        for side in (low, high):
+            ends = np.array([low, high])
+            ends[:, axis] = side[axis]
+            lines += [(*end, 0.0, 0.0, 0.0, 0.0, *SEAM_RGB) for end in ends]
     arrays: Arrays = {"lines": ("float32", np.array(lines))}
     if not solids:
         return {}, arrays
@@ -322,8 +330,7 @@ def _scenery_2d(trajectory: Trajectory) -> tuple[dict[str, Any], Arrays]:
     distance = signed_distance(solids, np.stack(np.meshgrid(x, y), axis=-1))
     unit = 2 * SOLID_CELLS * cell
     arrays["solid"] = ("uint8", np.clip(np.round(distance / unit * 255) + 128, 0, 255))
-    low, high = bounds.T.tolist()
-    return {"solid": {"width": len(x), "height": len(y), "low": low, "high": high, "unit": unit}}, arrays
+    return {"solid": {"width": len(x), "height": len(y), "low": low.tolist(), "high": high.tolist(), "unit": unit}}, arrays
 
 
 def _scenery_3d(trajectory: Trajectory) -> Arrays:

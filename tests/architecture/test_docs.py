@@ -9,7 +9,9 @@ from typing import get_args
 
 import pytest
 from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
 
+from gpe_pl.config import _groups as groups
 from gpe_pl.config import compose
 from gpe_pl.data.importers import Format
 
@@ -51,6 +53,19 @@ def named(page: str, key: str) -> set[str]:
 def test_tables_name_every_choice(page: str, key: str) -> None:
     choices = {path.stem for path in (ROOT / "conf" / key).glob("*.yaml")} - {"imported"}
     assert named(page, key) == choices
+
+
+@pytest.mark.parametrize("command", ["fit", "evaluate", "simulate", "benchmark"])
+def test_help_names_every_choice(command: str) -> None:
+    file = OmegaConf.load(ROOT / "conf" / f"{command}.yaml")
+    listed = OmegaConf.to_container(file.hydra.help)["template"]  # type: ignore[index, call-overload]
+    for group in groups(command) - {"paths"}:
+        text = re.search(rf"^{group} .*\n(?: +\S.*\n)*", listed, re.MULTILINE)
+        assert text, f"{command} --help does not have {group}"
+        choices = {path.stem for path in (ROOT / "conf" / group).glob("*.yaml")} - ({"imported"} if command == "simulate" else set())
+        assert choices <= set(re.findall(r"\w+", text[0])), f"{command} --help, {group}"
+    for key in {*map(str, file)} - {"defaults", "hydra", "evaluation"}:
+        assert re.search(rf"^(?:\w+, )?{key}\b", listed, re.MULTILINE), f"{command} --help does not have {key}"
 
 
 def test_every_format_is_in_the_table() -> None:

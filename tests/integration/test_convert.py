@@ -84,6 +84,7 @@ def test_a_periodic_data_set_is_imported_trained_on_and_evaluated(
     rows = list(read_rows(tmp_path / "runs" / "fit" / "metrics.csv"))
     assert {r.split for r in rows} == {"test"}
     assert {"rollout_mse", "momentum_error"} <= {r.metric for r in rows}
+    assert not any(r.metric.startswith(("share_outside", "share_corrected")) for r in rows)  # there are no walls
     assert (tmp_path / "runs" / "fit" / "rollout_test_00.png").stat().st_size > 1000
     simulator = LearnedSimulator.from_checkpoint(tmp_path / "runs" / "fit" / "checkpoints" / "best.ckpt")
     assert simulator.builder.metadata.periodic == (True, True)
@@ -95,7 +96,7 @@ def test_a_periodic_data_set_is_imported_trained_on_and_evaluated(
             f"paths.data={tmp_path / 'data'}", f"paths.runs={tmp_path / 'runs'}", "evaluation.num_pictures=0", "evaluation.horizons=[5]",
         )
     )  # fmt: skip
-    assert (tmp_path / "runs" / "evaluation_val" / "metrics.csv").exists()
+    assert (tmp_path / "runs" / "evaluation_fit_tgv_val" / "metrics.csv").exists()
     assert files(folder) == before
     with pytest.raises(ImportFailure, match="never overwritten"):
         convert(compose("convert", "format=lagrangebench", f"source={lagrangebench}", "name=tgv", f"paths.data={tmp_path / 'data'}"))

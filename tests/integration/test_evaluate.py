@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -17,15 +18,17 @@ from gpe_pl.fit import fit
 from gpe_pl.generation import trajectory_metadata
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned_simulator import LearnedSimulator, SceneError
 from gpe_pl.models.gpe import GPE
 from gpe_pl.report import summary
 from gpe_pl.simulate import dataset_spec
+from gpe_pl.store import StoreError
+from gpe_pl.training.run import RunError
 from tests.runs import DATA, compose, tiny
 
 
 def evaluate(data: Path, runs: Path, checkpoint: Path | str, *overrides: str) -> list[Row]:
-    shared = [f"paths.data={data}", f"paths.runs={runs}", "evaluation.horizons=[5]", "split=test_unseen"]
+    shared = [f"paths.data={data}", f"paths.runs={runs}", "evaluation.horizons=[5]", "split=test_unseen", "name=evaluation_test_unseen"]
     evaluate_checkpoint(compose("evaluate", *DATA, *shared, f"checkpoint={checkpoint}", *overrides))
     return list(read_rows(runs / "evaluation_test_unseen" / "metrics.csv"))
 
@@ -48,7 +51,56 @@ def test_a_run_that_was_moved_gives_the_same_numbers(
     assert {f"rollout_test_unseen_00.{suffix}" for suffix in ("png", "gif", "html", "pvd", "npz")} <= written
     assert {"error_curve_test_unseen.png", "ground_truth_test_unseen_00.pvd", "ground_truth_test_unseen_00.npz"} <= written
     assert "model.pt2" not in written
-    assert "rollout_mse            learned" in capsys.readouterr().out
+    assert re.search(r"rollout_mse +learned", capsys.readouterr().out)
+
+
+def test_a_folder_keeps_the_evaluation_that_it_holds(tiny_data: Path, tmp_path: Path) -> None:
+    fit(tiny(tiny_data, tmp_path))
+    run, folder = tmp_path / "fit", tmp_path / "evaluation_test_unseen"
+    rows = evaluate(tiny_data, tmp_path, run, "evaluation.num_pictures=0")
+    again = evaluate(tiny_data, tmp_path, run, "evaluation.num_pictures=1")  # the same numbers, and a picture
+    assert {key(r): r.value for r in again} == pytest.approx({key(r): r.value for r in rows}, rel=1e-12)
+    assert (folder / "rollout_test_unseen_00.png").exists()
+    before = (folder / "metrics.csv").read_bytes()
+    with pytest.raises(
+        RunError, match=r"evaluation_test_unseen holds a run with another configuration \(checkpoint: .*fit/checkpoints/best.ckpt"
+    ):
+        evaluate(tiny_data, tmp_path, run / "checkpoints" / "last.ckpt")
+    with pytest.raises(RunError, match=r"evaluation\.containment: True there, False now.*choose another name=… or delete the folder"):
+        evaluate(tiny_data, tmp_path, run, "evaluation.containment=false")
+    assert (folder / "metrics.csv").read_bytes() == before
+    (folder / "config.json").unlink()
+    with pytest.raises(RunError, match="of which there is no config.json"):
+        evaluate(tiny_data, tmp_path, run)
+
+
+def test_the_folder_is_named_after_model_and_data(tmp_path: Path) -> None:
+    checkpoint = f"checkpoint='{tmp_path}/runs/sweep/seed=0/checkpoints/best.ckpt'"
+    cfg = compose("evaluate", checkpoint, f"paths.runs={tmp_path}/runs", "data=snow")
+    assert cfg.name == "evaluation_sweep_seed=0_snow_test"
+    assert compose("evaluate", "checkpoint=sand").name == "evaluation_sand_sand_test"
+
+
+def test_data_that_do_not_fit_are_refused_before_any_is_generated(checkpoint: Path, tmp_path: Path) -> None:
+    with pytest.raises(
+        SceneError, match=r"was trained with .* in 2D on sand; the scene has .* in 3D and sand; choose the data set with data="
+    ):
+        evaluate(tmp_path / "data", tmp_path / "runs", checkpoint, "dimension=3")
+    with pytest.raises(SceneError, match="choose the data set with data=sand size=small$"):
+        evaluate(tmp_path / "data", tmp_path / "runs", "sand", "size=tiny")
+    assert not (tmp_path / "data").exists() and not (tmp_path / "runs").exists()
+
+
+def test_an_evaluation_that_fails_leaves_no_folder(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fit(tiny(tiny_data, tmp_path))
+
+    def fails(*_: object) -> None:
+        raise StoreError("damaged")
+
+    monkeypatch.setattr("gpe_pl.simulate.ensure_split", fails)
+    with pytest.raises(StoreError, match="damaged"):
+        evaluate(tiny_data, tmp_path, tmp_path / "fit")
+    assert not (tmp_path / "evaluation_test_unseen").exists()
 
 
 def test_a_shipped_model_is_named(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,7 +109,7 @@ def test_a_shipped_model_is_named(tiny_data: Path, tmp_path: Path, monkeypatch: 
     LearnedSimulator.from_checkpoint(tmp_path / "fit" / "checkpoints" / "best.ckpt").save(tmp_path / "shipped" / "sand.ckpt")
     rows = evaluate(tiny_data, tmp_path, "sand", "evaluation.num_pictures=0")
     assert {r.model for r in rows} == {"learned", "ballistic", "constant_velocity"}
-    with pytest.raises(ConfigError, match=r"checkpoint=None: name a checkpoint of a run.*, or a shipped model: sand"):
+    with pytest.raises(ConfigError, match=r"checkpoint=None: name the folder of a run.*, or a shipped model: sand"):
         evaluate(tiny_data, tmp_path, "null")
 
 
@@ -88,14 +140,17 @@ def test_a_summary_has_a_line_per_metric_and_a_column_per_horizon() -> None:
     rows = [
         *(row("learned", "rollout_mse", h, v) for h, v in (("20", 2.0), ("100", 3.0), ("full", 4.0), ("full", 6.0))),
         row("learned", "one_step_nmse", "1", 0.25),
+        row("learned", "share_outside_uncontained", "full", 0.0),
         *(row("ballistic", metric, "full", 7.0) for metric in ("rollout_mse", "velocity_error")),
     ]
     header, *lines = summary(rows).splitlines()
+    assert len({len(line) for line in (header, *lines)}) == 1  # aligned
     assert header.split() == ["split", "metric", "model", "20", "100", "full"]
     assert [line.split() for line in lines] == [
         ["test", "one_step_nmse", "learned", "0.25"],
         ["test", "rollout_mse", "ballistic", "7"],
         ["test", "rollout_mse", "learned", "2", "3", "5"],
+        ["test", "share_outside_uncontained", "learned", "0"],
     ]
 
 
@@ -145,4 +200,4 @@ def test_the_canyon_is_compared_with_the_solver_and_shown(tmp_path: Path, capsys
     assert {r.model for r in rows} == {"learned", "ballistic", "constant_velocity"}
     assert (tmp_path / "evaluation_test_unseen" / "showcase.json").exists()
     printed = capsys.readouterr().out
-    assert "rollout_mse            learned" in printed and "showcase  share_corrected" in printed
+    assert re.search(r"rollout_mse +learned", printed) and "showcase  share_corrected" in printed

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -290,7 +291,8 @@ def test_imported_data_are_never_overwritten(tmp_path: Path) -> None:
     [
         ("a/b", {"train": [0]}, "name='a/b': must be a folder's name"),
         ("../x", {"train": [0]}, "name='../x': must be"),
-        ("x", {}, "train is missing"),
+        ("x", {}, "train has no trajectories"),
+        ("x", {"train": []}, "train has no trajectories"),
         ("x", {"train": [0], "vla": [1]}, "vla is none of"),
         ("x", {"train": [0, 0]}, None),
     ],
@@ -303,6 +305,21 @@ def test_a_data_set_that_cannot_be(tmp_path: Path, name: str, splits: dict[str, 
         return
     with pytest.raises(ImportFailure, match=message):
         save_dataset(tmp_path, name, 0.1, **given)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("train", "message"),
+    [
+        (trajectory(), r"train: is one trajectory; give a list of them, train=\[…\]"),
+        ([trajectory(), np.zeros((3, 2, 2))], r"train\[1\]: is of type ndarray; make a trajectory of arrays with Trajectory.from_numpy"),
+    ],
+    ids=["one", "arrays"],
+)
+def test_only_trajectories_make_a_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, train: Any, message: str) -> None:
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as users have it
+    with pytest.raises(ImportFailure, match=message):
+        save_dataset(tmp_path, "x", train=train)
     assert not list(tmp_path.iterdir())
 
 

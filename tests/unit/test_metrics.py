@@ -56,7 +56,7 @@ def test_rollout_mse_is_the_mean_over_frames_one_to_horizon(ground_truth):
     records = rollout_metrics(shifted(ground_truth, 0.1 * np.arange(11)), ground_truth, (2, "full"))
     assert value(records, "rollout_mse", 2) == pytest.approx((0.01 + 0.04) / 2 / 2)
     assert value(records, "rollout_mse", "full") == pytest.approx(0.01 * 385 / 10 / 2)
-    assert {r.metric for r in records} == set(UNITS) - {"von_mises_error"}
+    assert {r.metric for r in records} == set(UNITS) - {"von_mises_error", "share_outside"}
 
 
 def test_a_perfect_rollout_is_zero_everywhere(ground_truth):
@@ -138,7 +138,7 @@ def test_periodic_axes_take_the_short_way():
     wrapped = np.where(pos >= 10, pos - 20, pos)
     truth, prediction = trajectory(pos, periodic=(True, False)), trajectory(wrapped, periodic=(True, False))
     records = rollout_metrics(prediction, truth, (2,))
-    assert {r.metric for r in records} == set(UNITS) - {"energy_distance", "angular_momentum_error", "von_mises_error"}
+    assert {r.metric for r in records} == set(UNITS) - {"energy_distance", "angular_momentum_error", "von_mises_error", "share_outside"}
     assert all(r.value == pytest.approx(0, abs=1e-12) for r in records)
 
 
@@ -217,6 +217,8 @@ def test_share_outside_counts_particle_frames_up_to_the_horizon():
     truth, prediction = (replace(trajectory(p), boundary=walls) for p in (inside, outside))
     records = rollout_metrics(prediction, truth, (2, 3, 4))
     assert [value(records, "share_outside", h) for h in (2, 3, 4)] == pytest.approx([0, 1 / 6, 2 / 8])
+    nodes_only = replace(truth, boundary=replace(walls, shapes=()))
+    assert "share_outside" not in {r.metric for r in rollout_metrics(prediction, nodes_only, (2,))}
 
 
 # --- torchmetrics

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gpe_pl.learned_simulator import LearnedSimulator
-from gpe_pl.pretrained import FOLDER, checkpoint_path, names
+from gpe_pl.pretrained import FOLDER, checkpoint_path, model_name, names
 
 LIMIT = 2_000_000
 
@@ -15,6 +15,19 @@ LIMIT = 2_000_000
 def test_a_path_stays_a_path() -> None:
     assert checkpoint_path("runs/sand/best.ckpt") == Path("runs/sand/best.ckpt")
     assert checkpoint_path("no such model") == Path("no such model")
+
+
+def test_a_run_is_named_by_its_folder(tmp_path: Path) -> None:
+    assert checkpoint_path(tmp_path) == tmp_path / "checkpoints" / "best.ckpt"
+
+
+def test_a_model_is_called_as_its_run(tmp_path: Path) -> None:
+    run = tmp_path / "runs" / "sweep" / "seed=0"
+    assert model_name("sand", "runs") == "sand"
+    assert model_name(run, tmp_path / "runs") == model_name(run / "checkpoints" / "best.ckpt", tmp_path / "runs") == "sweep_seed=0"
+    assert model_name(run / "checkpoints" / "last.ckpt", tmp_path / "runs") == "sweep_seed=0_last"
+    assert model_name(run / "checkpoints" / "best.ckpt", tmp_path / "other") == "seed=0"
+    assert model_name(tmp_path / "water.ckpt", tmp_path / "runs") == "water"
 
 
 @pytest.mark.parametrize("name", names())

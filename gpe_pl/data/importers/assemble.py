@@ -94,13 +94,18 @@ def save_dataset(root: Path | str, name: str, holdout: float = 0.1, **splits: It
             sequence that makes its trajectories when they are asked for is never in memory as a whole; other iterables become lists first.
 
     Raises:
-        ImportFailure: nothing to train on, or the data set exists already.
+        ImportFailure: nothing to train on, something else than trajectories, or the data set exists already.
     """
+    for split, trajectories in splits.items():
+        if isinstance(trajectories, Trajectory):
+            raise ImportFailure(f"{split}: is one trajectory; give a list of them, {split}=[…]")
     given = {split: trajectories if isinstance(trajectories, Sequence) else list(trajectories) for split, trajectories in splits.items()}
     unknown = sorted(set(given) - {"train", "val", "test", "test_unseen"})
     if unknown or not given.get("train"):
         raise ImportFailure(
-            f"splits: {unknown[0] if unknown else 'train'} {'is none of' if unknown else 'is missing; of'} train, val, test, test_unseen"
+            f"splits: {unknown[0]} is none of train, val, test, test_unseen"
+            if unknown
+            else "train has no trajectories; they are what a model learns from"
         )
     items = {split: [_member(split, trajectories, k) for k in range(len(trajectories))] for split, trajectories in given.items()}
     about = {"format": "arrays", "source": "memory", "settings": {}}
@@ -121,7 +126,13 @@ def draw_contact_sheet(report: Report) -> Path:
 
 
 def _member(split: str, trajectories: Sequence[Trajectory], k: int) -> Item:
-    return Item(f"{split}[{k}]", lambda _: Loaded(trajectories[k]))
+    def load(_: Facts) -> Loaded:
+        item = trajectories[k]
+        if not isinstance(item, Trajectory):
+            raise ImportFailure(f"{split}[{k}]: is of type {type(item).__name__}; make a trajectory of arrays with Trajectory.from_numpy")
+        return Loaded(item)
+
+    return Item(f"{split}[{k}]", load)
 
 
 def _free_folder(root: Path, name: str) -> Path:

@@ -239,9 +239,9 @@ class Viewer {
     const tick = (now) => {
       if (!this.playing || this.playback !== from) return;
       const frame = from.frame + Math.floor((now - from.time) / 1000 * Number($("rate").value)); // skips frames rather than time
-      if (frame !== this.frame) this.#show(Math.max(0, frame));
-      if (frame >= this.truth.frames - 1) this.#play(false);
-      else requestAnimationFrame(tick);
+      if (Math.min(frame, this.truth.frames - 1) !== this.frame) this.#show(frame);
+      if (frame >= this.truth.frames - 1 + Number($("rate").value) / 2) Object.assign(from, { frame: 0, time: now }); // from the start, after a look at the end
+      requestAnimationFrame(tick);
     };
     requestAnimationFrame(tick);
   }
@@ -289,7 +289,7 @@ class Viewer {
     options($("color"), scene.colors.filter((c) => c.by !== "error" || this.prediction).map((c) => [c.by, c.name]));
     options($("prediction"), this.predictions.map((p, k) => [k, p.name]));
     $("prediction-label").hidden = this.predictions.length < 2;
-    $("precision").textContent = `positions ± ${withUnit(scene.rounding, "m")}`;
+    $("precision").textContent = `positions shown to within ${withUnit(scene.rounding, "m")}`;
     $("precision").title = "Positions are stored with 16 bits per axis; this is the largest error of that.";
     $("frame").max = this.truth.frames - 1;
     document.querySelector("footer").hidden = this.truth.frames < 2;

@@ -86,9 +86,14 @@ def test_the_nodes_of_a_validation_batch_are_shared_by_the_ranks(root: Path, mon
 
 
 def test_validation_graphs_are_built_when_asked_for_and_held_within_a_limit(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module, built = datamodule(root), []
+    module, built = datamodule(root), list[int]()
     read = WindowDataset.__getitem__
-    monkeypatch.setattr(WindowDataset, "__getitem__", lambda self, window: (built.append(window), read(self, window))[1])
+
+    def read_and_note(self: WindowDataset, window: int) -> Any:
+        built.append(window)
+        return read(self, window)
+
+    monkeypatch.setattr(WindowDataset, "__getitem__", read_and_note)
     loader = module.val_dataloader()
     assert built == []
     first, again = list(loader), list(loader)

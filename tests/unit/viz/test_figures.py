@@ -73,7 +73,7 @@ def test_figures_leave_global_state_alone(ground_truth):
 
 
 def test_error_curve_is_the_median_over_trajectories():
-    curves = [s * np.arange(6.0) for s in (1, 2, 30)]
+    curves = [s * np.arange(6.0) for s in (1, 1, 3, 30)]
     figure = error_curve_figure({"GPE": curves, "GNS": [10 * c for c in curves]}, frame_dt=0.5)
     (axes,) = figure.axes
     line = axes.lines[0]
@@ -81,6 +81,9 @@ def test_error_curve_is_the_median_over_trajectories():
     np.testing.assert_allclose(line.get_ydata(), 2 * np.arange(1, 6))
     assert axes.get_yscale() == "log" and len(axes.collections) == 2
     assert [t.get_text() for t in axes.get_legend().get_texts()] == ["GPE", "GNS"]
+    assert axes.get_legend().get_title().get_text() == "median and 10% – 90%\nof 4 trajectories"
+    (only,) = error_curve_figure({"GPE": curves[:1]}, 1.0).axes
+    assert only.get_legend().get_title().get_text() == "one trajectory"
     assert (pixels(figure) < 250).any()
 
 
@@ -90,6 +93,19 @@ def test_failed_trajectories_leave_the_top_of_the_error_curve():
     median = axes.lines[0].get_ydata()
     np.testing.assert_allclose(median[:2], [1, 2])
     assert median[2] > axes.get_ylim()[1]
+
+
+def test_rounding_does_not_stretch_the_axis():
+    fall, learned = np.array([0, 1e-14, 1e-9, 1e-2]), np.array([0, 1e-6, 1e-5, 1e-4])
+    (axes,) = error_curve_figure({"learned": [learned], "ballistic": [fall]}, 1.0).axes
+    assert 1e-11 < axes.get_ylim()[0] < 1e-9 and axes.get_ylim()[1] > 1e-2
+    (axes,) = error_curve_figure({"exact": [np.full(4, 1e-14)], "ballistic": [fall]}, 1.0).axes
+    assert axes.get_ylim()[0] < 1e-14
+
+
+def test_coinciding_curves_are_both_seen():
+    (axes,) = error_curve_figure({name: [np.arange(5.0)] for name in ("learned", "ballistic", "constant velocity")}, 1.0).axes
+    assert len({line.get_linestyle() for line in axes.lines}) == len({line.get_color() for line in axes.lines}) == 3
 
 
 def test_error_curves_of_different_length_are_refused():
