@@ -158,7 +158,7 @@ def _text(cell: Cell | None) -> str:
 def _ratio(cells: dict[str, Cell]) -> str:
     baselines = [c for m, c in cells.items() if m != OWN and c.is_learned]
     own = cells.get(OWN)
-    if own is None or not own.is_learned:
+    if own is None or not own.is_learned or len(cells) == 1:
         return "–"
     if not baselines:
         return "no baseline learned"
