@@ -86,8 +86,8 @@ def positive(name: str, value: Any, unit: str) -> float:
 def checked_bounds(bounds: Any, periodic: Any, pos: np.ndarray, boundary_pos: np.ndarray) -> tuple[tuple[float, float], ...]:
     """Bounds that hold all positions [frame, node, dim] along axes that do not repeat; the extremes where none are given."""
     dim = pos.shape[2]
-    if periodic is not None and len(periodic) != dim:
-        raise ArrayError(f"periodic={list(periodic)}: needs one value per axis, there are {dim}")
+    if periodic is not None and np.shape(periodic) != (dim,):
+        raise ArrayError(f"periodic={np.asarray(periodic).tolist()}: needs one value per axis, there are {dim}")
     if bounds is None:
         if periodic is not None and any(periodic):
             raise ArrayError("bounds: a periodic axis needs bounds, since its period cannot be told from positions")
@@ -127,11 +127,10 @@ def checked_materials(
     unknown = sorted(set(names) - set(MATERIALS))
     if unknown:
         raise ArrayError(f"materials: node {names.index(unknown[0])} is {unknown[0]!r}; known: {', '.join(MATERIALS)}")
-    if set(params) != set(present):
+    if not isinstance(params, Mapping) or set(params) != set(present):
         wanted = ", ".join(f"{m}: {MATERIALS[m].name} [{MATERIALS[m].unit}]" for m in present)
-        raise ArrayError(
-            f"params: has {', '.join(sorted(params)) or 'nothing'}, needs {wanted}; any constant will do where it never varies"
-        )
+        given = ", ".join(sorted(params)) if isinstance(params, Mapping) else "no names"
+        raise ArrayError(f"params: has {given or 'nothing'}, needs {wanted}; any constant will do where it never varies")
     codes = np.array([node_code(name) for name in names], np.uint8)
     columns = np.full((num_nodes, len(param_names(present))), np.nan, np.float32)
     for material in present:

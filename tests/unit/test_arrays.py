@@ -119,6 +119,7 @@ BAD[3, 5, 1] = np.nan
         ({"bounds": [[0, 0.5], [0, 1]]}, r"^pos: frame 0, node \d+: x = 0\.\d+ m is outside the bounds 0 … 0.5 m$"),
         ({"periodic": [True, False]}, "^bounds: a periodic axis needs bounds"),
         ({"periodic": [True], "bounds": BOX}, "^periodic=.*needs one value per axis, there are 2$"),
+        ({"periodic": True, "bounds": BOX}, "^periodic=True: needs one value per axis, there are 2$"),
         ({"gravity": [0, 0, -9.81]}, r"^gravity: has shape \[3\], expected \[dim 2\]$"),
         ({"gravity": [0, np.nan]}, "^gravity: component 1 is nan$"),
         ({"spacing": 0}, "^spacing=0: must be a positive number of m$"),

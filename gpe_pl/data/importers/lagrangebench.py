@@ -68,6 +68,8 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         parameters["fluid"] = min(max(viscosity, spec.low), spec.high)
         if parameters["fluid"] != viscosity:
             notes.append(f"viscosity {viscosity:g} is outside {spec.low:g} … {spec.high:g}; {parameters['fluid']:g} {spec.unit} is stored")
+    if "write_every" not in values:
+        notes.append("write_every is not in the source; every step of dt is taken for a frame (frame_dt=…)")
     facts = Facts(
         number(values, "dt", described, low=1e-12) * number({"write_every": 1, **values}, "write_every", described, low=1.0),
         bounds,

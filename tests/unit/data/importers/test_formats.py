@@ -199,6 +199,17 @@ def test_walls_padding_and_a_lid_that_slides(tmp_path: Path) -> None:
     assert {event.split for event in report.repairs} == {"train", "val", "test"}  # by where they went
 
 
+def test_what_is_assumed_of_the_time_step_is_said(tmp_path: Path) -> None:
+    sources.lagrangebench_metadata(tmp_path / "raw")
+    description = tmp_path / "raw" / "metadata.json"
+    values = json.loads(description.read_text())
+    del values["write_every"]
+    description.write_text(json.dumps(values))
+    sources.lagrangebench_h5(tmp_path / "raw" / "train.h5", [(drift(seed=k), np.zeros(20, np.int64)) for k in range(3)])
+    report, _ = imported(tmp_path / "out", tmp_path / "raw", "lagrangebench")
+    assert any("write_every is not in the source" in note for note in report.notes) and report.frame_dt == values["dt"]
+
+
 def test_the_force_of_a_dam_break_is_gravity(tmp_path: Path) -> None:
     for case, gravity in (("DB", (0.0, -1.0)), ("RPF", (0.0, 0.0))):
         raw = tmp_path / case
