@@ -248,9 +248,13 @@ class _Conversion:
     def _decide(self) -> None:
         """Fill in what the source does not say, and the splits that it does not have."""
         survey, report = self.survey, self.report
-        if not survey.good:
-            refused = "; ".join(str(event) for event in report.refusals[:5]) or "it holds none"
-            raise ImportFailure(f"{report.source}: no trajectory can be used: {refused}")
+        trains = bool(self.source.splits.get("train"))
+        if not (survey.good.get("train") if trains else survey.good):
+            alike: dict[str, list[Event]] = {}
+            for event in report.refusals:
+                alike.setdefault(event.what, []).append(event)
+            refused = "; ".join(f"{events[0]}{f', and {len(events) - 1} more alike' * (len(events) > 1)}" for events in alike.values())
+            raise ImportFailure(f"{report.source}: no {'training ' * trains}trajectory can be used: {refused or 'it holds none'}")
         assert survey.common is not None
         facts, (frame_dt, dim, periodic) = self.facts, survey.common
         spacing = facts.spacing or float(np.median(survey.spacings))

@@ -187,7 +187,18 @@ def test_nan_beside_a_boundary(tmp_path: Path, records: list[bytes], node: int) 
 
 def test_when_nothing_is_left_the_first_reasons_are_given(tmp_path: Path, records: list[bytes]) -> None:
     write(tmp_path, records[0][:50])
-    refused(tmp_path, "gns", "no trajectory can be used: train, record 0: .*truncated")
+    refused(tmp_path, "gns", "no training trajectory can be used: train, record 0: .*truncated")
+
+
+def test_without_training_trajectories_nothing_is_written(tmp_path: Path) -> None:
+    sources.lagrangebench_metadata(tmp_path / "raw")
+    good, types = motion(), np.zeros(20, np.int64)
+    bad = good.copy()
+    bad[3, 2] = np.nan
+    sources.lagrangebench_h5(tmp_path / "raw" / "train.h5", [(bad, types)] * 3)
+    sources.lagrangebench_h5(tmp_path / "raw" / "valid.h5", [(good, types)])
+    refused(tmp_path, "lagrangebench", "no training trajectory can be used: train, 00000, frame 3: .*node 2.*, and 2 more alike$")
+    assert not (tmp_path / "data").exists() or not [*(tmp_path / "data").rglob("*.h5")]
 
 
 # --- descriptions --------------------------------------------------------------------------------------------------------------------------
@@ -349,7 +360,7 @@ def test_pickles_are_not_opened_unless_asked_for(tmp_path: Path, packed: bool) -
     np.savez(tmp_path / "raw" / "train.npz", **named)
     refused(tmp_path, "gns", "is an array of Python objects, a pickle, which can run any code.*allow_pickle=true")
     assert not trace.exists()
-    with pytest.raises(ImportFailure, match="no trajectory can be used"):
+    with pytest.raises(ImportFailure, match="no (training )?trajectory can be used"):
         convert(tmp_path, "gns", allow_pickle=True)
     assert trace.exists()  # the payload works
 

@@ -152,7 +152,9 @@ def test_what_float32_cannot_hold_is_refused(arrays: dict[str, Any]) -> None:
 
 
 def test_absurd_positions_in_a_file_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ImportFailure, match=r"no trajectory can be used: train, 0.npz, frame 0: pos: frame 0, node 0 is .* too large"):
+    with pytest.raises(
+        ImportFailure, match=r"no training trajectory can be used: train, 0.npz, frame 0: pos: frame 0, node 0 is .* too large"
+    ):
         converted(tmp_path, "absurd", [1e30 * swinging()])
 
 
