@@ -263,6 +263,7 @@ def test_a_trajectory_that_cannot_be_made_again(tmp_path: Path, monkeypatch: pyt
             return trajectory(seed=k)
 
     monkeypatch.setattr(assemble._Conversion, "_decide", lambda self: decided.append(decide(self)))
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # the tests' checks of types look at items themselves
     report = save_dataset(tmp_path, "mine", train=Scenes(), holdout=0.0)
     assert [str(e) for e in report.refusals] == ["train, train[1]: cannot be read (KeyError: 'gone')"]
     assert report.splits["train"].trajectories == 2
