@@ -283,26 +283,17 @@ class Report(Callback):
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         self._report(Path(config.hydra.sweep.dir), is_sweep=True)
 
-    def _show(self, folder: Path) -> None:
-        """The numbers of a run, and where to look next."""
-        from gpe_pl.evaluation import read_rows
-        from gpe_pl.report import summary
-
-        if (folder / "metrics.csv").exists():
-            print(summary(list(read_rows(folder / "metrics.csv"))))
-            for viewer in sorted(folder.glob("rollout_*_00.html")):
-                print(f"look at {viewer}")
-
     def _report(self, folder: Path, is_sweep: bool) -> None:
         """Ends the process on failure: Hydra turns an exception of a callback into a warning, and the command would seem to have succeeded."""
         try:
             from gpe_pl.domain_table import compares_models, report_domains
-            from gpe_pl.report import report, report_sweep
+            from gpe_pl.report import conclusion, report, report_sweep
             from gpe_pl.trial_table import compares_settings, report_trials
 
             if not is_sweep:
                 report(folder)
-                self._show(folder)
+                if (folder / "metrics.csv").exists():
+                    print(conclusion(folder))
             elif compares_settings(folder):
                 report_trials(folder)
             elif compares_models(folder):

@@ -20,7 +20,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     from gpe_pl.evaluation import EvaluationSettings, evaluate
     from gpe_pl.learned_simulator import LearnedSimulator
     from gpe_pl.pretrained import names
-    from gpe_pl.report import summary
+    from gpe_pl.report import conclusion
     from gpe_pl.simulate import ensure_split, evaluated_config, scene_metadata
     from gpe_pl.skips import Skips
     from gpe_pl.training.run import TrainerSettings, claim, release, set_up
@@ -41,14 +41,12 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     folder = Path(cfg.paths.runs) / cfg.name
     claim(folder, _identity(evaluated), results=["*"])
     try:
-        rows = evaluate(simulator, ensure_split(evaluated, cfg.split), settings, folder)
+        evaluate(simulator, ensure_split(evaluated, cfg.split), settings, folder)
     finally:
         release(folder)
-    print(summary(rows))
     if cfg.data.get("showcase") is not None:
         _show(cfg, simulator, folder)
-    for viewer in sorted(folder.glob("rollout_*_00.html")):
-        print(f"look at {viewer}")
+    print(conclusion(folder))
     print(folder)
 
 

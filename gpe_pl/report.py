@@ -95,6 +95,12 @@ def _report(folder: Path, runs: list[Run]) -> None:
         validation_loss_figure(curves).savefig(folder / "validation_loss.png", dpi=150)
 
 
+def conclusion(folder: Path) -> str:
+    """What a command ends with: the numbers of the run or evaluation in a folder, and what to look at next."""
+    viewers = sorted(folder.glob("rollout_*_00.html"))
+    return "\n".join([summary(list(read_rows(folder / "metrics.csv"))), *(f"look at {viewer}" for viewer in viewers)])
+
+
 def summary(rows: list[Row]) -> str:
     """Means over trajectories as plain text: a line per split, metric and model, a column per horizon. Trivial models have their rollout MSE only."""
     groups: dict[tuple[str, str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))

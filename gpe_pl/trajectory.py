@@ -557,16 +557,13 @@ class Trajectory:
         def extended(values: np.ndarray, more: Any) -> np.ndarray:
             return np.concatenate([values, np.broadcast_to(more, (count, *values.shape[1:])).astype(values.dtype)])
 
-        def of(part: np.ndarray, rows: np.ndarray) -> np.ndarray:
-            return part[: self.num_frames, rows]
-
-        b, stress = self.boundary, self.stress
+        b, way, stress = self.boundary, motion.frames(0, self.num_frames), self.stress
         if stress is not None:
             stress = Stress(np.pad(stress.node, ((0, 0), (0, count), (0, 0))), stress.cell)
         return replace(
             self,
-            pos=np.concatenate([self.pos, of(motion.pos, moves).astype(self.pos.dtype)], axis=1),
-            vel=np.concatenate([self.vel, of(motion.vel, moves).astype(self.vel.dtype)], axis=1),
+            pos=np.concatenate([self.pos, way.pos[:, moves].astype(self.pos.dtype)], axis=1),
+            vel=np.concatenate([self.vel, way.vel[:, moves].astype(self.vel.dtype)], axis=1),
             node_type=extended(self.node_type, node_code(BOUNDARY)),
             mass=extended(self.mass, 0.0),
             material_params=extended(self.material_params, np.nan),

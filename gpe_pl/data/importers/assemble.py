@@ -17,7 +17,7 @@ import numpy as np
 from gpe_pl import integrators
 from gpe_pl.arrays import ArrayError
 from gpe_pl.atomic import replacing
-from gpe_pl.data.importers.motion import Motion, better_origin, motion_of
+from gpe_pl.data.importers.motion import MotionSummary, better_origin, motion_of
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
 from gpe_pl.data.importers.source import NAME, Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments, with_checksum
@@ -155,7 +155,7 @@ class _Survey:
     radii: list[float] = field(default_factory=list)
     velocity_ratios: list[float] = field(default_factory=list)
     scenes: dict[bytes, str] = field(default_factory=dict)
-    motions: list[tuple[str, str, Motion]] = field(default_factory=list)
+    motions: list[tuple[str, str, MotionSummary]] = field(default_factory=list)
     suspects: list[Event] = field(default_factory=list)
     common: tuple[float, int, tuple[bool, ...]] | None = None
 

@@ -23,7 +23,7 @@ PRECISIONS: tuple[Precision, ...] = (np.float16, np.float32, np.float64)
 
 
 @dataclass(frozen=True)
-class Motion:
+class MotionSummary:
     """What is known of a trajectory's motion.
 
     Attributes:
@@ -49,7 +49,7 @@ class Motion:
         return np.spacing(farthest.astype(precision)).astype(np.float64) / (math.sqrt(2) * self.frame_dt**2)
 
 
-def motion_of(trajectory: Trajectory) -> Motion:
+def motion_of(trajectory: Trajectory) -> MotionSummary:
     """Measure a trajectory, some frames at a time."""
     m, pos = trajectory.metadata, trajectory.pos
     precisions = list(PRECISIONS)
@@ -65,12 +65,12 @@ def motion_of(trajectory: Trajectory) -> Motion:
         with np.errstate(over="ignore"):  # what a type cannot hold, it does not hold exactly either
             precisions = [p for p in precisions if (window.astype(p) == window).all()]
     acceleration = math.sqrt(squares / pos[2:].size)
-    return Motion(
+    return MotionSummary(
         pos.min(axis=(0, 1)).astype(np.float64), pos.max(axis=(0, 1)).astype(np.float64), m.frame_dt, precisions[0], acceleration, *farthest
     )
 
 
-def better_origin(motions: list[Motion], tolerance: float) -> np.ndarray:
+def better_origin(motions: list[MotionSummary], tolerance: float) -> np.ndarray:
     """The origin [dim] in m that stored positions need so that float32 rounds accelerations by no more than ``tolerance`` [m/s²].
 
     A round number near the middle of all positions, along axes where this helps positions that are finer than float32; 0 along the others.
