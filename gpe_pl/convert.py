@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def convert(cfg: DictConfig) -> None:
     """Import one data set and print the report."""
     from gpe_pl.data.importers import PAGE_FILE, ImportSettings, draw_contact_sheet, import_dataset
-    from gpe_pl.generation import progress_bar
+    from gpe_pl.progress import progress_bar
 
     settings = construct(ImportSettings, {str(key): value for key, value in cfg.items() if key != "paths"}, "")
     with progress_bar(f"{settings.format} {settings.name or ''}") as on_progress:

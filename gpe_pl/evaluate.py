@@ -82,7 +82,7 @@ def _own_data(simulator: LearnedSimulator) -> str:
 
 def _show(cfg: DictConfig, simulator: LearnedSimulator, folder: Path) -> None:
     from gpe_pl import showcase
-    from gpe_pl.generation import progress_bar
+    from gpe_pl.progress import progress_bar
 
     settings = construct(showcase.ShowcaseSettings, {k: v for k, v in cfg.data.showcase.items() if k != "scene"}, "data.showcase")
     scene = construct_target(cfg.data.showcase.scene, "data.showcase.scene", "gpe_pl.solvers.")

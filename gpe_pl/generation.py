@@ -35,6 +35,7 @@ from pydantic.dataclasses import dataclass
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, is_intact, shard_moments, with_checksum
 from gpe_pl.errors import GpeError
+from gpe_pl.progress import Progress
 from gpe_pl.rollout import Guard, SimulationError, Simulator, rollout
 from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup
 from gpe_pl.solvers.scenes import Scene, describe
@@ -49,8 +50,6 @@ SHEET_ROWS = 5
 
 Count = Annotated[int, Field(ge=0)]
 PathPart = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
-Progress = Callable[[int, int], Any]
-"""Called with the number of trajectories that are done and their total."""
 
 
 class GenerationError(GpeError):
@@ -502,18 +501,6 @@ def _row_label(values: Mapping[str, float]) -> str:
 
 def _labelled_trajectory(spec: DatasetSpec, index: int, label: str, values: dict[str, float]) -> tuple[str, Trajectory]:
     return label, generate_trajectory(spec, "train", index, values)
-
-
-@contextlib.contextmanager
-def progress_bar(description: str) -> Iterator[Progress]:
-    """A bar with the remaining time in the terminal; yields what ``generate`` takes as ``on_progress``."""
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Bar(*columns) as bar:
-        task = bar.add_task(description, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def _claim(folder: Path, spec: DatasetSpec) -> None:

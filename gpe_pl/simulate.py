@@ -62,7 +62,8 @@ def imported_data(cfg: DictConfig) -> Path:
 
 def ensure_data(cfg: DictConfig) -> Path:
     """Folder of the config's data set; generates what is missing if the data set is small."""
-    from gpe_pl.generation import dataset_bytes, generate, progress_bar
+    from gpe_pl.generation import dataset_bytes, generate
+    from gpe_pl.progress import progress_bar
 
     if cfg.data.size == IMPORTED:  # used as they are
         return imported_data(cfg)
@@ -107,7 +108,8 @@ def evaluated_config(cfg: DictConfig) -> DictConfig:
 
 def simulate(cfg: DictConfig) -> None:
     """Generate a data set, or what is missing of it or damaged, and say beforehand what a large one takes."""
-    from gpe_pl.generation import CONTACT_SHEET_FILE, discard_damaged, generate, plan, progress_bar, seconds_per_trajectory
+    from gpe_pl.generation import CONTACT_SHEET_FILE, discard_damaged, generate, plan, seconds_per_trajectory
+    from gpe_pl.progress import progress_bar
 
     if not (cfg.num_workers is None or (isinstance(cfg.num_workers, int) and cfg.num_workers >= 1)):
         raise ConfigError(f"num_workers={cfg.num_workers!r}: must be null (one per core) or an integer of at least 1")

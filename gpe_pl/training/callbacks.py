@@ -1,7 +1,8 @@
-"""Callbacks: weight averaging with warm-up, and rollouts as validation."""
+"""Callbacks: weight averaging with warm-up, rollouts as validation, progress."""
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from itertools import zip_longest
 from typing import Any
 
@@ -14,6 +15,7 @@ from gpe_pl import ranks
 from gpe_pl.containment import Contained
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import per_frame_mse
+from gpe_pl.progress import progress_bar
 from gpe_pl.rollout import Guard, Start, rollouts
 from gpe_pl.trajectory import Trajectory
 
@@ -76,3 +78,25 @@ class RolloutValidation(Callback):
             mean for part in zip_longest(*ranks.gathered(means)) for mean in part if mean is not None
         ]  # in the order of the trajectories
         return float(np.mean(everywhere))
+
+
+class StepProgress(Callback):
+    """Shows the steps of the whole training, also of a resumed one, in the terminal of the first process."""
+
+    def __init__(self) -> None:
+        self._bar = ExitStack()
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        if trainer.is_global_zero:
+            self._show = self._bar.enter_context(progress_bar("training"))
+            self._show(trainer.global_step, trainer.max_steps)
+
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        if trainer.is_global_zero:
+            self._show(trainer.global_step, trainer.max_steps)
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._bar.close()
+
+    def on_exception(self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException) -> None:
+        self._bar.close()

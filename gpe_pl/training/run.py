@@ -15,8 +15,9 @@ from typing import Annotated, Any, Literal
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
@@ -25,7 +26,7 @@ from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import NoiseKind
 from gpe_pl.data.sampling import PushForward, Sampling
 from gpe_pl.errors import GpeError
-from gpe_pl.training.callbacks import RolloutValidation, WarmAverage
+from gpe_pl.training.callbacks import RolloutValidation, StepProgress, WarmAverage
 from gpe_pl.training.checkpoints import AtomicCheckpoints
 from gpe_pl.training.module import Compile, Schedule, TrainingModule
 from gpe_pl.training.parallel import SummedGradients
@@ -142,12 +143,17 @@ def release(run_dir: Path) -> None:
 
 
 def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
-    """Copy the checkpoint of a finished run below ``folder`` that was trained with the configuration ``config``; None if there is no such run."""
+    """Copy the checkpoint of a finished run below ``folder`` that was trained with the configuration ``config``; None if there is no such run.
+
+    Of several processes that ``torchrun`` or Slurm started only the first returns, the others end.
+    """
     for path in sorted(folder.rglob(CONFIG)):
         trained = path.parent / "checkpoints" / "best.ckpt"
         if (path.parent / "metrics.csv").exists() and trained.exists():
             there = _config_in(path)
             if not _differences({key: value for key, value in there.items() if key != "evaluation"}, config):
+                if rank_zero_only.rank > 0:
+                    sys.exit()
                 log.info("taking the model that was trained in %s", path.parent)
                 own = run_dir / "checkpoints" / "best.ckpt"
                 with replacing(own) as part:
@@ -198,7 +204,7 @@ def train(
         latest,
     ]
     if trainer_settings.progress:
-        callbacks.append(TQDMProgressBar(refresh_rate=50))
+        callbacks.append(StepProgress())
     is_parallel = trainer_settings.num_processes > 1
     if is_parallel:
         os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # else Lightning shares out all cores
@@ -219,7 +225,7 @@ def train(
             callbacks=callbacks,
             logger=loggers,
             log_every_n_steps=min(50, training.num_steps),
-            enable_progress_bar=trainer_settings.progress,
+            enable_progress_bar=False,
             enable_model_summary=False,
             plugins=[AtomicCheckpoints()],
         )

@@ -7,6 +7,7 @@ import re
 import shutil
 import signal
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,10 @@ from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.evaluation import read_rows
 from gpe_pl.fit import fit
 from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.progress import Progress
 from gpe_pl.report import report_sweep, validation_curve
 from gpe_pl.store import StoreError
+from gpe_pl.training import callbacks
 from gpe_pl.training.module import TrainingError, TrainingModule
 from gpe_pl.training.run import RunError, claim
 from tests.runs import tiny
@@ -121,6 +124,25 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     assert curves[0] == curves[1]
     assert curves[0][0] == [2, 4, 6]
     assert (tmp_path / "whole" / "metrics.csv").read_bytes() == (tmp_path / "parts" / "metrics.csv").read_bytes()
+
+
+def test_progress_counts_the_steps_of_the_whole_training(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[tuple[int, int]] = []
+
+    @contextmanager
+    def bar(_: str) -> Iterator[Progress]:
+        yield lambda done, total: shown.append((done, total))
+
+    monkeypatch.setattr(callbacks, "progress_bar", bar)
+    cfg = tiny(tiny_data, tmp_path, *STEPS, "trainer.progress=true", "training.push_share=0")
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt(patch, 5, Killed)
+        with pytest.raises(Killed):
+            fit(cfg)
+    assert shown == [(step, 6) for step in range(6)]
+    shown.clear()
+    fit(cfg)
+    assert shown == [(step, 6) for step in (4, 5, 6)]
 
 
 @pytest.mark.slow

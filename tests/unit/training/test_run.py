@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from lightning.pytorch.utilities import rank_zero_only
 
 from gpe_pl.training.run import RunError, TrainerSettings, adopt, claim, set_up
 
@@ -37,6 +38,14 @@ def test_the_same_configuration_is_the_same_run(tmp_path: Path, config: dict[str
     claim(folder, {**config, "evaluation": {"splits": ["test"]}})
     taken = adopt(tmp_path / "there", config, tmp_path / "now")
     assert taken is not None and taken.read_bytes() == b"weights"
+
+
+def test_of_processes_started_together_one_takes_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    finished(tmp_path / "there", CONFIG)
+    monkeypatch.setattr(rank_zero_only, "rank", 1)
+    with pytest.raises(SystemExit):
+        adopt(tmp_path / "there", CONFIG, tmp_path / "now")
+    assert not (tmp_path / "now").exists()
 
 
 def test_a_gpu_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
