@@ -176,18 +176,23 @@ def velocities_of(pos: np.ndarray, frame_dt: float, periodicity: Periodicity) ->
     return vel
 
 
+def nearest_distances(pos: np.ndarray, periodicity: Periodicity = NOWHERE) -> np.ndarray:
+    """Distance [node] in m from each node [node, dim] to the nearest other one; infinite for a single node."""
+    from scipy.spatial import cKDTree
+
+    points, box = (periodicity.from_corner(pos), periodicity.period) if periodicity else (pos, None)
+    return cKDTree(points, boxsize=box).query(points, k=2)[0][:, 1]
+
+
 def typical_spacing(pos: np.ndarray, periodicity: Periodicity = NOWHERE) -> float:
     """Median distance [m] of nodes [node, dim] to their nearest neighbour.
 
     Raises:
         ArrayError: a single node, or nodes that coincide.
     """
-    from scipy.spatial import cKDTree
-
     if len(pos) < 2:
         raise ArrayError("spacing: a single node has no neighbours; pass spacing")
-    points, box = (periodicity.from_corner(pos), periodicity.period) if periodicity else (pos, None)
-    spacing = float(np.median(cKDTree(points, boxsize=box).query(points, k=2)[0][:, 1]))
+    spacing = float(np.median(nearest_distances(pos, periodicity)))
     if spacing <= 0:
         raise ArrayError("spacing: half of the nodes coincide with another one, so it cannot be told from positions; pass spacing")
     return spacing

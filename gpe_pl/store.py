@@ -150,7 +150,9 @@ def open_shard(path: Path | str) -> Iterator[h5py.File]:
     except StoreError:
         raise
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:  # all of these come out of HDF5 and h5py
-        raise StoreError(f"{path}: not a readable HDF5 file (damaged or truncated: {error}); delete it and run simulate again") from error
+        raise StoreError(
+            f"{path}: not a readable HDF5 file (damaged or truncated: {error}); delete it and generate or import the data again"
+        ) from error
 
 
 def _where(group: h5py.Group) -> str:
@@ -162,14 +164,16 @@ def open_group(file: h5py.File, name: str) -> h5py.Group:
     if name not in file:
         raise StoreError(f"{file.filename}: no trajectory {name!r}; it has {len(file)} trajectories")
     if not isinstance(file.get(name, getlink=True), h5py.HardLink) or not isinstance(file[name], h5py.Group):
-        raise StoreError(f"{file.filename}: {name!r} is not a trajectory of this file; delete the shard and run simulate again")
+        raise StoreError(
+            f"{file.filename}: {name!r} is not a trajectory of this file; delete the shard and generate or import the data again"
+        )
     return file[name]
 
 
 def read_text(group: h5py.Group, key: str) -> str:
     """A text attribute of a trajectory."""
     if key not in group.attrs:
-        raise StoreError(f"{_where(group)}: attribute {key!r} is missing; delete the shard and run simulate again")
+        raise StoreError(f"{_where(group)}: attribute {key!r} is missing; delete the shard and generate or import the data again")
     stored = group.attrs.get_id(key)
     if stored.shape != () or stored.dtype.kind != "S":  # text of variable length has kind "O" and is not safe to read from a damaged file
         raise StoreError(f"{_where(group)}: attribute {key!r} is {stored.dtype}{list(stored.shape)}, expected text of fixed length")
@@ -180,7 +184,7 @@ def read_field(group: h5py.Group, key: str, frames: slice | None = None) -> np.n
     """One stored array, compared with ``schema.FIELDS`` before any of it is read; only ``frames`` of it where it has frames."""
     spec, where = FIELDS[key], f"{_where(group)}: field {key!r}"
     if key not in group:
-        raise StoreError(f"{where} is missing; delete the shard and run simulate again")
+        raise StoreError(f"{where} is missing; delete the shard and generate or import the data again")
     dataset = group[key] if isinstance(group.get(key, getlink=True), h5py.HardLink) else None
     if not isinstance(dataset, h5py.Dataset) or dataset.is_virtual or dataset.external:
         raise StoreError(f"{where} is not an array inside this file; a shard must not refer to other files")
@@ -192,7 +196,7 @@ def read_field(group: h5py.Group, key: str, frames: slice | None = None) -> np.n
         has_frames = spec.dims[0] == "frame" or (spec.dims[0] == MOTION and dataset.shape[0] > 1)
         return dataset[frames] if frames is not None and has_frames else dataset[()]
     except (OSError, RuntimeError):
-        raise StoreError(f"{where} is damaged (checksum mismatch); delete the shard and run simulate again") from None
+        raise StoreError(f"{where} is damaged (checksum mismatch); delete the shard and generate or import the data again") from None
 
 
 def size_conflicts(arrays: dict[str, np.ndarray], metadata: Metadata) -> list[str]:
@@ -288,7 +292,9 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         if verify:
             attributes = {key: read_text(group, key) for key in ("metadata", "shapes", "node_types")}
             if digest(arrays, attributes) != read_text(group, "sha256"):
-                raise StoreError(f"{path}:{name}: SHA-256 digest does not match the content; delete the shard and run simulate again")
+                raise StoreError(
+                    f"{path}:{name}: SHA-256 digest does not match the content; delete the shard and generate or import the data again"
+                )
         if ("node_stress" in arrays) != ("cell_stress" in arrays):
             raise StoreError(f"{path}:{name}: has only one of the fields 'node_stress' and 'cell_stress'")
         for conflict in size_conflicts(arrays, metadata):
@@ -325,8 +331,10 @@ def shards(root: Path | str, split: str) -> list[Path]:
     """Shard files of a split under a data set's folder, in order; raises ``StoreError`` when there is none."""
     found = sorted((Path(root) / split).glob("shard-*.h5"))
     if not found:
+        others = sorted({path.parent.name for path in Path(root).glob("*/shard-*.h5")})
         raise StoreError(
-            f"{root}: no shards of split {split!r}; generate them with `python -m gpe_pl.simulate`, or import data that have it"
+            f"{root}: has no split {split!r} but {', '.join(others) or 'none'}; generate it with `python -m gpe_pl.simulate`, import data that have it, "
+            "or choose another split"
         )
     return found
 

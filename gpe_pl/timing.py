@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
+log = logging.getLogger(__name__)
 
-def paired_times(alternatives: Mapping[str, Callable[[], Any]], num_rounds: int = 20, num_warmups: int = 2) -> dict[str, np.ndarray]:
-    """Seconds [round] of each alternative; every round runs all of them once, in an order that rotates."""
+
+def paired_times(
+    alternatives: Mapping[str, Callable[[], Any]], num_rounds: int = 20, num_warmups: int = 2, what: str = ""
+) -> dict[str, np.ndarray]:
+    """Seconds [round] of each alternative; every round runs all of them once, in an order that rotates. Rounds of ``what`` are logged, if it is given."""
     names = list(alternatives)
     for _ in range(num_warmups):
         for name in names:
@@ -22,6 +27,8 @@ def paired_times(alternatives: Mapping[str, Callable[[], Any]], num_rounds: int 
             start = time.perf_counter()
             alternatives[name]()
             times[name].append(time.perf_counter() - start)
+        if what:
+            log.info("%s: round %d of %d", what, k + 1, num_rounds)
     return {name: np.array(t) for name, t in times.items()}
 
 

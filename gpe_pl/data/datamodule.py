@@ -35,7 +35,7 @@ def data_statistics(root: Path | str) -> dict[str, float]:
             raise ValueError("checksum mismatch")
         return {"acceleration_std": float(statistics["acceleration_std"])}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{path}: cannot be read ({error}); run `python -m gpe_pl.simulate` again") from None
+        raise StoreError(f"{path}: cannot be read ({error}); generate or import the data again") from None
 
 
 class TrajectoryDataModule(L.LightningDataModule):

@@ -171,9 +171,7 @@ def validate(paths: Iterable[Path | str]) -> Result:
     for path in map(Path, paths):
         files = sorted(path.rglob("*.h5")) if path.is_dir() else [path]
         if not files:
-            result.violations.append(
-                Violation(path, "", "", "no shards (*.h5) in this folder; generate them with `python -m gpe_pl.simulate`")
-            )
+            result.violations.append(Violation(path, "", "", "no shards (*.h5) in this folder; generate or import data"))
         for file in files:
             _check_file(file, result, seen, reference)
     return result
@@ -247,7 +245,7 @@ def _check_trajectory(group: h5py.Group, path: Path) -> tuple[Metadata, dict[str
     findings += [("", conflict) for conflict in conflicts]
     sha = read_text(group, "sha256")
     if digest(arrays, {key: read_text(group, key) for key in ("metadata", "shapes", "node_types")}) != sha:
-        findings.append(("sha256", "does not match the content; delete the shard and run simulate again"))
+        findings.append(("sha256", "does not match the content; delete the shard and generate or import the data again"))
     complete = all(key in arrays for key, spec in FIELDS.items() if spec.required)
     if complete and not conflicts:  # the checks of meaning rely on consistent shapes
         findings += _check_nodes(metadata, arrays, node_types_of(group))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,6 +21,8 @@ from gpe_pl.report import table_row
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+log = logging.getLogger(__name__)
 
 EDGES_PER_NODE = {2: 9.6, 3: 15.0}
 """Undirected edges of a node in the data sets' graphs."""
@@ -96,6 +99,7 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
             torch.cuda.reset_peak_memory_stats() if settings.device == "cuda" else None
             memory = peak_memory(whole_step, settings, num_nodes, dim) if settings.device == "cpu" else torch.cuda.max_memory_allocated()
             per_edge = forward_time / num_edges / settings.num_message_passing_steps
+            log.info("%dD, %d nodes: %.3f s per step", dim, num_nodes, graph_time + forward_time)
             rows.append((num_nodes, graph_time + forward_time, per_edge))
             forward_times.append((num_nodes, forward_time))
             values = {

@@ -143,7 +143,7 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
             for level in ("on", "off"):
                 runner = simulator(settings, edge_state, growth.builder, getattr(growth, level))
                 alternatives[level] = _step(approximate(runner), growth.state)
-            times = paired_times(alternatives, settings.num_rounds)
+            times = paired_times(alternatives, settings.num_rounds, what=f"{edge_state}, {growth.amount}")
             cells = [edge_state, growth.amount]
             for level in ("on", "off"):
                 case = f"{growth.amount}, {level}, {edge_state}"

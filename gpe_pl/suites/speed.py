@@ -180,8 +180,8 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
     forward = {n: synchronized(function, device) for n, function in passes.items()}
     step = {n: synchronized(with_precision(training_step(m, on_device), todo[n].precision), device) for n, m in models.items()}
     exact = {n.removesuffix(MEDIUM): forward[n.removesuffix(MEDIUM)]() for n in todo if n.endswith(MEDIUM)}
-    forward_times = paired_times(forward, settings.num_rounds, num_warmups=3)
-    training_times = paired_times(step, max(1, settings.num_rounds // 3), num_warmups=3)
+    forward_times = paired_times(forward, settings.num_rounds, num_warmups=3, what="forward passes")
+    training_times = paired_times(step, max(1, settings.num_rounds // 3), num_warmups=3, what="training steps")
 
     gemm, copy = gemm_rate(num_edges, settings.hidden_channels, device), copy_rate(device)
     records: list[dict[str, Any]] = [

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gpe_pl import integrators
-from gpe_pl.arrays import ArrayError
+from gpe_pl.arrays import ArrayError, nearest_distances
 from gpe_pl.atomic import replacing
 from gpe_pl.data.importers.motion import MotionSummary, better_origin, motion_of
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
@@ -41,6 +41,10 @@ NUM_SHOWN = 4
 """Rows of the contact sheet."""
 
 FEWEST_NEIGHBOURS, MOST_NEIGHBOURS = 3.0, 60.0
+SPACING_RATIO = 3.0
+"""A source's spacing and that of its nodes disagree beyond this ratio."""
+COINCIDENCE = 1e-3
+"""Of a spacing: nodes that are closer in the first frame are at one place."""
 VELOCITY_RATIO = 1.25
 """Positions and velocities of a source disagree about time beyond this ratio, …"""
 FRAMES_COMPARED = 200
@@ -152,6 +156,7 @@ class _Survey:
     materials: set[str] = field(default_factory=set)
     bounds: list[tuple[tuple[float, float], ...]] = field(default_factory=list)
     spacings: list[float] = field(default_factory=list)
+    distances: list[float] = field(default_factory=list)
     radii: list[float] = field(default_factory=list)
     velocity_ratios: list[float] = field(default_factory=list)
     scenes: dict[bytes, str] = field(default_factory=dict)
@@ -233,10 +238,16 @@ class _Conversion:
         if survey.scenes.setdefault(digest, where) != where:
             raise Refusal(f"has exactly the positions of {survey.scenes[digest]}: the same scene twice")
         survey.motions.append((split, name, motion_of(trajectory)))
+        nearest = nearest_distances(trajectory.pos[0].astype(np.float64), m.periodicity)
+        at_one_place = np.flatnonzero(nearest < COINCIDENCE * m.spacing)
+        if len(at_one_place):
+            what = f"{len(at_one_place)} nodes lie where another one is, the first of them node {at_one_place[0]}: do bodies overlap?"
+            survey.suspects.append(Event(split, name, 0, what))
         survey.materials |= set(m.materials)
         survey.bounds.append(m.bounds)
         if len(survey.spacings) < NUM_SAMPLED:
             survey.spacings.append(m.spacing)
+            survey.distances.append(float(np.median(nearest)))
             survey.radii.append(m.connectivity_radius)
             first = trajectory.frames(0, FRAMES_COMPARED)
             step = np.linalg.norm(m.periodicity.shortest(np.diff(first.pos.astype(np.float64), axis=0)), axis=-1).mean()
@@ -262,7 +273,7 @@ class _Conversion:
         bounds = facts.bounds
         if facts.spacing is None:
             report.notes.append(
-                f"spacing {spacing:.4g} m is the median distance of nodes to the nearest one, unless they say otherwise (spacing=…)"
+                f"spacing {spacing:.4g} m is the median of the trajectories' (what they were given, else the distance to the nearest node; spacing=…)"
             )
         if facts.connectivity_radius is None:
             report.notes.append(
@@ -271,7 +282,13 @@ class _Conversion:
         if bounds is None and not any(periodic):
             every = np.array(survey.bounds)
             bounds = tuple(zip(every[..., 0].min(axis=0).tolist(), every[..., 1].max(axis=0).tolist(), strict=True))
-            report.notes.append("bounds are the extremes of all positions, unless trajectories say otherwise (bounds=…)")
+            report.notes.append("bounds span those of all trajectories (what they were given, else the extremes of positions; bounds=…)")
+        distance = float(np.median(survey.distances))
+        if np.isfinite(distance) and not distance / SPACING_RATIO < spacing < distance * SPACING_RATIO:
+            report.warnings.append(
+                f"spacing is said to be {spacing:.4g} m, but nodes are {distance:.4g} m from the nearest one (median of first frames): spacing=… or bounds=… "
+                "may be wrong"
+            )
         self.facts = replace(facts, frame_dt=frame_dt, periodic=periodic, spacing=spacing, connectivity_radius=radius, bounds=bounds)
         self._compare_with_rounding()
         self._look_for_jumps(radius)
@@ -328,7 +345,9 @@ class _Conversion:
                     events[:] = [replace(e, split=split) if e.split == "train" and e.trajectory in moved else e for e in events]
                 report.notes.append(f"the source has no usable {split}: the last {count} training trajectories were taken")
         elif missing:
-            report.warnings.append(f"there is no split {' and no split '.join(missing)}; fit needs train, val and test")
+            report.warnings.append(
+                f"there is no split {' and no split '.join(missing)}; fit needs train, val and test, or three trajectories of train to take them from"
+            )
 
     # --- second pass -----------------------------------------------------------------------------------------------------------------------
 

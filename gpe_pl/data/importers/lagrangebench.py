@@ -107,4 +107,6 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         for key, found in counts.items()
         if (stated := count_in(values, key, described)) not in (None, found)
     ]
+    if values.get("dim", dim) != dim:
+        warnings.append(f"dim = {values['dim']!r} in {described.name}, but bounds have {dim} axes, as the data must")
     return Source(facts, splits, tuple(warnings))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -35,6 +35,9 @@ ASSUMED_FRICTION = 0.5
 
 STILL = 1e-2
 """Boundary nodes that never get farther than this share of the spacing from where they should be are still, or slide steadily."""
+
+WIDEST = 1.05
+"""Periods that nodes may spread over in a first frame."""
 
 MAX_JSON_BYTES = 2**24
 
@@ -222,6 +225,7 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
     outside = [k for k, frame in enumerate(pos) if periodicity and (periodicity.wrapped(frame.astype(np.float64)) != frame).any()]
     if outside:
         repairs.append(Repair(f"positions folded into the periodic domain in {len(outside)} frames", outside[0]))
+    warnings = [*nodes.warnings, *_wider_than_periods(pos[0], periodicity)]
     kinds = [str(k) for k in nodes.kind[moving]]
     parameters: dict[str, Any] = {}
     for material in dict.fromkeys(kinds):
@@ -251,8 +255,16 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
         ),
         (*repairs, *wall_repairs),
         (*notes, *wall_notes),
-        tuple(nodes.warnings),
+        tuple(warnings),
     )
+
+
+def _wider_than_periods(first: np.ndarray, periodicity: Periodicity) -> Iterator[str]:
+    """What speaks against the periods: a first frame [node, dim] that is wider than one."""
+    for axis in periodicity.axes:
+        width, period = np.ptp(first[:, axis]), periodicity.period[axis]
+        if width > WIDEST * period:
+            yield f"nodes spread over {width:.4g} m along {'xyz'[axis]} in the first frame, which is periodic with {period:.4g} m: bounds=… may be wrong"
 
 
 def _cells_of(nodes: Nodes, moving: np.ndarray, repairs: list[Repair]) -> np.ndarray | None:

@@ -189,7 +189,7 @@ def test_extra_and_missing_fields(shard: Path) -> None:
     with h5py.File(shard, "r+") as file:
         del file["00000"]["colour"], file["00000"]["mass"]
     found = [str(v) for v in validate([shard]).violations]
-    assert found[0] == f"{shard}: 00000: field 'mass' is missing; delete the shard and run simulate again"
+    assert found[0] == f"{shard}: 00000: field 'mass' is missing; delete the shard and generate or import the data again"
 
 
 def test_wrong_counts_units_and_version(shard: Path) -> None:

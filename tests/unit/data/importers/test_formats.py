@@ -138,7 +138,10 @@ def test_what_a_number_means_can_be_said(tmp_path: Path) -> None:
     assert trajectory.metadata.materials == ("elastomer",)
     assert (trajectory.material_params == 5e4).all()
     assert "frame_dt = 0.02 was given" in report.notes
-    assert "there is no split val and no split test; fit needs train, val and test" in report.warnings
+    assert (
+        "there is no split val and no split test; fit needs train, val and test, or three trajectories of train to take them from"
+        in report.warnings
+    )
 
 
 # --- LagrangeBench -------------------------------------------------------------------------------------------------------------------------
@@ -208,6 +211,17 @@ def test_what_is_assumed_of_the_time_step_is_said(tmp_path: Path) -> None:
     sources.lagrangebench_h5(tmp_path / "raw" / "train.h5", [(drift(seed=k), np.zeros(20, np.int64)) for k in range(3)])
     report, _ = imported(tmp_path / "out", tmp_path / "raw", "lagrangebench")
     assert any("write_every is not in the source" in note for note in report.notes) and report.frame_dt == values["dt"]
+
+
+def test_a_description_that_the_data_contradict_is_doubted(tmp_path: Path) -> None:
+    sources.lagrangebench_metadata(tmp_path / "raw", dx=10.0, dim=3, bounds=[[0.0, 0.5], [0.0, 1.0]])
+    sources.lagrangebench_h5(tmp_path / "raw" / "train.h5", [(drift(seed=k), np.zeros(20, np.int64)) for k in range(3)])
+    report, _ = imported(tmp_path / "out", tmp_path / "raw", "lagrangebench")
+    assert any("nodes spread over" in w and "along x in the first frame, which is periodic with 0.5 m" in w for w in report.warnings)
+    assert not any("along y in the first frame" in w for w in report.warnings)
+    (spacing,) = (w for w in report.warnings if w.startswith("spacing is said to be 10 m, but nodes are 0.0"))
+    assert spacing.endswith("spacing=… or bounds=… may be wrong")
+    assert "dim = 3 in metadata.json, but bounds have 2 axes, as the data must" in report.warnings
 
 
 def test_the_force_of_a_dam_break_is_gravity(tmp_path: Path) -> None:
@@ -440,7 +454,10 @@ def test_the_canyon(tmp_path: Path) -> None:
     np.testing.assert_allclose(trajectory.material_params, 0.01, rtol=1e-6)
     assert report.spacing == pytest.approx(0.05, rel=1e-3)  # the cube of which is the mass of water
     assert report.frame_dt == 0.02
-    assert report.warnings[0] == "there is no split val and no split test; fit needs train, val and test"
+    assert (
+        report.warnings[0]
+        == "there is no split val and no split test; fit needs train, val and test, or three trajectories of train to take them from"
+    )
     assert report.warnings[1].startswith(
         "train, canyon, frame 12: node 130 moves by 0.1146 m in one frame, farther than"
     )  # water that falls fast
@@ -484,4 +501,4 @@ def test_own_arrays_with_as_little_as_possible(tmp_path: Path) -> None:
     assert (trajectory.material_params == 35.0).all()
     assert (trajectory.boundary.normal[:, 1] > 0.5).all()
     assert trajectory.metadata.bounds == stored["test"][0].metadata.bounds
-    assert any("bounds are the extremes" in note for note in report.notes)
+    assert any("else the extremes of positions" in note for note in report.notes)

@@ -87,6 +87,20 @@ def test_everything_moves_with_the_origin(tmp_path: Path) -> None:
             np.testing.assert_allclose(shape.signed_distance(points), before.signed_distance(points + OFFSET), atol=1e-9)
 
 
+def test_nodes_at_one_place_are_named(tmp_path: Path) -> None:
+    """As where two bodies overlap; a spacing that was given says nothing of it."""
+    made = []
+    for seed in range(3):
+        pos = swinging(seed)
+        pos[:, 5] = pos[:, 2]
+        made.append(Trajectory.from_numpy(pos, DT, "sand", {"sand": 30.0}, spacing=SPACING))
+    report = save_dataset(tmp_path, "sand", train=made)
+    assert sorted(w for w in report.warnings if "do bodies overlap?" in w) == [
+        f"{split}, train[{k}], frame 0: 2 nodes lie where another one is, the first of them node 2: do bodies overlap?"
+        for k, split in ((1, "test"), (0, "train"), (2, "val"))
+    ]
+
+
 def test_rest_positions_of_their_own_stay_where_they_are(tmp_path: Path) -> None:
     rest = swinging()[0]
     made = [
