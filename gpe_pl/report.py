@@ -36,13 +36,17 @@ class Run:
     rows: list[Row]
 
 
+UNSAID: dict[str, Any] = {"training.sampling": "uniform", "training.push_share": 0.0, "training.push_correction": 1.0}
+"""What the ``config.json`` of a run leaves out where it is not used, as runs did before there was a choice."""
+
+
 def finished_runs(folder: Path) -> list[Run]:
     """All finished runs below a folder, in order of their paths."""
     runs = []
     for path in sorted(folder.rglob("metrics.csv")):
         config = path.parent / "config.json"
         if config.exists():
-            runs.append(Run(path.parent, dict(_flatten(json.loads(config.read_text()))), list(read_rows(path))))
+            runs.append(Run(path.parent, UNSAID | dict(_flatten(json.loads(config.read_text()))), list(read_rows(path))))
     return runs
 
 

@@ -24,12 +24,16 @@ from gpe_pl.trajectory import State, Trajectory
 
 
 class StartKey(NamedTuple):
-    """A window to start from for steps of the model's own; batches of the same ``lane`` go on where the last one has come to."""
+    """A window to start from for steps of the model's own; batches of the same ``lane`` go on where the last one has come to.
+
+    ``correction`` is the share of what the velocity has gone astray by in these steps that the target takes back within one.
+    """
 
     sample: int
     window: int
     own_steps: int
     lane: int = 0
+    correction: float = 1.0
 
 
 Key = int | tuple[int, int] | StartKey
@@ -87,7 +91,8 @@ class Start:
         state: with noise, as float64 tensors.
         truth: positions [own_steps + 2, node, dim] of the frames from the state's on [m].
         stress: true Cauchy stress [own_steps + 1, node, component] of the frames after the state's [Pa], where it is asked for.
-        correction: share of the distance from the true position that the target takes back within a step; see ``Noise``.
+        position_correction: share of the distance from the true position that the target takes back within a step; see ``Noise``.
+        velocity_correction: the same of the velocity, after own steps; as in the key.
         about: trajectory and frame, and the weight in the loss if there is one.
         sample, lane: as in the key.
     """
@@ -95,7 +100,8 @@ class Start:
     state: State
     truth: Tensor
     stress: Tensor | None
-    correction: float
+    position_correction: float
+    velocity_correction: float
     about: dict[str, Any]
     sample: int
     lane: int
@@ -113,12 +119,16 @@ class Start:
     def graph(self, builder: GraphBuilder, state: State, step: int) -> HeteroData:
         """The training graph of the state that a model has come to in so many steps.
 
-        Its target leads to the velocity that the true motion has then, and takes back ``correction`` of the distance from the true position.
+        Its target is the true velocity that follows, plus what is to remain of the distance from the true velocity, minus what is to be taken back of that
+        from the true position.
         """
         dt, where = builder.metadata.frame_dt, state.periodicity
         vel = integrators.velocities(self.truth[step : step + 2], dt, where)[0]
+        if step:  # the noise of the start is taken back as a whole
+            before = integrators.velocities(self.truth[step - 1 : step + 1], dt, where)[0]
+            vel = vel + (1 - self.velocity_correction) * (state.vel - before)
         astray = integrators.velocities(torch.stack([self.truth[step], state.pos]), dt, where)[0]
-        target = integrators.acceleration(vel - self.correction * astray, state.vel, dt) - state.gravity
+        target = integrators.acceleration(vel - self.position_correction * astray, state.vel, dt) - state.gravity
         return training_graph(builder, state, target, None if self.stress is None else self.stress[step], self.about)
 
 
@@ -259,7 +269,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
             about["weight"] = 1 / (len(self) * float(self.probability[window]))
         if start is not None:
             correction = self.noise.correction if self.noise is not None and self.noise.kind == "velocity" else 0.0
-            return Start(state, torch.from_numpy(truth[history:]), stress, correction, about, sample, start.lane)
+            return Start(state, torch.from_numpy(truth[history:]), stress, correction, start.correction, about, sample, start.lane)
         target = integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity
         return training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[-1], about)
 

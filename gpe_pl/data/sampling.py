@@ -46,10 +46,13 @@ class PushForward:
     Attributes:
         first_step: of the optimiser from which this is done.
         max_steps: own steps. A batch is trained on at its true state and after each of these steps, then the next one takes its lane.
+        correction: share of what velocities have gone astray by that the target takes back within a step. The trick takes all, which suits what friction
+            slows down anyway; bodies that swing would have to be stopped by forces that they do not have.
     """
 
     first_step: Annotated[int, Field(ge=0)]
     max_steps: Annotated[int, Field(ge=1)]
+    correction: Annotated[float, Field(ge=0, le=1)] = 1.0
 
     def starts(self, batches: Iterator[list[tuple[int, int]]]) -> Iterator[list[StartKey]]:
         """The starts of each optimiser step from ``first_step`` on. The lanes begin with different numbers of own steps, so that all numbers are about as
@@ -62,7 +65,7 @@ class PushForward:
                 own_steps = (turn + lane * num_visits // NUM_LANES) % num_visits
                 if turn and not own_steps:
                     lanes[lane] = next(batches)
-                yield [StartKey(sample, window, own_steps, lane) for sample, window in lanes[lane]]
+                yield [StartKey(sample, window, own_steps, lane, self.correction) for sample, window in lanes[lane]]
 
 
 class StepSampler(Sampler[tuple[int, int]]):

@@ -45,7 +45,7 @@ class TrainingSettings:
     """Everything about the optimisation; see ``TrainingModule``, ``TrajectoryDataModule``, ``data.noise`` and ``data.sampling`` for the meaning of each value.
 
     ``budget_minutes``, of one core or GPU, replaces ``num_steps`` (see ``training.budget``). The last ``push_share`` of the steps start where the model has
-    come to in up to ``push_steps`` steps of its own.
+    come to in up to ``push_steps`` steps of its own; ``push_correction`` of the way that its velocity has gone astray is to be taken back within a step.
     """
 
     num_steps: Annotated[int, Field(ge=1)]
@@ -63,6 +63,7 @@ class TrainingSettings:
     sampling: Sampling = "uniform"
     push_share: Annotated[float, Field(ge=0, le=1)] = 0.0
     push_steps: Annotated[int, Field(ge=1)] = 20
+    push_correction: Annotated[float, Field(ge=0, le=1)] = 1.0
     stress_weight: Annotated[float, Field(gt=0)] = 1.0
     compile: Compile = "auto"
     val_interval: Annotated[int, Field(ge=1)] = 1000
@@ -78,17 +79,20 @@ class TrainingSettings:
     def as_dict(self) -> dict[str, Any]:
         """For a run's ``config.json``: without what runs did not have once, where it is not used, so that those are known again."""
         values = asdict(self)
-        for key in ("sampling", "push_share"):
+        for key in ("sampling", "push_share", "push_correction"):
             if values[key] == type(self).__dataclass_fields__[key].default:
                 del values[key]
         if not self.push_share:
             del values["push_steps"]
+            values.pop("push_correction", None)
         return values
 
     @property
     def push_forward(self) -> PushForward | None:
         """When samples begin with own steps of the model."""
-        return PushForward(round((1 - self.push_share) * self.num_steps), self.push_steps) if self.push_share else None
+        return (
+            PushForward(round((1 - self.push_share) * self.num_steps), self.push_steps, self.push_correction) if self.push_share else None
+        )
 
 
 @dataclass(frozen=True)
@@ -152,7 +156,7 @@ def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
         if (path.parent / "metrics.csv").exists() and trained.exists():
             there = _config_in(path)
             if not _differences({key: value for key, value in there.items() if key != "evaluation"}, config):
-                if rank_zero_only.rank > 0:
+                if rank_zero_only.rank > 0:  # type: ignore[attr-defined]
                     sys.exit()
                 log.info("taking the model that was trained in %s", path.parent)
                 own = run_dir / "checkpoints" / "best.ckpt"

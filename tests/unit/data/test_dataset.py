@@ -202,7 +202,7 @@ def test_batches_of_a_number_of_graphs_are_cut_from_the_order(store: Path) -> No
 
 
 def test_a_split_that_is_not_held_takes_the_memory_of_a_window(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> None:
-    write_shard(tmp_path / "train" / "shard-00000.h5", [new_trajectory(0, num_frames=600, num_nodes=60)])
+    write_shard(tmp_path / "train" / "shard-00000.h5", [new_trajectory(0, num_frames=3000, num_nodes=60)])
     size = read_trajectory(tmp_path / "train" / "shard-00000.h5", "00000").pos.nbytes
     data = dataset(tmp_path, cache_bytes=0)
     data[0]  # what the first one loads stays
@@ -257,27 +257,28 @@ def test_a_start_without_own_steps_is_the_usual_sample(store: Path, noise: Noise
     assert_equal_graphs(graph, usual)
 
 
-def test_the_target_after_own_steps_leads_back(store: Path) -> None:
-    """To the true velocity of that frame, and by the share of the correction to the true position."""
+@pytest.mark.parametrize("correction", [0.2, 1.0])
+def test_the_target_after_own_steps_leads_back(store: Path, correction: float) -> None:
+    """By the shares of the corrections to the true velocity of that frame, and to the true position."""
     data = dataset(store, noise=Noise("velocity", 0.5, 0.25))
-    start, dt = data[StartKey(5, 0, 2)], data.builder.metadata.frame_dt
+    start, dt = data[StartKey(5, 0, 2, correction=correction)], data.builder.metadata.frame_dt
     assert start.own_steps == 2 == data[StartKey(5, 0, 9)].own_steps  # the trajectory ends there
-    state = start.state
-    astray = replace(state, pos=start.truth[2] + 0.01, vel=state.vel + 1.0)
+    before, truth = (start.truth[2] - start.truth[1]) / dt, (start.truth[3] - start.truth[2]) / dt
+    astray = replace(start.state, pos=start.truth[2] + 0.01, vel=before + 1.0)
     target = start.graph(data.builder, astray, 2)["sand"].target.double()
-    truth = (start.truth[3] - start.truth[2]) / dt
     next_vel = astray.vel + (target + astray.gravity) * dt
-    assert torch.allclose(next_vel, truth - 0.25 * 0.01 / dt, atol=1e-5)
+    assert torch.allclose(next_vel, truth + (1 - correction) - 0.25 * 0.01 / dt, atol=1e-5)
 
 
 def test_late_batches_ask_for_own_steps(store: Path) -> None:
     data = dataset(store)
-    push = PushForward(3, 4)
+    push = PushForward(3, 4, correction=0.3)
     keys = list(itertools.islice(BatchSampler(data, BatchSize(2), 0, lambda: 0, push), 3 + 6 * NUM_LANES))
     plain = list(itertools.islice(BatchSampler(data, BatchSize(2), 0, lambda: 0), 60))
     assert keys[:3] == plain[:3]
     late = cast(list[list[StartKey]], keys[3:])
     assert [[key[:2] for key in batch] for batch in late[:NUM_LANES]] == plain[3 : 3 + NUM_LANES]
+    assert {key.correction for batch in late for key in batch} == {0.3}
     assert collections.Counter(batch[0].own_steps for batch in late[: 5 * NUM_LANES]) == dict.fromkeys(range(5), NUM_LANES)
     following = iter(cast(list[tuple[int, int]], batch) for batch in plain[3 + NUM_LANES :])
     for before, after in zip(late, late[NUM_LANES:], strict=False):  # of the same lane

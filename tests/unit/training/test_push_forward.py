@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
+from gpe_pl.report import UNSAID
 from gpe_pl.rollout import SimulationError
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.push_forward import walked
@@ -151,12 +153,15 @@ def test_a_start_can_be_moved(data: WindowDataset) -> None:
 
 def test_settings_of_older_runs_are_known_again() -> None:
     old = TrainingSettings(num_steps=10, val_interval=5)
-    assert not {"sampling", "push_share", "push_steps"} & old.as_dict().keys()
+    assert not {"sampling", "push_share", "push_steps", "push_correction"} & old.as_dict().keys()
     assert old.push_forward is None
+    assert {f"training.{key}": value for key, value in asdict(old).items() if key not in {*old.as_dict(), "push_steps"}} == UNSAID
     new = TrainingSettings(num_steps=10, val_interval=5, sampling="activity", push_share=0.3, push_steps=4)
     assert {k: new.as_dict()[k] for k in ("sampling", "push_share", "push_steps")} == {
         "sampling": "activity",
         "push_share": 0.3,
         "push_steps": 4,
     }
-    assert new.push_forward == PushForward(7, 4)
+    assert "push_correction" not in new.as_dict() and new.push_forward == PushForward(7, 4)
+    newer = replace(new, push_correction=0.2)
+    assert newer.as_dict()["push_correction"] == 0.2 and newer.push_forward == PushForward(7, 4, 0.2)
