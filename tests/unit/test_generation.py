@@ -35,6 +35,7 @@ from gpe_pl.generation import (
     scene_seed,
     seconds_per_trajectory,
 )
+from gpe_pl.progress import progress_bar
 from gpe_pl.schema import SPLITS
 from gpe_pl.simulate import dataset_spec
 from gpe_pl.solvers.mpm import MPM
@@ -412,6 +413,6 @@ def test_start_is_free_flight():
 
 
 def test_progress_bar_reports(folder, capsys):
-    with generation.progress_bar("sand") as progress:
+    with progress_bar("sand") as progress:
         progress(3, 4)
     assert "3/4" in capsys.readouterr().out
