@@ -182,12 +182,12 @@ class LearnedSimulator(nn.Module):
         stress = [g[m].stress_target for g in graphs for m in self.builder.spec.stress_channels if "stress_target" in g[m]]
         if stress:
             self.stress_std.copy_(torch.cat(stress).double().square().mean().sqrt().clamp(min=1.0))
-        for material, trained in self._trained_ranges():
+        for material, trained in self.trained_ranges():
             params = torch.cat([g[material].material_params for g in graphs]).double()
             if len(params):
                 trained.copy_(torch.stack([params.amin(dim=0), params.amax(dim=0)]))
 
-    def _trained_ranges(self) -> Iterator[tuple[str, Tensor]]:
+    def trained_ranges(self) -> Iterator[tuple[str, Tensor]]:
         """Lowest and highest value [2, param] of each material's parameters in training."""
         for material in self.builder.spec.param_channels:
             yield material, self.get_buffer(f"trained_{material}")
@@ -195,7 +195,7 @@ class LearnedSimulator(nn.Module):
     def untrained_parameters(self, state: State) -> list[str]:
         """What in a scene lies outside the range of the training data: one line per material parameter, empty if nothing does."""
         found = []
-        for material, trained in self._trained_ranges():
+        for material, trained in self.trained_ranges():
             column = self.builder.metadata.param_names.index(MATERIALS[material].name)
             values = state.material_params[state.node_type == node_code(material), column]
             margin = RANGE_TOLERANCE * trained.abs()
@@ -208,7 +208,7 @@ class LearnedSimulator(nn.Module):
 
     def forward(self, data: HeteroData) -> Prediction:
         """Accelerations without gravity per material, in units of ``acceleration_std``."""
-        limits = dict(self._trained_ranges()) if self.holds_parameters else None
+        limits = dict(self.trained_ranges()) if self.holds_parameters else None
         return self.model(self.standardizer(data, self.skips.absent_types, limits))
 
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:

@@ -12,7 +12,7 @@ import torch
 
 from gpe_pl.errors import GpeError
 from gpe_pl.rollout import Guard, SimulationError, Simulator, Start, rollout, rollouts, step_all
-from gpe_pl.schema import BOUNDARY, node_code
+from gpe_pl.schema import BOUNDARY, MATERIALS, node_code
 from gpe_pl.stability.subject import Outcome, Subject, acceleration, no_boundary, relative_change, stress_test
 from gpe_pl.trajectory import State, Trajectory
 
@@ -39,13 +39,17 @@ class Spoiled:
 @stress_test(
     17,
     "material parameters",
-    "0.1 and 10 times those trained: finite and flagged; infinite, NaN or missing: refused with the node's number",
+    "a tenth of the smallest and ten times the largest trained one: finite and flagged; infinite, NaN or missing: refused with the node's number",
 )
 def materials(subject: Subject) -> Outcome:
     simulator, state = subject.simulator, subject.state()
     found = []
-    for factor in (0.1, 10.0):
-        scaled = replace(state, material_params=state.material_params * factor)
+    for end, factor in ((0, 0.1), (1, 10.0)):
+        params = state.material_params.clone()
+        for material, trained in simulator.trained_ranges():
+            column = simulator.builder.metadata.param_names.index(MATERIALS[material].name)
+            params[state.node_type == node_code(material), column] = factor * trained[end].item()
+        scaled = replace(state, material_params=params)
         finite = bool(torch.isfinite(acceleration(simulator, scaled)).all())
         found.append(finite and bool(simulator.untrained_parameters(scaled)))
     refused = 0

@@ -45,7 +45,7 @@ def subject(spec: DatasetSpec, scenes: list[Trajectory], **settings: str) -> Sub
     torch.manual_seed(0)
     build = GraphBuilder(GraphConfig(history=2, islands=True), scenes[0].metadata)
     simulator = LearnedSimulator(GPE(build.spec, num_message_passing_steps=2, hidden_channels=8, **settings), build).eval()  # type: ignore[arg-type]
-    for _, trained in simulator._trained_ranges():
+    for _, trained in simulator.trained_ranges():
         trained.copy_(torch.tensor([[20.0], [40.0]]))
     return Subject("GPE", "sand", simulator, spec, scenes, max_speed=10.0, is_gating=True, horizon_factors=(1.0, 2.0), num_rest_steps=5)
 
