@@ -141,7 +141,7 @@ def test_errors_name_the_file(shard: Path) -> None:
         read_trajectory(shard.with_name("nothing.h5"), "00000")
     with pytest.raises(StoreError, match=r"shard-00000\.h5: no trajectory '7'; it has 1 trajectories"):
         read_trajectory(shard, "7")
-    with pytest.raises(StoreError, match="no shards of split 'val'"):
+    with pytest.raises(StoreError, match="has no split 'val' but train"):
         shards(shard.parent.parent, "val")
 
 
