@@ -66,10 +66,10 @@ def fit(cfg: DictConfig) -> float:
         return TrainingModule(simulator, **{n: getattr(training, n) for n in names})
 
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
+    settings["data"].pop("comparison", None)  # what is taken of it is in graph and training
     unusual = {"batching": settings["batching"]} if batch_size.max_nodes is not None else {}  # as runs had it before there was a choice
     if training.budget_minutes is not None:
-        dataset = {k: v for k, v in settings["data"].items() if k != "comparison"}
-        parts = {k: settings[k] for k in ("graph", "model")} | {"data": dataset, "batch_size": training.batch_size, "device": device}
+        parts = {k: settings[k] for k in ("graph", "model", "data")} | {"batch_size": training.batch_size, "device": device}
         parts |= unusual
         parts |= {"push_forward": [training.push_share, training.push_steps]} if training.push_share else {}
         key = f"{cfg.data.name} {cfg.size.name} {cfg.model._target_.rpartition('.')[2]} {digest(parts)}"

@@ -168,7 +168,10 @@ def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
 
 def _config_in(path: Path) -> dict[str, Any]:
     try:
-        return dict(json.loads(path.read_text()))
+        values = dict(json.loads(path.read_text()))
+        if isinstance(values.get("data"), dict):
+            values["data"].pop("comparison", None)  # which older runs wrote down, though it says nothing that graph and training do not
+        return values
     except ValueError:
         raise RunError(f"{path} is damaged; delete the folder {path.parent} or choose another name=…") from None
 

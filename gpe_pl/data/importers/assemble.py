@@ -6,7 +6,7 @@ import hashlib
 import importlib
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -24,6 +24,7 @@ from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments, wit
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.periodicity import PeriodicityError
+from gpe_pl.progress import Progress
 from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup, node_code, param_names
 from gpe_pl.store import iter_trajectories, write_shard
 from gpe_pl.trajectory import Trajectory
@@ -44,7 +45,7 @@ FEWEST_NEIGHBOURS, MOST_NEIGHBOURS = 3.0, 60.0
 SPACING_RATIO = 3.0
 """A source's spacing and that of its nodes disagree beyond this ratio."""
 COINCIDENCE = 1e-3
-"""Of a spacing: nodes that are closer in the first frame are at one place."""
+"""Of the median distance to the nearest node: nodes that are closer in the first frame are at one place."""
 VELOCITY_RATIO = 1.25
 """Positions and velocities of a source disagree about time beyond this ratio, …"""
 FRAMES_COMPARED = 200
@@ -55,17 +56,13 @@ TYPED = ("gns", "lagrangebench", "meshgraphnets")
 """Formats with types of nodes."""
 
 
-Progress = Callable[[int, int], Any]
-"""Called with the number of trajectories that were read, and how often one will be."""
-
-
 def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Progress | None = None) -> Report:
     """Convert a source into ``{root}/{name}/imported``.
 
     Args:
         root: folder of all data sets.
         settings: what to read, and what to take instead of what it says.
-        on_progress: called after each trajectory that was read.
+        on_progress: called after each trajectory that was read, with the number of those and how often one will be.
 
     Raises:
         ImportFailure: the source cannot be read, none of its training trajectories can be used, or the data set exists already.
@@ -239,7 +236,7 @@ class _Conversion:
             raise Refusal(f"has exactly the positions of {survey.scenes[digest]}: the same scene twice")
         survey.motions.append((split, name, motion_of(trajectory)))
         nearest = nearest_distances(trajectory.pos[0].astype(np.float64), m.periodicity)
-        at_one_place = np.flatnonzero(nearest < COINCIDENCE * m.spacing)
+        at_one_place = np.flatnonzero((nearest == 0) | (nearest < COINCIDENCE * np.median(nearest)))
         if len(at_one_place):
             what = f"{len(at_one_place)} nodes lie where another one is, the first of them node {at_one_place[0]}: do bodies overlap?"
             survey.suspects.append(Event(split, name, 0, what))

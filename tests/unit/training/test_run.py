@@ -40,6 +40,14 @@ def test_the_same_configuration_is_the_same_run(tmp_path: Path, config: dict[str
     assert taken is not None and taken.read_bytes() == b"weights"
 
 
+def test_what_a_data_set_offers_to_comparisons_is_no_part_of_a_run(tmp_path: Path) -> None:
+    """Older runs wrote it down; new settings there must not make other runs of them."""
+    now = {**CONFIG, "data": {"name": "sand"}}
+    folder = finished(tmp_path / "there", {**now, "data": {"name": "sand", "comparison": {"noise_std": 1.0}}})
+    claim(folder, {**now, "evaluation": {"splits": ["test"]}})
+    assert adopt(tmp_path / "there", now, tmp_path / "now") is not None
+
+
 def test_of_processes_started_together_one_takes_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     finished(tmp_path / "there", CONFIG)
     monkeypatch.setattr(rank_zero_only, "rank", 1)
