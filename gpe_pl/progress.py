@@ -19,6 +19,6 @@ def progress_bar(description: str) -> Iterator[Progress]:
     from rich.progress import Progress as Bar
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Bar(*columns) as bar:
+    with Bar(*columns, refresh_per_second=2) as bar:  # drawn from within the process whose work it shows
         task = bar.add_task(description, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
