@@ -263,7 +263,7 @@ def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]],
             cells = []
             for h in horizons:
                 values = values_by_seed(runs, LEARNED, split, "rollout_mse", h)
-                cells.append(f"{_interval(values, 1e3)} {_factor(trivial[h] / _mean(values))}" if values else "–")
+                cells.append(_interval(values, 1e3) + _factor(trivial[h] / _mean(values)) if values else "–")
             lines.append(table_row([*(key or (LEARNED,)), split, *cells]))
         for baseline in baselines:
             cells = [_interval(values_by_seed([first], baseline, split, "rollout_mse", h), 1e3) for h in horizons]
@@ -281,7 +281,9 @@ def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]],
 
 
 def _factor(ratio: float) -> str:
-    return f"**{ratio:.1f}×**" if ratio > 1 else f"{ratio:.2g}×"
+    if ratio == 0:  # of a mean that failed rollouts make infinite
+        return ""
+    return f" **{ratio:.1f}×**" if ratio > 1 else f" {ratio:.2g}×" if ratio >= 0.01 else " < 0.01×"
 
 
 def table_row(cells: list[str]) -> str:

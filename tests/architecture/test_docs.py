@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+import yaml
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from gpe_pl.config import _groups as groups
 from gpe_pl.config import compose
@@ -58,7 +59,7 @@ def test_tables_name_every_choice(page: str, key: str) -> None:
 @pytest.mark.parametrize("command", ["fit", "evaluate", "simulate", "benchmark"])
 def test_help_names_every_choice(command: str) -> None:
     file = OmegaConf.load(ROOT / "conf" / f"{command}.yaml")
-    listed = OmegaConf.to_container(file.hydra.help)["template"]  # type: ignore[index, call-overload]
+    listed = listed_help(file)
     for group in groups(command) - {"paths"}:
         text = re.search(rf"^{group} .*\n(?: +\S.*\n)*", listed, re.MULTILINE)
         assert text, f"{command} --help does not have {group}"
@@ -66,6 +67,25 @@ def test_help_names_every_choice(command: str) -> None:
         assert choices <= set(re.findall(r"\w+", text[0])), f"{command} --help, {group}"
     for key in {*map(str, file)} - {"defaults", "hydra", "evaluation"}:
         assert re.search(rf"^(?:\w+, )?{key}\b", listed, re.MULTILINE), f"{command} --help does not have {key}"
+
+
+@pytest.mark.parametrize("command", ["fit", "evaluate", "simulate", "benchmark", "convert"])
+def test_help_says_the_defaults(command: str) -> None:
+    GlobalHydra.instance().clear()
+    file, cfg = OmegaConf.load(ROOT / "conf" / f"{command}.yaml"), compose(command, [])
+    chosen = {group: choice for default in file.defaults if OmegaConf.is_dict(default) for group, choice in default.items()}
+    compared = 0
+    for keys, said in re.findall(r"^(\w\S*(?:, \w\S*)*) .*\(([^()]+)\)$", listed_help(file), re.MULTILINE):
+        for key, value in zip(keys.split(", "), said.split(", "), strict=False):
+            default = chosen.get(key, OmegaConf.select(cfg, key))
+            if default is not None and not OmegaConf.is_interpolation(file, key):  # otherwise the help says how it is computed
+                assert str(yaml.safe_load(value)) == str(default), f"{command} --help, {key}"
+                compared += 1
+    assert compared
+
+
+def listed_help(file: DictConfig | ListConfig) -> str:
+    return str(file.hydra.help.template).replace("${hydra.help.app_name}", "")
 
 
 def test_every_format_is_in_the_table() -> None:

@@ -1,0 +1,77 @@
+"""Tables of runs whose numbers are known."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from gpe_pl import report
+from gpe_pl.evaluation import LEARNED, Row, write_rows
+
+ERRORS = {  # of two test scenes; free flight has 2e-3 and 6e-3
+    ("negated", 0): [1e-3, 3e-3],
+    ("negated", 1): [2e-3, 2e-3],
+    ("odd", 0): [8e-3, 8e-3],
+    ("directed", 0): [float("inf"), 5e-3],
+    ("odd_even", 0): [4e6, 4e6],
+}
+
+
+def write_run(folder: Path, interaction: str, seed: int) -> None:
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps({"seed": seed, "model": {"interaction": interaction}}))
+    groups = ("interpolated", "extrapolated")
+    rows = [Row(LEARNED, "test_unseen", k, groups[k], 20.0, "rollout_mse", "full", v) for k, v in enumerate(ERRORS[interaction, seed])]
+    rows += [Row("ballistic", "test_unseen", k, groups[k], 20.0, "rollout_mse", "full", v) for k, v in enumerate((2e-3, 6e-3))]
+    write_rows(folder / "metrics.csv", [*rows, Row("constant_velocity", "test_unseen", 0, groups[0], 20.0, "rollout_mse", "full", 1.0)])
+    log = folder / "log" / "version_0"
+    log.mkdir(parents=True)
+    (log / "metrics.csv").write_text(f"step,val/one_step_nmse\n9,0.9\n19,{0.2 + 0.2 * seed}\n")
+
+
+@pytest.fixture
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(report, "forward_time_ratios", lambda variants: {})  # there are no checkpoints
+    for interaction, seed in ERRORS:
+        write_run(tmp_path / interaction / str(seed), interaction, seed)
+    return tmp_path
+
+
+def cells(folder: Path, interaction: str) -> list[list[str]]:
+    """The row of one variant in each table of ``table.md``, without its intervals."""
+    lines = (folder / "table.md").read_text().splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith(f"| {interaction} ")]
+    return [[" ".join(word for word in cell.split() if word[0] != "[" and word[-1] != "]") for cell in row] for row in rows]
+
+
+def test_errors_are_means_and_factors_over_the_best_trivial_baseline(runs: Path) -> None:
+    report.report_sweep(runs)
+    (training, rollout) = cells(runs, "negated")
+    assert training[1:3] == ["2", "0.3000 (0.2000 – 0.4000)"]
+    assert rollout[1:] == ["test_unseen", "2 **2.0×**"]
+    assert cells(runs, "odd")[1][2] == "8 0.5×"
+    assert cells(runs, "odd_even")[1][2] == "4e+09 < 0.01×"
+    assert cells(runs, "ballistic")[0][2] == "4"
+
+
+def test_failed_rollouts_are_counted(runs: Path) -> None:
+    report.report_sweep(runs)
+    assert cells(runs, "directed")[1][2] == "1 of 2 failed, median inf"
+
+
+def test_the_csv_has_unseen_values_also_apart(runs: Path) -> None:
+    report.report_sweep(runs)
+    with open(runs / "table.csv", newline="") as handle:
+        lines = [line for line in csv.DictReader(handle) if line["interaction"] == "negated" and line["seed"] == "0"]
+    values = {line["split"]: float(line["value"]) for line in lines if line["metric"] == "rollout_mse"}
+    assert values == pytest.approx({"test_unseen": 2e-3, "test_unseen/interpolated": 1e-3, "test_unseen/extrapolated": 3e-3})
+
+
+def test_a_repeated_run_counts_once(runs: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_run(runs / "again", "odd", 0)
+    report.report_sweep(runs)
+    assert cells(runs, "odd")[0][1] == "1"
+    assert "repeats" in caplog.text
