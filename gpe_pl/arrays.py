@@ -44,6 +44,8 @@ def numbers(name: str, values: Any, axes: Mapping[str, int | None]) -> np.ndarra
     Raises:
         ArrayError: other numbers or another shape; names the first place.
     """
+    if np.ma.is_masked(values):
+        raise ArrayError(f"{name}: is a masked array with {np.ma.count_masked(values)} masked values; only whole arrays can be used")
     try:
         array = np.asarray(values)
     except (ValueError, TypeError) as error:
@@ -83,13 +85,21 @@ def positive(name: str, value: Any, unit: str) -> float:
     raise ArrayError(f"{name}={value!r}: must be a positive number of {unit}")
 
 
-def checked_bounds(bounds: Any, periodic: Any, pos: np.ndarray, boundary_pos: np.ndarray) -> tuple[tuple[float, float], ...]:
+def flags(name: str, values: Any, count: int) -> tuple[bool, ...]:
+    """``count`` truth values, one per axis; None: none is true."""
+    if values is None:
+        return (False,) * count
+    array = np.asarray(values)
+    if array.shape != (count,) or not (array.dtype == bool or (array.dtype.kind in "iu" and np.isin(array, (0, 1)).all())):
+        raise ArrayError(f"{name}={array.tolist()!r:.80}: needs true or false for each of {count} axes")
+    return tuple(array.astype(bool).tolist())
+
+
+def checked_bounds(bounds: Any, periodic: tuple[bool, ...], pos: np.ndarray, boundary_pos: np.ndarray) -> tuple[tuple[float, float], ...]:
     """Bounds that hold all positions [frame, node, dim] along axes that do not repeat; the extremes where none are given."""
     dim = pos.shape[2]
-    if periodic is not None and np.shape(periodic) != (dim,):
-        raise ArrayError(f"periodic={np.asarray(periodic).tolist()}: needs one value per axis, there are {dim}")
     if bounds is None:
-        if periodic is not None and any(periodic):
+        if any(periodic):
             raise ArrayError("bounds: a periodic axis needs bounds, since its period cannot be told from positions")
         points = [pos.min(axis=(0, 1)), pos.max(axis=(0, 1))]
         if len(boundary_pos):
@@ -107,7 +117,7 @@ def checked_bounds(bounds: Any, periodic: Any, pos: np.ndarray, boundary_pos: np
         far = max(abs(low), abs(high)) if pos.dtype == np.float32 else 0.0  # where rounding can lead out
         slack = 1e-5 * max(far, high - low)
         outside = (pos[..., axis] < low - slack) | (pos[..., axis] > high + slack)
-        if not (periodic is not None and periodic[axis]) and outside.any():
+        if not periodic[axis] and outside.any():
             frame, node = np.argwhere(outside)[0]
             raise ArrayError(
                 f"pos: frame {frame}, node {node}: {'xyz'[axis]} = {pos[frame, node, axis]:.6g} m is outside the bounds {low:g} … {high:g} m",

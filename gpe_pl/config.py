@@ -48,6 +48,9 @@ def _for_model(values: Mapping[str, Any], target: str) -> Any:
 OmegaConf.register_new_resolver("for_model", _for_model, replace=True)
 OmegaConf.register_new_resolver("model_name", model_name, replace=True)  # ${model_name:checkpoint,runs}
 
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells have it."""
+
 CONF = Path(__file__).resolve().parent.parent / "conf"
 T = TypeVar("T")
 
@@ -177,6 +180,9 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             os.environ["HYDRA_FULL_ERROR"] = "1"  # let exceptions reach us instead of Hydra's own report
             try:
                 return hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
+            except KeyboardInterrupt:
+                print("interrupted", file=sys.stderr)
+                sys.exit(INTERRUPTED)
             except SweepError as error:
                 _fail(error)
             except (HydraException, OmegaConfBaseException, ValueError) as error:  # some of Hydra's are an OSError too

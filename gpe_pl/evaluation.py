@@ -19,7 +19,7 @@ from gpe_pl.approximate import approximate
 from gpe_pl.atomic import replacing
 from gpe_pl.baselines import Ballistic, ConstantVelocity
 from gpe_pl.containment import TOLERANCE, Contained
-from gpe_pl.data.dataset import WindowDataset, open_split
+from gpe_pl.data.dataset import WindowDataset, long_enough, open_split
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.batching import batched
 from gpe_pl.learned_simulator import LearnedSimulator
@@ -27,7 +27,6 @@ from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
 from gpe_pl.portable import export_model
 from gpe_pl.rollout import Guard, Simulator, Start, rollout, rollouts, share_outside
 from gpe_pl.schema import Split
-from gpe_pl.store import iter_trajectories
 from gpe_pl.trajectory import State, Trajectory
 
 log = logging.getLogger(__name__)
@@ -114,7 +113,7 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     for split in settings.splits:
         curves: dict[str, list[np.ndarray]] = {}
         rows += [Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split))]
-        trajectories = islice(iter_trajectories(root, split), settings.num_trajectories)
+        trajectories = islice(long_enough(root, split, simulator.builder.config.history), settings.num_trajectories)
         number, truth = 0, None
         while batch := list(islice(trajectories, SCENES_AT_ONCE)):
             left = len(batch) if settings.num_uncontained is None else max(0, settings.num_uncontained - number)

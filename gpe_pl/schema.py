@@ -13,6 +13,10 @@ STICKY = 1.0e6
 """Coulomb friction coefficient that stands for a no-slip boundary (any value this large or larger is no-slip)."""
 
 
+HISTORY = 5
+"""Velocities per node that a model sees, unless ``graph.history`` says otherwise."""
+
+
 @dataclass(frozen=True)
 class MaterialParameter:
     """One continuous parameter of a material.

@@ -18,6 +18,7 @@ from gpe_pl.arrays import (
     checked_bounds,
     checked_cells,
     checked_materials,
+    flags,
     numbers,
     per_node,
     positive,
@@ -464,8 +465,9 @@ class Trajectory:
         if boundary.motion is not None and boundary.motion.num_frames != num_frames:
             raise ArrayError(f"boundary: its motion has {boundary.motion.num_frames} frames, pos has {num_frames}")
         way = boundary.pos if boundary.motion is None else boundary.motion.pos.reshape(-1, dim)
-        bounds = checked_bounds(bounds, periodic, pos, way)
-        periodicity = Periodicity(bounds, tuple(map(bool, periodic)) if periodic is not None else (False,) * dim)
+        repeats = flags("periodic", periodic, dim)
+        bounds = checked_bounds(bounds, repeats, pos, way)
+        periodicity = Periodicity(bounds, repeats)
         if periodicity:
             pos = np.stack([periodicity.wrapped(frame.astype(np.float64)).astype(pos.dtype) for frame in pos])
         codes, columns, names = checked_materials(materials, params, num_nodes)

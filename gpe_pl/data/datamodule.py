@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
 import lightning as L
@@ -13,13 +14,13 @@ from torch.utils.data import DataLoader
 from torch_geometric.data import HeteroData
 
 from gpe_pl import ranks
-from gpe_pl.data.dataset import HeldGraphs, WindowDataset, collated, open_split
+from gpe_pl.data.dataset import HeldGraphs, WindowDataset, collated, long_enough, open_split
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling, probabilities
 from gpe_pl.data.statistics import is_intact
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.store import StoreError, iter_trajectories
+from gpe_pl.store import StoreError
 from gpe_pl.trajectory import Trajectory
 
 NUM_VAL_GRAPHS = 8
@@ -88,8 +89,8 @@ class TrajectoryDataModule(L.LightningDataModule):
             yield self.train_set[int(window)]
 
     def val_trajectories(self, count: int) -> list[Trajectory]:
-        """The first ``count`` trajectories of the ``val`` split."""
-        return [t for t, _ in zip(iter_trajectories(self.root, "val"), range(count), strict=False)]
+        """The first ``count`` trajectories of the ``val`` split that are long enough."""
+        return list(islice(long_enough(self.root, "val", self.builder.config.history), count))
 
     def train_dataloader(self) -> DataLoader:
         trainer = self.trainer

@@ -5,6 +5,8 @@ A sample is a pure function of (split, seed, sample number): runs resume exactly
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias, overload
@@ -19,8 +21,10 @@ from gpe_pl import integrators
 from gpe_pl.data.noise import Noise
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
-from gpe_pl.store import StoreError, open_group, open_shard, read_trajectory, shards
+from gpe_pl.store import StoreError, iter_trajectories, open_group, open_shard, read_trajectory, shards
 from gpe_pl.trajectory import State, Trajectory
+
+log = logging.getLogger(__name__)
 
 
 class StartKey(NamedTuple):
@@ -72,6 +76,18 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
             held = _read_only(read_trajectory(path, name)) if hold else None
             stored.append(StoredTrajectory(path, name, num_frames, num_nodes, held))
     return stored
+
+
+def long_enough(root: Path | str, split: str, history: int) -> Iterator[Trajectory]:
+    """The trajectories of a split that have a frame with so many velocities and one to predict; warns of the others."""
+    for number, trajectory in enumerate(iter_trajectories(root, split)):
+        if trajectory.num_frames >= history + 2:
+            yield trajectory
+        else:
+            log.warning(
+                "%s, trajectory %d: left out, its %d frames are fewer than the %d that graph.history=%d needs",
+                Path(root) / split, number, trajectory.num_frames, history + 2, history,
+            )  # fmt: skip
 
 
 def _read_only(trajectory: Trajectory) -> Trajectory:
@@ -193,7 +209,10 @@ class WindowDataset(Dataset[HeteroData | Start]):
         self.ends = np.cumsum(counts)
         if not len(self.ends) or self.ends[-1] == 0:
             longest = max((t.num_frames for t in trajectories), default=0)
-            raise StoreError(f"no trajectory has the {history + 2} frames that graph.history={history} needs; the longest has {longest}")
+            where = f"{trajectories[0].path.parent}: " if trajectories else ""
+            raise StoreError(
+                f"{where}no trajectory has the {history + 2} frames that graph.history={history} needs; the longest has {longest}"
+            )
 
     def __len__(self) -> int:
         return int(self.ends[-1])

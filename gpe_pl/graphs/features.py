@@ -16,6 +16,7 @@ from gpe_pl.graphs.multiscale import levels_of
 from gpe_pl.schema import (
     BOUNDARY,
     CELL,
+    HISTORY,
     MESH_MATERIALS,
     RADIUS,
     EdgeType,
@@ -51,7 +52,7 @@ class GraphConfig:
     """
 
     features: Features = "contact"
-    history: Annotated[int, Field(ge=1, le=20)] = 5
+    history: Annotated[int, Field(ge=1, le=20)] = HISTORY
     connectivity_spacings: Annotated[float, Field(gt=0)] | None = None
     trim_boundary: bool = True
     mesh: bool = False

@@ -14,6 +14,7 @@ from urllib.parse import urlparse
 from lightning.pytorch.loggers import CSVLogger, Logger
 
 from gpe_pl.atomic import replace_text
+from gpe_pl.errors import GpeError
 
 log = logging.getLogger(__name__)
 
@@ -41,16 +42,29 @@ class LoggerSettings:
         """
         loggers: list[Logger] = [CSVLogger(run_dir, name="log", flush_logs_every_n_steps=1)]
         if self.kind == "wandb":
-            from lightning.pytorch.loggers import WandbLogger
-
-            mode = self.mode or ("online" if has_key() else "offline")
-            own = (
-                run_dir.parts[run_dir.parts.index(name) + 1 :] if name in run_dir.parts else ()
-            )  # of a sweep: what is special about this run
-            options: dict[str, Any] = {"group": name, "mode": mode, "resume": "allow"}
-            loggers.append(WandbLogger("/".join(own) or name, save_dir=run_dir, project=self.project, id=run_id(run_dir), **options))
-            loggers[-1].log_hyperparams({**config, "run_dir": str(run_dir)})
+            mode = self.mode or os.environ.get("WANDB_MODE") or ("online" if has_key() else "offline")
+            loggers.append(self._wandb(run_dir, name, config, mode))
         return loggers
+
+    def _wandb(self, run_dir: Path, name: str, config: Mapping[str, Any], mode: str) -> Logger:
+        import wandb
+        from lightning.pytorch.loggers import WandbLogger
+
+        own = run_dir.parts[run_dir.parts.index(name) + 1 :] if name in run_dir.parts else ()  # of a sweep: what is special about this run
+        options: dict[str, Any] = {"group": name, "mode": mode, "resume": "allow"}
+        logger = WandbLogger("/".join(own) or name, save_dir=run_dir, project=self.project, id=run_id(run_dir), **options)
+        try:
+            logger.log_hyperparams({**config, "run_dir": str(run_dir)})
+        except wandb.errors.CommError as error:
+            log.warning("W&B cannot be reached (%s); this run is kept offline", error)
+            return self._wandb(run_dir, name, config, "offline")
+        except wandb.errors.Error as error:
+            raise TrackingError(f"W&B: {error}; logger.mode=offline keeps the run here") from None
+        return logger
+
+
+class TrackingError(GpeError):
+    """W&B refuses a run; the message says why."""
 
 
 def has_key() -> bool:
@@ -88,7 +102,8 @@ def publish(loggers: Iterable[Logger], run_dir: Path, results: Mapping[str, floa
             }
             run.log({**pictures, **films})
             run.summary.update(dict(results))
-            folder, is_offline = Path(run.dir).parent, run.settings.mode == "offline"
+            is_offline = run.settings.mode == "offline"
             run.finish()
             if is_offline:
-                log.warning("W&B: kept offline%s; upload it with `wandb sync %s`", "" if has_key() else ", as there is no API key", folder)
+                folders = " ".join(map(str, sorted((run_dir / "wandb").glob(f"offline-run-*-{run_id(run_dir)}"))))  # one for every start
+                log.warning("W&B: kept offline%s; upload it with `wandb sync %s`", "" if has_key() else ", as there is no API key", folders)

@@ -49,35 +49,32 @@ def rollout_figure(
 
 
 def error_curve_figure(
-    curves: Mapping[str, Sequence[Float[np.ndarray, "frame"]]],
+    curves: Mapping[str, Sequence[Float[np.ndarray, "_"]]],
     frame_dt: float,
     quantiles: tuple[float, float] = (0.1, 0.9),
     label: str = "position MSE [m²]",
 ) -> Figure:
-    """Error against time on a logarithmic axis: median over trajectories, and a band between two quantiles, as the legend says.
+    """Error against time on a logarithmic axis: median over the trajectories that last so long, and a band between two quantiles, as the legend says.
 
     Infinite errors (rollouts that failed) leave the top of the axes, and errors far below that of every curve's end the bottom. Frame 0, the shared start, is
     not drawn.
 
     Args:
-        curves: per-frame errors of the trajectories (``metrics.per_frame_mse``), by the name of the simulator.
+        curves: per-frame errors [frame] of the trajectories (``metrics.per_frame_mse``), of any lengths, by the name of the simulator.
         frame_dt: time between frames [s].
         quantiles: edges of the band.
         label: of the vertical axis.
-
-    Raises:
-        ValueError: trajectories of one simulator differ in length.
     """
     figure = new_figure(COLUMN_WIDTH, 2.5)
     axes = _plain_axes(figure)
     bands = {}
     for name, errors in curves.items():
-        if len({len(e) for e in errors}) != 1:
-            raise ValueError(f"{name}: error curves must exist and have one length, got {sorted({len(e) for e in errors})}")
-        table = np.stack([np.asarray(e, float)[1:] for e in errors])
+        table = np.full((len(errors), max(map(len, errors)) - 1), np.nan)
+        for row, values in zip(table, errors, strict=True):
+            row[: len(values) - 1] = values[1:]
         # Order statistics: interpolation between infinities is not a number.
-        low, high = np.quantile(table, quantiles, axis=0, method="inverted_cdf")
-        bands[name] = np.stack([low, np.median(table, axis=0), high])
+        low, high = np.nanquantile(table, quantiles, axis=0, method="inverted_cdf")
+        bands[name] = np.stack([low, np.nanmedian(table, axis=0), high])
     ceiling = _set_log_limits(axes, np.concatenate([b.ravel() for b in bands.values()]))
     ends = [band[1, -1] for band in bands.values() if 0 < band[1, -1] < np.inf]
     if ends:  # what is rounding at first may be no error to look at

@@ -23,6 +23,7 @@ from gpe_pl.evaluation import read_rows
 from gpe_pl.fit import fit
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.simulate import ensure_data
+from gpe_pl.store import StoreError
 from gpe_pl.trajectory import Trajectory
 from tests import sources
 from tests.runs import RUN, compose
@@ -101,6 +102,35 @@ def test_a_periodic_data_set_is_imported_trained_on_and_evaluated(
     with pytest.raises(ImportFailure, match="never overwritten"):
         convert(compose("convert", "format=lagrangebench", f"source={lagrangebench}", "name=tgv", f"paths.data={tmp_path / 'data'}"))
     assert files(folder) == before
+
+
+def test_trajectories_of_any_length(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Of those too short for the history nothing is used; the others differ in length."""
+    lengths = {"train": (14, 3, 28), "val": (3, 14), "test": (20, 3, 14)}
+
+    def scene(seed: int, num_frames: int) -> Trajectory:
+        pos = np.concatenate([crowd(seed), crowd(seed) + 0.01])[:num_frames]
+        return Trajectory.from_numpy(
+            pos % 1.0, 0.01, "sand", {"sand": 30.0}, bounds=[(0, 1)] * 2, periodic=[True, True], connectivity_radius=0.2
+        )
+
+    splits = {split: [scene(10 * k + i, n) for i, n in enumerate(found)] for k, (split, found) in enumerate(lengths.items())}
+    save_dataset(tmp_path / "data", "any", **splits)  # type: ignore[arg-type]
+    trained(tmp_path, "any", "evaluation.num_pictures=1", "evaluation.splits=[test]")
+    rows = [r for r in read_rows(tmp_path / "runs" / "fit" / "metrics.csv") if r.model == "learned" and r.horizon == "full"]
+    assert {r.trajectory: r.value for r in rows if r.metric == "num_good_frames"} == {0: 17.0, 1: 11.0}  # after 2 of history
+    assert (tmp_path / "runs" / "fit" / "error_curve_test.png").exists()
+    for split, number in (("val", 0), ("test", 1)):
+        assert f"{split}, trajectory {number}: left out, its 3 frames are fewer than the 4" in caplog.text
+
+
+def test_what_cannot_be_evaluated_is_said_before_the_training(tmp_path: Path) -> None:
+    short = Trajectory.from_numpy(crowd(9)[:3], 0.01, "sand", {"sand": 30.0})
+    long = [Trajectory.from_numpy(crowd(k), 0.01, "sand", {"sand": 30.0}) for k in range(2)]
+    save_dataset(tmp_path / "data", "short", train=long[:1], val=long[1:], test=[short])
+    with pytest.raises(StoreError, match=r"short/imported/test: no trajectory has the 4 frames that graph.history=2 needs"):
+        trained(tmp_path, "short", "evaluation.splits=[test]")
+    assert not list((tmp_path / "runs").rglob("*.ckpt"))
 
 
 @pytest.mark.slow

@@ -277,6 +277,16 @@ def test_a_report_that_fails_fails_the_command(
     assert str(error) in capsys.readouterr().err
 
 
+def test_an_interruption_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    def task(_: DictConfig) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as caught:
+        call(monkeypatch, tmp_path, task)
+    assert caught.value.code == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
 def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def task(_: DictConfig) -> None:
         raise ValueError("a bug, not a setting")

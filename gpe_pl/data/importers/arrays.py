@@ -1,6 +1,6 @@
 """Your own arrays, as archives that NumPy writes.
 
-``source`` is a folder with ``train/``, ``val/`` and ``test/``, or a folder of files, which are ``.npz`` archives with one trajectory each::
+``source`` is a folder with ``train/``, ``val/``, ``test/`` and ``test_unseen/``, or a folder of files, which are ``.npz`` archives with one trajectory each::
 
     np.savez("train/00.npz", pos=pos, frame_dt=0.01, materials="fluid", params_fluid=1e-3, bounds=bounds, periodic=[True, False])
 
@@ -22,7 +22,6 @@ import numpy as np
 from gpe_pl.arrays import estimated_normals, numbers
 from gpe_pl.data.importers import npz
 from gpe_pl.data.importers.source import (
-    SPLIT_NAMES,
     Facts,
     ImportFailure,
     ImportSettings,
@@ -32,6 +31,7 @@ from gpe_pl.data.importers.source import (
     Source,
     joined,
     natural,
+    split_folders,
     walls_at_bounds,
 )
 from gpe_pl.trajectory import Boundary, Trajectory
@@ -58,13 +58,15 @@ SCALARS = ("frame_dt", "spacing", "connectivity_radius")
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
     """A data set in this format; raises ``ImportFailure``."""
-    folders = {split: path / name for name, split in SPLIT_NAMES.items() if (path / name).is_dir()} or {"train": path}
-    files = {split: sorted(folder.glob("*.npz"), key=lambda file: natural(file.name)) for split, folder in folders.items()}
+    folders, warnings = split_folders(path)
+    files = {
+        split: sorted(folder.glob("*.npz"), key=lambda file: natural(file.name)) for split, folder in (folders or {"train": path}).items()
+    }
     splits = {split: [Item(file.name, partial(_load, file)) for file in found] for split, found in files.items()}
     splits = {split: items for split, items in splits.items() if items}
     if not splits:
         raise ImportFailure(f"{path}: {'no such folder' if not path.is_dir() else 'holds no *.npz'}")
-    return Source(Facts().overridden(settings), splits)
+    return Source(Facts().overridden(settings), splits, warnings)
 
 
 def _load(path: Path, facts: Facts) -> Loaded:

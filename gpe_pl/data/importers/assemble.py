@@ -25,7 +25,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.periodicity import PeriodicityError
 from gpe_pl.progress import Progress
-from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup, node_code, param_names
+from gpe_pl.schema import HISTORY, MATERIALS, SPLITS, ParameterGroup, node_code, param_names
 from gpe_pl.store import iter_trajectories, write_shard
 from gpe_pl.trajectory import Trajectory
 
@@ -44,6 +44,8 @@ NUM_SHOWN = 4
 FEWEST_NEIGHBOURS, MOST_NEIGHBOURS = 3.0, 60.0
 SPACING_RATIO = 3.0
 """A source's spacing and that of its nodes disagree beyond this ratio."""
+LONG_ENOUGH = HISTORY + 2
+"""Frames that a model's history and a step take."""
 COINCIDENCE = 1e-3
 """Of the median distance to the nearest node: nodes that are closer in the first frame are at one place."""
 VELOCITY_RATIO = 1.25
@@ -235,6 +237,9 @@ class _Conversion:
         if survey.scenes.setdefault(digest, where) != where:
             raise Refusal(f"has exactly the positions of {survey.scenes[digest]}: the same scene twice")
         survey.motions.append((split, name, motion_of(trajectory)))
+        if trajectory.num_frames < LONG_ENOUGH:
+            what = f"has {trajectory.num_frames} frames; models leave it out unless graph.history is below the default, which needs {LONG_ENOUGH}"
+            survey.suspects.append(Event(split, name, -1, what))
         nearest = nearest_distances(trajectory.pos[0].astype(np.float64), m.periodicity)
         at_one_place = np.flatnonzero((nearest == 0) | (nearest < COINCIDENCE * np.median(nearest)))
         if len(at_one_place):
@@ -399,7 +404,8 @@ class _Conversion:
         report, m = self.report, trajectory.metadata
         so_far = report.bounds or m.bounds
         report.bounds = [[min(a[0], b[0]), max(a[1], b[1])] for a, b in zip(so_far, m.bounds, strict=True)]
-        report.gravity = list(m.gravity)
+        so_far = report.gravity or [[g, g] for g in m.gravity]
+        report.gravity = [[min(low, g), max(high, g)] for (low, high), g in zip(so_far, m.gravity, strict=True)]
         for material in m.materials:
             rows = trajectory.node_type == node_code(material)
             if rows.any():

@@ -17,13 +17,13 @@ import math
 import re
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gpe_pl.data.importers.source import (
-    SPLIT_NAMES,
     Facts,
     ImportFailure,
     ImportSettings,
@@ -35,10 +35,13 @@ from gpe_pl.data.importers.source import (
     Source,
     build,
     natural,
+    split_folders,
 )
 from gpe_pl.store import LARGEST_DEFLATE_RATIO
 
 ENDING = ".msgpack.zst"
+PART = re.compile(r"(_\d+)_(\d+)$")
+"""The number of a part at the end of a file's name, which the number of its scene precedes."""
 FRAME_DT = 0.02
 GRAVITY = -9.81
 MAX_BYTES = 2**32
@@ -52,15 +55,16 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     """A data set in this format; raises ``ImportFailure``."""
     _libraries()
     if path.is_file():
-        scenes = {"train": [[path]]}
+        scenes, warnings = {"train": [[path]]}, tuple[str, ...]()
     else:
-        folders = {split: path / name for name, split in SPLIT_NAMES.items() if (path / name).is_dir()} or {"train": path}
-        scenes = {split: found for split, folder in folders.items() if (found := _scenes(folder))}
+        folders, warnings = split_folders(path)
+        scenes = {split: found for split, folder in (folders or {"train": path}).items() if (found := _scenes(folder))}
     if not scenes:
         raise ImportFailure(f"{path}: {'no such file or folder' if not path.exists() else f'holds no *{ENDING}'}")
     notes = () if settings.frame_dt else (f"frame_dt is not in the source; {FRAME_DT:g} s is the format's usual one (frame_dt=…)",)
     facts = Facts(FRAME_DT, notes=notes).overridden(settings)
-    return Source(facts, {split: [Item(_scene_of(parts[0]), partial(_load, parts)) for parts in found] for split, found in scenes.items()})
+    items = {split: [Item(_scene_of(parts[0]), partial(_load, parts)) for parts in found] for split, found in scenes.items()}
+    return Source(facts, items, warnings)
 
 
 def _libraries() -> tuple[Any, Any]:
@@ -73,7 +77,7 @@ def _libraries() -> tuple[Any, Any]:
 
 
 def _scene_of(path: Path) -> str:
-    return re.sub(r"(_\d+)_\d+$", r"\1", path.name.removesuffix(ENDING))
+    return PART.sub(r"\1", path.name.removesuffix(ENDING))
 
 
 def _scenes(folder: Path) -> list[list[Path]]:
@@ -84,7 +88,17 @@ def _scenes(folder: Path) -> list[list[Path]]:
     return list(scenes.values())
 
 
+def _require_all_parts(parts: list[Path]) -> None:
+    numbers = [int(found[2]) for part in parts if (found := PART.search(part.name.removesuffix(ENDING)))]
+    gaps = [n for n, following in pairwise(numbers) if following != n + 1]
+    if gaps:
+        raise Refusal(f"part {gaps[0] + 1} is missing between {gaps[0]} and {next(n for n in numbers if n > gaps[0])}")
+    if len(parts) > 1 and numbers[0] > 1:
+        raise Refusal(f"parts begin with {numbers[0]}: those before are missing")
+
+
 def _load(parts: list[Path], facts: Facts) -> Loaded:
+    _require_all_parts(parts)
     frames = [frame for part in parts for frame in _frames(part)]
     columns: dict[str, list[np.ndarray]] = {name: [] for name in ("pos", "vel")}
     for k, frame in enumerate(frames):
@@ -92,6 +106,8 @@ def _load(parts: list[Path], facts: Facts) -> Loaded:
             raise Refusal(f"is {type(frame).__name__}, expected a map", k)
         if "frame_id" in frame and _number(frame, "frame_id", k) != _number(frames[0], "frame_id", 0) + k:
             raise Refusal("frame_id does not follow that of the frame before: a part is missing, or parts are of several scenes", k)
+        if frame.get("scene_id", frames[0].get("scene_id")) != frames[0].get("scene_id"):
+            raise Refusal(f"scene_id is {frame['scene_id']!r:.50}, that of frame 0 {frames[0].get('scene_id')!r:.50}", k)
         for name, arrays in columns.items():
             arrays.append(_array(frame, name, k))
             if arrays[-1].shape != (len(columns["pos"][0]), 3):
@@ -107,6 +123,8 @@ def _load(parts: list[Path], facts: Facts) -> Loaded:
         walls = _array(first, "box", 0), _array(first, "box_normals", 0)
         if walls[0].shape != walls[1].shape or walls[0].ndim != 2 or walls[0].shape[1] != 3:
             raise Refusal(f"box and box_normals are {list(walls[0].shape)} and {list(walls[1].shape)}, expected [boundary_node, 3] both", 0)
+        for name, values in zip(("box", "box_normals"), walls, strict=True):
+            _require_constant(frames, name, values)
     nodes = Nodes(pos, np.full(count, "fluid", dtype="U16"), vel=vel, walls=walls, friction=0.0)
     for name in ("m", "viscosity"):
         if name in first:

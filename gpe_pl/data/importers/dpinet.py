@@ -19,7 +19,6 @@ import numpy as np
 
 from gpe_pl.data.importers import hdf5
 from gpe_pl.data.importers.source import (
-    SPLIT_NAMES,
     Facts,
     ImportFailure,
     ImportSettings,
@@ -30,6 +29,7 @@ from gpe_pl.data.importers.source import (
     Source,
     build,
     natural,
+    split_folders,
 )
 
 FRAME_DT = 1 / 60
@@ -40,7 +40,7 @@ GROUND_FRICTION = 0.5
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
     """A data set in this format; raises ``ImportFailure``."""
-    folders = {split: path / name for name, split in SPLIT_NAMES.items() if (path / name).is_dir()}
+    folders, warnings = split_folders(path)
     if not folders:
         raise ImportFailure(f"{path}: {'no such folder' if not path.exists() else 'holds no folder train or valid'}")
     rollouts = {split: _numbered(folder, "") for split, folder in folders.items()}
@@ -57,7 +57,9 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     notes.append("gravity 9.8 m/s² along −y is the format's, not in the files")
     facts = Facts(FRAME_DT, gravity=gravity, walls=dict.fromkeys(sides, GROUND_FRICTION), notes=tuple(notes)).overridden(settings)
     return Source(
-        facts, {split: [Item(f"{r.parent.name}/{r.name}", partial(_load, r, settings)) for r in found] for split, found in rollouts.items()}
+        facts,
+        {split: [Item(f"{r.parent.name}/{r.name}", partial(_load, r, settings)) for r in found] for split, found in rollouts.items()},
+        warnings,
     )
 
 

@@ -76,7 +76,7 @@ class Report:
     frame_dt: float = 0.0
     bounds: list[list[float]] = field(default_factory=list)
     periodic: list[bool] = field(default_factory=list)
-    gravity: list[float] = field(default_factory=list)
+    gravity: list[list[float]] = field(default_factory=list)
     spacing: float = 0.0
     connectivity_radius: float = 0.0
     materials: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -127,7 +127,7 @@ class Report:
         rows = [
             ("frame dt", f"{self.frame_dt:.6g} s"),
             ("bounds", f"{box} m"),
-            ("gravity", f"({', '.join(f'{g:.4g}' for g in self.gravity)}) m/s²"),
+            ("gravity", f"({', '.join(map(_span, self.gravity))}) m/s²"),
             ("spacing", f"{self.spacing:.4g} m"),
             ("radius", f"{self.connectivity_radius:.4g} m = {self.connectivity_radius / self.spacing:.3g} spacings"),
         ]

@@ -25,7 +25,7 @@ Format = Literal["gns", "lagrangebench", "meshgraphnets", "dpinet", "dmcf", "arr
 NAME = "[A-Za-z0-9][A-Za-z0-9_.-]*"
 """Names of data sets, which are folders."""
 
-SPLIT_NAMES = {"train": "train", "valid": "val", "validation": "val", "val": "val", "test": "test"}
+SPLIT_NAMES = {"train": "train", "valid": "val", "validation": "val", "val": "val", "test": "test", "test_unseen": "test_unseen"}
 """Names of splits in public data sets, and those of the store."""
 
 ASSUMED_PARAMETERS = {"sand": 30.0, "snow": 8.0, "fluid": 1e-3, "elastomer": 1e5, "solid": 1e6}
@@ -446,8 +446,29 @@ def split_files(path: Path, endings: Sequence[str]) -> dict[str, Path]:
     """Files ``train``, ``valid`` and ``test`` with one of the endings in a folder, by split; a single file is one of training data."""
     if path.is_file():
         return {SPLIT_NAMES.get(path.name.partition(".")[0], "train"): path}
-    found = {split: file for name, split in SPLIT_NAMES.items() for ending in endings if (file := path / f"{name}{ending}").is_file()}
+    there = [(split, path / f"{name}{ending}") for name, split in SPLIT_NAMES.items() for ending in endings]
+    found = _one_each(path, [(split, file) for split, file in there if file.is_file()])
     if not found:
         wanted = " or ".join(f"train{ending}" for ending in endings)
         raise ImportFailure(f"{path}: {'no such file or folder' if not path.exists() else f'holds no {wanted}'}")
     return found
+
+
+def split_folders(path: Path) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Folders ``train``, ``valid``, ``test`` and ``test_unseen`` in a folder, by split, and a warning for each other one beside them."""
+    if not path.is_dir():
+        return {}, ()
+    folders = sorted(entry for entry in path.iterdir() if entry.is_dir() and not entry.name.startswith("."))
+    found = _one_each(path, [(SPLIT_NAMES[folder.name], folder) for folder in folders if folder.name in SPLIT_NAMES])
+    others = [folder.name for folder in folders if folder.name not in SPLIT_NAMES]
+    return found, tuple(f"{name}/ was not read: splits are {', '.join(SPLIT_NAMES)}" for name in others) if found else ()
+
+
+def _one_each(path: Path, found: Sequence[tuple[str, Path]]) -> dict[str, Path]:
+    """What was found by split; raises ``ImportFailure`` where two places are the same split."""
+    places: dict[str, Path] = {}
+    for split, place in found:
+        if split in places:
+            raise ImportFailure(f"{path}: {places[split].name} and {place.name} are both the split {split}; move one of them elsewhere")
+        places[split] = place
+    return places

@@ -108,9 +108,12 @@ def test_coinciding_curves_are_both_seen():
     assert len({line.get_linestyle() for line in axes.lines}) == len({line.get_color() for line in axes.lines}) == 3
 
 
-def test_error_curves_of_different_length_are_refused():
-    with pytest.raises(ValueError, match=r"GPE: .* length"):
-        error_curve_figure({"GPE": [np.ones(3), np.ones(4)]}, 1.0)
+def test_error_curves_of_different_length_count_as_long_as_they_last():
+    curves = [np.array([0.0, 1, 1]), np.array([0.0, 3, 3, 5, 5]), np.array([0.0, 2, 2, np.inf, np.inf])]
+    (axes,) = error_curve_figure({"GPE": curves}, 1.0).axes
+    np.testing.assert_allclose(axes.lines[0].get_ydata()[:2], [2, 2])
+    assert len(axes.lines[0].get_ydata()) == 4
+    assert axes.lines[0].get_ydata()[2] > axes.get_ylim()[1]  # the median of 5 and infinity
 
 
 def test_validation_loss_shows_every_seed_and_their_median():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from gpe_pl.data.importers import ImportSettings, Report, import_dataset
+from gpe_pl.data.importers import ImportFailure, ImportSettings, Report, import_dataset
 from gpe_pl.data.importers.source import natural
 from gpe_pl.data.validate import validate
 from gpe_pl.schema import STICKY, node_code
@@ -489,6 +489,41 @@ def test_own_arrays(tmp_path: Path) -> None:
         np.testing.assert_array_equal(trajectory.boundary.normal, [[0, 1]])
         assert trajectory.boundary.friction == np.float32(0.4)
     assert report.format == "arrays"
+
+
+def write_arrays(folder: Path, seed: int, num_frames: int = 14, gravity: tuple[float, float] = (0.0, 0.0)) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    pos = motion(num_frames=num_frames, seed=seed)
+    np.savez(folder / f"{seed}.npz", pos=pos, frame_dt=DT, materials="sand", params_sand=30.0, gravity=gravity)
+
+
+def test_unseen_splits_and_folders_that_are_none(tmp_path: Path) -> None:
+    for seed, split in enumerate(("train", "valid", "test", "test_unseen", "train_more")):
+        write_arrays(tmp_path / "raw" / split, seed)
+    report, stored = imported(tmp_path, tmp_path / "raw", "arrays")
+    assert {split: len(found) for split, found in stored.items()} == {"train": 1, "val": 1, "test": 1, "test_unseen": 1}
+    assert any(w.startswith("train_more/ was not read") for w in report.warnings)
+
+
+def test_two_places_for_one_split_are_refused(tmp_path: Path) -> None:
+    for seed, split in enumerate(("train", "val", "valid")):
+        write_arrays(tmp_path / "raw" / split, seed)
+    with pytest.raises(ImportFailure, match="val and valid are both the split val; move one of them"):
+        imported(tmp_path, tmp_path / "raw", "arrays")
+    sources.gns_metadata(tmp_path / "gns", motion())
+    for name in ("train.tfrecord", "train.h5"):
+        (tmp_path / "gns" / name).touch()
+    with pytest.raises(ImportFailure, match="train.tfrecord and train.h5 are both the split train"):
+        imported(tmp_path, tmp_path / "gns", "gns")
+
+
+def test_the_report_spans_all_gravities_and_names_what_is_too_short(tmp_path: Path) -> None:
+    for seed in range(4):
+        write_arrays(tmp_path / "raw" / "train", seed, num_frames=5 if seed == 3 else 14, gravity=(0.0, -1.0 - seed))
+    report, _ = imported(tmp_path, tmp_path / "raw", "arrays", holdout=0.0)
+    assert report.gravity == [[0.0, 0.0], [-4.0, -1.0]]
+    assert "(0, -4 … -1) m/s²" in report.text()
+    assert any("3.npz" in w and "has 5 frames" in w for w in report.warnings)
 
 
 def test_own_arrays_with_as_little_as_possible(tmp_path: Path) -> None:

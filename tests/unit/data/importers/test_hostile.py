@@ -585,6 +585,41 @@ def test_a_scene_that_cannot_be_used(tmp_path: Path, content: Any, message: str)
     assert re.search(message, text), text
 
 
+def of_two_parts(pos: np.ndarray, names: tuple[str, str], **static: np.ndarray) -> dict[str, list[dict[str, Any]]]:
+    """Frames by name of file, without numbers, so that only the files say what follows what; ``static`` goes into the first of each."""
+    vel, half = np.gradient(pos, 0.02, axis=0), len(pos) // 2
+    parts = [sources.dmcf_frames(x, v, 0, **static) for x, v in ((pos[:half], vel[:half]), (pos[half:], vel[half:]))]
+    return {name: [{k: v for k, v in frame.items() if k != "frame_id"} for frame in part] for name, part in zip(names, parts, strict=True)}
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [(("sim_0001_00", "sim_0001_02"), "part 1 is missing between 0 and 2"), (("sim_0001_03", "sim_0001_04"), "parts begin with 3")],
+)
+def test_a_scene_that_lacks_a_part(tmp_path: Path, names: tuple[str, str], message: str) -> None:
+    for name, part in of_two_parts(motion(dim=3), names).items():
+        sources.dmcf(tmp_path / "raw" / f"{name}.msgpack.zst", part)
+    assert message in unreadable(tmp_path, "dmcf")
+
+
+def test_parts_of_several_scenes(tmp_path: Path) -> None:
+    parts = of_two_parts(motion(dim=3), ("sim_0001_00", "sim_0001_01"))
+    for frame in parts["sim_0001_01"]:
+        frame["scene_id"] = "other"
+    for name, part in parts.items():
+        sources.dmcf(tmp_path / "raw" / f"{name}.msgpack.zst", part)
+    assert "scene_id is 'other', that of frame 0 'sim'" in unreadable(tmp_path, "dmcf")
+
+
+def test_walls_that_change_with_time(tmp_path: Path) -> None:
+    box, normals = np.random.default_rng(0).uniform(size=(30, 3)).astype(np.float32), np.tile(np.array([0, 1, 0], np.float32), (30, 1))
+    parts = of_two_parts(motion(dim=3), ("sim_0001_00", "sim_0001_01"), box=box, box_normals=normals)
+    parts["sim_0001_01"][0]["box"] = sources.msgpack_array(box + 0.1)
+    for name, part in parts.items():
+        sources.dmcf(tmp_path / "raw" / f"{name}.msgpack.zst", part)
+    assert "box changes with time" in unreadable(tmp_path, "dmcf")
+
+
 @pytest.mark.parametrize(
     "damage", [lambda d: d[: len(d) // 2], lambda d: b"hello", lambda d: d[:60] + bytes(b ^ 255 for b in d[60:90]) + d[90:]]
 )

@@ -1,0 +1,90 @@
+"""Runs in W&B: where they go, and that a user's wish and a missing network are respected."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+import wandb
+from lightning.pytorch import loggers as lightning_loggers
+from lightning.pytorch.loggers import Logger
+
+from gpe_pl.training import tracking
+from gpe_pl.training.tracking import LoggerSettings, TrackingError, publish, run_id
+
+
+class Recorder(Logger):
+    """Stands for ``WandbLogger``; online it ends with ``error``."""
+
+    name, version = "recorder", 0
+    modes: ClassVar[list[str]] = []
+    error: ClassVar[Exception | None] = None
+
+    def __init__(self, name: str, mode: str, **_: Any) -> None:
+        super().__init__()
+        self.mode = mode
+
+    def log_metrics(self, *_: Any) -> None: ...
+
+    def log_hyperparams(self, *_: Any) -> None:
+        Recorder.modes.append(self.mode)
+        if self.mode == "online" and Recorder.error is not None:
+            raise Recorder.error
+
+
+@pytest.fixture(autouse=True)
+def recorder(monkeypatch: pytest.MonkeyPatch) -> type[Recorder]:
+    monkeypatch.setattr(lightning_loggers, "WandbLogger", Recorder)
+    monkeypatch.setattr(Recorder, "modes", [])
+    monkeypatch.setattr(Recorder, "error", None)
+    monkeypatch.setattr(tracking, "has_key", lambda: True)
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    return Recorder
+
+
+@pytest.mark.parametrize(
+    ("setting", "environment", "mode"),
+    [(None, None, "online"), (None, "offline", "offline"), ("online", "offline", "online"), (None, "disabled", "disabled")],
+)
+def test_the_setting_goes_before_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, setting: Any, environment: str | None, mode: str
+) -> None:
+    if environment is not None:
+        monkeypatch.setenv("WANDB_MODE", environment)
+    LoggerSettings("wandb", mode=setting).loggers(tmp_path, "run", {})
+    assert Recorder.modes == [mode]
+
+
+def test_without_a_network_a_run_is_kept_offline(tmp_path: Path, recorder: type[Recorder], caplog: pytest.LogCaptureFixture) -> None:
+    recorder.error = wandb.errors.CommError("no route")
+    *_, logger = LoggerSettings("wandb").loggers(tmp_path, "run", {})
+    assert recorder.modes == ["online", "offline"]
+    assert isinstance(logger, Recorder) and logger.mode == "offline"
+    assert "W&B cannot be reached (no route)" in caplog.text
+
+
+def test_what_wandb_refuses_is_one_line(tmp_path: Path, recorder: type[Recorder]) -> None:
+    recorder.error = wandb.errors.UsageError("API key must be 40 characters")
+    with pytest.raises(TrackingError, match="API key must be 40 characters; logger.mode=offline"):
+        LoggerSettings("wandb").loggers(tmp_path, "run", {})
+
+
+def test_every_start_of_a_run_is_to_be_uploaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    class Run:
+        settings: ClassVar = wandb.Settings(mode="offline")
+        summary: ClassVar[dict[str, float]] = {}
+
+        def log(self, _: Any) -> None: ...
+
+        def finish(self) -> None: ...
+
+    folders = [tmp_path / "wandb" / f"offline-run-2026010{k}_000000-{run_id(tmp_path)}" for k in (1, 2)]
+    for folder in (*folders, tmp_path / "wandb" / "offline-run-20260103_000000-another"):
+        folder.mkdir(parents=True)
+    logger = Recorder("run", "offline")
+    monkeypatch.setattr(logger, "experiment", Run(), raising=False)
+    with caplog.at_level(logging.WARNING):
+        publish([logger], tmp_path, {"test/rollout_mse@full": 1.0})
+    assert f"wandb sync {folders[0]} {folders[1]}`" in caplog.text
