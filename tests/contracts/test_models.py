@@ -55,7 +55,13 @@ MODELS: dict[str, Factory] = {
 TWO = ("sand", "snow")
 
 
-@pytest.fixture(params=list(MODELS), ids=list(MODELS))
+USUAL = {
+    "gpe-directed-node-latent", "gpe-negated-node-latent", "gpe-odd-pair-geometry", "gpe-odd_even-node-geometry", "gpe-angular", "gns", "dpinet", "cconv",
+}  # fmt: skip
+"""Every setting and every model once; all combinations are among the slow tests."""
+
+
+@pytest.fixture(params=[pytest.param(name, marks=() if name in USUAL else pytest.mark.slow, id=name) for name in MODELS])
 def make(request: pytest.FixtureRequest) -> Factory:
     return MODELS[request.param]
 

@@ -422,7 +422,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.fixture(params=list(VARIANTS))
+USUAL = {"negated", "pair", "geometry", "sweep-separate-odd"}
+"""The others are among the slow tests."""
+
+
+@pytest.fixture(params=[pytest.param(name, marks=() if name in USUAL else pytest.mark.slow) for name in VARIANTS])
 def settings(request: pytest.FixtureRequest) -> dict[str, Any]:
     return VARIANTS[request.param]
 

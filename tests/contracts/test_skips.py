@@ -88,7 +88,9 @@ def test_no_level_changes_a_mesh(level: str, kind: str) -> None:
 
 @pytest.mark.parametrize("decoder", ["node", "pair"])
 @pytest.mark.parametrize("edge_state", ["latent", "geometry"])
-@pytest.mark.parametrize("interaction", ["directed", "negated", "odd", "odd_even"])
+@pytest.mark.parametrize(
+    "interaction", [pytest.param("directed", marks=pytest.mark.slow), "negated", "odd", pytest.param("odd_even", marks=pytest.mark.slow)]
+)
 def test_no_level_changes_what_a_model_says(interaction: Any, edge_state: Any, decoder: Any) -> None:
     build = scenes.builder(THREE, history=2)
     data = scenes.to_dtype(build(scattered(THREE, ("sand", "fluid")).to_torch()), torch.float64)

@@ -80,7 +80,9 @@ SOLVERS: dict[str, Callable[[], tuple[Simulator, State]]] = {
 }
 
 
-@pytest.fixture(params=SOLVERS)
+@pytest.fixture(
+    params=[pytest.param(name, marks=pytest.mark.slow if "3d" in name else ()) for name in SOLVERS]
+)  # they take long to compile
 def case(request):
     return SOLVERS[request.param]()
 

@@ -12,8 +12,8 @@ from gpe_pl.fit import fit
 from tests.runs import compose, first_choices, tiny
 
 EXPERIMENTS = sorted(p.stem for p in (CONF / "experiment").glob("*.yaml"))
-QUICK = {"smoke", "table1"}
-"""These run with the fast tests, all others with the slow ones."""
+QUICK = {"smoke"}
+"""This runs with the fast tests, all others with the slow ones."""
 
 
 def test_there_are_experiments() -> None:

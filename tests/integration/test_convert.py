@@ -140,6 +140,7 @@ def test_other_models_train_on_periodic_data(tmp_path: Path, lagrangebench: Path
     trained(tmp_path, "tgv", f"model={model}")
 
 
+@pytest.mark.slow
 def test_own_arrays_are_trained_on(tmp_path: Path) -> None:
     """What one does in a notebook."""
     made = [

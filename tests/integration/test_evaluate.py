@@ -54,6 +54,7 @@ def test_a_run_that_was_moved_gives_the_same_numbers(
     assert re.search(r"rollout_mse +learned", capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_a_folder_keeps_the_evaluation_that_it_holds(tiny_data: Path, tmp_path: Path) -> None:
     fit(tiny(tiny_data, tmp_path))
     run, folder = tmp_path / "fit", tmp_path / "evaluation_test_unseen"
@@ -91,6 +92,7 @@ def test_data_that_do_not_fit_are_refused_before_any_is_generated(checkpoint: Pa
     assert not (tmp_path / "data").exists() and not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 def test_an_evaluation_that_fails_leaves_no_folder(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fit(tiny(tiny_data, tmp_path))
 

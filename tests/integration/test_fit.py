@@ -126,6 +126,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     assert (tmp_path / "whole" / "metrics.csv").read_bytes() == (tmp_path / "parts" / "metrics.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_progress_counts_the_steps_of_the_whole_training(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[tuple[int, int]] = []
 
@@ -160,6 +161,7 @@ def test_the_seed_matters_and_nothing_else_is_random(tiny_data: Path, tmp_path: 
     assert values[0] == values[1] != values[2]
 
 
+@pytest.mark.slow
 def test_a_run_killed_while_evaluating_trains_no_further(tiny_data: Path, tmp_path: Path, losses: dict[int, list[float]]) -> None:
     cfg = tiny(tiny_data, tmp_path)
     value = fit(cfg)
@@ -205,6 +207,7 @@ def _claimed(cfg: DictConfig) -> dict[str, Any]:
     return {k: values[k] for k in ("seed", "size", "data", "graph", "model", "training", "evaluation")}
 
 
+@pytest.mark.slow
 def test_a_folder_in_which_nothing_was_saved_is_free(tiny_data: Path, tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="graph.history=11 needs"):
         fit(tiny(tiny_data, tmp_path, "graph.history=11"))
@@ -258,7 +261,7 @@ def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(
     assert not (tmp_path / "fit" / "metrics.csv").exists()
 
 
-@pytest.mark.parametrize("push_share", [0.0, 0.6])
+@pytest.mark.parametrize("push_share", [pytest.param(0.0, marks=pytest.mark.slow), 0.6])
 def test_one_corrupted_batch_does_not_end_a_run(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, push_share: float
 ) -> None:
@@ -320,6 +323,7 @@ def test_metrics_hold_the_model_and_the_baselines(tiny_data: Path, tmp_path: Pat
     assert len(set(ballistic.values())) == 3
 
 
+@pytest.mark.slow
 def test_what_containment_corrects_is_looked_at_where_asked_for(tiny_data: Path, tmp_path: Path) -> None:
     fit(tiny(tiny_data, tmp_path, "evaluation.num_uncontained=1"))
     rows = list(read_rows(tmp_path / "fit" / "metrics.csv"))
@@ -327,6 +331,7 @@ def test_what_containment_corrects_is_looked_at_where_asked_for(tiny_data: Path,
     assert [(r.split, r.trajectory) for r in rows if r.metric == "share_corrected"] == [("test", 0), ("test_unseen", 0), ("test_unseen", 1)]
 
 
+@pytest.mark.slow
 def test_a_trained_model_is_evaluated_again_without_training(tiny_data: Path, tmp_path: Path) -> None:
     first = tiny(tiny_data, tmp_path, "name=first")
     fit(first)

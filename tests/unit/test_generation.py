@@ -89,7 +89,7 @@ def test_layout(folder):
         assert all(t.num_frames == SPEC.num_frames and t.metadata.split == split for t in trajectories)
 
 
-@pytest.mark.parametrize("num_workers", [1, 2])
+@pytest.mark.parametrize("num_workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_resume_equals_uninterrupted(folder, tmp_path, num_workers):
     """Lose shards, damage one, leave a half-written file behind: the next run restores the same bytes."""
     again = generate(tmp_path, SPEC, num_workers)
@@ -310,7 +310,7 @@ def test_statistics_are_of_the_train_split(folder):
     assert (statistics["num_trajectories"], statistics["num_frames"], statistics["num_nodes"]) == (5, 50, 200)
 
 
-@pytest.mark.parametrize("num_workers", [1, 2])
+@pytest.mark.parametrize("num_workers", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_failure_names_split_index_and_seed(tmp_path, num_workers):
     spec = replace(SPEC, solver=replace(SOLVER, max_substeps=1))
     with pytest.raises(GenerationError, match=r"split train, index \d, seed \d+: explosion: frame 1") as error:

@@ -58,6 +58,7 @@ def test_a_rollout_that_explodes_says_so(tmp_path: Path) -> None:
     assert "not finite" in json.loads((tmp_path / "showcase.json").read_text())["stopped"]
 
 
+@pytest.mark.slow
 def test_nodes_faster_than_gravity_explains_are_counted(tmp_path: Path) -> None:
     fast, slow = (values(run(simulator(a), CANYON, SETTINGS, tmp_path)) for a in (1e5, 1.0))
     assert slow["share_too_fast"] == 0 and slow["max_speed"] < 1

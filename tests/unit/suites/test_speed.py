@@ -49,6 +49,7 @@ def test_a_training_step_has_gradients_and_changes_nothing() -> None:
     assert all(torch.equal(v, before[k]) for k, v in model.state_dict().items())
 
 
+@pytest.mark.slow
 def test_every_case_has_its_records_and_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gpe_pl.suites.speed.peak_memory", lambda *_: 1_000_000)
     monkeypatch.setattr("gpe_pl.suites.speed.copy_rate", lambda *_: 1e9)

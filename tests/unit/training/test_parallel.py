@@ -185,7 +185,7 @@ SLOW = pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "late"),
     [
-        (BatchSize(3), False),
+        pytest.param(BatchSize(3), False, marks=SLOW),
         pytest.param(BatchSize(3, max_nodes=64), False, marks=SLOW),
         pytest.param(BatchSize(3), True, marks=SLOW, id="push-forward"),
         pytest.param(BatchSize(3, max_nodes=64), True, marks=SLOW, id="push-forward by nodes"),
