@@ -57,6 +57,7 @@ class LoggerSettings:
             logger.log_hyperparams({**config, "run_dir": str(run_dir)})
         except wandb.errors.CommError as error:
             log.warning("W&B cannot be reached (%s); this run is kept offline", error)
+            wandb.teardown()  # what it began under this identifier
             return self._wandb(run_dir, name, config, "offline")
         except wandb.errors.Error as error:
             raise TrackingError(f"W&B: {error}; logger.mode=offline keeps the run here") from None
