@@ -37,6 +37,15 @@ def environment() -> dict[str, Any]:
     }
 
 
+def without_folder(value: Any, runs: str) -> Any:
+    """Settings as they can be shown to others, whose results lie elsewhere: ``paths.runs`` in place of that folder."""
+    if isinstance(value, dict):
+        return {key: without_folder(item, runs) for key, item in value.items()}
+    if isinstance(value, list):
+        return [without_folder(item, runs) for item in value]
+    return value.replace(runs, "paths.runs", 1) if isinstance(value, str) and Path(value).is_relative_to(runs) else value
+
+
 def benchmark(cfg: DictConfig) -> None:
     """Run one suite and write ``results.json``, ``table.md`` and its figures."""
     from omegaconf import OmegaConf
@@ -55,7 +64,7 @@ def benchmark(cfg: DictConfig) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in getattr(suite, "figures", lambda _: {})(records).items():
         figure.savefig(folder / f"{name}.png", dpi=150)
-    results = {"environment": environment(), "settings": asdict(settings), "records": records}
+    results = {"environment": environment(), "settings": without_folder(asdict(settings), cfg.paths.runs), "records": records}
     for name, text in (("results.json", json.dumps(results, indent=1)), ("table.md", table + "\n")):
         replace_text(folder / name, text)
     print(table)

@@ -18,7 +18,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from pydantic import Field
 
-from gpe_pl.benchmark import benchmark
+from gpe_pl.benchmark import benchmark, without_folder
 from gpe_pl.config import CONF, ConfigError, Report, bind, construct, entry_point, explain, output_dir
 from gpe_pl.errors import GpeError
 from gpe_pl.fit import fit
@@ -293,6 +293,18 @@ def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
 
     with pytest.raises(ValueError, match="a bug"):
         call(monkeypatch, tmp_path, task)
+
+
+def test_results_do_not_say_where_they_lay(tmp_path: Path) -> None:
+    runs = str(tmp_path / "runs")
+    settings = {
+        "runs": [f"{runs}/table1", runs, f"{runs}_old"],
+        "cases": {"sand": {"overrides": [f"name={runs}"]}},
+        "budget": 5.0,
+        "size": None,
+    }
+    assert without_folder(settings, runs) == {**settings, "runs": ["paths.runs/table1", "paths.runs", f"{runs}_old"]}
+    assert without_folder({"runs": ["runs/table1"]}, "runs") == {"runs": ["paths.runs/table1"]}
 
 
 def test_without_hydra_the_output_lies_under_runs(tmp_path: Path) -> None:
