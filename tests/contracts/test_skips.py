@@ -108,7 +108,7 @@ def test_no_level_changes_what_a_model_says(interaction: Any, edge_state: Any, d
 
 
 @pytest.mark.parametrize("level", LEVELS)
-@pytest.mark.parametrize("implementation", ["factored", "plain"])
+@pytest.mark.parametrize("implementation", ["factored", pytest.param("plain", marks=pytest.mark.slow)])
 def test_no_level_changes_a_rollout(level: str, implementation: Any) -> None:
     build = scenes.builder(THREE, history=2)
     simulated, start = (

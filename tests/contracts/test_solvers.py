@@ -254,7 +254,7 @@ def test_hostile_input_gives_a_typed_error(case, name):
     assert (caught.value.reason, caught.value.node) == (reason, node)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_random_particles_stay_in_the_domain(case, seed):
     """Particles thrown anywhere, overlapping and inside obstacles, at up to 10 m/s."""
     solver, state = case

@@ -16,6 +16,8 @@ from gpe_pl.solvers.materials import lame_parameters
 from gpe_pl.solvers.solid_scenes import SolidScene
 from gpe_pl.trajectory import Boundary, State, von_mises
 
+pytestmark = pytest.mark.slow
+
 DENSITY, GRAVITY = 1000.0, 9.81
 KINDS = ("triangle", "quad", "tetrahedron")
 UNIT = ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
@@ -370,7 +372,6 @@ def test_cantilever_of_scikit_fem(kind, physics):
     physics("largest relative difference of u", worst, 1e-3, formula="K u = f", source="scikit-fem", kind="at_most")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["triangle", "quad"])
 def test_cantilever_of_beam_theory(kind, physics):
     points, _, shift = cantilever(kind, 80, 8)
@@ -451,7 +452,6 @@ def test_block_on_a_slope(kind, surface, physics):
         )
 
 
-@pytest.mark.slow
 def test_hertz_line_contact(physics):
     """A disc pressed on a rigid frictionless plane by its weight, at rest; half-width and load from the nodal reactions, ∫ p x² = P b²/4."""
     radius, modulus, nu, spacing = 0.1, 1e7, 0.35, 0.0025
@@ -490,9 +490,7 @@ def test_hertz_line_contact(physics):
     )
 
 
-@pytest.mark.parametrize(
-    ("kind", "modulus"), [("triangle", 5e5), ("triangle", 1e7), ("quad", 5e5), pytest.param("tetrahedron", 5e5, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("kind", "modulus"), [("triangle", 5e5), ("triangle", 1e7), ("quad", 5e5), ("tetrahedron", 5e5)])
 def test_no_node_inside_an_obstacle(kind, modulus, physics):
     """Random bodies thrown at up to 10 m/s per axis onto random obstacles, at the end of every frame."""
     dim = 3 if kind == "tetrahedron" else 2

@@ -16,6 +16,8 @@ from gpe_pl.solvers.flip.transfer import add_impulse, scatter
 from gpe_pl.solvers.fluid_scenes import FluidScene
 from gpe_pl.trajectory import Boundary, State
 
+pytestmark = pytest.mark.slow
+
 DENSITY, GRAVITY = 1000.0, 9.81
 DAM_BREAK = Path(__file__).parents[3] / "shared" / "data" / "dam_break_front.csv"
 
@@ -427,7 +429,6 @@ def steady_profile(body, force, exact):
     return float(np.abs(body.fields.velocity[0, cells[middle]] - expected).max() / expected.max())
 
 
-@pytest.mark.slow
 def test_film_of_particles(physics):
     """The same film through whole steps, until it is steady: speed of the particles at the surface, and no-slip at the wall."""
     dx, height, viscosity, force = 1 / 32, 0.25, 0.5, 1.0
@@ -479,7 +480,6 @@ RELEASE = 0.175
 """Time, in √(a/2g), that an ideal release is ahead of the experiment: the value that the finite elements of Lethe need for the same records."""
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not DAM_BREAK.exists(), reason="needs the measured dam-break front")
 def test_dam_break(physics):
     """A column twice as high as wide. The front, at the floor, against both series of Martin and Moyce, with their clock and with a later release.
@@ -535,7 +535,6 @@ def test_dam_break(physics):
 BOWL = Bowl((0.5, 0.5, 0.5), 0.45, 0.0)
 
 
-@pytest.mark.slow
 def test_volume_over_a_fall_into_a_bowl(physics):
     """5,400 particles in 3D: the liquid takes the same room while it falls, splashes, sloshes and rests."""
     solver = FLIP(bounds=unit(3), grid_spacing=1 / 32, frame_dt=0.01)
@@ -593,7 +592,6 @@ def caps(radius, spacing, count):
         yield points[np.argsort(points[:, 2])[:count]]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "cells", "count", "limits"),
     [("tiny", 10, 500, (0.03, 0.15)), ("small", 12, 1200, (0.02, 0.08)), ("paper", 18, 4000, (0.02, 0.02))],
@@ -658,7 +656,6 @@ def test_no_particle_passes_a_curved_wall(physics, dim):
     physics(f"depth of particles in curved walls in {dim}D", deepest, 1e-9, kind="at_most", formula="φ >= 0", source="exact", unit="m")
 
 
-@pytest.mark.slow
 def test_self_convergence_of_a_collapse(physics):
     """A viscous column that collapses: height of its centre of mass after 0.5 s on three grids, and with three time steps."""
 

@@ -14,6 +14,8 @@ from gpe_pl.solvers.mpm import MPM
 from gpe_pl.trajectory import Boundary
 from tests.particles import VALUE, block, run, together
 
+pytestmark = pytest.mark.slow
+
 GRAVITY = 9.81
 MATERIALS = ("sand", "snow", "elastomer")
 DIMS = (2, 3)
@@ -255,7 +257,6 @@ def test_bar_frequency(dim, modulus, physics):
     physics("amplitude left after four periods", left, 0.95, formula="1", source="no damping", kind="at_least")
 
 
-@pytest.mark.slow
 def test_bar_frequency_converges(physics):
     """Self-convergence of the solver, in space and in time."""
     exact = math.sqrt(1e5 / 1000)
@@ -289,7 +290,6 @@ def deposit(xi):
     return float(np.quantile(after.pos[:, 1], 0.95))
 
 
-@pytest.mark.slow
 def test_snow_deposit_rises_with_hardening(physics):
     heights = {xi: deposit(xi) for xi in (3.0, 7.0, 10.0, 20.0)}
     for (lower, low), (higher, high) in itertools.pairwise(heights.items()):
@@ -329,21 +329,18 @@ def run_outs():
     return {(a, angle): run_out(collapse(a, angle)) for a in ASPECTS for angle in ANGLES}
 
 
-@pytest.mark.slow
 def test_run_out_falls_with_the_friction_angle(run_outs, physics):
     for a, (low, high) in itertools.product(ASPECTS, itertools.pairwise(ANGLES)):
         ratio = run_outs[a, low] / run_outs[a, high]
         physics(f"ΔL at {low:g}° over {high:g}°, H/L = {a:g}", ratio, 1.1, formula="monotone", source=LUBE, kind="at_least")
 
 
-@pytest.mark.slow
 def test_run_out_grows_with_the_aspect_ratio(run_outs, physics):
     for angle, (low, high) in itertools.product(ANGLES, itertools.pairwise(ASPECTS)):
         ratio = run_outs[high, angle] / run_outs[low, angle]
         physics(f"ΔL at H/L = {high:g} over {low:g}, {angle:g}°", ratio, 1.3, formula="monotone", source=LUBE, kind="at_least")
 
 
-@pytest.mark.slow
 def test_run_out_follows_the_scaling_of_experiments(physics):
     """Sand, here the front on a grid of L0/25 at 40°.
 
@@ -359,7 +356,6 @@ def test_run_out_follows_the_scaling_of_experiments(physics):
     physics("log-slope from a = 2 to 4", slopes[2], 0.75, 0.15, formula="2/3", source=LUBE, kind="absolute")
 
 
-@pytest.mark.slow
 def test_pile_comes_to_rest(physics):
     """A pile on a rough floor."""
     state = collapse(1.0, 30.0, duration=3.0)
@@ -384,7 +380,6 @@ def slip(angle, tilt):
     return float(np.mean(after.pos[middle, 0] - state.pos[middle, 0]) / dx)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("angle", [20.0, 30.0, 40.0])
 def test_slope_stays_below_and_flows_above_the_friction_angle(angle, physics):
     """Without dilation simple shear mobilises tan θ = sin φ, so the threshold lies between atan(sin φ) and φ."""
