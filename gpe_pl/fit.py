@@ -20,7 +20,7 @@ def fit(cfg: DictConfig) -> float:
     from omegaconf import OmegaConf
 
     from gpe_pl.data.datamodule import TrajectoryDataModule
-    from gpe_pl.data.dataset import WindowDataset, open_split
+    from gpe_pl.data.dataset import open_split, window_counts
     from gpe_pl.data.noise import Noise
     from gpe_pl.data.sampling import BatchSize
     from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
@@ -88,7 +88,7 @@ def fit(cfg: DictConfig) -> float:
     if not (run_dir / "metrics.csv").exists():
         best = None if cfg.reuse is None else adopt(Path(cfg.paths.runs) / cfg.reuse, trained, run_dir)
         for split in evaluation.splits:  # what cannot be evaluated is said before the training, not after it
-            WindowDataset(open_split(evaluated, split, cache_bytes=0), data().builder)
+            window_counts(open_split(evaluated, split, cache_bytes=0), graph.history)
         loggers = logger.loggers(run_dir, cfg.name, config)
         best = best or train(new_module(training), data(), training, trainer, loggers, run_dir)
         rows = evaluate(LearnedSimulator.from_checkpoint(best, device), evaluated, evaluation, run_dir)

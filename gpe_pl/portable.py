@@ -96,7 +96,7 @@ class PortableStep(nn.Module):
         data = HeteroData()
         for material in self.spec.materials:
             store = data[material]
-            store.x = material_features(scene[f"velocity_history.{material}"], scene["gravity"], self.scales)
+            store.x = material_features(scene[f"velocity_history.{material}"], scene["gravity"], self.scales).float()
             store.material_params, store.mass = scene[f"material_params.{material}"].float(), scene[f"mass.{material}"].float()
             if self.spec.islands:
                 arms = scene[f"{'arm' if self.periodicity else 'pos'}.{material}"]
@@ -106,7 +106,7 @@ class PortableStep(nn.Module):
             data.num_islands = torch.full((1,), scene["island_is_free"].shape[0])
         pos, vel, normal, friction, restitution = (scene[f"boundary.{name}"] for name in BOUNDARY_FIELDS)
         boundary = Boundary(pos, vel, normal, friction, restitution)
-        data[BOUNDARY].x = boundary_features(boundary, self.scales)
+        data[BOUNDARY].x = boundary_features(boundary, self.scales).float()
         self._add_radius_edges(data, scene, boundary)
         self._add_mesh(data, scene)
         return data
@@ -126,7 +126,8 @@ class PortableStep(nn.Module):
             displacement = self.periodicity.shortest(pos[target][i] - pos[source][j])
             relative_velocity = vel[target][i] - vel[source][j]
             normal = boundary.normal[j] if source == BOUNDARY else None
-            store.odd, store.even = edge_features(self.features, displacement, relative_velocity, normal, self.scales)
+            odd, even = edge_features(self.features, displacement, relative_velocity, normal, self.scales)
+            store.odd, store.even = odd.float(), even.float()
             store.offset = store.odd[:, : self.spec.dim]
 
     def _add_mesh(self, data: HeteroData, scene: Scene) -> None:
@@ -150,16 +151,17 @@ class PortableStep(nn.Module):
                     weighted = weighted.index_add(0, j, mass[child][i] * values[child][i])
             mass[name], values[name] = total, weighted / total
             motion = values[name][:, 2 * dim :].unflatten(1, (-1, dim))
-            data[name].x = virtual_features(motion, torch.full((size.shape[0],), level), scene["gravity"], self.scales)
+            data[name].x = virtual_features(motion, torch.full((size.shape[0],), level), scene["gravity"], self.scales).float()
         for relation in relations:
             source, name, target = relation
             store = data[relation]
             j, i = store.edge_index = self._edges(scene, relation)
             difference = values[target][i] - values[source][j]
             level_of_source = None if name == CELL else torch.full((j.shape[0],), level_of(source))
-            store.odd, store.even = mesh_features(
+            odd, even = mesh_features(
                 self.features, difference[:, :dim], difference[:, dim : 2 * dim], difference[:, -dim:], level_of_source, self.scales
             )
+            store.odd, store.even = odd.float(), even.float()
 
 
 def describe(simulator: LearnedSimulator) -> dict[str, Input]:

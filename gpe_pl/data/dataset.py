@@ -6,7 +6,7 @@ A sample is a pure function of (split, seed, sample number): runs resume exactly
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias, overload
@@ -171,6 +171,16 @@ def collated(samples: list[HeteroData | Start]) -> Samples:
     return starts or batched(samples)
 
 
+def window_counts(trajectories: Sequence[StoredTrajectory], history: int) -> list[int]:
+    """How many windows of frames t − H … t + 1 each trajectory of a split has; raises ``StoreError`` where none has any."""
+    counts = [max(0, t.num_frames - history - 1) for t in trajectories]
+    if not any(counts):
+        longest = max((t.num_frames for t in trajectories), default=0)
+        where = f"{trajectories[0].path.parent}: " if trajectories else ""
+        raise StoreError(f"{where}no trajectory has the {history + 2} frames that graph.history={history} needs; the longest has {longest}")
+    return counts
+
+
 class WindowDataset(Dataset[HeteroData | Start]):
     """Windows x[t−H … t+1] of a split as graphs at frame t.
 
@@ -204,15 +214,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         self.trajectories, self.builder, self.noise, self.stress = trajectories, builder, noise, stress
         self.velocity_unit, self.seed = velocity_unit, seed
         self.probability: np.ndarray | None = None
-        history = builder.config.history
-        counts = [max(0, t.num_frames - history - 1) for t in trajectories]
-        self.ends = np.cumsum(counts)
-        if not len(self.ends) or self.ends[-1] == 0:
-            longest = max((t.num_frames for t in trajectories), default=0)
-            where = f"{trajectories[0].path.parent}: " if trajectories else ""
-            raise StoreError(
-                f"{where}no trajectory has the {history + 2} frames that graph.history={history} needs; the longest has {longest}"
-            )
+        self.ends = np.cumsum(window_counts(trajectories, builder.config.history))
 
     def __len__(self) -> int:
         return int(self.ends[-1])

@@ -109,7 +109,7 @@ class GraphBuilder:
         data = HeteroData()
         for material, r in rows.items():
             store = data[material]
-            store.x = material_features(history[r], state.gravity, self.scales)
+            store.x = self._rounded(material_features(history[r], state.gravity, self.scales))
             column = self.metadata.param_names.index(MATERIALS[material].name)
             store.material_params = state.material_params[r, column : column + 1].float()
             store.mass = self._rounded(state.mass[r])
@@ -156,7 +156,7 @@ class GraphBuilder:
             edges[relation] = torch.from_numpy(pairs).to(device)
 
         boundary = _trim(state.boundary, edges) if self.config.trim_boundary else state.boundary
-        data[BOUNDARY].x = boundary_features(boundary, self.scales)
+        data[BOUNDARY].x = self._rounded(boundary_features(boundary, self.scales))
         pos[BOUNDARY], vel[BOUNDARY] = boundary.pos, boundary.vel
         for relation in relations:
             if relation not in edges:
@@ -165,16 +165,12 @@ class GraphBuilder:
             source, _, target = relation
             edge_index = edges[relation]
             chunk = max(1, edge_index.shape[1]) if self.skips.edges_at_once is None else self.skips.edges_at_once
-            parts = [
-                edge_features(
-                    self.config.features,
-                    state.periodicity.shortest(pos[target][i] - pos[source][j]),
-                    vel[target][i] - vel[source][j],
-                    boundary.normal[j] if source == BOUNDARY else None,
-                    self.scales,
-                )
-                for j, i in edge_index.split(chunk, dim=1)
-            ]
+            parts = []
+            for j, i in edge_index.split(chunk, dim=1):
+                displacement, velocity = state.periodicity.shortest(pos[target][i] - pos[source][j]), vel[target][i] - vel[source][j]
+                normal = boundary.normal[j] if source == BOUNDARY else None
+                odd, even = edge_features(self.config.features, displacement, velocity, normal, self.scales)
+                parts.append((self._rounded(odd), self._rounded(even)))
             store = data[relation]
             store.edge_index = edge_index
             store.odd, store.even = (part[0] if len(part) == 1 else torch.cat(part) for part in zip(*parts, strict=True))
@@ -264,7 +260,7 @@ class GraphBuilder:
         total = mass.new_zeros(sum(sizes), 1).index_add_(0, above, mass)
         mean = values.new_zeros(sum(sizes), values.shape[1]).index_add_(0, above, mass * values[below]) / total
         pos, rest, motion = torch.cat([values, mean]).split([dim, dim, values.shape[1] - 2 * dim], dim=1)
-        x = virtual_features(motion[n:].unflatten(1, (-1, dim)), level[n:], state.gravity, scales)
+        x = self._rounded(virtual_features(motion[n:].unflatten(1, (-1, dim)), level[n:], state.gravity, scales))
         for k, part in enumerate(x.split(sizes), start=1):
             data[grid(k)].x = part
 
@@ -290,7 +286,7 @@ class GraphBuilder:
                     is_target = state.node_type[i[chosen]] == node_code(target)
                     chosen = torch.arange(len(i), device=device)[chosen][is_target]
                 store = data[relation]
-                store.edge_index, store.odd, store.even = row[edges[:, chosen]], odd[chosen], even[chosen]
+                store.edge_index, store.odd, store.even = row[edges[:, chosen]], self._rounded(odd[chosen]), self._rounded(even[chosen])
 
     def _kept_whole(self, state: State, mesh: MultiscaleGraph) -> Tensor:
         """Positions that do not tear meshes apart at the seams of a periodic domain."""

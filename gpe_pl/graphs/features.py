@@ -1,7 +1,7 @@
 """Node and edge features, made dimensionless with the data set's own scales.
 
 ``paper``: the relative displacement only (paper, section 2.1). ``contact``: also how a pair moves, how near it is to touching, how it meets a wall, and in a
-mesh how far it is from its rest shape. Odd channels change sign when source and target swap, even channels do not.
+mesh how far it is from its rest shape. Odd channels change sign when source and target swap, even channels do not. All are in the double precision of states.
 """
 
 from dataclasses import dataclass
@@ -131,14 +131,14 @@ def material_features(velocity_history: Float64[Tensor, "node history dim"], gra
     n = velocity_history.shape[0]
     changes = velocity_history[:, 1:] - velocity_history[:, :-1]
     motion = torch.cat([velocity_history[:, -1:], changes.flip(1)], dim=1).flatten(1) / scales.velocity
-    return torch.cat([motion, (gravity / scales.acceleration).expand(n, -1)], dim=1).float()
+    return torch.cat([motion, (gravity / scales.acceleration).expand(n, -1)], dim=1)
 
 
 def boundary_features(boundary: Boundary, scales: Scales) -> Tensor:
     """Velocity, normal and boundary condition of boundary nodes [boundary_node, 2 dim + 2]; friction μ enters as μ/(1+μ), so no-slip is 1."""
     friction = boundary.friction / (1 + boundary.friction)
     condition = torch.stack([friction, boundary.restitution], dim=1)
-    return torch.cat([boundary.vel / scales.velocity, boundary.normal, condition], dim=1).float()
+    return torch.cat([boundary.vel / scales.velocity, boundary.normal, condition], dim=1)
 
 
 def edge_features(
@@ -159,7 +159,7 @@ def edge_features(
     """
     relative = displacement / scales.radius
     if features == "paper":
-        return relative.float(), displacement.new_empty((displacement.shape[0], 0)).float()
+        return relative, displacement.new_empty((displacement.shape[0], 0))
     distance = (displacement.square().sum(dim=1, keepdim=True) + TINY**2).sqrt()
     unit = displacement / distance  # zero for coincident nodes
     velocity = relative_velocity / scales.velocity
@@ -173,14 +173,14 @@ def edge_features(
         wall_approach = (velocity * normal).sum(dim=1, keepdim=True)
     odd = torch.cat([relative, unit, velocity], dim=1)
     even = torch.cat([gap, approach, wall, wall_approach], dim=1)
-    return odd.float(), even.float()
+    return odd, even
 
 
 def virtual_features(
     velocity_history: Float64[Tensor, "node history dim"], level: Int64[Tensor, " node"], gravity: Float64[Tensor, " dim"], scales: Scales
 ) -> Tensor:
     """Features of virtual nodes [node, (history + 1) · dim + 1]: those of material nodes, and the level, which is log₂ of width over rest spacing."""
-    return torch.cat([material_features(velocity_history, gravity, scales), level[:, None].float()], dim=1)
+    return torch.cat([material_features(velocity_history, gravity, scales), level[:, None].double()], dim=1)
 
 
 def mesh_features(
@@ -207,7 +207,7 @@ def mesh_features(
     width = scales.spacing if level is None else scales.spacing * torch.exp2(level.double())[:, None]
     relative, rest = _without_rounding(displacement / width), _without_rounding(rest_displacement / width)
     if features == "paper":
-        return relative.float(), relative.new_empty((relative.shape[0], 0)).float()
+        return relative, relative.new_empty((relative.shape[0], 0))
     velocity = relative_velocity * scales.frame_dt / width
     length = (relative.square().sum(dim=1, keepdim=True) + TINY**2).sqrt()
     rest_length = rest.norm(dim=1, keepdim=True)
@@ -216,7 +216,7 @@ def mesh_features(
     even = [stretch, (velocity * unit).sum(dim=1, keepdim=True), rest_length]
     if level is not None:
         even.append(level[:, None].double())
-    return torch.cat(odd, dim=1).float(), torch.cat(even, dim=1).float()
+    return torch.cat(odd, dim=1), torch.cat(even, dim=1)
 
 
 def _without_rounding(displacement: Tensor) -> Tensor:

@@ -169,7 +169,7 @@ def relative_change(new: Tensor, old: Tensor) -> float:
 
 
 class _DoubleBuilder(GraphBuilder):
-    """Masses and lever arms in double precision too; features are dimensionless and stay as networks are given them."""
+    """Features, masses and lever arms in double precision."""
 
     def _rounded(self, values: Tensor) -> Tensor:
         return values

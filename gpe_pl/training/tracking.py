@@ -55,11 +55,11 @@ class LoggerSettings:
         logger = WandbLogger("/".join(own) or name, save_dir=run_dir, project=self.project, id=run_id(run_dir), **options)
         try:
             logger.log_hyperparams({**config, "run_dir": str(run_dir)})
-        except wandb.errors.CommError as error:
-            log.warning("W&B cannot be reached (%s); this run is kept offline", error)
-            wandb.teardown()  # what it began under this identifier
-            return self._wandb(run_dir, name, config, "offline")
         except wandb.errors.Error as error:
+            if isinstance(error, wandb.errors.CommError) and mode != "offline":  # no network, or a key that is not accepted
+                log.warning("W&B: %s; this run is kept offline", error)
+                wandb.teardown()  # what it began under this identifier
+                return self._wandb(run_dir, name, config, "offline")
             raise TrackingError(f"W&B: {error}; logger.mode=offline keeps the run here") from None
         return logger
 

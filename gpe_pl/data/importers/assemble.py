@@ -170,7 +170,9 @@ class _Conversion:
     def __init__(
         self, name: str, folder: Path, source: Source, holdout: float, about: dict[str, Any], on_progress: Progress | None = None
     ) -> None:
-        self.source, self.facts, self.holdout, self.folder, self.about = source, source.facts, holdout, folder, about
+        # training first: what all splits share is taken from it, and of a scene that is in two splits the later one is refused
+        self.source = replace(source, splits={split: source.splits[split] for split in SPLITS if split in source.splits})
+        self.facts, self.holdout, self.folder, self.about = source.facts, holdout, folder, about
         self.report = Report(name, about["format"], about["source"], str(folder), warnings=list(source.warnings))
         self.survey = _Survey()
         self.trained: dict[str, tuple[float, float]] = {}

@@ -17,7 +17,6 @@ import math
 import re
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -90,11 +89,8 @@ def _scenes(folder: Path) -> list[list[Path]]:
 
 def _require_all_parts(parts: list[Path]) -> None:
     numbers = [int(found[2]) for part in parts if (found := PART.search(part.name.removesuffix(ENDING)))]
-    gaps = [n for n, following in pairwise(numbers) if following != n + 1]
-    if gaps:
-        raise Refusal(f"part {gaps[0] + 1} is missing between {gaps[0]} and {next(n for n in numbers if n > gaps[0])}")
-    if len(parts) > 1 and numbers[0] > 1:
-        raise Refusal(f"parts begin with {numbers[0]}: those before are missing")
+    if len(parts) > 1 and (numbers[0] > 1 or numbers != [*range(numbers[0], numbers[0] + len(parts))]):
+        raise Refusal(f"parts are numbered {', '.join(map(str, numbers))}, expected each number once, from 0 or 1 on")
 
 
 def _load(parts: list[Path], facts: Facts) -> Loaded:

@@ -458,9 +458,9 @@ def split_folders(path: Path) -> tuple[dict[str, Path], tuple[str, ...]]:
     """Folders ``train``, ``valid``, ``test`` and ``test_unseen`` in a folder, by split, and a warning for each other one beside them."""
     if not path.is_dir():
         return {}, ()
-    folders = sorted(entry for entry in path.iterdir() if entry.is_dir() and not entry.name.startswith("."))
-    found = _one_each(path, [(SPLIT_NAMES[folder.name], folder) for folder in folders if folder.name in SPLIT_NAMES])
-    others = [folder.name for folder in folders if folder.name not in SPLIT_NAMES]
+    folders = {entry.name: entry for entry in path.iterdir() if entry.is_dir() and not entry.name.startswith(".")}
+    found = _one_each(path, [(split, folders[name]) for name, split in SPLIT_NAMES.items() if name in folders])
+    others = sorted({*folders} - {*SPLIT_NAMES})
     return found, tuple(f"{name}/ was not read: splits are {', '.join(SPLIT_NAMES)}" for name in others) if found else ()
 
 

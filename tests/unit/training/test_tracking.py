@@ -16,11 +16,12 @@ from gpe_pl.training.tracking import LoggerSettings, TrackingError, publish, run
 
 
 class Recorder(Logger):
-    """Stands for ``WandbLogger``; online it ends with ``error``."""
+    """Stands for ``WandbLogger``; in modes that fail it ends with ``error``."""
 
     name, version = "recorder", 0
     modes: ClassVar[list[str]] = []
     error: ClassVar[Exception | None] = None
+    fails: ClassVar[tuple[str, ...]] = ("online",)
 
     def __init__(self, name: str, mode: str, **_: Any) -> None:
         super().__init__()
@@ -30,7 +31,7 @@ class Recorder(Logger):
 
     def log_hyperparams(self, *_: Any) -> None:
         Recorder.modes.append(self.mode)
-        if self.mode == "online" and Recorder.error is not None:
+        if self.mode in Recorder.fails and Recorder.error is not None:
             raise Recorder.error
 
 
@@ -39,6 +40,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> type[Recorder]:
     monkeypatch.setattr(lightning_loggers, "WandbLogger", Recorder)
     monkeypatch.setattr(Recorder, "modes", [])
     monkeypatch.setattr(Recorder, "error", None)
+    monkeypatch.setattr(Recorder, "fails", ("online",))
     monkeypatch.setattr(tracking, "has_key", lambda: True)
     monkeypatch.delenv("WANDB_MODE", raising=False)
     return Recorder
@@ -62,7 +64,14 @@ def test_without_a_network_a_run_is_kept_offline(tmp_path: Path, recorder: type[
     *_, logger = LoggerSettings("wandb").loggers(tmp_path, "run", {})
     assert recorder.modes == ["online", "offline"]
     assert isinstance(logger, Recorder) and logger.mode == "offline"
-    assert "W&B cannot be reached (no route)" in caplog.text
+    assert "W&B: no route; this run is kept offline" in caplog.text
+
+
+def test_offline_is_not_tried_again(tmp_path: Path, recorder: type[Recorder]) -> None:
+    recorder.error, recorder.fails = wandb.errors.CommError("disk"), ("online", "offline")
+    with pytest.raises(TrackingError, match="disk"):
+        LoggerSettings("wandb").loggers(tmp_path, "run", {})
+    assert recorder.modes == ["online", "offline"]
 
 
 def test_what_wandb_refuses_is_one_line(tmp_path: Path, recorder: type[Recorder]) -> None:

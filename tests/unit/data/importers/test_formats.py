@@ -505,10 +505,19 @@ def test_unseen_splits_and_folders_that_are_none(tmp_path: Path) -> None:
     assert any(w.startswith("train_more/ was not read") for w in report.warnings)
 
 
+def test_a_scene_that_is_in_two_splits_stays_in_training(tmp_path: Path) -> None:
+    for folder, seeds in {"train": (0, 1, 2), "test": (2, 3), "val": (4,)}.items():
+        for seed in seeds:
+            write_arrays(tmp_path / "raw" / folder, seed)
+    report, stored = imported(tmp_path, tmp_path / "raw", "arrays")
+    assert {split: len(trajectories) for split, trajectories in stored.items()} == {"train": 3, "val": 1, "test": 1}
+    assert [(refusal.split, refusal.trajectory) for refusal in report.refusals] == [("test", "2.npz")]
+
+
 def test_two_places_for_one_split_are_refused(tmp_path: Path) -> None:
     for seed, split in enumerate(("train", "val", "valid")):
         write_arrays(tmp_path / "raw" / split, seed)
-    with pytest.raises(ImportFailure, match="val and valid are both the split val; move one of them"):
+    with pytest.raises(ImportFailure, match="valid and val are both the split val; move one of them"):
         imported(tmp_path, tmp_path / "raw", "arrays")
     sources.gns_metadata(tmp_path / "gns", motion())
     for name in ("train.tfrecord", "train.h5"):
