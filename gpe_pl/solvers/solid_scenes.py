@@ -13,8 +13,9 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from gpe_pl.bodies import random_outline, random_solid
 from gpe_pl.geometry import Box, Polygon, Shape, Sphere, signed_distance
-from gpe_pl.meshing import TETRAHEDRA_PER_CUBE, MeshingError, quadrangulate, random_outline, random_solid, tetrahedralise, triangulate
+from gpe_pl.meshing import TETRAHEDRA_PER_CUBE, MeshingError, quadrangulate, tetrahedralise, triangulate
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.scenes import (
     MAX_ATTEMPTS,

@@ -7,15 +7,12 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from gpe_pl.bodies import OUTLINES, SOLIDS, random_outline, random_solid
 from gpe_pl.meshing import (
-    OUTLINES,
-    SOLIDS,
     TETRAHEDRA_PER_CUBE,
     MeshingError,
     optimise_shapes,
     quadrangulate,
-    random_outline,
-    random_solid,
     shape_quality,
     tetrahedralise,
     triangulate,

@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gpe_pl import terrain
+from gpe_pl import terrain, terrain_files
+from gpe_pl.canyon import canyon
 from gpe_pl.geometry import DistanceGrid
-from gpe_pl.terrain import TerrainError, canyon, read_terrain
+from gpe_pl.grid_distance import unsigned
+from gpe_pl.terrain import read_terrain
+from gpe_pl.terrain_files import TerrainError
 
 UNIT = ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
 
@@ -55,19 +58,19 @@ def test_distances_equal_brute_force() -> None:
     corners = rng.uniform(-0.3, 1.3, (12, 3, 3))  # some of them cross the rim of the grid or lie outside
     corners[5] += 3.0
     low, spacing, counts = np.zeros(3), 1 / 8, (9, 9, 9)
-    distance = terrain._unsigned(corners, low, spacing, counts)
+    distance = unsigned(corners, low, spacing, counts)
     points = np.stack(np.meshgrid(*[np.arange(9) / 8] * 3, indexing="ij"), -1).reshape(-1, 3)
     expected = to_triangles(points, corners)
     found = distance.ravel()
     assert np.all(found <= expected + 1e-12)  # the lattice only comes near to the nearest point
     np.testing.assert_allclose(found, expected, atol=0.035)
-    single = terrain._unsigned(corners[:1], low, spacing, counts).ravel()
+    single = unsigned(corners[:1], low, spacing, counts).ravel()
     np.testing.assert_allclose(single, to_triangles(points, corners[:1]), atol=0.035)
 
 
 def test_point_to_triangle_in_every_region() -> None:
     triangle = np.array([[[0.25, 0.25, 0.5], [0.75, 0.25, 0.5], [0.25, 0.75, 0.5]]])
-    distance = terrain._unsigned(triangle, np.zeros(3), 0.25, (5, 5, 5))
+    distance = unsigned(triangle, np.zeros(3), 0.25, (5, 5, 5))
     cases = {(1, 1, 4): 0.5, (2, 1, 2): 0.0, (0, 0, 2): 0.25 * 2**0.5, (4, 1, 2): 0.25, (1, 0, 2): 0.25, (3, 3, 2): 0.25 * 2**0.5}
     for node, expected in cases.items():
         assert distance[node] == pytest.approx(expected, abs=1e-12), node
@@ -347,10 +350,10 @@ def test_missing_and_large_files_are_refused(tmp_path: Path, monkeypatch: pytest
         read_terrain(tmp_path / "a.csv", UNIT, 0.25)
     np.save(tmp_path / "a.npy", np.random.default_rng(0).random((50, 50)))
     np.savez_compressed(tmp_path / "a.npz", heights=np.zeros((500, 500)))
-    monkeypatch.setattr(terrain, "MAX_HEIGHTS", 100)
+    monkeypatch.setattr(terrain_files, "MAX_HEIGHTS", 100)
     with pytest.raises(TerrainError, match="2500 heights are too many"):
         read_terrain(tmp_path / "a.npy", UNIT, 0.25)
-    monkeypatch.setattr(terrain, "MAX_FILE_BYTES", 10_000)
+    monkeypatch.setattr(terrain_files, "MAX_FILE_BYTES", 10_000)
     with pytest.raises(TerrainError, match="bytes are too many"):
         read_terrain(tmp_path / "a.npy", UNIT, 0.25)
     with pytest.raises(TerrainError, match="unpacks to"):
@@ -428,7 +431,3 @@ def test_canyon_is_reproducible_and_differs_by_seed() -> None:
     difference = np.abs(fine.terrain.signed_distance(points) - made.terrain.signed_distance(points))
     assert np.quantile(difference, 0.95) < 0.5 / 16  # the same canyon, seen more closely
     assert fine.fall == made.fall
-
-
-def test_kernels_compile() -> None:
-    terrain.compile_kernels()

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from gpe_pl.geometry import Bowl, Box, DistanceGrid, domain_walls, shape_from_dict, shape_to_dict, signed_distance
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers.fluid_scenes import CLEARANCE, FluidScene, TerrainOptions
-from gpe_pl.terrain import TerrainError
+from gpe_pl.terrain_files import TerrainError
 from gpe_pl.trajectory import State
 
 EARTH_2D = (0.0, -9.81)
