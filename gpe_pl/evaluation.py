@@ -55,6 +55,7 @@ class EvaluationSettings:
         containment: put particles that cross a wall back on its surface.
         num_uncontained: trajectories per split that are also rolled out without containment, to see what it corrects; None takes all.
         hold_parameters: takes material parameters outside the trained range for the nearest trained value.
+        static_friction: speed in rest spacings per frame below which what lies on a wall stays where it is; None takes the model's own.
         num_pictures: trajectories per split that get a figure, an animation and a viewer.
         export: what to write for other programs: those trajectories as ``vtk`` series, ``npz`` and ``mp4``, and the ``model`` (see ``portable``).
     """
@@ -65,6 +66,7 @@ class EvaluationSettings:
     containment: bool = True
     num_uncontained: Annotated[int, Field(ge=0)] | None = None
     hold_parameters: bool = True
+    static_friction: Annotated[float, Field(ge=0, le=1)] | None = None
     num_pictures: Annotated[int, Field(ge=0)] = 2
     export: list[Export] = field(default_factory=list)
 
@@ -92,7 +94,7 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     and ``rollout_*.html`` (a viewer) of some, and their ``stress_*.png`` where the model decodes a stress.
 
     All rollouts start at the first frame with enough history and run to the end of the ground truth; ``simulator`` is left with
-    ``settings.hold_parameters``. Share outside with containment off is reported as
+    ``settings.hold_parameters`` and ``settings.static_friction``. Share outside with containment off is reported as
     ``share_outside_uncontained``, where it was asked for, the share of corrected particle-steps as ``share_corrected``; neither where a boundary is known by
     its nodes only.
 
@@ -108,6 +110,8 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
             "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
         )
     simulator.holds_parameters = settings.hold_parameters
+    if settings.static_friction is not None:
+        simulator.static_friction = settings.static_friction
     run_dir.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     for split in settings.splits:

@@ -27,9 +27,10 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import Standardize
+from gpe_pl.nn.static_friction import is_held, supported
 from gpe_pl.pretrained import checkpoint_path, names
 from gpe_pl.rollout import SimulationError
-from gpe_pl.schema import MATERIALS, EdgeType, FeatureSpec, node_code, role
+from gpe_pl.schema import BOUNDARY, MATERIALS, EdgeType, FeatureSpec, node_code, role
 from gpe_pl.signatures import checked
 from gpe_pl.skips import Skips
 from gpe_pl.trajectory import Metadata, State, Stress, Trajectory
@@ -133,8 +134,9 @@ class LearnedSimulator(nn.Module):
         skips: what steps leave out.
         holds_parameters: material parameters outside the range of the training data are taken for the nearest trained value, which a network is more to be
             trusted with than with its own continuation.
+        static_friction: speed in rest spacings per frame below which what lies on a wall stays where it is (see ``nn.static_friction``); 0 for none.
 
-    Both attributes may be changed at any time and are no part of a checkpoint.
+    All may be changed at any time; a checkpoint that ``save`` writes keeps ``static_friction`` alone.
     """
 
     acceleration_std: Tensor
@@ -144,6 +146,7 @@ class LearnedSimulator(nn.Module):
     def __init__(self, model: nn.Module, builder: GraphBuilder) -> None:
         super().__init__()
         self.model, self.builder = model, builder
+        self._static_friction = 0.0
         self.standardizer = GraphStandardizer(builder.spec)
         self.register_buffer("acceleration_std", torch.ones((), dtype=torch.float64))
         self.register_buffer("stress_std", torch.ones((), dtype=torch.float64))
@@ -160,6 +163,18 @@ class LearnedSimulator(nn.Module):
     def skips(self, skips: Skips) -> None:
         self.builder = replace(self.builder, skips=skips)
         cast(Any, self.model).skips = skips
+
+    @property
+    def static_friction(self) -> float:
+        return self._static_friction
+
+    @static_friction.setter
+    def static_friction(self, speed: Any) -> None:
+        if isinstance(speed, bool) or not isinstance(speed, int | float) or not 0 <= speed <= 1:
+            raise ValueError(f"static_friction={speed!r}: must be a number from 0 to 1, in spacings per frame")
+        if speed and not self.builder.spec.islands:
+            raise SceneError(f"static_friction={speed:g}: needs a model that was trained with graph.islands=true; 0 turns it off")
+        self._static_friction = float(speed)
 
     @property
     def num_hops(self) -> int:
@@ -309,7 +324,26 @@ class LearnedSimulator(nn.Module):
         acc = [state.gravity.expand_as(state.pos).clone() for state in states]
         for scene, rows, part in _per_scene(acceleration, graphs):
             acc[scene][rows] += part.double() * self.acceleration_std
-        return [self.advance(state, a) for state, a in zip(states, acc, strict=True)]
+        new = [self.advance(state, a) for state, a in zip(states, acc, strict=True)]
+        return [self._held(*parts) for parts in zip(states, new, graphs, strict=True)] if self.static_friction else new
+
+    def _held(self, state: State, new: State, graph: HeteroData) -> State:
+        """The new state, with those nodes where they were that static friction holds."""
+        island = torch.empty(state.num_nodes, dtype=torch.int64, device=state.pos.device)
+        for material in self.builder.spec.materials:
+            island[graph[material].node_id] = graph[material].island
+        held = is_held(state.vel, new.vel, island, self.supported(graph), self.static_friction * self.builder.scales.velocity)[:, None]
+        vel = torch.where(held, 0.0, new.vel)
+        history = torch.cat([history_of(new)[:, :-1], vel[:, None]], dim=1)
+        return replace(new, pos=torch.where(held, state.pos, new.pos), vel=vel, velocity_history=history)
+
+    def supported(self, graph: HeteroData) -> Tensor:
+        """Islands of a graph [island] that static friction may hold."""
+        spec = self.builder.spec
+        moves = (graph[BOUNDARY].x[:, : spec.dim] != 0).any(dim=1)
+        walls = [relation for relation in spec.relations if relation[0] == BOUNDARY]
+        edges = [(graph[relation].edge_index, graph[relation[2]].island) for relation in walls]
+        return supported(graph.island_is_free, [(island[i], moves[j]) for (j, i), island in edges])
 
     def _with_stress(self, states: list[State], predicted: dict[str, Tensor], graphs: list[HeteroData]) -> list[State]:
         components = next(iter(self.builder.spec.stress_channels.values()))
@@ -353,6 +387,7 @@ class LearnedSimulator(nn.Module):
             "settings": dict(cast(Any, self.model).settings),
             "graph": asdict(self.builder.config),
             "metadata": asdict(self.builder.metadata),
+            "static_friction": self.static_friction,
         }
 
     @classmethod
@@ -362,7 +397,9 @@ class LearnedSimulator(nn.Module):
             raise ValueError(f"checkpoint format {values.get('format')!r}, this version reads {CHECKPOINT_FORMAT}")
         graph, metadata = GraphConfig(**checked(GraphConfig, values["graph"])), Metadata(**checked(Metadata, values["metadata"]))
         builder, model = GraphBuilder(graph, metadata), model_class(values["model"])
-        return cls(model(builder.spec, **checked(model, values["settings"], "spec")), builder)
+        simulator = cls(model(builder.spec, **checked(model, values["settings"], "spec")), builder)
+        simulator.static_friction = values.get("static_friction", 0.0)
+        return simulator
 
     def save(self, path: Path | str) -> None:
         """Write weights and description alone, which ``from_checkpoint`` reads, atomically; a training checkpoint also holds the optimiser's state."""

@@ -32,6 +32,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import boundary_features, edge_features, history_of, material_features, mesh_features, virtual_features
 from gpe_pl.graphs.islands import unwrapped
 from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.nn.static_friction import is_held
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, RADIUS, EdgeType, FeatureSpec, grid, level_of
 from gpe_pl.skips import Skips
 from gpe_pl.trajectory import Boundary, State
@@ -77,13 +78,20 @@ class PortableStep(nn.Module):
 
     def forward(self, scene: Scene) -> tuple[Scene, Scene]:
         """The next positions and velocity history; acceleration [m/s²], gravity included, and stress [Pa] at nodes where the model has one."""
-        predicted = self.simulator(self.graph(scene))
+        graph = self.graph(scene)
+        predicted = self.simulator(graph)
+        is_supported = self.simulator.supported(graph) if self.simulator.static_friction else None
         moved: Scene = {}
         further: Scene = {}
         for material, values in predicted.acceleration.items():
             history = scene[f"velocity_history.{material}"]
             acc = scene["gravity"].expand_as(history[:, -1]) + values.double() * self.simulator.acceleration_std
-            pos, vel = integrators.advance(scene[f"pos.{material}"], history[:, -1], acc, self.frame_dt)
+            before = scene[f"pos.{material}"]
+            pos, vel = integrators.advance(before, history[:, -1], acc, self.frame_dt)
+            if is_supported is not None:
+                speed = self.simulator.static_friction * self.scales.velocity
+                held = is_held(history[:, -1], vel, graph[material].island, is_supported, speed)[:, None]
+                pos, vel = torch.where(held, before, pos), torch.where(held, 0.0, vel)
             moved[f"pos.{material}"] = pos
             moved[f"velocity_history.{material}"] = torch.cat([history[:, 1:], vel[:, None]], dim=1)
             further[f"acceleration.{material}"] = acc

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +10,13 @@ from typing import Any, cast
 
 from gpe_pl.generation import DatasetSpec
 from gpe_pl.learned_simulator import LearnedSimulator
-from gpe_pl.report import Run, finished_runs
+from gpe_pl.report import Run, axes_of, finished_runs
 
 DEPTHS = ("num_message_passing_steps", "num_propagation_steps", "num_convolutions")
 """What models call the number of their layers."""
+
+
+LENGTHS = ("training.num_steps", "training.val_interval", "training.budget_minutes")
 
 
 @dataclass(frozen=True)
@@ -28,12 +32,20 @@ def runs_in(folders: Sequence[str]) -> list[Run]:
 
 
 def trained_on(spec: DatasetSpec, runs: Iterable[Run]) -> dict[str, tuple[LearnedSimulator, Run]]:
-    """Simulators that were trained on a data set, and their runs, by the models' labels; the first seed of each."""
-    found: dict[str, tuple[LearnedSimulator, Run]] = {}
+    """Simulators that were trained on a data set, and their runs, by label: the model's, and what else differs between runs of the same model. Of several
+    seeds, and of runs that differ in their length alone, the first.
+    """
+    same: dict[str, list[tuple[LearnedSimulator, Run]]] = defaultdict(list)
     for run in runs:
         if (run.config["data.name"], run.config["size.name"]) == (spec.name, spec.size):
             simulator = LearnedSimulator.from_checkpoint(run.folder / "checkpoints" / "best.ckpt")
-            found.setdefault(model_label(simulator), (simulator, run))
+            same[model_label(simulator)].append((simulator, run))
+    found: dict[str, tuple[LearnedSimulator, Run]] = {}
+    for label, members in same.items():
+        axes = [axis for axis in axes_of([run for _, run in members]) if axis.startswith(("training.", "graph.")) and axis not in LENGTHS]
+        for simulator, run in members:
+            differences = [f"{axis.rpartition('.')[2]}={run.config.get(axis)}" for axis in axes]
+            found.setdefault(", ".join([label, *differences]), (simulator, run))
     return found
 
 

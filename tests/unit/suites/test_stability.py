@@ -17,13 +17,14 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
+from gpe_pl.report import Run
 from gpe_pl.simulate import dataset
 from gpe_pl.stability import conservation, geometry, horizon, inputs, invariances, precision
 from gpe_pl.stability.horizon import energy, growth_rate, separation, valid_steps
 from gpe_pl.stability.subject import Outcome, StressTest, Subject
 from gpe_pl.suites.stability import GROUPS, NothingToTestError, Settings, figures, is_gating, run
 from gpe_pl.suites.stability import test as run_tests
-from gpe_pl.suites.trained import Case, model_label
+from gpe_pl.suites.trained import Case, model_label, trained_on
 from gpe_pl.trajectory import State, Trajectory
 
 NUM_FRAMES = 16
@@ -200,3 +201,24 @@ def test_what_gates_is_the_shipped_configuration(spec: DatasetSpec, scenes: list
     assert not is_gating(subject(spec, scenes).simulator, SHIPPED)
     assert not is_gating(subject(spec, scenes, **SHIPPED).simulator, {})
     assert model_label(subject(spec, scenes, **SHIPPED).simulator) == "GPE 2 × 8 geometry angular"
+
+
+def test_runs_of_one_model_are_told_apart_by_their_training(spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path) -> None:
+    def made(name: str, model: Subject, **training: Any) -> Run:
+        model.simulator.save(tmp_path / name / "checkpoints" / "best.ckpt")
+        config = {"data.name": spec.name, "size.name": spec.size, "seed": len(name), "training.num_steps": len(name)}
+        return Run(tmp_path / name, config | {f"training.{key}": value for key, value in training.items()}, [])
+
+    plain, tuned = subject(spec, scenes), subject(spec, scenes, **SHIPPED)
+    runs = [
+        made("a", plain, noise_std=0.3),
+        made("bb", tuned, noise_std=0.3),
+        made("ccc", tuned, noise_std=0.0),
+        made("dddd", tuned, noise_std=0.0),
+    ]
+    found = trained_on(spec, runs)
+    assert {label: run.folder.name for label, (_, run) in found.items()} == {
+        "GPE 2 × 8": "a",
+        "GPE 2 × 8 geometry angular, noise_std=0.3": "bb",
+        "GPE 2 × 8 geometry angular, noise_std=0.0": "ccc",
+    }

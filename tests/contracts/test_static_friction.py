@@ -1,0 +1,123 @@
+"""What lies on a wall and hardly moves stays; what flies, is fast, or is pushed by a wall goes as if there were no static friction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator, SceneError
+from gpe_pl.models.gpe import GPE
+from gpe_pl.nn.static_friction import supported
+from gpe_pl.rollout import rollout
+from gpe_pl.trajectory import State
+from tests import scenes
+
+ENOUGH = 0.01
+"""Spacings per frame; gravity alone gives half of this in one frame."""
+
+
+def simulator(islands: bool = True, materials: tuple[str, ...] = ("sand",)) -> LearnedSimulator:
+    """One whose network answers zero, so that nothing but gravity acts."""
+    build = scenes.builder(materials, islands=islands)
+    made = LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=8), build).eval()
+    with torch.no_grad():
+        for p in made.model.parameters():
+            p.zero_()
+    return made
+
+
+def lying_and_flying(materials: tuple[str, ...] = ("sand",)) -> tuple[State, np.ndarray]:
+    """A layer on the floor and a cloud above it, both without velocity, and which nodes lie [node]."""
+    state = scenes.state(24, materials, seed=3)
+    lies = np.arange(24) % 4 < 2
+    pos = np.stack([np.linspace(0.3, 0.7, 24), np.where(lies, 0.04, 0.5)], axis=1)
+    return replace(state, pos=pos, vel=np.zeros_like(pos), velocity_history=np.zeros((24, 1, 2))), lies
+
+
+@pytest.mark.parametrize("materials", [("sand",), ("snow", "sand")])
+def test_what_lies_on_a_wall_stays_and_what_flies_falls(materials: tuple[str, ...]) -> None:
+    state, lies = lying_and_flying(materials)
+    learned = simulator(materials=materials)
+    free = learned.step(state.to_torch())
+    learned.static_friction = ENOUGH
+    held = learned.step(state.to_torch())
+    assert torch.equal(held.pos[lies], state.to_torch().pos[lies])
+    assert not held.vel[lies].any() and held.velocity_history is not None and not held.velocity_history[lies].any()
+    assert torch.equal(held.pos[~lies], free.pos[~lies]) and torch.equal(held.vel[~lies], free.vel[~lies])
+    assert free.vel[lies].any()
+
+
+def test_at_rest_is_for_ever() -> None:
+    state, lies = lying_and_flying()
+    learned = simulator()
+    learned.static_friction = ENOUGH
+    result = rollout(learned, state.to_torch(), 20, learned.builder.metadata)
+    assert (result.pos[:, lies] == result.pos[0, lies]).all()
+    assert (result.pos[-1, ~lies] < result.pos[0, ~lies])[:, 1].all()
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_what_moves_is_not_held(when: str) -> None:
+    """Before the step, or because of it, where the threshold is below what gravity does within a frame."""
+    state, lies = lying_and_flying()
+    learned = simulator()
+    velocity = 1.01 * ENOUGH * learned.builder.scales.velocity
+    vel = np.where(lies[:, None] & (when == "before"), [velocity, 0.0], 0.0)
+    moving = replace(state, vel=vel, velocity_history=vel[:, None]).to_torch()
+    free = learned.step(moving)
+    learned.static_friction = ENOUGH if when == "before" else 0.4 * ENOUGH
+    held = learned.step(moving)
+    assert torch.equal(held.pos, free.pos)
+
+
+def test_a_wall_that_moves_holds_nothing() -> None:
+    state, lies = lying_and_flying()
+    floor = state.boundary.pos[:, 1] <= 0
+    vel = np.where((floor & (state.boundary.pos[:, 0] > 0.5))[:, None], [0.2, 0.0], 0.0)
+    moving = replace(state, boundary=replace(state.boundary, vel=vel)).to_torch()
+    learned = simulator()
+    free = learned.step(moving)
+    learned.static_friction = ENOUGH
+    assert torch.equal(learned.step(moving).pos, free.pos)
+    assert not torch.equal(learned.step(state.to_torch()).pos[lies], free.pos[lies])
+
+
+def test_islands_that_touch_walls_none_of_which_moves() -> None:
+    is_free = torch.tensor([False, False, True, False])
+    contacts = [
+        (torch.tensor([0, 1, 1]), torch.tensor([False, False, True])),
+        (torch.tensor([3]), torch.tensor([False])),
+        (torch.empty(0, dtype=torch.int64), torch.empty(0, dtype=torch.bool)),
+    ]
+    assert supported(is_free, contacts).tolist() == [True, False, False, True]
+
+
+def test_a_model_that_does_not_know_its_islands_has_none() -> None:
+    with pytest.raises(SceneError, match="needs a model that was trained with graph.islands=true"):
+        simulator(islands=False).static_friction = ENOUGH
+
+
+@pytest.mark.parametrize("speed", [-0.1, float("nan"), 2.0, True, "0.01"])
+def test_values_that_make_no_sense(speed: Any) -> None:
+    with pytest.raises(ValueError, match="must be a number from 0 to 1"):
+        simulator().static_friction = speed
+
+
+def test_a_checkpoint_keeps_it(tmp_path: Path) -> None:
+    learned = simulator()
+    learned.static_friction = ENOUGH
+    learned.save(tmp_path / "model.ckpt")
+    assert LearnedSimulator.from_checkpoint(tmp_path / "model.ckpt").static_friction == ENOUGH
+    checkpoint = torch.load(tmp_path / "model.ckpt", weights_only=True)
+    checkpoint["simulator"]["static_friction"] = -1.0
+    torch.save(checkpoint, tmp_path / "wrong.ckpt")
+    with pytest.raises(CheckpointError, match="static_friction=-1"):
+        LearnedSimulator.from_checkpoint(tmp_path / "wrong.ckpt")
+    del checkpoint["simulator"]["static_friction"]  # as before there was any
+    torch.save(checkpoint, tmp_path / "old.ckpt")
+    assert LearnedSimulator.from_checkpoint(tmp_path / "old.ckpt").static_friction == 0
