@@ -21,9 +21,10 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     from gpe_pl.learned_simulator import LearnedSimulator
     from gpe_pl.pretrained import names
     from gpe_pl.report import conclusion
+    from gpe_pl.run_folder import claim, release
     from gpe_pl.simulate import ensure_split, evaluated_config, scene_metadata
     from gpe_pl.skips import Skips
-    from gpe_pl.training.run import TrainerSettings, claim, release, set_up
+    from gpe_pl.training.run import TrainerSettings, set_up
 
     if not isinstance(cfg.checkpoint, str):
         shipped = f", or a shipped model: {', '.join(names())}" if names() else ""

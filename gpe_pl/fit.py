@@ -26,10 +26,11 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
+    from gpe_pl.run_folder import claim
     from gpe_pl.simulate import ensure_data, evaluated_config
     from gpe_pl.training.budget import digest, mean_step_time, within_budget
     from gpe_pl.training.module import TrainingModule
-    from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, claim, set_up, train
+    from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, set_up, train
     from gpe_pl.training.tracking import LoggerSettings, publish
 
     if type(cfg.seed) is not int or cfg.seed < 0:

@@ -514,7 +514,7 @@ def _claim(folder: Path, spec: DatasetSpec) -> None:
         return
     try:
         stored = json.loads(path.read_text())["spec"]
-    except (json.JSONDecodeError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError):
         raise GenerationError(f"{path}: unreadable; delete the folder {folder} and run simulate again") from None
     differing = _differences(stored, values)
     if differing:

@@ -18,6 +18,7 @@ from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.evaluation import LEARNED, Row, read_rows
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import bootstrap_interval
+from gpe_pl.run_folder import config_in
 from gpe_pl.timing import paired_ratio, paired_times
 
 log = logging.getLogger(__name__)
@@ -46,7 +47,7 @@ def finished_runs(folder: Path) -> list[Run]:
     for path in sorted(folder.rglob("metrics.csv")):
         config = path.parent / "config.json"
         if config.exists():
-            runs.append(Run(path.parent, UNSAID | dict(_flatten(json.loads(config.read_text()))), list(read_rows(path))))
+            runs.append(Run(path.parent, UNSAID | dict(_flatten(config_in(config))), list(read_rows(path))))
     return runs
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import shutil
 import sys
 import warnings
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,23 +19,17 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
-from gpe_pl.atomic import replace_text, replacing
+from gpe_pl.atomic import replacing
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import NoiseKind
 from gpe_pl.data.sampling import PushForward, Sampling
-from gpe_pl.errors import GpeError
+from gpe_pl.run_folder import CONFIG, RunError, config_in, differences
 from gpe_pl.training.callbacks import RolloutValidation, StepProgress, WarmAverage
 from gpe_pl.training.checkpoints import AtomicCheckpoints
 from gpe_pl.training.module import Compile, Schedule, TrainingModule
 from gpe_pl.training.parallel import SummedGradients
 
 log = logging.getLogger(__name__)
-
-CONFIG = "config.json"
-
-
-class RunError(GpeError, RuntimeError):
-    """A run folder cannot be used; the message says why and what to do."""
 
 
 @dataclass(frozen=True)
@@ -121,31 +113,6 @@ class TrainerSettings:
         return self.devices * self.num_nodes
 
 
-def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("checkpoints/last.ckpt", "metrics.csv")) -> None:
-    """Take a folder for a run with this configuration; one without ``results`` (patterns) is free.
-
-    Raises:
-        RunError: the folder holds a run with another configuration; names the first differing key.
-    """
-    run_dir.mkdir(parents=True, exist_ok=True)
-    path = run_dir / CONFIG
-    if any(found.name != CONFIG for pattern in results for found in run_dir.glob(pattern)):
-        different = sorted(_differences(_config_in(path), config)) if path.exists() else [f"of which there is no {CONFIG}"]
-        if different:
-            raise RunError(
-                f"{run_dir} holds a run with another configuration ({'; '.join(different[:3])}); choose another name=… or delete the folder"
-            )
-        return
-    replace_text(path, json.dumps(config, indent=1, sort_keys=True))
-
-
-def release(run_dir: Path) -> None:
-    """Give a claimed folder back if nothing was written to it."""
-    if [path.name for path in run_dir.iterdir()] == [CONFIG]:
-        (run_dir / CONFIG).unlink()
-        run_dir.rmdir()
-
-
 def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
     """Copy the checkpoint of a finished run below ``folder`` that was trained with the configuration ``config``; None if there is no such run.
 
@@ -154,8 +121,8 @@ def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
     for path in sorted(folder.rglob(CONFIG)):
         trained = path.parent / "checkpoints" / "best.ckpt"
         if (path.parent / "metrics.csv").exists() and trained.exists():
-            there = _config_in(path)
-            if not _differences({key: value for key, value in there.items() if key != "evaluation"}, config):
+            there = config_in(path)
+            if not differences({key: value for key, value in there.items() if key != "evaluation"}, config):
                 if rank_zero_only.rank > 0:  # type: ignore[attr-defined]
                     sys.exit()
                 log.info("taking the model that was trained in %s", path.parent)
@@ -164,22 +131,6 @@ def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
                     shutil.copy(trained, part)
                 return own
     return None
-
-
-def _config_in(path: Path) -> dict[str, Any]:
-    try:
-        values = dict(json.loads(path.read_text()))
-        if isinstance(values.get("data"), dict):
-            values["data"].pop("comparison", None)  # which older runs wrote down, though it says nothing that graph and training do not
-        return values
-    except ValueError:
-        raise RunError(f"{path} is damaged; delete the folder {path.parent} or choose another name=…") from None
-
-
-def _differences(a: Any, b: Any, path: str = "") -> list[str]:
-    if isinstance(a, dict) and isinstance(b, dict):
-        return [d for k in sorted({*a, *b}) for d in _differences(a.get(k), b.get(k), f"{path}.{k}" if path else k)]
-    return [] if a == b else [f"{path}: {a!r} there, {b!r} now"]
 
 
 def train(

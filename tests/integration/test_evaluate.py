@@ -21,9 +21,9 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator, SceneError
 from gpe_pl.models.gpe import GPE
 from gpe_pl.report import summary
+from gpe_pl.run_folder import RunError
 from gpe_pl.simulate import dataset_spec
 from gpe_pl.store import StoreError
-from gpe_pl.training.run import RunError
 from tests.runs import DATA, compose, tiny
 
 

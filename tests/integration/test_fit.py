@@ -24,10 +24,10 @@ from gpe_pl.fit import fit
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.progress import Progress
 from gpe_pl.report import report_sweep, validation_curve
+from gpe_pl.run_folder import RunError, claim
 from gpe_pl.store import StoreError
 from gpe_pl.training import callbacks
 from gpe_pl.training.module import TrainingError, TrainingModule
-from gpe_pl.training.run import RunError, claim
 from tests.runs import tiny
 
 STEPS = ("training.num_steps=6", "training.val_interval=2", "training.warmup_steps=2")

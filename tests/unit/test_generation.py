@@ -416,3 +416,12 @@ def test_progress_bar_reports(folder, capsys):
     with progress_bar("sand") as progress:
         progress(3, 4)
     assert "3/4" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", [b"{", b"5", b"\xa1\xff", b'{"spec'])
+def test_a_damaged_description_is_named(folder, tmp_path, content):
+    again = tmp_path / "sand" / "smoke"
+    shutil.copytree(folder, again)
+    (again / "dataset.json").write_bytes(content)
+    with pytest.raises(GenerationError, match=r"dataset.json: unreadable; delete the folder"):
+        generate(tmp_path, SPEC, 1)

@@ -10,6 +10,7 @@ import pytest
 
 from gpe_pl import report
 from gpe_pl.evaluation import LEARNED, Row, write_rows
+from gpe_pl.run_folder import RunError
 
 ERRORS = {  # of two test scenes; free flight has 2e-3 and 6e-3
     ("negated", 0): [1e-3, 3e-3],
@@ -75,3 +76,11 @@ def test_a_repeated_run_counts_once(runs: Path, caplog: pytest.LogCaptureFixture
     report.report_sweep(runs)
     assert cells(runs, "odd")[0][1] == "1"
     assert "repeats" in caplog.text
+
+
+@pytest.mark.parametrize("content", [b"{", b"5", b"\xa1\xff"])
+def test_a_damaged_configuration_is_named(runs: Path, content: bytes) -> None:
+    path = runs / "negated" / "0" / "config.json"
+    path.write_bytes(content)
+    with pytest.raises(RunError, match=r"negated/0/config.json is damaged; delete the folder"):
+        report.report_sweep(runs)

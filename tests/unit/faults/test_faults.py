@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import time
 from collections.abc import Callable
 from functools import partial
@@ -14,7 +15,7 @@ import pytest
 import torch
 
 from gpe_pl.errors import GpeError
-from gpe_pl.faults import checkpoints, configs, scenes, stores
+from gpe_pl.faults import checkpoints, configs, runs, scenes, stores
 from gpe_pl.faults.isolation import Ended, verdicts
 from gpe_pl.faults.verdict import GOOD, Fault, Verdict, judge
 from gpe_pl.generation import DatasetSpec
@@ -93,6 +94,17 @@ def test_a_changed_value_with_a_fitting_checksum_is_accepted(shard: Path, tmp_pa
             file["00001"]["pos"][2, 3, 1] += np.float32(0.1)
 
     assert stores.read_rewritten(shard, rewrite, tmp_path).status == "accepted"
+
+
+def test_bytes_without_meaning_may_change(shard: Path, tmp_path: Path) -> None:
+    same, other = tmp_path / "same.h5", tmp_path / "other.h5"
+    same.write_bytes(shard.read_bytes() + b"beyond the end")
+    shutil.copy(shard, other)
+    with h5py.File(other, "r+") as file:
+        file["00000"]["pos"][0, 0, 0] += 0.5
+    assert runs._hold_the_same(shard, same)
+    assert not runs._hold_the_same(shard, other)
+    assert not runs._hold_the_same(shard, tmp_path / "missing.h5")
 
 
 def test_payloads_work_where_they_are_let(tmp_path: Path) -> None:

@@ -10,7 +10,8 @@ import pytest
 import torch
 from lightning.pytorch.utilities import rank_zero_only
 
-from gpe_pl.training.run import RunError, TrainerSettings, adopt, claim, set_up
+from gpe_pl.run_folder import RunError, claim
+from gpe_pl.training.run import TrainerSettings, adopt, set_up
 
 CONFIG: dict[str, Any] = {"seed": 0, "model": {"depth": 3}, "training": {"batch_size": 2}}
 BY_NODES = {**CONFIG, "batching": {"max_nodes": 500}}

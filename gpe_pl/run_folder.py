@@ -1,0 +1,60 @@
+"""Folders of runs: each belongs to one configuration, which is written into it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from gpe_pl.atomic import replace_text
+from gpe_pl.errors import GpeError
+
+CONFIG = "config.json"
+
+
+class RunError(GpeError, RuntimeError):
+    """A run folder cannot be used; the message says why and what to do."""
+
+
+def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("checkpoints/last.ckpt", "metrics.csv")) -> None:
+    """Take a folder for a run with this configuration; one without ``results`` (patterns) is free.
+
+    Raises:
+        RunError: the folder holds a run with another configuration; names the first differing key.
+    """
+    run_dir.mkdir(parents=True, exist_ok=True)
+    path = run_dir / CONFIG
+    if any(found.name != CONFIG for pattern in results for found in run_dir.glob(pattern)):
+        different = sorted(differences(config_in(path), config)) if path.exists() else [f"of which there is no {CONFIG}"]
+        if different:
+            raise RunError(
+                f"{run_dir} holds a run with another configuration ({'; '.join(different[:3])}); choose another name=… or delete the folder"
+            )
+        return
+    replace_text(path, json.dumps(config, indent=1, sort_keys=True))
+
+
+def release(run_dir: Path) -> None:
+    """Give a claimed folder back if nothing was written to it."""
+    if [path.name for path in run_dir.iterdir()] == [CONFIG]:
+        (run_dir / CONFIG).unlink()
+        run_dir.rmdir()
+
+
+def config_in(path: Path) -> dict[str, Any]:
+    """The configuration that a run has left in a file; raises ``RunError`` if that is damaged."""
+    try:
+        values = dict(json.loads(path.read_text()))
+        if isinstance(values.get("data"), dict):
+            values["data"].pop("comparison", None)  # which older runs wrote down, though it says nothing that graph and training do not
+        return values
+    except (ValueError, TypeError):
+        raise RunError(f"{path} is damaged; delete the folder {path.parent} or choose another name=…") from None
+
+
+def differences(a: Any, b: Any, path: str = "") -> list[str]:
+    """Where two configurations differ: each key with both values."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        return [d for k in sorted({*a, *b}) for d in differences(a.get(k), b.get(k), f"{path}.{k}" if path else k)]
+    return [] if a == b else [f"{path}: {a!r} there, {b!r} now"]
