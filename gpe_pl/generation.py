@@ -48,7 +48,10 @@ SPEC_FILE = "dataset.json"
 CONTACT_SHEET_FILE = "contact_sheet.png"
 SHEET_ROWS = 5
 
-Count = Annotated[int, Field(ge=0)]
+MOST = 1_000_000
+"""Trajectories of a split, and frames of a trajectory: far more than anyone needs, and few enough to be listed."""
+
+Count = Annotated[int, Field(ge=0, le=MOST)]
 PathPart = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
 
 
@@ -130,8 +133,8 @@ class DatasetSpec:
     parameters: dict[str, ParameterValues]
     scene: InstanceOf[Scene]
     solver: InstanceOf[Solver]
-    num_train: Annotated[int, Field(ge=1)]
-    num_frames: Annotated[int, Field(ge=3)]
+    num_train: Annotated[int, Field(ge=1, le=MOST)]
+    num_frames: Annotated[int, Field(ge=3, le=MOST)]
     num_val: Count = 0
     num_test: Count = 0
     num_test_unseen: Count = 0

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 from gpe_pl import generation
+from gpe_pl.config import ConfigError
 from gpe_pl.data.validate import validate
 from gpe_pl.generation import (
     DatasetSpec,
@@ -425,3 +426,9 @@ def test_a_damaged_description_is_named(folder, tmp_path, content):
     (again / "dataset.json").write_bytes(content)
     with pytest.raises(GenerationError, match=r"dataset.json: unreadable; delete the folder"):
         generate(tmp_path, SPEC, 1)
+
+
+@pytest.mark.parametrize("name", ["num_train", "num_val", "num_test", "num_test_unseen", "num_frames"])
+def test_numbers_that_no_machine_can_list_are_refused(name):
+    with pytest.raises(ConfigError, match=rf"data.{name}.*1000000"):
+        dataset_spec(compose("simulate", "data=sand", "size=tiny", f"data.{name}={10**30}"))
