@@ -12,7 +12,7 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -57,6 +57,10 @@ T = TypeVar("T")
 
 class ConfigError(GpeError, ValueError):
     """A config value is not allowed; the message names key, value and what is allowed."""
+
+
+LARGEST_INTEGER = 2**63 - 1
+"""Of settings: what NumPy, PyTorch and ``range`` can count with."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +111,9 @@ def bind(target: Callable[..., T], settings: Mapping[str, Any], path: str, *late
     unknown = set(values) - set(valid)
     if unknown:
         raise ConfigError(f"{path}.{min(unknown)}: unknown key; valid keys: {', '.join(valid)}")
+    for key, number in _integers(values, path):
+        if abs(number) > LARGEST_INTEGER:
+            raise ConfigError(f"{key}={number}: must be within ±{LARGEST_INTEGER}")
     try:
         arguments = checked(target, values, *later)
     except ValidationError as error:
@@ -123,6 +130,18 @@ def bind(target: Callable[..., T], settings: Mapping[str, Any], path: str, *late
             raise ConfigError(f"{path}: {error}") from error
 
     return call
+
+
+def _integers(value: Any, path: str) -> Iterator[tuple[str, int]]:
+    """All integers in nested settings, with their paths."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _integers(item, f"{path}.{key}")
+    elif isinstance(value, list):
+        for k, item in enumerate(value):
+            yield from _integers(item, f"{path}.{k}")
+    elif isinstance(value, int):
+        yield path, value
 
 
 def _one_line(error: ValidationError, path: str) -> str:

@@ -73,6 +73,8 @@ def test_construct_resolves_interpolations() -> None:
         ({"size": 1, "kind": "c"}, "inner.kind='c': input should be 'a' or 'b'"),
         ({"size": 1, "rate": -1.0}, "inner.rate=-1.0: input should be greater than 0"),
         ({"size": 1, "rate": float("inf")}, "inner.rate=inf: input should be a finite number"),
+        ({"size": 10**30}, f"inner.size={10**30}: must be within ±9223372036854775807"),
+        ({"size": 1, "names": ["x", -(10**30)]}, f"inner.names.1={-(10**30)}: must be within ±9223372036854775807"),
         ({"size": 1, "names": ["x", 3]}, "inner.names.1=3: input should be a valid string"),
         ({"size": 1, "sise": 2}, "inner.sise: unknown key; valid keys: size, kind, rate, names"),
         ({"size": 0, "kind": "c"}, "inner.size=0: input should be greater than or equal to 1; inner.kind='c': input should be 'a' or 'b'"),
