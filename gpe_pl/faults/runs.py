@@ -58,10 +58,16 @@ class Command:
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """SHA-256 of what must not depend on how a command was interrupted: data, metrics, tables, weights and the state of the optimiser, bit for bit."""
+    """SHA-256 of what must not depend on how a command was interrupted: data, metrics, tables, weights and the state of the optimiser, bit for bit.
+
+    Logs do: each start of a run has its own.
+    """
     found = {}
     for path in _final_files(folder):
-        name = str(path.relative_to(folder))
+        relative = path.relative_to(folder)
+        name = str(relative)
+        if "log" in relative.parts:
+            continue
         if path.suffix == ".ckpt":
             stored = load_checkpoint(path)
             found[name] = _digest({key: stored[key] for key in SAVED})
