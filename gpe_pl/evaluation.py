@@ -55,7 +55,7 @@ class EvaluationSettings:
         containment: put particles that cross a wall back on its surface.
         num_uncontained: trajectories per split that are also rolled out without containment, to see what it corrects; None takes all.
         hold_parameters: takes material parameters outside the trained range for the nearest trained value.
-        static_friction: speed in rest spacings per frame below which what lies on a wall stays where it is; None takes the model's own.
+        static_friction: share of gravity within a frame below which what lies on a wall stays where it is; None takes the model's own.
         num_pictures: trajectories per split that get a figure, an animation and a viewer.
         export: what to write for other programs: those trajectories as ``vtk`` series, ``npz`` and ``mp4``, and the ``model`` (see ``portable``).
     """
@@ -66,7 +66,7 @@ class EvaluationSettings:
     containment: bool = True
     num_uncontained: Annotated[int, Field(ge=0)] | None = None
     hold_parameters: bool = True
-    static_friction: Annotated[float, Field(ge=0, le=1)] | None = None
+    static_friction: Annotated[float, Field(ge=0, lt=1)] | None = None
     num_pictures: Annotated[int, Field(ge=0)] = 2
     export: list[Export] = field(default_factory=list)
 

@@ -26,7 +26,7 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
-    from gpe_pl.run_folder import claim
+    from gpe_pl.run_folder import RunError, claim
     from gpe_pl.simulate import ensure_data, evaluated_config
     from gpe_pl.training.budget import digest, mean_step_time, within_budget
     from gpe_pl.training.module import TrainingModule
@@ -100,6 +100,9 @@ def fit(cfg: DictConfig) -> float:
         for r in read_rows(run_dir / "metrics.csv")
         if (r.model, r.split, r.metric, r.horizon) == (LEARNED, evaluation.splits[0], "rollout_mse", "full")
     ]
+    if not values:
+        path = run_dir / "metrics.csv"
+        raise RunError(f"{path}: has no rollout_mse of {LEARNED} on {evaluation.splits[0]}; delete the file to evaluate again")
     return sum(values) / len(values)
 
 

@@ -134,7 +134,7 @@ class LearnedSimulator(nn.Module):
         skips: what steps leave out.
         holds_parameters: material parameters outside the range of the training data are taken for the nearest trained value, which a network is more to be
             trusted with than with its own continuation.
-        static_friction: speed in rest spacings per frame below which what lies on a wall stays where it is (see ``nn.static_friction``); 0 for none.
+        static_friction: share of what gravity gives within a frame below which what lies on a wall stays where it is (see ``nn.static_friction``); 0: none.
 
     All may be changed at any time; a checkpoint that ``save`` writes keeps ``static_friction`` alone.
     """
@@ -169,12 +169,12 @@ class LearnedSimulator(nn.Module):
         return self._static_friction
 
     @static_friction.setter
-    def static_friction(self, speed: Any) -> None:
-        if isinstance(speed, bool) or not isinstance(speed, int | float) or not 0 <= speed <= 1:
-            raise ValueError(f"static_friction={speed!r}: must be a number from 0 to 1, in spacings per frame")
-        if speed and not self.builder.spec.islands:
-            raise SceneError(f"static_friction={speed:g}: needs a model that was trained with graph.islands=true; 0 turns it off")
-        self._static_friction = float(speed)
+    def static_friction(self, share: Any) -> None:
+        if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
+            raise ValueError(f"static_friction={share!r}: must be a number from 0 to less than 1, a share of gravity")
+        if share and not self.builder.spec.islands:
+            raise SceneError(f"static_friction={share:g}: needs a model that was trained with graph.islands=true; 0 turns it off")
+        self._static_friction = float(share)
 
     @property
     def num_hops(self) -> int:
@@ -332,10 +332,14 @@ class LearnedSimulator(nn.Module):
         island = torch.empty(state.num_nodes, dtype=torch.int64, device=state.pos.device)
         for material in self.builder.spec.materials:
             island[graph[material].node_id] = graph[material].island
-        held = is_held(state.vel, new.vel, island, self.supported(graph), self.static_friction * self.builder.scales.velocity)[:, None]
+        held = is_held(state.vel, new.vel, island, self.supported(graph), self.slowest(state.gravity))[:, None]
         vel = torch.where(held, 0.0, new.vel)
         history = torch.cat([history_of(new)[:, :-1], vel[:, None]], dim=1)
         return replace(new, pos=torch.where(held, state.pos, new.pos), vel=vel, velocity_history=history)
+
+    def slowest(self, gravity: Tensor) -> Tensor:
+        """Speed [m/s] below which static friction holds."""
+        return self.static_friction * self.builder.metadata.frame_dt * gravity.norm()
 
     def supported(self, graph: HeteroData) -> Tensor:
         """Islands of a graph [island] that static friction may hold."""
@@ -370,11 +374,17 @@ class LearnedSimulator(nn.Module):
             boundary=state.boundary.at(1),
         )
 
-    def _check_finite(self) -> None:
+    def _check_values(self) -> None:
         for name, values in self.state_dict().items():
             is_range = name.startswith("trained_")  # unlimited before training
             if bool(values.isnan().any()) or not (is_range or bool(values.isfinite().all())):
                 raise ValueError(f"{name} has values that are not finite")
+            is_scale = name in ("acceleration_std", "stress_std") or (name.startswith("standardizer.") and name.endswith(("std", "mass")))
+            if is_scale and not bool((values > 0).all()):
+                raise ValueError(f"{name} has values that are not positive")
+        for material, trained in self.trained_ranges():
+            if not bool((trained[0] <= trained[1]).all()):
+                raise ValueError(f"trained_{material} ends before it begins")
 
     # --- checkpoints ----------------------------------------------------------------------------------------------------------------------
 
@@ -396,6 +406,8 @@ class LearnedSimulator(nn.Module):
         if values.get("format") != CHECKPOINT_FORMAT:
             raise ValueError(f"checkpoint format {values.get('format')!r}, this version reads {CHECKPOINT_FORMAT}")
         graph, metadata = GraphConfig(**checked(GraphConfig, values["graph"])), Metadata(**checked(Metadata, values["metadata"]))
+        for key, fault in metadata.violations():
+            raise ValueError(f"{key} {fault}")
         builder, model = GraphBuilder(graph, metadata), model_class(values["model"])
         simulator = cls(model(builder.spec, **checked(model, values["settings"], "spec")), builder)
         simulator.static_friction = values.get("static_friction", 0.0)
@@ -423,8 +435,13 @@ class LearnedSimulator(nn.Module):
         try:
             simulator = cls.from_description(checkpoint["simulator"])
             weights = {k.removeprefix("simulator."): v for k, v in checkpoint["state_dict"].items() if k.startswith("simulator.")}
+            strange = [
+                k for k, own in simulator.state_dict().items() if k in weights and weights[k].is_floating_point() != own.is_floating_point()
+            ]
+            if strange:
+                raise ValueError(f"{strange[0]} is of type {weights[strange[0]].dtype}")
             simulator.load_state_dict(weights)
-            simulator._check_finite()
+            simulator._check_values()
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model ({_reason(error)})") from None
         return simulator.to(device).eval()

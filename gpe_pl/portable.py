@@ -89,7 +89,7 @@ class PortableStep(nn.Module):
             before = scene[f"pos.{material}"]
             pos, vel = integrators.advance(before, history[:, -1], acc, self.frame_dt)
             if is_supported is not None:
-                speed = self.simulator.static_friction * self.scales.velocity
+                speed = self.simulator.slowest(scene["gravity"])
                 held = is_held(history[:, -1], vel, graph[material].island, is_supported, speed)[:, None]
                 pos, vel = torch.where(held, before, pos), torch.where(held, 0.0, vel)
             moved[f"pos.{material}"] = pos

@@ -75,8 +75,9 @@ class Guard:
     spacing: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.max_speed <= 0 or self.margin < 0 or self.spacing < 0:
-            raise ValueError(f"guard limits must be positive, got {self}")
+        sound = self.max_speed > 0 and self.margin >= 0 and 0 <= self.spacing < math.inf  # what is not a number is neither
+        if not (sound and all(low < high for low, high in self.bounds)):
+            raise ValueError(f"guard limits must be positive, and bounds (low, high), got {self}")
 
     def check(self, state: State, frame: int, before: State | None = None) -> Termination | None:
         """The first violated limit of a state, or None; ``before`` is the state one frame earlier."""
@@ -109,7 +110,7 @@ class Guard:
             return None
         xp = array_namespace(state.pos)
         speed = xp.sqrt(xp.sum(state.vel * state.vel, axis=-1))
-        if not float(xp.max(speed)) > self.max_speed:
+        if float(xp.max(speed)) <= self.max_speed:
             return None
         node = int(xp.argmax(speed))
         text = f"frame {frame}: node {node} moves at {float(speed[node]):.3g} m/s, limit {self.max_speed:.3g} m/s"
@@ -191,7 +192,7 @@ class Start:
         state: becomes frame 0.
         num_steps: frames to add.
         metadata: of the scene; describes the result.
-        guard: stops the rollout at the first state that cannot be trusted.
+        guard: stops the rollout at the first state that cannot be trusted; if that is the first of all, the frame of the termination is 0.
     """
 
     state: State
@@ -204,7 +205,8 @@ def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int,
     """Step all scenes side by side and yield (scene, frame, new state), or a ``Termination`` as a scene's last item. Holds one state per scene."""
     live = {}
     for scene, start in enumerate(starts):
-        impossible = None if start.guard is None else impossible_material(start.state, start.metadata)
+        guard = start.guard
+        impossible = None if guard is None else impossible_material(start.state, start.metadata) or guard.check(start.state, 0)
         if impossible is None:
             live[scene] = start.state
         else:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -26,8 +27,8 @@ from gpe_pl.arrays import (
     velocities_of,
 )
 from gpe_pl.geometry import Shape, moved
-from gpe_pl.periodicity import NOWHERE, Periodicity
-from gpe_pl.schema import BOUNDARY, STICKY, node_code, param_names
+from gpe_pl.periodicity import NOWHERE, Periodicity, PeriodicityError
+from gpe_pl.schema import BOUNDARY, MATERIALS, STICKY, node_code, param_names
 
 Array = Any
 """A NumPy array or a torch tensor."""
@@ -368,6 +369,34 @@ class Metadata:
     @cached_property
     def periodicity(self) -> Periodicity:
         return Periodicity(self.bounds, self.periodic)
+
+    def violations(self) -> Iterator[tuple[str, str]]:
+        """Fields that describe no scene, each with what is wrong with it. Files may hold anything, so whoever reads one asks."""
+        unknown = [name for name in self.materials if name not in MATERIALS]
+        if unknown or not self.materials:
+            yield "materials", f"names {unknown or 'nothing'}; known: {', '.join(MATERIALS)}"
+        elif self.param_names != param_names(self.materials):
+            yield "param_names", f"is {self.param_names}, expected {param_names(self.materials)} for {self.materials}"
+        for key in ("frame_dt", "spacing", "connectivity_radius"):
+            if not 0 < getattr(self, key) < math.inf:
+                yield key, f"is {getattr(self, key)}, must be positive"
+        if not 0 <= self.solver_dt <= self.frame_dt * (1 + 1e-9):
+            yield "solver_dt", f"is {self.solver_dt} s, must lie between 0 and frame_dt = {self.frame_dt} s"
+        if self.dim not in (2, 3):
+            yield "bounds", f"has {self.dim} axes, must have 2 or 3"
+        for axis, (low, high) in enumerate(self.bounds):
+            if not -math.inf < low < high < math.inf:
+                yield "bounds", f"axis {axis}: low {low} must be below high {high}, both finite"
+        for key in ("gravity", "periodic"):
+            if len(getattr(self, key)) != self.dim:
+                yield key, f"has {len(getattr(self, key))} components in {self.dim}D"
+        if len(self.periodic) == self.dim:
+            try:
+                self.periodicity.check_radius(self.connectivity_radius)
+            except PeriodicityError as error:
+                yield "connectivity_radius", str(error)
+        if not all(map(math.isfinite, self.gravity)):
+            yield "gravity", f"is {self.gravity}, must be finite"
 
 
 @dataclass(frozen=True)

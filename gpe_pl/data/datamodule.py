@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 from torch_geometric.data import HeteroData
 
 from gpe_pl import ranks
-from gpe_pl.data.dataset import HeldGraphs, WindowDataset, collated, long_enough, open_split
+from gpe_pl.data.dataset import HeldGraphs, WindowDataset, collated, long_enough, open_split, usable
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling, probabilities
 from gpe_pl.data.statistics import is_intact
@@ -73,8 +73,8 @@ class TrajectoryDataModule(L.LightningDataModule):
         self.root, self.noise, self.batch_size, self.seed = Path(root), noise, batch_size, seed
         self.num_workers, self.num_val_windows = num_workers, num_val_windows
         self.push_forward: PushForward | None = None
-        train = open_split(root, "train")
-        val = open_split(root, "val")
+        train = usable(open_split(root, "train"))
+        val = usable(open_split(root, "val"))
         self.metadata = train[0].window(0, 1).metadata
         self.builder = GraphBuilder(graph, self.metadata)
         unit = data_statistics(root)["acceleration_std"] * self.metadata.frame_dt

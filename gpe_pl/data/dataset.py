@@ -21,6 +21,7 @@ from gpe_pl import integrators
 from gpe_pl.data.noise import Noise
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.schema import MATERIALS, node_code
 from gpe_pl.store import StoreError, iter_trajectories, open_group, open_shard, read_trajectory, shards
 from gpe_pl.trajectory import State, Trajectory
 
@@ -45,6 +46,10 @@ Key = int | tuple[int, int] | StartKey
 
 CACHE_BYTES = 2 * 1024**3
 """Splits smaller than this are held in memory; larger ones are read from disk window by window. Graphs that are needed again are held up to as much."""
+
+
+MAX_DAMAGED = 0.2
+"""Share of a split's trajectories that may be left out."""
 
 
 @dataclass(frozen=True)
@@ -81,13 +86,62 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
 def long_enough(root: Path | str, split: str, history: int) -> Iterator[Trajectory]:
     """The trajectories of a split that have a frame with so many velocities and one to predict; warns of the others."""
     for number, trajectory in enumerate(iter_trajectories(root, split)):
-        if trajectory.num_frames >= history + 2:
+        if trajectory.num_nodes == 0:
+            log.warning("%s, trajectory %d: left out, it has no nodes", Path(root) / split, number)
+        elif trajectory.num_frames >= history + 2:
             yield trajectory
         else:
             log.warning(
                 "%s, trajectory %d: left out, its %d frames are fewer than the %d that graph.history=%d needs",
                 Path(root) / split, number, trajectory.num_frames, history + 2, history,
             )  # fmt: skip
+
+
+def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
+    """Those that can be learned from; warns of the others.
+
+    Raises:
+        StoreError: more than ``MAX_DAMAGED`` of them cannot be.
+    """
+    found = []
+    for stored in trajectories:
+        fault = damage(stored.window(0, stored.num_frames))
+        if fault is None:
+            found.append(stored)
+        else:
+            log.warning("%s:%s: left out, %s; see `python -m gpe_pl.data.validate`", stored.path, stored.name, fault)
+    if len(found) < (1 - MAX_DAMAGED) * len(trajectories):
+        where = trajectories[0].path.parent
+        raise StoreError(
+            f"{where}: {len(trajectories) - len(found)} of {len(trajectories)} trajectories cannot be learned from; see the warnings above"
+        )
+    return found
+
+
+def damage(trajectory: Trajectory) -> str | None:
+    """Why a trajectory cannot be learned from, with the frame and node, or None."""
+    pos, metadata = trajectory.pos.astype(np.float64), trajectory.metadata
+    if trajectory.num_nodes == 0:
+        return "it has no nodes"
+    for key, fault in metadata.violations():
+        return f"{key} {fault}"
+    bounds = np.array(metadata.bounds)
+    width = np.ptp(bounds, axis=1)
+    near = (pos >= bounds[:, 0] - width) & (pos <= bounds[:, 1] + width)
+    if not near.all():
+        frame, node = np.argwhere(~near)[0, :2]
+        what = "farther outside the domain than this is wide" if np.isfinite(pos[frame, node]).all() else "not finite"
+        return f"the position of node {node} in frame {frame} is {what}"
+    wrong = np.flatnonzero(~((trajectory.mass > 0) & np.isfinite(trajectory.mass)))
+    if len(wrong):
+        return f"the mass of node {wrong[0]} is {trajectory.mass[wrong[0]]:g} kg"
+    for material in metadata.materials:
+        name = MATERIALS[material].name
+        rows = np.flatnonzero(trajectory.node_type == node_code(material))
+        wrong = rows[~np.isfinite(trajectory.material_params[rows, metadata.param_names.index(name)])]
+        if len(wrong):
+            return f"the {name} of node {wrong[0]} is not finite"
+    return None
 
 
 def _read_only(trajectory: Trajectory) -> Trajectory:

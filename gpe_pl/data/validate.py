@@ -26,8 +26,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from gpe_pl.geometry import Shape
 from gpe_pl.graphs.islands import Islands, free_since, islands_within
-from gpe_pl.periodicity import PeriodicityError
-from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup, param_names
+from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup
 from gpe_pl.store import (
     StoreError,
     digest,
@@ -258,31 +257,7 @@ def _check_metadata(m: Metadata, path: Path) -> Iterator[Finding]:
     for key in ("dataset", "solver", "solver_version"):
         if not getattr(m, key):
             yield key, "is empty; it is needed to tell where the data come from"
-    unknown = [name for name in m.materials if name not in MATERIALS]
-    if unknown or not m.materials:
-        yield "materials", f"names {unknown or 'nothing'}; known: {', '.join(MATERIALS)}"
-    elif m.param_names != param_names(m.materials):
-        yield "param_names", f"is {m.param_names}, expected {param_names(m.materials)} for {m.materials}"
-    for key in ("frame_dt", "spacing", "connectivity_radius"):
-        if not 0 < getattr(m, key) < math.inf:
-            yield key, f"is {getattr(m, key)}, must be positive"
-    if not 0 <= m.solver_dt <= m.frame_dt * (1 + 1e-9):
-        yield "solver_dt", f"is {m.solver_dt} s, must lie between 0 and frame_dt = {m.frame_dt} s"
-    if m.dim not in (2, 3):
-        yield "bounds", f"has {m.dim} axes, must have 2 or 3"
-    for axis, (low, high) in enumerate(m.bounds):
-        if not -math.inf < low < high < math.inf:
-            yield "bounds", f"axis {axis}: low {low} must be below high {high}, both finite"
-    for key in ("gravity", "periodic"):
-        if len(getattr(m, key)) != m.dim:
-            yield key, f"has {len(getattr(m, key))} components in {m.dim}D"
-    if len(m.periodic) == m.dim:
-        try:
-            m.periodicity.check_radius(m.connectivity_radius)
-        except PeriodicityError as error:
-            yield "connectivity_radius", str(error)
-    if not all(map(math.isfinite, m.gravity)):
-        yield "gravity", f"is {m.gravity}, must be finite"
+    yield from m.violations()
     try:
         json.loads(m.config)
     except (ValueError, RecursionError):

@@ -41,6 +41,10 @@ class GraphError(GpeError, ValueError):
     """A state does not fit the data set whose graphs are built; the message says how."""
 
 
+LARGEST = 1e100
+"""Of coordinates [m] and velocities [m/s]: squares of larger ones overflow."""
+
+
 @dataclass(frozen=True)
 class GraphBuilder:
     """Builds the graph of a state.
@@ -94,10 +98,12 @@ class GraphBuilder:
         history = history_of(state)
         if history.shape[1] != self.config.history:
             raise GraphError(f"state has a history of {history.shape[1]} velocities, the graph needs {self.config.history}")
-        bad = ~torch.isfinite(torch.cat([state.pos, history.flatten(1)], dim=1)).all(dim=1)
+        bad = ~(torch.cat([state.pos, history.flatten(1)], dim=1).abs() < LARGEST).all(dim=1)
         if bad.any():
             node = int(bad.nonzero()[0])
-            raise SimulationError(f"node {node} has a position or velocity that is not finite", reason="nan", node=node)
+            is_finite = bool(torch.isfinite(torch.cat([state.pos[node], history[node].flatten()])).all())
+            what, reason = ("beyond all measure", "explosion") if is_finite else ("not finite", "nan")
+            raise SimulationError(f"node {node} has a position or velocity that is {what}", reason=reason, node=node)
         check_crowding(_array(state.pos), self.scales.radius, self.scales.spacing, state.periodicity)
         rows = {m: self._rows(state, m) for m in self.spec.materials}
         if sum(len(r) for r in rows.values()) != state.num_nodes:

@@ -1,8 +1,8 @@
 """Static friction: what lies on a wall and hardly moves stays where it is.
 
-A network is never exactly right, and what it is wrong by at rest adds up, frame by frame, to a heap that creeps. Below some speed it cannot tell motion from
-rest, so nodes that are slower, before a step and after it, are held. Only those are that edges tie to a wall, directly or through others, and to none that
-moves: what flies freely, or is pushed, is let alone.
+A network is never exactly right, and what it is wrong by at rest adds up, frame by frame, to a heap that creeps. So nodes are held that are slower, before a
+step and after it, than a share of what gravity gives within a frame: what rests starts to move when more than this share of gravity is left over. What nothing
+supports gets all of it and falls. Only nodes are held that edges tie to a wall, directly or through others, and to none that moves.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def is_held(
     after: Float[Tensor, "node dim"],
     island: Int64[Tensor, " node"],
     is_supported: Bool[Tensor, " island"],
-    speed: float,
+    speed: Float[Tensor, ""],
 ) -> Bool[Tensor, " node"]:
     """Nodes that stay where they are: in supported islands, and slower than ``speed`` [m/s] before and after a step."""
     slow = (before.square().sum(dim=1) < speed**2) & (after.square().sum(dim=1) < speed**2)

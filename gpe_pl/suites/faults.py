@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import tempfile
 import time
 from collections import Counter
@@ -25,6 +26,8 @@ log = logging.getLogger(__name__)
 
 Count = Annotated[int, Field(ge=0)]
 KILLED = "killed"
+TEMPORARY = re.compile(r"\S*/faults-\w+/")
+"""Folders in which faults were done."""
 
 
 class PreparationError(GpeError):
@@ -93,9 +96,10 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
 
 
 def _note(records: list[dict[str, Any]], kind: str, name: str, verdict: Verdict) -> None:
-    records.append({"kind": kind, "fault": name, "status": verdict.status, "detail": verdict.detail})
+    detail = TEMPORARY.sub("", verdict.detail)
+    records.append({"kind": kind, "fault": name, "status": verdict.status, "detail": detail})
     if verdict.status in BAD:
-        log.warning("%s, %s: %s: %s", kind, name, verdict.status, verdict.detail)
+        log.warning("%s, %s: %s: %s", kind, name, verdict.status, detail)
 
 
 def _prepared(settings: Settings, root: Path) -> dict[str, Command]:

@@ -41,7 +41,7 @@ GROUPS = {
 
 
 class NothingToTestError(GpeError, ValueError):
-    """No model for a data set; the message says where they were looked for."""
+    """No model for a data set, or several of one name; the message says where they were looked for."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,12 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
 def _test_domain(name: str, spec: DatasetSpec, settings: Settings) -> list[dict[str, Any]]:
     """Records of all models of a data set."""
     torch.set_num_threads(settings.num_threads)
-    return [record for subject in subjects(name, spec, dict(_models(spec, settings)), settings) for record in test(subject, settings.tests)]
+    models: dict[str, LearnedSimulator] = {}
+    for label, simulator in _models(spec, settings):
+        if label in models:
+            raise NothingToTestError(f"two models of {spec.name} are called {label}; copy one of the checkpoints to a file of another name")
+        models[label] = simulator
+    return [record for subject in subjects(name, spec, models, settings) for record in test(subject, settings.tests)]
 
 
 def test(subject: Subject, numbers: Sequence[int] = ()) -> Iterator[dict[str, Any]]:
@@ -140,6 +145,8 @@ def subjects(domain: str, spec: DatasetSpec, models: dict[str, LearnedSimulator]
     """The models of a data set with what they are tested on, the gating ones first."""
     scenes = [generate_trajectory(spec, "test", k) for k in range(settings.num_scenes)]
     speed = horizon.max_speed(spec, generate_trajectory, settings.num_scenes)
+    for simulator in models.values():
+        simulator.static_friction = 0.0  # what a network does by itself
     found = [
         Subject(
             name,
@@ -165,13 +172,14 @@ def is_gating(simulator: LearnedSimulator, gating: dict[str, str]) -> bool:
 
 
 def _models(spec: DatasetSpec, settings: Settings) -> Iterator[tuple[str, LearnedSimulator]]:
-    """Simulators by name; one that has the name of another is left out."""
+    """Simulators with their names."""
     yield from ((name, simulator) for name, (simulator, _) in trained_on(spec, runs_in(settings.runs)).items())
     for checkpoint in settings.checkpoints:
         simulator = LearnedSimulator.from_checkpoint(checkpoint)
         metadata = simulator.builder.metadata
         if (metadata.dataset, metadata.spacing) == (spec.name, spec.scene.spacing):
-            yield Path(checkpoint).stem, simulator
+            path = Path(checkpoint)
+            yield path.parent.parent.name if path.parent.name == "checkpoints" else path.stem, simulator
 
 
 # --- the table ------------------------------------------------------------------------------------------------------------------------------
