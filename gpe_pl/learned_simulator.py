@@ -433,6 +433,8 @@ class LearnedSimulator(nn.Module):
         path = checkpoint_path(path)
         checkpoint = load_checkpoint(path, device)
         try:
+            if not isinstance(checkpoint, dict):
+                raise TypeError(f"holds a {type(checkpoint).__name__}")
             simulator = cls.from_description(checkpoint["simulator"])
             weights = {k.removeprefix("simulator."): v for k, v in checkpoint["state_dict"].items() if k.startswith("simulator.")}
             strange = [

@@ -56,7 +56,8 @@ CROWDING_LIMIT = 32
 """Nodes in the space that one of them has at rest beyond which a cloud has collapsed."""
 TUNNEL_DEPTH = 0.25
 """Of a spacing: a path between two frames that goes deeper through a wall or obstacle than this has not gone around it."""
-MAX_PATH_SAMPLES = 64
+MAX_PATH_SAMPLES = 4096
+"""Of a path: those of ways longer than as many eighths of a spacing lie farther apart."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,8 @@ class Guard:
     Attributes:
         max_speed: m/s.
         bounds: ``(low, high)`` per axis of the region that nodes may not leave by more than ``margin`` [m].
-        spacing: rest spacing [m] of nodes, for recognising nodes that went through an obstacle within one frame and clouds that collapse; 0 does neither.
+        spacing: rest spacing [m] of nodes, for recognising clouds that collapse and nodes that went through an obstacle within one frame, or are deeper in
+            one than ``margin``; 0 does neither.
     """
 
     max_speed: float = math.inf
@@ -85,7 +87,7 @@ class Guard:
             return None
         found = self._not_finite(state, frame) or self._escape(state, frame) or self._explosion(state, frame)
         if found is None and self.spacing > 0:
-            found = self._clustering(state, frame) or (None if before is None else self._tunnelling(before, state, frame))
+            found = self._clustering(state, frame) or self._tunnelling(before, state, frame)
         return found
 
     def _not_finite(self, state: State, frame: int) -> Termination | None:
@@ -124,23 +126,34 @@ class Guard:
         text = f"frame {frame}: node {node} shares a box as wide as the spacing with {counts.max() - 1} others, limit {CROWDING_LIMIT}"
         return Termination("clustering", frame, node, text)
 
-    def _tunnelling(self, before: State, state: State, frame: int) -> Termination | None:
-        """Nodes that were and are outside of all shapes, but not between the two frames."""
+    def _tunnelling(self, before: State | None, state: State, frame: int) -> Termination | None:
+        """Nodes deeper in a wall or obstacle than ``margin``, and those that were and are outside of all shapes, but not between the two frames."""
+        shapes, end = state.boundary.shapes, _numpy(state.pos)
+        if not shapes:
+            return None
+        depth = -signed_distance(shapes, end)
+        node = int(np.argmax(depth))
+        if 0 < self.margin < depth[node]:
+            return Termination("tunnelling", frame, node, f"frame {frame}: node {node} is {depth[node]:.3g} m deep in a wall or obstacle")
+        if before is None:
+            return None
         start = _numpy(before.pos)
-        end = start + state.periodicity.shortest(_numpy(state.pos) - start)
-        shapes, length = state.boundary.shapes, np.linalg.norm(end - start, axis=-1)
-        fast = np.flatnonzero(length > 2 * TUNNEL_DEPTH * self.spacing)
-        if not shapes or not len(fast):
+        way = state.periodicity.shortest(end - start)
+        num_samples = np.linalg.norm(way, axis=-1) / (0.5 * TUNNEL_DEPTH * self.spacing)
+        deepest = np.zeros(len(end))
+        level = 4.0  # shorter ways go through nothing
+        while level < num_samples.max() and level <= MAX_PATH_SAMPLES:  # one fast node does not make the paths of all others expensive
+            of_level = (num_samples > level) & ((num_samples <= 2 * level) | (2 * level > MAX_PATH_SAMPLES))
+            shares = np.arange(1, 2 * level)[:, None, None] / (2 * level)
+            distance = signed_distance(shapes, start[of_level] + shares * way[of_level])
+            deepest[of_level] = -distance.min(axis=0, initial=math.inf)
+            level *= 2
+        were_outside = (depth < TUNNEL_DEPTH * self.spacing) & (-signed_distance(shapes, start) < TUNNEL_DEPTH * self.spacing)
+        deepest[~were_outside] = 0.0
+        node = int(np.argmax(deepest))
+        if not deepest[node] > TUNNEL_DEPTH * self.spacing:
             return None
-        count = min(MAX_PATH_SAMPLES, math.ceil(length.max() / (0.5 * TUNNEL_DEPTH * self.spacing)))
-        shares = np.arange(1, count)[:, None, None] / count
-        distance = signed_distance(shapes, start[fast] + shares * (end - start)[fast])
-        ends = np.minimum(signed_distance(shapes, start[fast]), signed_distance(shapes, end[fast]))
-        depth = np.where(ends > -TUNNEL_DEPTH * self.spacing, -distance.min(axis=0), 0.0)
-        if not depth.max() > TUNNEL_DEPTH * self.spacing:
-            return None
-        node = int(fast[np.argmax(depth)])
-        text = f"frame {frame}: node {node} went {depth.max():.3g} m deep through a wall or obstacle within one frame"
+        text = f"frame {frame}: node {node} went {deepest[node]:.3g} m deep through a wall or obstacle within one frame"
         return Termination("tunnelling", frame, node, text)
 
 

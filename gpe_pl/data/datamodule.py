@@ -73,11 +73,15 @@ class TrajectoryDataModule(L.LightningDataModule):
         self.root, self.noise, self.batch_size, self.seed = Path(root), noise, batch_size, seed
         self.num_workers, self.num_val_windows = num_workers, num_val_windows
         self.push_forward: PushForward | None = None
-        train = usable(open_split(root, "train"))
-        val = usable(open_split(root, "val"))
+        statistics = data_statistics(root)
+        stored = open_split(root, "train")
+        train, acceleration_std = usable(stored)
+        val, _ = usable(open_split(root, "val"))
         self.metadata = train[0].window(0, 1).metadata
         self.builder = GraphBuilder(graph, self.metadata)
-        unit = data_statistics(root)["acceleration_std"] * self.metadata.frame_dt
+        if len(train) == len(stored):
+            acceleration_std = statistics["acceleration_std"]
+        unit = acceleration_std * self.metadata.frame_dt
         self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress)
         self.val_set = WindowDataset(val, self.builder, stress=stress)
         if sampling == "activity":

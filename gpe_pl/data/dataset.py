@@ -6,6 +6,7 @@ A sample is a pure function of (split, seed, sample number): runs resume exactly
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl import integrators
 from gpe_pl.data.noise import Noise
+from gpe_pl.data.statistics import motion
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.schema import MATERIALS, node_code
@@ -50,6 +52,8 @@ CACHE_BYTES = 2 * 1024**3
 
 MAX_DAMAGED = 0.2
 """Share of a split's trajectories that may be left out."""
+MAX_JUMP, MAX_ROUGHNESS = 2.0, 30.0
+"""Way within a frame in neighbour radii, and root mean square acceleration in units of the other trajectories', beyond both of which a frame is damaged."""
 
 
 @dataclass(frozen=True)
@@ -97,25 +101,76 @@ def long_enough(root: Path | str, split: str, history: int) -> Iterator[Trajecto
             )  # fmt: skip
 
 
-def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
-    """Those that can be learned from; warns of the others.
+@dataclass(frozen=True)
+class Motion:
+    """How a trajectory moves: longest way [m] of a node within a frame, after which frame, and the sum of squared accelerations of so many numbers."""
+
+    jump: float = 0.0
+    frame: int = 0
+    power: float = 0.0
+    count: int = 0
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Motion:
+        sums, jumps = {"velocity": (0.0, 0), "acceleration": (0.0, 0)}, []
+        for key, values in motion(trajectory):
+            sums[key] = sums[key][0] + float(np.square(values).sum()), sums[key][1] + values.size
+            if key == "velocity":
+                jumps.append(np.square(values).sum(axis=-1).max(axis=1))
+        longest = np.concatenate(jumps)
+        if not len(longest):
+            return cls()
+        frame = int(np.argmax(longest))
+        return cls(float(np.sqrt(longest[frame])) * trajectory.metadata.frame_dt, frame, *sums["acceleration"])
+
+
+def usable(trajectories: list[StoredTrajectory]) -> tuple[list[StoredTrajectory], float]:
+    """Those that can be learned from, with the root mean square of their accelerations other than gravity's [m/s²]; warns of the others.
 
     Raises:
         StoreError: more than ``MAX_DAMAGED`` of them cannot be.
     """
-    found = []
-    for stored in trajectories:
-        fault = damage(stored.window(0, stored.num_frames))
+    motions: dict[int, Motion] = {}
+    radius = 0.0
+    for number, stored in enumerate(trajectories):
+        whole = stored.window(0, stored.num_frames)
+        fault = damage(whole)
         if fault is None:
-            found.append(stored)
+            motions[number], radius = Motion.of(whole), whole.metadata.connectivity_radius
         else:
-            log.warning("%s:%s: left out, %s; see `python -m gpe_pl.data.validate`", stored.path, stored.name, fault)
-    if len(found) < (1 - MAX_DAMAGED) * len(trajectories):
+            _left_out(stored, fault)
+    while (jump := _jump(motions, radius)) is not None:
+        number, text = jump
+        _left_out(trajectories[number], text)
+        del motions[number]
+    if len(motions) < (1 - MAX_DAMAGED) * len(trajectories):
         where = trajectories[0].path.parent
         raise StoreError(
-            f"{where}: {len(trajectories) - len(found)} of {len(trajectories)} trajectories cannot be learned from; see the warnings above"
+            f"{where}: {len(trajectories) - len(motions)} of {len(trajectories)} trajectories cannot be learned from; see the warnings above"
         )
-    return found
+    power, count = (sum(getattr(m, name) for m in motions.values()) for name in ("power", "count"))
+    return [trajectories[number] for number in motions], math.sqrt(power / max(1, count))
+
+
+def _left_out(stored: StoredTrajectory, why: str) -> None:
+    log.warning("%s:%s: left out, %s; see `python -m gpe_pl.data.validate`", stored.path, stored.name, why)
+
+
+def _jump(motions: dict[int, Motion], radius: float) -> tuple[int, str] | None:
+    """The roughest trajectory if it jumps farther than neighbours see, which no other does by far, and what it does; or None.
+
+    One frame that went wrong is the largest of all accelerations, and the scale to which all others are related.
+    """
+    if len(motions) < 2:
+        return None
+    number = max(motions, key=lambda n: motions[n].power / max(1, motions[n].count))
+    worst, others = motions[number], [m for n, m in motions.items() if n != number]
+    typical = sum(m.power for m in others) / max(1, sum(m.count for m in others))
+    ratio = math.sqrt(worst.power / max(1, worst.count) / max(typical, 1e-300))
+    if worst.jump <= MAX_JUMP * radius or ratio <= MAX_ROUGHNESS:
+        return None
+    where = f"between frames {worst.frame} and {worst.frame + 1}"
+    return number, f"a node moves by {worst.jump:.3g} m {where}, and accelerations are {ratio:.3g} times those of the other trajectories"
 
 
 def damage(trajectory: Trajectory) -> str | None:

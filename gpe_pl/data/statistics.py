@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,14 +27,9 @@ def shard_moments(path: Path) -> tuple[str, dict[str, Any]]:
     sums: dict[str, Any] = {"velocity": [0, 0.0], "acceleration": [0, 0.0], "params": None, "nodes": 0, "frames": 0, "trajectories": 0}
     for name in trajectory_names(path):
         trajectory = read_trajectory(path, name)
-        dt = trajectory.metadata.frame_dt
-        for start in range(0, max(1, trajectory.num_frames - 2), FRAMES_AT_ONCE):
-            pos = trajectory.pos[start : start + FRAMES_AT_ONCE + 2].astype(np.float64)
-            vel = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
-            acc = integrators.acceleration(vel[1:], vel[:-1], dt) - np.asarray(trajectory.metadata.gravity)
-            for key, values in (("velocity", vel[1:] if start else vel), ("acceleration", acc)):
-                sums[key][0] += values.size
-                sums[key][1] += float(np.sum(values * values))
+        for key, values in motion(trajectory):
+            sums[key][0] += values.size
+            sums[key][1] += float(np.sum(values * values))
         params = _scaled(trajectory)
         finite = np.isfinite(params)
         values = np.where(finite, params, 0.0)
@@ -44,6 +40,16 @@ def shard_moments(path: Path) -> tuple[str, dict[str, Any]]:
         sums["frames"] += trajectory.num_frames
         sums["trajectories"] += 1
     return str(path), sums
+
+
+def motion(trajectory: Trajectory) -> Iterator[tuple[str, np.ndarray]]:
+    """Velocities and accelerations other than gravity's [frame, node, dim], part by part, each with its name."""
+    dt = trajectory.metadata.frame_dt
+    for start in range(0, max(1, trajectory.num_frames - 2), FRAMES_AT_ONCE):
+        pos = trajectory.pos[start : start + FRAMES_AT_ONCE + 2].astype(np.float64)
+        vel = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
+        yield "velocity", vel[1:] if start else vel
+        yield "acceleration", integrators.acceleration(vel[1:], vel[:-1], dt) - np.asarray(trajectory.metadata.gravity)
 
 
 def _scaled(trajectory: Trajectory) -> np.ndarray:

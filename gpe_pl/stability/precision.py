@@ -13,7 +13,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.approximate import approximate
 from gpe_pl.containment import Contained
-from gpe_pl.geometry import signed_distance
+from gpe_pl.geometry import Box
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.machine import resident_bytes
@@ -71,14 +71,20 @@ def implementations(subject: Subject) -> Outcome:
 @stress_test(27, "memory and recompilation", "200 steps with changing edges: resident memory grows by < 1 % after 50; ≤ 3 recompilations")
 def memory(subject: Subject) -> Outcome:
     simulator, state = Contained(subject.simulator, subject.dt), subject.state(0, 0.0)
-    used, edges = [], set()
+    used, edges, num_compiled = [], set(), compilations()
     for _ in range(200):
         state = simulator.step(state)
         used.append(resident_bytes())
         graph = subject.simulator.builder(state)
         edges.add(sum(graph[r].edge_index.shape[1] for r in subject.simulator.builder.spec.relations))
-    growth = max(used[100:]) / max(used[:50]) - 1
-    return Outcome(growth < 0.01, f"{100 * growth:.2g} %, {len(edges)} numbers of edges; rollouts compile nothing")
+    growth, num_compiled = max(used[100:]) / max(used[:50]) - 1, compilations() - num_compiled
+    text = f"{100 * growth:.2g} %, {num_compiled} compilations, {len(edges)} numbers of edges"
+    return Outcome(growth < 0.01 and num_compiled <= 4 and len(edges) > 1, text)
+
+
+def compilations() -> int:
+    """Graphs that ``torch.compile`` has made in this process."""
+    return int(torch._dynamo.utils.counters["stats"]["unique_graphs"])
 
 
 @stress_test(28, "skipped work", "exact levels: change < 1e-6; sleeping: error after 20 steps ≤ 1.05 times that of computing everything")
@@ -219,7 +225,11 @@ def gradients_are_correct(subject: Subject) -> bool:
 # --- the guard ------------------------------------------------------------------------------------------------------------------------------
 
 
-@stress_test(30, "guard", "NaN, explosion, escape, tunnelling, clustering: stopped at that frame with reason and node, good frames kept")
+@stress_test(
+    30,
+    "guard",
+    "NaN, explosion, escape, tunnelling, clustering: stopped at that frame with reason, node and good frames; impossible material: at once",
+)
 def guard(subject: Subject) -> Outcome:
     state = subject.state(0, 0.0)
     radius, size = subject.simulator.builder.scales.radius, 1e3 * subject.spacing
@@ -230,11 +240,15 @@ def guard(subject: Subject) -> Outcome:
         result = rollout(simulator, state, 5, subject.scenes[0].metadata, limits)
         stop = result.termination
         found[reason] = stop is not None and (stop.reason, stop.frame) == (reason, 3) and stop.node >= 0 and result.num_frames == 3
-    through = _through(state)
-    if through is not None:  # a model that sees the obstacle need not come to where the jump begins, so the two states are made
-        before, behind = (replace(state, pos=torch.cat([place[None], state.pos[1:]])) for place in through)
-        stop = limits.check(behind, 3, before)
-        found["tunnelling"] = stop is not None and (stop.reason, stop.frame, stop.node) == ("tunnelling", 3, 0)
+    obstructed = replace(state, boundary=replace(state.boundary, shapes=(*state.boundary.shapes, obstacle(state, subject.spacing))))
+    before, behind = (replace(obstructed, pos=torch.cat([place[None], state.pos[1:]])) for place in _beside(obstructed, subject.spacing))
+    stop = limits.check(behind, 3, before)  # a model that sees an obstacle need not go through it, so the two states are made
+    found["tunnelling"] = stop is not None and (stop.reason, stop.frame, stop.node) == ("tunnelling", 3, 0)
+    params = state.material_params.clone()
+    params[1] = 1e30
+    result = rollout(subject.simulator, replace(state, material_params=params), 5, subject.scenes[0].metadata, limits)
+    stop = result.termination
+    found["material"] = stop is not None and (stop.reason, stop.frame, stop.node) == ("material", 0, 1)
     bad = [reason for reason, is_found in found.items() if not is_found]
     return Outcome(not bad, f"not found: {', '.join(bad)}" if bad else f"{len(found)} of {len(found)} found")
 
@@ -257,16 +271,21 @@ def attacks(subject: Subject, limits: Guard) -> dict[str, Callable[[State, State
     return found
 
 
-def _through(state: State) -> tuple[torch.Tensor, torch.Tensor] | None:
-    """Two places on opposite sides of an obstacle, or None without obstacles: walls have no other side."""
-    shapes = state.boundary.shapes
-    for pos, normal in zip(state.boundary.pos, state.boundary.normal, strict=True):
-        steps = pos - normal * torch.linspace(-0.01, 0.5, 200, dtype=torch.float64)[:, None]
-        outside = signed_distance(shapes, steps) > 0
-        behind = torch.nonzero(outside & (torch.cumsum(~outside, dim=0) > 0)).flatten()
-        if bool(outside[0]) and len(behind):
-            return steps[0], steps[behind[0]]
-    return None
+def obstacle(state: State, spacing: float) -> Box:
+    """A plate, two spacings thick, right above all nodes."""
+    middle, top = state.pos.mean(dim=0), state.pos.max(dim=0).values
+    low, high = middle - 4 * spacing, middle + 4 * spacing
+    low[-1], high[-1] = top[-1] + 2 * spacing, top[-1] + 4 * spacing
+    return Box(tuple(low.tolist()), tuple(high.tolist()), friction=0.0)
+
+
+def _beside(state: State, spacing: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """A place below the plate, and one above it."""
+    plate = state.boundary.shapes[-1]
+    assert isinstance(plate, Box)
+    below, above = torch.tensor([plate.low, plate.high], dtype=torch.float64)
+    below[:-1] = above[:-1] = 0.5 * (below + above)[:-1]
+    return below - spacing * (torch.arange(state.dim) == state.dim - 1), above + spacing * (torch.arange(state.dim) == state.dim - 1)
 
 
 TESTS = (single_precision, implementations, memory, skipping, training, guard)

@@ -348,6 +348,10 @@ def test_a_file_of_torch_that_is_no_checkpoint_says_so(tmp_path: Path, content: 
         ("settings", {"width": 8}, "width Extra inputs are not permitted"),
         ("graph", {"history": 3}, "size mismatch"),
         ("metadata", {"dataset": "x"}, "materials Field required"),
+        ("metadata", {"spacing": -0.1}, "spacing is -0.1, must be positive"),
+        ("metadata", {"bounds": ((0.0, 1.0), (1.0, 0.0))}, "axis 1: low 1.0 must be below high 0.0"),
+        ("metadata", {"gravity": (0.0,)}, "gravity has 1 components in 2D"),
+        ("metadata", {"materials": ("honey",)}, "names \\['honey'\\]; known: "),
         ("model", "os.system", "not one of gpe_pl.models"),
         ("model", "gpe_pl.models.gpe.torch", "is not a model"),
         ("model", "gpe_pl.models.gpe.Nothing", "does not exist"),
@@ -356,10 +360,29 @@ def test_a_file_of_torch_that_is_no_checkpoint_says_so(tmp_path: Path, content: 
 )
 def test_a_description_of_another_model_is_refused(simulator: LearnedSimulator, tmp_path: Path, key: str, value: Any, message: str) -> None:
     description = simulator.description()
-    if key == "settings":
-        value = {**description["settings"], **value}
+    if key in ("settings", "metadata") and "dataset" not in value:
+        value = {**description[key], **value}
     with pytest.raises(CheckpointError, match=message):
         LearnedSimulator.from_checkpoint(save(simulator, tmp_path / "a.ckpt", simulator={**description, key: value}))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("acceleration_std", lambda x: -x, "acceleration_std has values that are not positive"),
+        ("acceleration_std", lambda x: x * torch.nan, "acceleration_std has values that are not finite"),
+        ("standardizer.node.sand.std", lambda x: 0 * x, "standardizer.node.sand.std has values that are not positive"),
+        ("trained_sand", lambda x: torch.tensor([[40.0], [20.0]]), "trained_sand ends before it begins"),
+        ("trained_sand", lambda x: torch.tensor([[20], [40]]), "trained_sand is of type torch.int64"),
+    ],
+)
+def test_values_that_no_training_gives_are_refused(
+    simulator: LearnedSimulator, tmp_path: Path, name: str, change: Callable[[torch.Tensor], torch.Tensor], message: str
+) -> None:
+    weights = {f"simulator.{key}": value for key, value in simulator.state_dict().items()}
+    key = next(k for k in weights if k.removeprefix("simulator.") == name)
+    with pytest.raises(CheckpointError, match=message):
+        LearnedSimulator.from_checkpoint(save(simulator, tmp_path / "a.ckpt", state_dict={**weights, key: change(weights[key])}))
 
 
 def test_only_models_of_the_package_are_looked_up() -> None:

@@ -120,3 +120,17 @@ def test_checkpoints_are_written_whole_or_not_at_all(tmp_path: Path, monkeypatch
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["last.ckpt"]
     assert AtomicCheckpoints().load_checkpoint(path) == {"a": 1}
+
+
+def test_a_table_without_results_is_no_result(data: Path, tmp_path: Path) -> None:
+    fit = command("fit", data)
+    assert isolation.run("fit", fit.given(tmp_path)).code == 0
+    table = tmp_path / "runs" / "fit" / "metrics.csv"
+    whole = table.read_text()
+    table.write_text(whole.splitlines(keepends=True)[0])
+    ended = isolation.run("fit", fit.given(tmp_path))
+    assert ended.verdict().status == "refused"
+    assert "has no rollout_mse of learned on" in ended.output and "delete the file" in ended.output
+    table.unlink()
+    assert isolation.run("fit", fit.given(tmp_path)).code == 0
+    assert table.read_text() == whole

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -155,6 +157,36 @@ def test_a_path_around_an_obstacle_is_no_tunnel(new_trajectory: New) -> None:
     assert guard.check(replace(before, pos=np.array([[0.42, 0.08]])), 1, before) is None  # inside: containment's business
 
 
+@pytest.mark.parametrize("way", [0.24, 0.6])
+def test_a_thin_obstacle_is_seen_on_a_way_of_any_length(new_trajectory: New, way: float) -> None:
+    """Also where another node is much faster."""
+    two = new_trajectory(num_nodes=2, gravity=(0.0, 0.0))
+    before = replace(two.state(0), pos=np.array([[0.38, 0.05], [0.5, 0.5]]))
+    after = replace(before, pos=np.array([[0.38 + way, 0.05], [1e4, 0.5]]))
+    stop = Guard(spacing=two.metadata.spacing).check(after, 7, before)
+    assert stop is not None
+    assert (stop.reason, stop.frame, stop.node) == ("tunnelling", 7, 0)
+
+
+def test_who_goes_through_an_obstacle_slowly_is_seen_inside(new_trajectory: New) -> None:
+    one = new_trajectory(num_nodes=1, gravity=(0.0, 0.0))
+    before = replace(one.state(0), pos=np.array([[0.41, 0.04]]))
+    inside = replace(before, pos=np.array([[0.45, 0.04]]))  # 0.05 m deep
+    assert Guard(spacing=one.metadata.spacing, margin=0.06).check(inside, 1, before) is None
+    stop = Guard(spacing=one.metadata.spacing, margin=0.03).check(inside, 1, before)
+    assert stop is not None
+    assert (stop.reason, stop.frame, stop.node) == ("tunnelling", 1, 0)
+
+
+def test_a_start_that_cannot_be_trusted_is_frame_0(trajectory: Trajectory) -> None:
+    start = replace(trajectory.state(0), vel=trajectory.vel[0].copy())
+    start.vel[2] = 1e3
+    result = rollout(FreeFall(0.01), start, 5, trajectory.metadata, Guard(max_speed=50.0))
+    assert result.termination is not None
+    assert (result.termination.reason, result.termination.frame, result.termination.node) == ("explosion", 0, 2)
+    assert result.num_frames == 1
+
+
 @pytest.mark.parametrize("value", [75.0, -1.0, np.nan, np.inf])
 def test_an_impossible_material_ends_the_rollout_before_it_begins(trajectory: Trajectory, value: float) -> None:
     start = replace(trajectory.state(0), material_params=trajectory.material_params.copy())
@@ -167,8 +199,21 @@ def test_an_impossible_material_ends_the_rollout_before_it_begins(trajectory: Tr
     assert rollout(FreeFall(0.01), start, 8, trajectory.metadata).num_frames == 9  # nobody looks
 
 
-@pytest.mark.parametrize("limits", [{"max_speed": 0.0}, {"max_speed": -1.0}, {"margin": -0.1}, {"spacing": -0.1}])
-def test_guard_refuses_impossible_limits(limits: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"max_speed": 0.0},
+        {"max_speed": -1.0},
+        {"max_speed": math.nan},
+        {"margin": -0.1},
+        {"margin": math.nan},
+        {"spacing": -0.1},
+        {"spacing": math.inf},
+        {"bounds": ((1.0, 0.0),)},
+        {"bounds": ((math.nan, 1.0),)},
+    ],
+)
+def test_guard_refuses_impossible_limits(limits: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match="must be positive"):
         Guard(**limits)  # type: ignore[arg-type]
 

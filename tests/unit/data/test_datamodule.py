@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import itertools
 import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,8 +19,10 @@ from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.dataset import HeldGraphs, WindowDataset
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
+from gpe_pl.data.statistics import motion
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.store import StoreError
+from gpe_pl.store import StoreError, read_trajectory, trajectory_names, write_shard
+from gpe_pl.trajectory import Trajectory
 
 
 @pytest.fixture
@@ -135,3 +141,58 @@ def test_a_missing_split_is_named(root: Path) -> None:
     (root / "val" / "shard-00000.h5").unlink()
     with pytest.raises(StoreError, match="has no split 'val' but test, test_unseen, train"):
         datamodule(root)
+
+
+def with_another(root: Path, change: Callable[[Trajectory], Trajectory], num_sound: int = 6) -> Path:
+    """The data set with other training trajectories, which swing to and fro; the last of them is changed."""
+    shard = root / "train" / "shard-00000.h5"
+    jumping = read_trajectory(shard, trajectory_names(shard)[0])
+    swing = 1e-3 * np.sin(np.arange(jumping.num_frames))[:, None, None]
+    sound = replace(jumping, pos=(jumping.pos[:1] + swing).astype(np.float32))
+    shard.unlink()
+    write_shard(shard, [*[sound] * num_sound, change(sound)])
+    return root
+
+
+def moved(frame: int, to: float) -> Callable[[Trajectory], Trajectory]:
+    def change(trajectory: Trajectory) -> Trajectory:
+        pos = trajectory.pos.copy()
+        pos[frame] = to
+        return replace(trajectory, pos=pos)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (moved(3, np.nan), r"the position of node 0 in frame 3 is not finite"),
+        (moved(3, 1e9), r"the position of node 0 in frame 3 is farther outside the domain than this is wide"),
+        (
+            moved(4, 0.5),
+            r"a node moves by .* m between frames [34] and [45], and accelerations are .* times those of the other trajectories",
+        ),
+        (lambda t: replace(t, mass=0 * t.mass), r"the mass of node 0 is 0 kg"),
+        (lambda t: replace(t, material_params=np.nan * t.material_params), r"the friction_angle of node 0 is not finite"),
+        (lambda t: replace(t, metadata=replace(t.metadata, frame_dt=-1.0)), r"frame_dt is -1.0, must be positive"),
+    ],
+)
+def test_a_damaged_trajectory_is_left_out_by_name(
+    root: Path, change: Callable[[Trajectory], Trajectory], message: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    sound = datamodule(with_another(root, lambda t: t))
+    assert len(sound.train_set.trajectories) == 7
+    assert not caplog.records
+    module = datamodule(with_another(root, change))
+    assert [t.name for t in module.train_set.trajectories] == [t.name for t in sound.train_set.trajectories[:6]]
+    assert re.search(rf"shard-00000.h5:{sound.train_set.trajectories[6].name}: left out, {message}", caplog.text)
+    spread = np.concatenate([v.ravel() for key, v in motion(module.train_set.trajectories[0].window(0, 100)) if key == "acceleration"])
+    assert module.train_set.velocity_unit == pytest.approx(
+        float(np.sqrt(np.square(spread).mean())) * module.metadata.frame_dt
+    )  # without it
+    assert sound.train_set.velocity_unit == 50.0 * module.metadata.frame_dt
+
+
+def test_many_damaged_trajectories_are_an_error(root: Path) -> None:
+    with pytest.raises(StoreError, match="train: 1 of 4 trajectories cannot be learned from"):
+        datamodule(with_another(root, moved(3, np.nan), 3))

@@ -223,3 +223,13 @@ def test_runs_of_one_model_are_told_apart_by_their_training(spec: DatasetSpec, s
         "GPE 2 × 8 geometry angular, noise_std=0.3": "bb",
         "GPE 2 × 8 geometry angular, noise_std=0.0": "ccc",
     }
+
+
+def test_two_checkpoints_of_one_name_are_an_error(spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path) -> None:
+    files = [tmp_path / name / "model.ckpt" for name in "ab"]
+    for file in files:
+        file.parent.mkdir()
+        subject(spec, scenes).simulator.save(file)
+    settings = Settings({"sand": Case([])}, [], [str(f) for f in files], SHIPPED, 1, [1.0], 5, [19])
+    with pytest.raises(NothingToTestError, match="two models of sand are called model"):
+        run(settings, {"sand": spec})
