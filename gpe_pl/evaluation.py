@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import importlib.util
+import io
 import logging
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
@@ -16,7 +18,7 @@ import torch
 from pydantic import Field
 
 from gpe_pl.approximate import approximate
-from gpe_pl.atomic import replacing
+from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.baselines import Ballistic, ConstantVelocity
 from gpe_pl.containment import TOLERANCE, Contained
 from gpe_pl.data.dataset import WindowDataset, long_enough, open_split
@@ -218,38 +220,53 @@ def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windo
 
 
 def write_rows(path: Path, rows: list[Row]) -> None:
-    """Write rows as CSV, atomically."""
-    with replacing(path) as part, open(part, "w", newline="") as handle:
-        writer = csv.DictWriter(handle, fieldnames=list(Row.__dataclass_fields__))
-        writer.writeheader()
-        writer.writerows(asdict(row) for row in rows)
+    """Write rows as CSV, atomically, with their SHA-256 digest in a file beside it, as ``sha256sum`` writes it."""
+    table = io.StringIO(newline="")
+    writer = csv.DictWriter(table, fieldnames=list(Row.__dataclass_fields__))
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
+    content = table.getvalue().encode()
+    replace_text(
+        _digest_file(path), f"{hashlib.sha256(content).hexdigest()}  {path.name}\n"
+    )  # first: a table without one is taken as it is
+    with replacing(path) as part:
+        part.write_bytes(content)
 
 
 class MetricsError(GpeError, ValueError):
-    """A ``metrics.csv`` is damaged; the message names file and line."""
+    """A ``metrics.csv`` is damaged; the message names the file, and the line if it is one that cannot be read."""
 
 
 def read_rows(path: Path) -> Iterator[Row]:
     """Rows of a ``metrics.csv``.
 
     Raises:
-        MetricsError: a line is not one that ``write_rows`` has written.
+        MetricsError: it is not what ``write_rows`` has written.
     """
-    with open(path, newline="") as handle:
-        reader = csv.DictReader(handle, strict=True)
-        try:
-            for r in reader:
-                if set(r) != set(Row.__dataclass_fields__) or None in r.values():
-                    raise ValueError(f"expected the columns {', '.join(Row.__dataclass_fields__)}")
-                known: dict[str, Any] = {
-                    **r,
-                    "trajectory": int(r["trajectory"]),
-                    "parameter": float(r["parameter"]),
-                    "value": float(r["value"]),
-                }
-                yield Row(**known)
-        except (ValueError, csv.Error) as error:  # also what is not text
-            raise MetricsError(f"{path}, line {reader.line_num}: damaged ({error}); delete the file to evaluate again") from None
+    content = path.read_bytes()
+    digest = _digest_file(path)
+    if digest.exists() and digest.read_bytes().split()[:1] != [hashlib.sha256(content).hexdigest().encode()]:
+        raise MetricsError(
+            f"{path}: damaged or changed (checksum mismatch); delete the file to evaluate again, or {digest.name} to take it as it is"
+        )
+    reader = csv.DictReader(io.TextIOWrapper(io.BytesIO(content), "utf-8", newline=""), strict=True)
+    try:
+        for r in reader:
+            if set(r) != set(Row.__dataclass_fields__) or None in r.values():
+                raise ValueError(f"expected the columns {', '.join(Row.__dataclass_fields__)}")
+            known: dict[str, Any] = {
+                **r,
+                "trajectory": int(r["trajectory"]),
+                "parameter": float(r["parameter"]),
+                "value": float(r["value"]),
+            }
+            yield Row(**known)
+    except (ValueError, csv.Error) as error:  # also what is not text
+        raise MetricsError(f"{path}, line {reader.line_num}: damaged ({error}); delete the file to evaluate again") from None
+
+
+def _digest_file(path: Path) -> Path:
+    return path.with_name(f"{path.name}.sha256")
 
 
 def means(rows: list[Row], label: str = LEARNED) -> dict[str, float]:

@@ -218,9 +218,9 @@ def _hold_the_same(sound: Path, damaged: Path) -> bool:
 
 
 def damage_faults(command: Command, sound: Path, count: int, seed: int, limit: float) -> list[Fault]:
-    """So many damages to files that a command has left in a folder, other than pictures, logs, and results as plain text."""
+    """So many damages to files that a command has left in a folder, other than pictures and logs."""
     rng = np.random.default_rng(seed)
-    names = sorted(name for name in digests(sound) if not name.endswith((".csv", ".md")))  # text without checksums
+    names = sorted(digests(sound))
     kinds = list(stores.damages(4 * count, seed))
     found = []
     for _ in range(count if names else 0):

@@ -128,6 +128,7 @@ def test_a_table_without_results_is_no_result(data: Path, tmp_path: Path) -> Non
     table = tmp_path / "runs" / "fit" / "metrics.csv"
     whole = table.read_text()
     table.write_text(whole.splitlines(keepends=True)[0])
+    table.with_name("metrics.csv.sha256").unlink()  # as if it had been written so
     ended = isolation.run("fit", fit.given(tmp_path))
     assert ended.verdict().status == "refused"
     assert "has no rollout_mse of learned on" in ended.output and "delete the file" in ended.output

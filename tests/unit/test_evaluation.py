@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gpe_pl.evaluation import Row, _share_outside, read_rows, write_rows
+from gpe_pl.evaluation import MetricsError, Row, _share_outside, read_rows, write_rows
 from gpe_pl.trajectory import Termination, Trajectory
 
 
@@ -37,4 +38,17 @@ def test_rows_survive_the_file(tmp_path: Path) -> None:
     rows = [Row("learned", "test", 3, "seen", 30.0, "rollout_mse", "full", np.inf), Row("ballistic", "test", 0, "", 0.1, "x", "5", 1e-300)]
     write_rows(tmp_path / "metrics.csv", rows)
     assert list(read_rows(tmp_path / "metrics.csv")) == rows
-    assert [p.name for p in tmp_path.iterdir()] == ["metrics.csv"]
+    assert {p.name for p in tmp_path.iterdir()} == {"metrics.csv", "metrics.csv.sha256"}
+    digest = (tmp_path / "metrics.csv.sha256").read_text()
+    assert digest == f"{hashlib.sha256((tmp_path / 'metrics.csv').read_bytes()).hexdigest()}  metrics.csv\n"
+
+
+@pytest.mark.parametrize("change", [lambda b: b.replace(b"30.0", b"31.0"), lambda b: b[: b.rindex(b"ballistic")], lambda b: b""])
+def test_changed_rows_are_refused(tmp_path: Path, change: Callable[[bytes], bytes]) -> None:
+    path = tmp_path / "metrics.csv"
+    write_rows(path, [Row(model, "test", 3, "seen", 30.0, "rollout_mse", "full", 1.0) for model in ("learned", "ballistic")])
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(MetricsError, match=r"metrics.csv: damaged or changed \(checksum mismatch\); delete the file to evaluate again"):
+        list(read_rows(path))
+    (tmp_path / "metrics.csv.sha256").unlink()
+    assert len(list(read_rows(path))) < 3  # as in runs of earlier versions
