@@ -435,18 +435,22 @@ class LearnedSimulator(nn.Module):
         try:
             if not isinstance(checkpoint, dict):
                 raise TypeError(f"holds a {type(checkpoint).__name__}")
-            simulator = cls.from_description(checkpoint["simulator"])
+            with torch.device("meta"):  # takes no memory, whatever the description says
+                simulator = cls.from_description(checkpoint["simulator"])
             weights = {k.removeprefix("simulator."): v for k, v in checkpoint["state_dict"].items() if k.startswith("simulator.")}
-            strange = [
-                k for k, own in simulator.state_dict().items() if k in weights and weights[k].is_floating_point() != own.is_floating_point()
-            ]
-            if strange:
-                raise ValueError(f"{strange[0]} is of type {weights[strange[0]].dtype}")
-            simulator.load_state_dict(weights)
+            simulator.load_state_dict(_typed(weights, simulator.state_dict()), assign=True)
             simulator._check_values()
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model ({_reason(error)})") from None
         return simulator.to(device).eval()
+
+
+def _typed(weights: dict[str, Any], own: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Weights in the precision that a model has; raises ``ValueError`` where they are no numbers of its kind."""
+    for name, value in weights.items():
+        if name in own and value.is_floating_point() != own[name].is_floating_point():
+            raise ValueError(f"{name} is of type {value.dtype}")
+    return {name: value.to(own[name].dtype) if name in own else value for name, value in weights.items()}
 
 
 def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:

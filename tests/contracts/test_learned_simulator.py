@@ -345,6 +345,7 @@ def test_a_file_of_torch_that_is_no_checkpoint_says_so(tmp_path: Path, content: 
     ("key", "value", "message"),
     [
         ("settings", {"hidden_channels": 16}, "size mismatch"),
+        ("settings", {"hidden_channels": 4096, "num_message_passing_steps": 64}, "Missing key"),  # 60 GB
         ("settings", {"width": 8}, "width Extra inputs are not permitted"),
         ("graph", {"history": 3}, "size mismatch"),
         ("metadata", {"dataset": "x"}, "materials Field required"),
