@@ -7,6 +7,7 @@ import logging
 import math
 import multiprocessing
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
@@ -188,7 +189,7 @@ MARKS = {"passed": "passed", "failed": "**failed**", "not_applicable": "–"}
 
 
 def _report(records: Sequence[dict[str, Any]], untested: Sequence[str] = ()) -> str:
-    """Counts, and a table per domain: a row per test, a column per model."""
+    """Counts, of every model too, and a table per domain: a row per test, a column per model."""
     gating = [r for r in records if r["gating"]]
     failed = [r for r in gating if r["status"] == "failed"]
     lines = [
@@ -197,6 +198,10 @@ def _report(records: Sequence[dict[str, Any]], untested: Sequence[str] = ()) -> 
     ]
     if untested:
         lines += ["", f"Not tested, for want of a model: {', '.join(untested)}."]
+    lines += ["", table_row(["domain", "model", "passed", "failed", "do not apply"]), "|" + "---|" * 5]
+    for domain, model in dict.fromkeys((r["domain"], r["model"]) for r in records):
+        counts = Counter(r["status"] for r in records if (r["domain"], r["model"]) == (domain, model))
+        lines.append(table_row([domain, model, *(str(counts[status]) for status in MARKS)]))
     for domain in dict.fromkeys(r["domain"] for r in records):
         own = [r for r in records if r["domain"] == domain]
         models = {r["model"]: r["gating"] for r in own}

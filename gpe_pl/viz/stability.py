@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -49,7 +49,9 @@ def long_horizon_figure(models: Curves) -> Figure:
         panel.tick_params(labelsize=6)
         panel.spines[["top", "right"]].set_visible(False)
     axes[1, 1].set_ylim(-0.05, 1.05)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=6, frameon=False, ncols=3, loc="outside upper center")
+    figure.legend(
+        *axes[0, 0].get_legend_handles_labels(), fontsize=6, frameon=False, ncols=_columns(models, 150), loc="outside upper center"
+    )
     return figure
 
 
@@ -67,5 +69,10 @@ def perturbation_figure(models: Curves) -> Figure:
     axes.set_ylabel("distance of twins [spacings]", fontsize=7)
     axes.tick_params(labelsize=6)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(fontsize=6, frameon=False)
+    figure.legend(*axes.get_legend_handles_labels(), fontsize=6, frameon=False, ncols=_columns(models, 70), loc="outside upper center")
     return figure
+
+
+def _columns(names: Iterable[str], width: int) -> int:
+    """Columns of a legend that is as wide as so many letters."""
+    return min(3, max(1, width // (8 + max(map(len, names), default=0))))

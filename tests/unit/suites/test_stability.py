@@ -190,7 +190,7 @@ def test_a_run_writes_records_table_and_figures(spec: DatasetSpec, scenes: list[
     assert all(r["gating"] and r["model"] == "own" and r["domain"] == "sand" for r in records)
     assert json.loads(json.dumps(records, allow_nan=False)) == records
     assert "Not tested, for want of a model: snow." in table
-    assert sum(line.startswith("| ") for line in table.splitlines()) == 1 + len(tests)
+    assert sum(line.startswith("| ") for line in table.splitlines()) == 2 + 1 + len(tests)
     assert "‖Pᵀf(Px) − f(x)‖" in table
     assert set(figures(records)) == {"long_horizon_sand", "perturbation_sand"}
     with pytest.raises(NothingToTestError, match="no model that was trained on one of snow tiny; train with"):
