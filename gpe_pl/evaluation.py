@@ -21,7 +21,7 @@ from gpe_pl.approximate import approximate
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.baselines import Ballistic, ConstantVelocity
 from gpe_pl.containment import TOLERANCE, Contained
-from gpe_pl.data.dataset import WindowDataset, long_enough, open_split
+from gpe_pl.data.dataset import WindowDataset, long_enough, open_split, usable
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.batching import batched
 from gpe_pl.learned_simulator import LearnedSimulator
@@ -208,7 +208,7 @@ def _share_outside(prediction: Trajectory, first: int, last: int, tolerance: flo
 
 def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windows: int = ONE_STEP_WINDOWS) -> float:
     """Noise-free one-step error over windows spread evenly over a split, relative to predicting free fall."""
-    dataset = WindowDataset(open_split(root, split), simulator.builder)
+    dataset = WindowDataset(usable(open_split(root, split)), simulator.builder)
     windows = np.unique(np.linspace(0, len(dataset) - 1, min(len(dataset), num_windows)).round().astype(int))
     metric = OneStepNMSE()
     with torch.inference_mode():

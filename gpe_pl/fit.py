@@ -85,6 +85,8 @@ def fit(cfg: DictConfig) -> float:
     settings["training"] = training.as_dict()
     trained = {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training")} | unusual
     config = trained | {"evaluation": settings["evaluation"]}
+    if evaluation.static_friction and not graph.islands:
+        raise ConfigError(f"evaluation.static_friction={evaluation.static_friction:g}: needs graph.islands=true, which model=gpe_tuned has")
     claim(run_dir, config)
     if not (run_dir / "metrics.csv").exists():
         best = None if cfg.reuse is None else adopt(Path(cfg.paths.runs) / cfg.reuse, trained, run_dir)

@@ -374,6 +374,28 @@ class LearnedSimulator(nn.Module):
             boundary=state.boundary.at(1),
         )
 
+    @classmethod
+    def _check_size(cls, description: dict[str, Any], weights: dict[str, Tensor]) -> None:
+        """Raise ``ValueError`` where weights are not those of a description, before a model of any size is made of it."""
+        try:
+            with torch.device("meta"):
+                expected = cls.from_description(description).state_dict()
+        except (
+            NotImplementedError,
+            RuntimeError,
+        ):  # of a model that looks at its own values while it is made; or of any, which comes again
+            return
+        for name, value in weights.items():
+            if name in expected and value.shape != expected[name].shape:
+                raise ValueError(f"size mismatch for {name}: {tuple(value.shape)} instead of {tuple(expected[name].shape)}")
+            if name in expected and value.is_floating_point() != expected[name].is_floating_point():
+                raise ValueError(f"{name} is of type {value.dtype}")
+            if value.untyped_storage().nbytes() < value.numel() * value.element_size():
+                raise ValueError(f"{name} has fewer values than its shape says")
+        missing = expected.keys() - weights.keys()
+        if missing:
+            raise ValueError(f"Missing key {min(missing)}")
+
     def _check_values(self) -> None:
         for name, values in self.state_dict().items():
             is_range = name.startswith("trained_")  # unlimited before training
@@ -435,22 +457,14 @@ class LearnedSimulator(nn.Module):
         try:
             if not isinstance(checkpoint, dict):
                 raise TypeError(f"holds a {type(checkpoint).__name__}")
-            with torch.device("meta"):  # takes no memory, whatever the description says
-                simulator = cls.from_description(checkpoint["simulator"])
             weights = {k.removeprefix("simulator."): v for k, v in checkpoint["state_dict"].items() if k.startswith("simulator.")}
-            simulator.load_state_dict(_typed(weights, simulator.state_dict()), assign=True)
+            cls._check_size(checkpoint["simulator"], weights)
+            simulator = cls.from_description(checkpoint["simulator"])
+            simulator.load_state_dict(weights)
             simulator._check_values()
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
             raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model ({_reason(error)})") from None
         return simulator.to(device).eval()
-
-
-def _typed(weights: dict[str, Any], own: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Weights in the precision that a model has; raises ``ValueError`` where they are no numbers of its kind."""
-    for name, value in weights.items():
-        if name in own and value.is_floating_point() != own[name].is_floating_point():
-            raise ValueError(f"{name} is of type {value.dtype}")
-    return {name: value.to(own[name].dtype) if name in own else value for name, value in weights.items()}
 
 
 def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:

@@ -53,11 +53,13 @@ class Replay:
 
 
 CROWDING_LIMIT = 32
-"""Nodes in the space that one of them has at rest beyond which a cloud has collapsed."""
+"""Nodes in the space that one of them has at rest beyond which a cloud has collapsed, unless it was as dense at the start."""
 TUNNEL_DEPTH = 0.25
 """Of a spacing: a path between two frames that goes deeper through a wall or obstacle than this has not gone around it."""
 MAX_PATH_SAMPLES = 4096
 """Of a path: those of ways longer than as many eighths of a spacing lie farther apart."""
+SUSPECTS_AT_ONCE = 1000
+"""Nodes whose paths are sampled as finely as that of the fastest of them."""
 
 
 @dataclass(frozen=True)
@@ -69,12 +71,14 @@ class Guard:
         bounds: ``(low, high)`` per axis of the region that nodes may not leave by more than ``margin`` [m].
         spacing: rest spacing [m] of nodes, for recognising clouds that collapse and nodes that went through an obstacle within one frame, or are deeper in
             one than ``margin``; 0 does neither.
+        max_crowding: nodes in the space that one of them has at rest.
     """
 
     max_speed: float = math.inf
     bounds: tuple[tuple[float, float], ...] = ()
     margin: float = 0.0
     spacing: float = 0.0
+    max_crowding: int = CROWDING_LIMIT
 
     def __post_init__(self) -> None:
         sound = self.max_speed > 0 and self.margin >= 0 and 0 <= self.spacing < math.inf  # what is not a number is neither
@@ -120,10 +124,10 @@ class Guard:
 
     def _clustering(self, state: State, frame: int) -> Termination | None:
         counts = crowding(_numpy(state.pos), self.spacing)
-        if counts.max() <= CROWDING_LIMIT:
+        if counts.max() <= self.max_crowding:
             return None
         node = int(np.argmax(counts))
-        text = f"frame {frame}: node {node} shares a box as wide as the spacing with {counts.max() - 1} others, limit {CROWDING_LIMIT}"
+        text = f"frame {frame}: node {node} shares a box as wide as the spacing with {counts.max() - 1} others, limit {self.max_crowding}"
         return Termination("clustering", frame, node, text)
 
     def _tunnelling(self, before: State | None, state: State, frame: int) -> Termination | None:
@@ -139,22 +143,26 @@ class Guard:
             return None
         start = _numpy(before.pos)
         way = state.periodicity.shortest(end - start)
-        num_samples = np.linalg.norm(way, axis=-1) / (0.5 * TUNNEL_DEPTH * self.spacing)
+        length, clearance = np.linalg.norm(way, axis=-1), signed_distance(shapes, start)
+        tolerance = TUNNEL_DEPTH * self.spacing
+        suspects = np.flatnonzero((length > clearance) & (length > 2 * tolerance) & (clearance > -tolerance) & (depth < tolerance))
+        suspects = suspects[np.argsort(length[suspects])]
         deepest = np.zeros(len(end))
-        level = 4.0  # shorter ways go through nothing
-        while level < num_samples.max() and level <= MAX_PATH_SAMPLES:  # one fast node does not make the paths of all others expensive
-            of_level = (num_samples > level) & ((num_samples <= 2 * level) | (2 * level > MAX_PATH_SAMPLES))
-            shares = np.arange(1, 2 * level)[:, None, None] / (2 * level)
-            distance = signed_distance(shapes, start[of_level] + shares * way[of_level])
-            deepest[of_level] = -distance.min(axis=0, initial=math.inf)
-            level *= 2
-        were_outside = (depth < TUNNEL_DEPTH * self.spacing) & (-signed_distance(shapes, start) < TUNNEL_DEPTH * self.spacing)
-        deepest[~were_outside] = 0.0
+        for some in np.array_split(suspects, max(1, len(suspects) // SUSPECTS_AT_ONCE)):
+            count = min(MAX_PATH_SAMPLES, math.ceil(float(length[some].max(initial=0.0)) / (0.5 * tolerance)))
+            for share in np.arange(1, count) / max(1, count):
+                deepest[some] = np.maximum(deepest[some], -signed_distance(shapes, start[some] + share * way[some]))
         node = int(np.argmax(deepest))
-        if not deepest[node] > TUNNEL_DEPTH * self.spacing:
+        if not deepest[node] > tolerance:
             return None
         text = f"frame {frame}: node {node} went {deepest[node]:.3g} m deep through a wall or obstacle within one frame"
         return Termination("tunnelling", frame, node, text)
+
+    def of(self, start: State) -> Guard:
+        """The same for a rollout from a state, which may be finer in places: clouds collapse where twice as many are in one place as in the finest."""
+        if self.spacing == 0 or start.num_nodes == 0 or self._not_finite(start, 0) is not None:
+            return self
+        return replace(self, max_crowding=max(self.max_crowding, 2 * int(crowding(_numpy(start.pos), self.spacing).max())))
 
 
 def crowding(pos: np.ndarray, width: float) -> np.ndarray:
@@ -217,8 +225,8 @@ class Start:
 def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int, int, State | Termination]]:
     """Step all scenes side by side and yield (scene, frame, new state), or a ``Termination`` as a scene's last item. Holds one state per scene."""
     live = {}
-    for scene, start in enumerate(starts):
-        guard = start.guard
+    guards = [None if start.guard is None else start.guard.of(start.state) for start in starts]
+    for scene, (start, guard) in enumerate(zip(starts, guards, strict=True)):
         impossible = None if guard is None else impossible_material(start.state, start.metadata) or guard.check(start.state, 0)
         if impossible is None:
             live[scene] = start.state
@@ -231,7 +239,7 @@ def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int,
         if not live:
             return
         for scene, item in zip(list(live), step_all(simulator, list(live.values())), strict=True):
-            stop = _termination(item, frame, starts[scene].guard, live[scene])
+            stop = _termination(item, frame, guards[scene], live[scene])
             if stop is None:
                 live[scene] = cast(State, item)
             else:

@@ -17,7 +17,7 @@ from gpe_pl import ranks
 from gpe_pl.data.dataset import HeldGraphs, WindowDataset, collated, long_enough, open_split, usable
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling, probabilities
-from gpe_pl.data.statistics import is_intact
+from gpe_pl.data.statistics import acceleration_std, is_intact
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.store import StoreError
@@ -75,13 +75,13 @@ class TrajectoryDataModule(L.LightningDataModule):
         self.push_forward: PushForward | None = None
         statistics = data_statistics(root)
         stored = open_split(root, "train")
-        train, acceleration_std = usable(stored)
-        val, _ = usable(open_split(root, "val"))
+        train = usable(stored)
+        val = usable(open_split(root, "val"))
         self.metadata = train[0].window(0, 1).metadata
         self.builder = GraphBuilder(graph, self.metadata)
-        if len(train) == len(stored):
-            acceleration_std = statistics["acceleration_std"]
-        unit = acceleration_std * self.metadata.frame_dt
+        whole = len(train) == len(stored)
+        std = statistics["acceleration_std"] if whole else acceleration_std(t.window(0, t.num_frames) for t in train)
+        unit = std * self.metadata.frame_dt
         self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress)
         self.val_set = WindowDataset(val, self.builder, stress=stress)
         if sampling == "activity":

@@ -6,7 +6,6 @@ A sample is a pure function of (split, seed, sample number): runs resume exactly
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl import integrators
 from gpe_pl.data.noise import Noise
-from gpe_pl.data.statistics import motion
+from gpe_pl.data.statistics import FRAMES_AT_ONCE
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.schema import MATERIALS, node_code
@@ -52,8 +51,8 @@ CACHE_BYTES = 2 * 1024**3
 
 MAX_DAMAGED = 0.2
 """Share of a split's trajectories that may be left out."""
-MAX_JUMP, MAX_ROUGHNESS = 2.0, 30.0
-"""Way within a frame in neighbour radii, and root mean square acceleration in units of the other trajectories', beyond both of which a frame is damaged."""
+MAX_JUMP, MIN_RATIO = 2.0, 10.0
+"""A way within a frame longer than so many neighbour radii, and so many times that within the frame before or after it, is a fault of the data."""
 
 
 @dataclass(frozen=True)
@@ -88,89 +87,35 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
 
 
 def long_enough(root: Path | str, split: str, history: int) -> Iterator[Trajectory]:
-    """The trajectories of a split that have a frame with so many velocities and one to predict; warns of the others."""
+    """The undamaged trajectories of a split that have a frame with so many velocities and one to predict; warns of the others."""
     for number, trajectory in enumerate(iter_trajectories(root, split)):
-        if trajectory.num_nodes == 0:
-            log.warning("%s, trajectory %d: left out, it has no nodes", Path(root) / split, number)
-        elif trajectory.num_frames >= history + 2:
+        fault = damage(trajectory)
+        if fault is None and trajectory.num_frames < history + 2:
+            fault = f"its {trajectory.num_frames} frames are fewer than the {history + 2} that graph.history={history} needs"
+        if fault is None:
             yield trajectory
         else:
-            log.warning(
-                "%s, trajectory %d: left out, its %d frames are fewer than the %d that graph.history=%d needs",
-                Path(root) / split, number, trajectory.num_frames, history + 2, history,
-            )  # fmt: skip
+            log.warning("%s, trajectory %d: left out, %s", Path(root) / split, number, fault)
 
 
-@dataclass(frozen=True)
-class Motion:
-    """How a trajectory moves: longest way [m] of a node within a frame, after which frame, and the sum of squared accelerations of so many numbers."""
-
-    jump: float = 0.0
-    frame: int = 0
-    power: float = 0.0
-    count: int = 0
-
-    @classmethod
-    def of(cls, trajectory: Trajectory) -> Motion:
-        sums, jumps = {"velocity": (0.0, 0), "acceleration": (0.0, 0)}, []
-        for key, values in motion(trajectory):
-            sums[key] = sums[key][0] + float(np.square(values).sum()), sums[key][1] + values.size
-            if key == "velocity":
-                jumps.append(np.square(values).sum(axis=-1).max(axis=1))
-        longest = np.concatenate(jumps)
-        if not len(longest):
-            return cls()
-        frame = int(np.argmax(longest))
-        return cls(float(np.sqrt(longest[frame])) * trajectory.metadata.frame_dt, frame, *sums["acceleration"])
-
-
-def usable(trajectories: list[StoredTrajectory]) -> tuple[list[StoredTrajectory], float]:
-    """Those that can be learned from, with the root mean square of their accelerations other than gravity's [m/s²]; warns of the others.
+def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
+    """Those that can be learned from; warns of the others.
 
     Raises:
-        StoreError: more than ``MAX_DAMAGED`` of them cannot be.
+        StoreError: more than one, and more than ``MAX_DAMAGED`` of them, cannot be.
     """
-    motions: dict[int, Motion] = {}
-    radius = 0.0
-    for number, stored in enumerate(trajectories):
-        whole = stored.window(0, stored.num_frames)
-        fault = damage(whole)
+    found = []
+    for stored in trajectories:
+        fault = damage(stored.window(0, stored.num_frames))
         if fault is None:
-            motions[number], radius = Motion.of(whole), whole.metadata.connectivity_radius
+            found.append(stored)
         else:
-            _left_out(stored, fault)
-    while (jump := _jump(motions, radius)) is not None:
-        number, text = jump
-        _left_out(trajectories[number], text)
-        del motions[number]
-    if len(motions) < (1 - MAX_DAMAGED) * len(trajectories):
+            log.warning("%s:%s: left out, %s; see `python -m gpe_pl.data.validate`", stored.path, stored.name, fault)
+    num_damaged = len(trajectories) - len(found)
+    if not found or num_damaged > max(1, MAX_DAMAGED * len(trajectories)):
         where = trajectories[0].path.parent
-        raise StoreError(
-            f"{where}: {len(trajectories) - len(motions)} of {len(trajectories)} trajectories cannot be learned from; see the warnings above"
-        )
-    power, count = (sum(getattr(m, name) for m in motions.values()) for name in ("power", "count"))
-    return [trajectories[number] for number in motions], math.sqrt(power / max(1, count))
-
-
-def _left_out(stored: StoredTrajectory, why: str) -> None:
-    log.warning("%s:%s: left out, %s; see `python -m gpe_pl.data.validate`", stored.path, stored.name, why)
-
-
-def _jump(motions: dict[int, Motion], radius: float) -> tuple[int, str] | None:
-    """The roughest trajectory if it jumps farther than neighbours see, which no other does by far, and what it does; or None.
-
-    One frame that went wrong is the largest of all accelerations, and the scale to which all others are related.
-    """
-    if len(motions) < 2:
-        return None
-    number = max(motions, key=lambda n: motions[n].power / max(1, motions[n].count))
-    worst, others = motions[number], [m for n, m in motions.items() if n != number]
-    typical = sum(m.power for m in others) / max(1, sum(m.count for m in others))
-    ratio = math.sqrt(worst.power / max(1, worst.count) / max(typical, 1e-300))
-    if worst.jump <= MAX_JUMP * radius or ratio <= MAX_ROUGHNESS:
-        return None
-    where = f"between frames {worst.frame} and {worst.frame + 1}"
-    return number, f"a node moves by {worst.jump:.3g} m {where}, and accelerations are {ratio:.3g} times those of the other trajectories"
+        raise StoreError(f"{where}: {num_damaged} of {len(trajectories)} trajectories cannot be used; see the warnings above")
+    return found
 
 
 def damage(trajectory: Trajectory) -> str | None:
@@ -196,6 +141,26 @@ def damage(trajectory: Trajectory) -> str | None:
         wrong = rows[~np.isfinite(trajectory.material_params[rows, metadata.param_names.index(name)])]
         if len(wrong):
             return f"the {name} of node {wrong[0]} is not finite"
+    return _jump(trajectory)
+
+
+def _jump(trajectory: Trajectory) -> str | None:
+    """A node that goes farther than neighbours see between two frames, but hardly moves before or after them.
+
+    What is fast is so for more than a frame; a frame that went wrong is the largest of all accelerations, and the scale to which all others are related.
+    """
+    limit = MAX_JUMP * trajectory.metadata.connectivity_radius
+    for start in range(0, trajectory.num_frames - 1, FRAMES_AT_ONCE):
+        first = max(0, start - 1)
+        pos = trajectory.pos[first : start + FRAMES_AT_ONCE + 2].astype(np.float64)
+        way = np.linalg.norm(integrators.velocities(pos, 1.0, trajectory.metadata.periodicity), axis=-1)
+        before, after = np.full_like(way, np.inf), np.full_like(way, np.inf)
+        before[1:], after[:-1] = way[:-1], way[1:]
+        jumps = np.argwhere((way > limit) & (np.minimum(before, after) < way / MIN_RATIO))
+        if len(jumps):
+            frame, node = jumps[0]
+            where = f"between frames {first + frame} and {first + frame + 1}"
+            return f"node {node} jumps by {way[frame, node]:.3g} m {where}"
     return None
 
 

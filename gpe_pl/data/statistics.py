@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,13 @@ def shard_moments(path: Path) -> tuple[str, dict[str, Any]]:
         sums["frames"] += trajectory.num_frames
         sums["trajectories"] += 1
     return str(path), sums
+
+
+def acceleration_std(trajectories: Iterable[Trajectory]) -> float:
+    """Root mean square per component of accelerations other than gravity's, m/s²."""
+    sums = [(float(np.sum(v * v)), v.size) for t in trajectories for key, v in motion(t) if key == "acceleration"]
+    power, count = np.sum(sums, axis=0)
+    return math.sqrt(power / max(1, count))
 
 
 def motion(trajectory: Trajectory) -> Iterator[tuple[str, np.ndarray]]:

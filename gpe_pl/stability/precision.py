@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,7 +14,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.approximate import approximate
 from gpe_pl.containment import Contained
-from gpe_pl.geometry import Box
+from gpe_pl.geometry import Box, Sphere
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.machine import resident_bytes
@@ -51,7 +52,7 @@ def single_precision(subject: Subject) -> Outcome:
     difference = float((a.pos - b.pos).square().sum(dim=1).mean().sqrt()) / subject.spacing
     twin = float(separation(single, start, NUM_STEPS, subject.spacing)[-1])
     text = f"{difference:.2g} spacings, twins {PERTURBATION:g} m apart {twin:.2g}; bf16 and TF32 are not offered"
-    return Outcome(bool(difference <= twin), text)
+    return Outcome(bool(difference <= twin < math.inf), text)
 
 
 @stress_test(26, "equal implementations", "fused = plain: change < 1e-5")
@@ -77,9 +78,9 @@ def memory(subject: Subject) -> Outcome:
         used.append(resident_bytes())
         graph = subject.simulator.builder(state)
         edges.add(sum(graph[r].edge_index.shape[1] for r in subject.simulator.builder.spec.relations))
-    growth, num_compiled = max(used[100:]) / max(used[:50]) - 1, compilations() - num_compiled
+    growth, num_compiled = max(used[50:]) / max(used[:50]) - 1, compilations() - num_compiled
     text = f"{100 * growth:.2g} %, {num_compiled} compilations, {len(edges)} numbers of edges"
-    return Outcome(growth < 0.01 and num_compiled <= 4 and len(edges) > 1, text)
+    return Outcome(growth < 0.01 and num_compiled <= 3 and len(edges) > 1, text)
 
 
 def compilations() -> int:
@@ -99,9 +100,8 @@ def skipping(subject: Subject) -> Outcome:
         untrimmed = output(subject.simulator, other(state), state.num_nodes).double() * subject.acceleration_std
         changes.append(relative_change(untrimmed, everything))
     ratio, speed_up, share = sleeping(subject)
-    text = (
-        f"exact levels {max(changes):.1e}; sleeping {ratio:.3f} times the error, {speed_up:.2f} times as fast, {100 * share:.2g} % asleep"
-    )
+    slept = f"sleeping {ratio:.3f} times the error, {speed_up:.2f} times as fast, {100 * share:.2g} % asleep"
+    text = f"exact levels {max(changes):.1e}; {slept if share > 0 else 'nothing fell asleep'}"
     return Outcome(max(changes) < 1e-6 and ratio <= 1.05, text)
 
 
@@ -244,6 +244,9 @@ def guard(subject: Subject) -> Outcome:
     before, behind = (replace(obstructed, pos=torch.cat([place[None], state.pos[1:]])) for place in _beside(obstructed, subject.spacing))
     stop = limits.check(behind, 3, before)  # a model that sees an obstacle need not go through it, so the two states are made
     found["tunnelling"] = stop is not None and (stop.reason, stop.frame, stop.node) == ("tunnelling", 3, 0)
+    inside = replace(obstructed, boundary=replace(state.boundary, shapes=(ball(state, 2 * radius),)))
+    stop = limits.check(inside, 3)
+    found["deep inside"] = stop is not None and (stop.reason, stop.frame, stop.node) == ("tunnelling", 3, 0)
     params = state.material_params.clone()
     params[1] = 1e30
     result = rollout(subject.simulator, replace(state, material_params=params), 5, subject.scenes[0].metadata, limits)
@@ -277,6 +280,11 @@ def obstacle(state: State, spacing: float) -> Box:
     low, high = middle - 4 * spacing, middle + 4 * spacing
     low[-1], high[-1] = top[-1] + 2 * spacing, top[-1] + 4 * spacing
     return Box(tuple(low.tolist()), tuple(high.tolist()), friction=0.0)
+
+
+def ball(state: State, radius: float) -> Sphere:
+    """An obstacle around the first node."""
+    return Sphere(tuple(state.pos[0].tolist()), radius, friction=0.0)
 
 
 def _beside(state: State, spacing: float) -> tuple[torch.Tensor, torch.Tensor]:

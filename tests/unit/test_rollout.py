@@ -149,6 +149,18 @@ def test_guard_sees_what_no_single_limit_shows(new_trajectory: New, reason: str,
     assert result.num_frames == 4
 
 
+def test_a_cloud_that_is_fine_from_the_start_has_not_collapsed(new_trajectory: New) -> None:
+    many = new_trajectory(num_nodes=80, gravity=(0.0, 0.0))
+    fine = replace(many.state(0), vel=np.zeros((80, 2)), pos=0.35 + 0.5 * many.metadata.spacing * np.random.default_rng(0).random((80, 2)))
+    guard = Guard(bounds=many.metadata.bounds, spacing=many.metadata.spacing)
+    assert guard.check(fine, 1) is not None
+    assert rollout(FreeFall(0.01), fine, 3, many.metadata, guard).termination is None
+    with_far = replace(fine, pos=np.concatenate([fine.pos[:20], many.state(0).pos[20:]]))
+    result = rollout(FreeFall(0.01, 2, lambda state: replace(state, pos=fine.pos)), with_far, 3, many.metadata, guard)
+    assert result.termination is not None
+    assert (result.termination.reason, result.termination.frame) == ("clustering", 2)
+
+
 def test_a_path_around_an_obstacle_is_no_tunnel(new_trajectory: New) -> None:
     one = new_trajectory(num_nodes=1, gravity=(0.0, 0.0))
     before = replace(one.state(0), pos=np.array([[0.38, 0.2]]))
