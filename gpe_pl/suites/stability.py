@@ -80,7 +80,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
     untested = [name for name, spec in specs.items() if not any(_models(spec, settings))]
     tested = {name: spec for name, spec in specs.items() if name not in untested}
     if min(settings.num_workers, len(tested)) > 1:
-        with ProcessPoolExecutor(settings.num_workers, multiprocessing.get_context("spawn")) as pool:
+        with ProcessPoolExecutor(settings.num_workers, multiprocessing.get_context("spawn"), _show_progress) as pool:
             for found in pool.map(_test_domain, tested, tested.values(), [settings] * len(tested)):
                 records += found
     else:
@@ -93,6 +93,11 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
             "suite.runs or suite.checkpoints"
         )
     return records, _report(records, untested)
+
+
+def _show_progress() -> None:
+    """What a process logs goes to the terminal; it knows nothing of the settings of the one that made it."""
+    logging.basicConfig(level=logging.INFO, format="[%(asctime)s][%(name)s][%(levelname)s] - %(message)s")
 
 
 def _test_domain(name: str, spec: DatasetSpec, settings: Settings) -> list[dict[str, Any]]:
