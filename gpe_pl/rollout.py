@@ -54,6 +54,8 @@ class Replay:
 
 CROWDING_LIMIT = 32
 """Nodes in the space that one of them has at rest beyond which a cloud has collapsed, unless it was as dense at the start."""
+FINEST = 0.01
+"""Of a spacing: nodes that are closer at the start lie on top of each other."""
 TUNNEL_DEPTH = 0.25
 """Of a spacing: a path between two frames that goes deeper through a wall or obstacle than this has not gone around it."""
 MAX_PATH_SAMPLES = 4096
@@ -162,7 +164,10 @@ class Guard:
         """The same for a rollout from a state, which may be finer in places: clouds collapse where twice as many are in one place as in the finest."""
         if self.spacing == 0 or start.num_nodes == 0 or self._not_finite(start, 0) is not None:
             return self
-        return replace(self, max_crowding=max(self.max_crowding, 2 * int(crowding(_numpy(start.pos), self.spacing).max())))
+        pos = _numpy(start.pos)
+        if crowding(pos, FINEST * self.spacing).max() > self.max_crowding:
+            return self
+        return replace(self, max_crowding=max(self.max_crowding, 2 * int(crowding(pos, self.spacing).max())))
 
 
 def crowding(pos: np.ndarray, width: float) -> np.ndarray:

@@ -240,7 +240,7 @@ def guard(subject: Subject) -> Outcome:
         result = rollout(simulator, state, 5, subject.scenes[0].metadata, limits)
         stop = result.termination
         found[reason] = stop is not None and (stop.reason, stop.frame) == (reason, 3) and stop.node >= 0 and result.num_frames == 3
-    obstructed = replace(state, boundary=replace(state.boundary, shapes=(*state.boundary.shapes, obstacle(state, subject.spacing))))
+    obstructed = replace(state, boundary=replace(state.boundary, shapes=(obstacle(state, subject.spacing),)))
     before, behind = (replace(obstructed, pos=torch.cat([place[None], state.pos[1:]])) for place in _beside(obstructed, subject.spacing))
     stop = limits.check(behind, 3, before)  # a model that sees an obstacle need not go through it, so the two states are made
     found["tunnelling"] = stop is not None and (stop.reason, stop.frame, stop.node) == ("tunnelling", 3, 0)

@@ -161,6 +161,14 @@ def test_a_cloud_that_is_fine_from_the_start_has_not_collapsed(new_trajectory: N
     assert (result.termination.reason, result.termination.frame) == ("clustering", 2)
 
 
+def test_a_cloud_that_lies_in_one_place_from_the_start_has_collapsed(new_trajectory: New) -> None:
+    many = new_trajectory(num_nodes=80, gravity=(0.0, 0.0))
+    start = replace(many.state(0), vel=np.zeros((80, 2)), pos=np.full((80, 2), 0.35))
+    result = rollout(FreeFall(0.01), start, 3, many.metadata, Guard(spacing=many.metadata.spacing))
+    assert result.termination is not None
+    assert (result.termination.reason, result.termination.frame) == ("clustering", 0)
+
+
 def test_a_path_around_an_obstacle_is_no_tunnel(new_trajectory: New) -> None:
     one = new_trajectory(num_nodes=1, gravity=(0.0, 0.0))
     before = replace(one.state(0), pos=np.array([[0.38, 0.2]]))
