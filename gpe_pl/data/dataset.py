@@ -50,7 +50,7 @@ CACHE_BYTES = 2 * 1024**3
 
 
 MAX_DAMAGED = 0.2
-"""Share of a split's trajectories that may be left out."""
+"""Share of a split's trajectories that may be left out; one may always."""
 MAX_JUMP, MIN_RATIO = 2.0, 10.0
 """A way within a frame longer than so many neighbour radii, and so many times that within the frame before or after it, is a fault of the data."""
 
@@ -120,14 +120,17 @@ def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
 
 def damage(trajectory: Trajectory) -> str | None:
     """Why a trajectory cannot be learned from, with the frame and node, or None."""
-    pos, metadata = trajectory.pos.astype(np.float64), trajectory.metadata
+    pos, metadata = trajectory.pos, trajectory.metadata
     if trajectory.num_nodes == 0:
         return "it has no nodes"
     for key, fault in metadata.violations():
         return f"{key} {fault}"
     bounds = np.array(metadata.bounds)
     width = np.ptp(bounds, axis=1)
-    near = (pos >= bounds[:, 0] - width) & (pos <= bounds[:, 1] + width)
+    low, high = (
+        limits.astype(pos.dtype) for limits in (bounds[:, 0] - width, bounds[:, 1] + width)
+    )  # long trajectories would not fit twice
+    near = (pos >= low) & (pos <= high)
     if not near.all():
         frame, node = np.argwhere(~near)[0, :2]
         what = "farther outside the domain than this is wide" if np.isfinite(pos[frame, node]).all() else "not finite"

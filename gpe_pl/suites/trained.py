@@ -44,9 +44,7 @@ def trained_on(spec: DatasetSpec, runs: Iterable[Run]) -> dict[str, tuple[Learne
     for label, members in same.items():
         these = [run for _, run in members]
         axes = [axis for axis in axes_of(these) if axis.startswith(("training.", "graph.")) and axis not in LENGTHS]
-        axes = [
-            axis for axis in axes if all(run.config.get(axis) is not None for run in these)
-        ]  # what others leave open follows from another setting
+        axes = [axis for axis in axes if all(run.config.get(axis) is not None for run in these)]  # others follow from another setting
         for simulator, run in members:
             differences = [f"{axis.rpartition('.')[2]}={run.config.get(axis)}" for axis in axes]
             found.setdefault(", ".join([label, *differences]), (simulator, run))
