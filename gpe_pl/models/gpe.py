@@ -11,6 +11,7 @@ Virtual nodes above meshes take part as nodes of their own types and carry hidde
 level per step; ``sweep`` climbs all levels, passes messages within each, and comes down again, so that every step couples the whole body.
 """
 
+from functools import partial
 from typing import Annotated, Literal, cast
 
 import torch
@@ -46,10 +47,12 @@ class IslandError(GpeError, ValueError):
 class MaterialEmbedding(nn.Module):
     """Θ(v) of the paper, section 2.1: ``affine`` satisfies Θ(λv₁ + (1−λ)v₂) = λΘ(v₁) + (1−λ)Θ(v₂); ``mlp`` is the comparison."""
 
-    def __init__(self, param_channels: int, hidden_channels: int, kind: MaterialEmbeddingKind) -> None:
+    def __init__(self, param_channels: int, hidden_channels: int, kind: MaterialEmbeddingKind, is_fused: bool) -> None:
         super().__init__()
-        affine = kind == "affine"
-        self.theta = nn.Linear(param_channels, hidden_channels) if affine else MLP(param_channels, hidden_channels, hidden_channels)
+        if kind == "affine":
+            self.theta: nn.Module = nn.Linear(param_channels, hidden_channels)
+        else:
+            self.theta = MLP(param_channels, hidden_channels, hidden_channels, is_fused=is_fused)
 
     def forward(self, params: Float[Tensor, "node param"]) -> Float[Tensor, "node hidden"]:
         return self.theta(params)
@@ -186,20 +189,23 @@ class GPE(nn.Module):
         self.level_weights, self.schedule = level_weights, schedule
         self.num_message_passing_steps = num_message_passing_steps
         hidden, norm = hidden_channels, node_norm == "layer"
+        mlp = partial(MLP, is_fused=implementation == "factored")
         params = {m: c for m, c in spec.param_channels.items() if c}
-        self.material_embedding = nn.ModuleDict({m: MaterialEmbedding(c, hidden, material_embedding) for m, c in params.items()})
+        self.material_embedding = nn.ModuleDict(
+            {m: MaterialEmbedding(c, hidden, material_embedding, implementation == "factored") for m, c in params.items()}
+        )
         readable = self._readable()
         relations = [r for r in spec.relations if {r[0], r[2]} & readable[0]]
         ends = readable[0].union(*({r[0], r[2]} for r in relations))
         self.node_encoder, self.edge_encoder = nn.ModuleDict(), nn.ModuleDict()
         for t in spec.node_types:
             if t in ends and self.type_key(t) not in self.node_encoder:
-                self.node_encoder[self.type_key(t)] = MLP(spec.node_channels[t] + (hidden if t in params else 0), hidden, hidden, norm)
+                self.node_encoder[self.type_key(t)] = mlp(spec.node_channels[t] + (hidden if t in params else 0), hidden, hidden, norm)
         for relation in relations if edge_state == "latent" else []:
             if self.key(relation) not in self.edge_encoder:
                 odd, even = spec.odd_channels[relation], spec.even_channels[relation]
                 is_odd = self._interaction(relation) in ("odd", "odd_even")
-                self.edge_encoder[self.key(relation)] = OddEncoder(odd, even, hidden) if is_odd else MLP(odd + even, hidden, hidden)
+                self.edge_encoder[self.key(relation)] = OddEncoder(odd, even, hidden) if is_odd else mlp(odd + even, hidden, hidden)
         self.convs, self.updates = nn.ModuleList(), nn.ModuleList()
         for types in readable:
             convs = nn.ModuleDict()
@@ -213,14 +219,14 @@ class GPE(nn.Module):
                 convs[self.key(relation)] = MomentumConv(hidden, edge_channels, even, kind, implementation)
             self.convs.append(convs)
             keys = dict.fromkeys(self.type_key(t) for t in spec.node_types if t in types)
-            self.updates.append(nn.ModuleDict({k: MLP(hidden, hidden, hidden, norm) for k in keys}))
+            self.updates.append(nn.ModuleDict({k: mlp(hidden, hidden, hidden, norm) for k in keys}))
         if decoder == "node":
-            self.node_decoder = nn.ModuleDict({m: MLP(hidden, hidden, spec.dim) for m in spec.materials})
+            self.node_decoder = nn.ModuleDict({m: mlp(hidden, hidden, spec.dim) for m in spec.materials})
         else:
             forces = [r for r in spec.relations if r[1] in (RADIUS, CELL)]
             self.pair_decoder = nn.ModuleDict({self.key(r): PairForce(spec, r, hidden) for r in forces})
         if stress:
-            self.stress_decoder = nn.ModuleDict({m: MLP(hidden, hidden, c) for m, c in spec.stress_channels.items()})
+            self.stress_decoder = nn.ModuleDict({m: mlp(hidden, hidden, c) for m, c in spec.stress_channels.items()})
 
     @property
     def num_hops(self) -> int:
@@ -364,7 +370,7 @@ class GPE(nn.Module):
                         continue
                     update, state = updates[self.type_key(node_type)], h[node_type]
                     incoming = total[node_type] if node_type in total else torch.zeros_like(state)
-                    h[node_type] = state + update(incoming) if rows is None else state.index_add(0, rows, update(incoming[rows]))
+                    h[node_type] = update(incoming, state) if rows is None else state.index_add(0, rows, update(incoming[rows]))
 
         stress = {m: self.stress_decoder[m](h[m]) for m in mass if self._decodes_stress(m)}
         if self.decoder == "node":

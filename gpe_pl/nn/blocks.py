@@ -1,19 +1,40 @@
 """Small building blocks shared by all models."""
 
 from collections.abc import Iterable
+from typing import cast
 
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
+from gpe_pl.nn.fused import works_on
+from gpe_pl.nn.fused_mlp import fused_mlp
+
 
 class MLP(nn.Sequential):
-    """Two linear layers with a PReLU between them: every function of the paper (section 3.2); then LayerNorm if asked for."""
+    """Two linear layers with a PReLU between them: every function of the paper (section 3.2); then LayerNorm if asked for.
 
-    def __init__(self, in_channels: int, hidden_channels: int, out_channels: int, norm: bool = False) -> None:
+    Args:
+        is_fused: on a CPU, use the code of its own that ``nn.fused_mlp`` has for it; the same function of the same parameters.
+    """
+
+    def __init__(self, in_channels: int, hidden_channels: int, out_channels: int, norm: bool = False, is_fused: bool = False) -> None:
         layers = [nn.Linear(in_channels, hidden_channels), nn.PReLU(), nn.Linear(hidden_channels, out_channels)]
         super().__init__(*layers, *([nn.LayerNorm(out_channels)] if norm else []))
+        self.is_fused = is_fused
+
+    def forward(self, x: Float[Tensor, "*row in"], residual: Float[Tensor, "*row out"] | None = None) -> Float[Tensor, "*row out"]:
+        """The function of every row, added to that of ``residual``."""
+        first, act, last, *norm = self
+        first, act, last = cast(nn.Linear, first), cast(nn.PReLU, act), cast(nn.Linear, last)
+        if not (self.is_fused and x.dim() == 2 and works_on(x, first.weight)):
+            y = super().forward(x)
+            return y if residual is None else residual + y
+        y = fused_mlp(x, first.weight, first.bias, act.weight, last.weight, last.bias, None if norm else residual)
+        for layer in norm:
+            y = layer(y) if residual is None else residual + layer(y)
+        return y
 
 
 class ReluMLP(nn.Sequential):

@@ -12,8 +12,6 @@ computes the activations again.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, no_type_check
 
 import numpy as np
@@ -22,15 +20,13 @@ from jaxtyping import Float, Int64
 from numba import njit
 from torch import Tensor
 
-BLOCK = 512
-"""Edges at a time: at 128 channels in single precision an array of a block takes 256 KiB, and a handful of them fit a core's second-level cache."""
-FASTMATH = {"contract", "nsz", "arcp"}
+from gpe_pl.nn.fused import FASTMATH, block_size, blocks
 
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _activate(a, b, w, slope, source, target, first, x):
-    for k in range(len(w)):
+def _activate(a, b, w, slope, source, target, first, count, x):
+    for k in range(count):
         i, j = target[first + k], source[first + k]
         for c in range(w.shape[1]):
             z = a[i, c] + b[j, c] + w[k, c]
@@ -39,8 +35,8 @@ def _activate(a, b, w, slope, source, target, first, x):
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _activate_odd(a, b, w, u, slope, source, target, first, x):
-    for k in range(len(w)):
+def _activate_odd(a, b, w, u, slope, source, target, first, count, x):
+    for k in range(count):
         i, j = target[first + k], source[first + k]
         for c in range(w.shape[1]):
             y = a[i, c] + b[j, c] + u[k, c] + w[k, c]
@@ -50,21 +46,24 @@ def _activate_odd(a, b, w, u, slope, source, target, first, x):
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _update(m, bias, e, source, target, first, at_target, at_source):
-    """Adds m + bias to the states e of a block, and to the sums at its ends."""
-    for k in range(len(m)):
+def _update(m, bias, e, source, target, first, count, new, at_target, at_source):
+    """Adds m + bias to the sums at the ends of a block's edges, and to their states e: in place, or into ``new``."""
+    for k in range(count):
         i, j = target[first + k], source[first + k]
         for c in range(m.shape[1]):
             message = m[k, c] + bias[c]
-            e[k, c] += message
+            if new is None:  # one array under two names would not be vectorised
+                e[first + k, c] += message
+            else:
+                new[first + k, c] = e[first + k, c] + message
             at_target[i, c] += message
             at_source[j, c] -= message
 
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _sum(x, source, target, first, at_target, at_source):
-    for k in range(len(x)):
+def _sum(x, source, target, first, count, at_target, at_source):
+    for k in range(count):
         i, j = target[first + k], source[first + k]
         for c in range(x.shape[1]):
             at_target[i, c] += x[k, c]
@@ -73,8 +72,8 @@ def _sum(x, source, target, first, at_target, at_source):
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _gather_grad(grad_target, grad_source, source, target, first, g):
-    for k in range(len(g)):
+def _gather_grad(grad_target, grad_source, source, target, first, count, g):
+    for k in range(count):
         i, j = target[first + k], source[first + k]
         for c in range(g.shape[1]):
             g[k, c] = grad_target[i, c] - grad_source[j, c]
@@ -82,21 +81,21 @@ def _gather_grad(grad_target, grad_source, source, target, first, g):
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _gather_message_grad(grad_target, grad_source, grad_new, source, target, first, g, total):
+def _gather_message_grad(grad_target, grad_source, grad_new, source, target, first, count, g, total):
     """Gradients of the messages, which also reach the new states, and their sum in ``total``."""
-    for k in range(len(g)):
+    for k in range(count):
         i, j = target[first + k], source[first + k]
         for c in range(g.shape[1]):
-            y = grad_target[i, c] - grad_source[j, c] + grad_new[k, c]
+            y = grad_target[i, c] - grad_source[j, c] + grad_new[first + k, c]
             g[k, c] = y
             total[c] += y
 
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _backward(a, b, w, slope, source, target, first, g, grad_a, grad_b, below):
+def _backward(a, b, w, slope, source, target, first, count, g, grad_a, grad_b, below):
     """Turns g, the gradient of x, into that of z."""
-    for k in range(len(w)):
+    for k in range(count):
         i, j = target[first + k], source[first + k]
         for c in range(w.shape[1]):
             z = a[i, c] + b[j, c] + w[k, c]
@@ -110,9 +109,9 @@ def _backward(a, b, w, slope, source, target, first, g, grad_a, grad_b, below):
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
-def _backward_odd(a, b, w, u, slope, source, target, first, g, even, grad_a, grad_b, below):
+def _backward_odd(a, b, w, u, slope, source, target, first, count, g, even, grad_a, grad_b, below):
     """Turns g, the gradient of x, into that of W e; ``even`` becomes that of V s."""
-    for k in range(len(w)):
+    for k in range(count):
         i, j = target[first + k], source[first + k]
         for c in range(w.shape[1]):
             y = a[i, c] + b[j, c] + u[k, c] + w[k, c]
@@ -128,71 +127,52 @@ def _backward_odd(a, b, w, u, slope, source, target, first, g, even, grad_a, gra
             grad_b[i, c] -= q
 
 
-@dataclass(frozen=True)
 class _Layer:
-    """What all blocks of a layer share: rows a and b, edges, and the first linear map."""
+    """What all blocks share: rows a and b, states and features of the edges, the first linear map; and room for W e, V s and x of one block."""
 
-    a: Tensor
-    b: Tensor
-    e: Tensor
-    s: Tensor | None
-    weight: Tensor
-    even_weight: Tensor
-    slope: Tensor
-    edge_index: Tensor
+    def __init__(
+        self, a: Tensor, b: Tensor, e: Tensor, s: Tensor | None, weight: Tensor, even_weight: Tensor, slope: Tensor, edge_index: Tensor
+    ) -> None:
+        self.a, self.b, self.e = (t.detach().contiguous() for t in (a, b, e))
+        self.s = None if s is None else s.detach()
+        self.weight, self.even_weight = (t.detach().t().contiguous() for t in (weight, even_weight))
+        self.slope = slope.detach().numpy()[0]
+        self.source, self.target = edge_index.contiguous().numpy()
+        self.rows = self.a.numpy(), self.b.numpy()
+        self.w, self.u, self.x = e.new_empty(3, block_size(len(e)), weight.shape[0])
+        self.arrays = self.w.numpy(), self.u.numpy(), self.x.numpy()
 
-    def blocks(self) -> Iterator[_Block]:
-        """Edges ``BLOCK`` at a time, their W e and V s multiplied."""
-        source, target = self.edge_index.contiguous().numpy()
-        weight, even_weight = self.weight.t(), self.even_weight.t()
-        w, u, x = self.e.new_empty(3, BLOCK, self.weight.shape[0])
-        rows = [None] * -(-len(self.e) // BLOCK) if self.s is None else self.s.split(BLOCK)
-        for number, (e, s) in enumerate(zip(self.e.split(BLOCK), rows, strict=False)):  # of no edges, ``split`` makes one part
-            n = len(e)
-            if n < BLOCK:
-                w, u, x = w[:n], u[:n], x[:n]
-            torch.mm(e, weight, out=w)
-            if s is not None:
-                torch.mm(s, even_weight, out=u)
-            yield _Block(e, s, (source, target, number * BLOCK), w, u, x)
-
-    def activate(self, block: _Block) -> None:
-        """Fills ``block.x``."""
-        a, b, w, p, x = self.a.numpy(), self.b.numpy(), block.w.numpy(), self.slope.numpy()[0], block.x.numpy()
+    def multiply(self, first: int, count: int) -> tuple[np.ndarray, ...]:
+        """W e of a block, and V s where messages are odd."""
+        w, u, _ = self.arrays
+        torch.mm(self.e[first : first + count], self.weight, out=self.w[:count])
         if self.s is None:
-            _activate(a, b, w, p, *block.ends, x)
-        else:
-            _activate_odd(a, b, w, block.u.numpy(), p, *block.ends, x)
+            return (w,)
+        torch.mm(self.s[first : first + count], self.even_weight, out=self.u[:count])
+        return w, u
 
-
-@dataclass(frozen=True)
-class _Block:
-    """Some edges: their rows of e and s, their ends and the number of the first, W e, V s, and room for as many rows."""
-
-    e: Tensor
-    s: Tensor | None
-    ends: tuple[np.ndarray, np.ndarray, int]
-    w: Tensor
-    u: Tensor
-    x: Tensor
+    def activate(self, first: int, count: int, products: tuple[np.ndarray, ...]) -> Tensor:
+        """X of a block."""
+        kernel = _activate if self.s is None else _activate_odd
+        kernel(*self.rows, *products, self.slope, self.source, self.target, first, count, self.arrays[-1])
+        return self.x[:count]
 
 
 def _forward(layer: _Layer, out: tuple[Tensor, Tensor] | None, overwrites: bool) -> tuple[Tensor, Tensor, Tensor | None]:
     at_target, at_source = torch.zeros_like(layer.a), torch.zeros_like(layer.b)
-    new = None if out is None else layer.e if overwrites else torch.empty_like(layer.e)
-    states = iter(() if new is None else new.split(BLOCK))
-    for block in layer.blocks():
-        layer.activate(block)
-        sums = at_target.numpy(), at_source.numpy()
-        if out is None:
-            _sum(block.x.numpy(), *block.ends, *sums)
-            continue
-        weight, bias = out
-        state = next(states)
-        if not overwrites:
-            state.copy_(block.e)
-        m = torch.mm(block.x, weight.t(), out=block.w)
-        _update(m.numpy(), bias.numpy(), state.numpy(), *block.ends, *sums)
+    sums = at_target.numpy(), at_source.numpy()
+    ends = layer.source, layer.target
+    if out is None:
+        for block in blocks(len(layer.e)):
+            layer.activate(*block, layer.multiply(*block))
+            _sum(layer.arrays[-1], *ends, *block, *sums)
+        return at_target, at_source, None
+    new = layer.e if overwrites else torch.empty_like(layer.e)
+    old, written, weight, bias = layer.e.numpy(), None if overwrites else new.numpy(), out[0].t().contiguous(), out[1].numpy()
+    for block in blocks(len(layer.e)):
+        x = layer.activate(*block, layer.multiply(*block))
+        torch.mm(x, weight, out=layer.w[: len(x)])
+        _update(layer.arrays[0], bias, old, *ends, *block, written, *sums)
     return at_target, at_source, new
 
 
@@ -200,9 +180,9 @@ class _FusedLatent(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor, e: Tensor, s: Tensor | None, *others: Tensor) -> Any:
         weight, even_weight, slope, out_weight, out_bias, edge_index = others
-        ctx.is_odd, ctx.updates = s is not None, out_weight.numel() > 0
+        ctx.updates = out_weight.numel() > 0
         ctx.save_for_backward(a, b, e, s, *others)
-        layer = _layer(a, b, e, s, weight, even_weight, slope, edge_index)
+        layer = _Layer(a, b, e, s, weight, even_weight, slope, edge_index)
         at_target, at_source, new = _forward(layer, (out_weight.detach(), out_bias.detach()) if ctx.updates else None, False)
         return at_target, at_source, layer.e[:0] if new is None else new
 
@@ -210,53 +190,41 @@ class _FusedLatent(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_target: Tensor, grad_source: Tensor, grad_new: Tensor) -> Any:  # type: ignore[override]
         a, b, e, s, weight, even_weight, slope, out_weight, out_bias, edge_index = ctx.saved_tensors
-        layer = _layer(a, b, e, s, weight, even_weight, slope, edge_index)
-        arriving = grad_target.contiguous().numpy(), grad_source.contiguous().numpy()
-        p = slope.numpy()[0]
+        layer = _Layer(a, b, e, s, weight, even_weight, slope, edge_index)
+        ends, arriving = (layer.source, layer.target), (grad_target.contiguous().numpy(), grad_source.contiguous().numpy())
         grad_a, grad_b, grad_weight, grad_even_weight, grad_out_weight, grad_out_bias = (
             torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (a, b, weight, even_weight, out_weight, out_bias)
         )
-        grad_e = torch.empty_like(layer.e)
-        grad_s = torch.empty_like(layer.s) if layer.s is not None and ctx.needs_input_grad[3] else None
-        below = e.new_zeros(a.shape[1])
+        grad_e, grad_new = torch.empty_like(layer.e), grad_new.contiguous()
+        grad_s = torch.empty_like(s, memory_format=torch.contiguous_format) if s is not None and ctx.needs_input_grad[3] else None
+        below = a.new_zeros(a.shape[1])
         sums = grad_a.numpy(), grad_b.numpy(), below.numpy()
-        g, grad_m, even = e.new_empty(3, BLOCK, a.shape[1])
-        blocks, of_e = layer.blocks(), grad_e.split(BLOCK)
-        of_new = grad_new.contiguous().split(BLOCK) if ctx.updates else [None] * len(of_e)
-        of_s = [None] * len(of_e) if grad_s is None else grad_s.split(BLOCK)
-        for block, grad_e_rows, grad_new_rows, grad_s_rows in zip(blocks, of_e, of_new, of_s, strict=False):
-            n = len(block.e)
-            if n < BLOCK:
-                g, grad_m, even = g[:n], grad_m[:n], even[:n]
-            if grad_new_rows is None:
-                _gather_grad(*arriving, *block.ends, g.numpy())
+        g, grad_m, even = torch.empty_like(layer.x), torch.empty_like(layer.x), torch.empty_like(layer.x)
+        of_x, of_m, of_even, of_new, of_bias = (t.numpy() for t in (g, grad_m, even, grad_new, grad_out_bias))
+        for first, count in blocks(len(layer.e)):
+            block, rows = (first, count), slice(first, first + count)
+            products = layer.multiply(*block)
+            if ctx.updates:
+                x = layer.activate(*block, products)
+                _gather_message_grad(*arriving, of_new, *ends, *block, of_m, of_bias)
+                grad_out_weight.addmm_(grad_m[:count].t(), x)
+                torch.mm(grad_m[:count], out_weight, out=g[:count])
             else:
-                layer.activate(block)
-                _gather_message_grad(*arriving, grad_new_rows.numpy(), *block.ends, grad_m.numpy(), grad_out_bias.numpy())
-                grad_out_weight.addmm_(grad_m.t(), block.x)
-                torch.mm(grad_m, out_weight, out=g)
-            values = layer.a.numpy(), layer.b.numpy(), block.w.numpy()
-            if block.s is None:
-                _backward(*values, p, *block.ends, g.numpy(), *sums)
+                _gather_grad(*arriving, *ends, *block, of_x)
+            if s is None or layer.s is None:
+                _backward(*layer.rows, *products, layer.slope, *ends, *block, of_x, *sums)
             else:
-                _backward_odd(*values, block.u.numpy(), p, *block.ends, g.numpy(), even.numpy(), *sums)
-                grad_even_weight.addmm_(even.t(), block.s)
-                if grad_s_rows is not None:
-                    torch.mm(even, even_weight, out=grad_s_rows)
-            grad_weight.addmm_(g.t(), block.e)
-            torch.mm(g, weight, out=grad_e_rows)
-            if grad_new_rows is not None:
-                grad_e_rows += grad_new_rows
-        grads = grad_weight, grad_even_weight, below.sum().reshape(1), grad_out_weight, grad_out_bias
-        return grad_a, grad_b, grad_e, grad_s, *grads, None
-
-
-def _layer(
-    a: Tensor, b: Tensor, e: Tensor, s: Tensor | None, weight: Tensor, even_weight: Tensor, slope: Tensor, edge_index: Tensor
-) -> _Layer:
-    s = None if s is None else s.detach().contiguous()
-    a, b, e = (t.detach().contiguous() for t in (a, b, e))
-    return _Layer(a, b, e, s, weight.detach(), even_weight.detach(), slope.detach(), edge_index)
+                _backward_odd(*layer.rows, *products, layer.slope, *ends, *block, of_x, of_even, *sums)
+                grad_even_weight.addmm_(even[:count].t(), layer.s[rows])
+                if grad_s is not None:
+                    torch.mm(even[:count], even_weight, out=grad_s[rows])
+            grad_weight.addmm_(g[:count].t(), layer.e[rows])
+            if ctx.updates:
+                torch.mm(g[:count], weight, out=layer.w[:count])
+                torch.add(layer.w[:count], grad_new[rows], out=grad_e[rows])
+            else:
+                torch.mm(g[:count], weight, out=grad_e[rows])
+        return grad_a, grad_b, grad_e, grad_s, grad_weight, grad_even_weight, below.sum().reshape(1), grad_out_weight, grad_out_bias, None
 
 
 def fused_latent(
@@ -283,7 +251,7 @@ def fused_latent(
     c, bias = out if out is not None else (e.new_empty(0, 0), None)
     bias = c.new_zeros(len(c)) if bias is None else bias
     if not torch.is_grad_enabled():
-        layer = _layer(a, b, e, s, weight, even_weight, slope, edge_index)
+        layer = _Layer(a, b, e, s, weight, even_weight, slope, edge_index)
         return _forward(layer, None if out is None else (c.detach(), bias.detach()), overwrites)
     at_target, at_source, new = _FusedLatent.apply(a, b, e, s, weight, even_weight, slope, c, bias, edge_index)  # type: ignore[no-untyped-call]
     return at_target, at_source, new if out is not None else None

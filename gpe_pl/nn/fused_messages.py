@@ -19,8 +19,10 @@ from jaxtyping import Float, Int64
 from numba import njit
 from torch import Tensor
 
+from gpe_pl.nn.fused import FASTMATH
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
+
+@njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _add_up(z, a, b, e, w, i, j, k):
     """Z of edge k, from j to i."""
@@ -32,7 +34,7 @@ def _add_up(z, a, b, e, w, i, j, k):
             z[c] += feature * w[q, c]
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
+@njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _forward(a, b, e, w, slope, source, target, at_target, at_source):
     width = a.shape[1]
@@ -46,7 +48,7 @@ def _forward(a, b, e, w, slope, source, target, at_target, at_source):
             at_source[j, c] -= x
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "nsz", "arcp"})
+@njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _backward(a, b, e, w, slope, source, target, grad_target, grad_source, grad_a, grad_b, grad_e, grad_w, grad_slope):
     width, channels = a.shape[1], e.shape[1]
@@ -114,10 +116,3 @@ def fused_messages(
     ``edge_index`` must hold rows that exist: nothing is checked.
     """
     return _FusedMessages.apply(a, b, e, weight, slope, edge_index)  # type: ignore[no-untyped-call,return-value]
-
-
-def works_on(*tensors: Tensor) -> bool:
-    """Whether ``fused_messages`` can take these tensors, here and now."""
-    first = tensors[0]
-    alike = all(t.device.type == "cpu" and t.dtype == first.dtype for t in tensors)
-    return alike and first.dtype in (torch.float32, torch.float64) and not torch.compiler.is_compiling()

@@ -20,8 +20,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch_geometric.nn import MessagePassing
 
+from gpe_pl.nn.fused import works_on
 from gpe_pl.nn.fused_latent import fused_latent
-from gpe_pl.nn.fused_messages import fused_messages, works_on
+from gpe_pl.nn.fused_messages import fused_messages
 
 Interaction = Literal["directed", "negated", "odd", "odd_even"]
 EdgeState = Literal["latent", "geometry"]

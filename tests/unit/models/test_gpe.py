@@ -179,7 +179,7 @@ def test_pair_forces_push_two_materials_apart_equally() -> None:
 def test_affine_embedding_interpolates_as_the_paper_says(kind: str) -> None:
     """Θ(λv₁ + (1−λ)v₂) = λΘ(v₁) + (1−λ)Θ(v₂) holds for ``affine`` and, generically, not for ``mlp``."""
     torch.manual_seed(0)
-    theta = MaterialEmbedding(1, 32, kind).double()  # type: ignore[arg-type]
+    theta = MaterialEmbedding(1, 32, kind, is_fused=True).double()  # type: ignore[arg-type]
     v1, v2 = torch.tensor([[-1.3]], dtype=DOUBLE), torch.tensor([[2.1]], dtype=DOUBLE)
     errors = [(theta(x * v1 + (1 - x) * v2) - x * theta(v1) - (1 - x) * theta(v2)).norm() for x in torch.linspace(-1, 2, 7, dtype=DOUBLE)]
     assert (max(errors) < 1e-13) == (kind == "affine")

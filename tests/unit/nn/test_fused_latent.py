@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gpe_pl.nn import fused_latent as module
-from gpe_pl.nn import momentum_conv
+from gpe_pl.nn import fused, momentum_conv
 from gpe_pl.nn.fused_latent import fused_latent
 from gpe_pl.nn.momentum_conv import MomentumConv
 
@@ -17,7 +16,7 @@ WIDTH, EVEN = 6, 3
 
 @pytest.fixture(autouse=True)
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "BLOCK", 16)
+    monkeypatch.setattr(fused, "BLOCK", 16)
 
 
 def inputs(num_edges: int, dtype: torch.dtype, is_odd: bool) -> tuple[list[Tensor], Tensor]:
@@ -44,7 +43,7 @@ def plain(values: list[Tensor], edges: Tensor, is_odd: bool, update: bool) -> li
     return [*sums, e + m] if update else sums
 
 
-def fused(values: list[Tensor], edges: Tensor, is_odd: bool, update: bool) -> list[Tensor]:
+def in_blocks(values: list[Tensor], edges: Tensor, is_odd: bool, update: bool) -> list[Tensor]:
     a, b, e, s, weight, even, slope, out, bias = values
     c = (out, None if is_odd else bias) if update else None
     found = fused_latent(a, b, e, s if is_odd else None, weight, even, slope, c, edges)
@@ -60,7 +59,7 @@ def test_results_and_gradients_equal_the_plain_ones(
     num_edges: int, is_odd: bool, update: bool, dtype: torch.dtype, tolerance: float
 ) -> None:
     results = []
-    for function in (plain, fused):
+    for function in (plain, in_blocks):
         values, edges = inputs(num_edges, dtype, is_odd)
         for value in values:
             value.requires_grad_()
@@ -99,14 +98,14 @@ def test_views_are_read_as_they_are(has_gradient: bool) -> None:
     turned = [v.t().contiguous().t() if v.dim() == 2 else v for v in values]
     edges = edges.flip(0).contiguous().flip(0)
     with torch.set_grad_enabled(has_gradient):
-        for x, y in zip(fused(turned, edges, True, True), plain(values, edges, True, True), strict=True):
+        for x, y in zip(in_blocks(turned, edges, True, True), plain(values, edges, True, True), strict=True):
             torch.testing.assert_close(x, y, rtol=1e-12, atol=1e-12)
 
 
 def test_not_a_number_stays_one() -> None:
     values, edges = inputs(20, torch.float64, is_odd=False)
     values[2][4, 1] = float("nan")
-    at_target, at_source, state = fused(values, edges, False, True)
+    at_target, at_source, state = in_blocks(values, edges, False, True)
     assert at_target[edges[1, 4]].isnan().all() and at_source[edges[0, 4]].isnan().all() and state[4].isnan().all()
     assert state[5].isfinite().all()
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gpe_pl.nn import momentum_conv
-from gpe_pl.nn.fused_messages import fused_messages, works_on
+from gpe_pl.nn.fused_messages import fused_messages
 from gpe_pl.nn.momentum_conv import MomentumConv
 
 
@@ -58,13 +58,6 @@ def test_not_a_number_stays_one() -> None:
     at_target, at_source = fused_messages(a, b, e, weight, slope, index)
     assert at_target[index[1, 4]].isnan().all()
     assert at_source[index[0, 4]].isnan().all()
-
-
-def test_other_devices_and_precisions_are_declined() -> None:
-    assert works_on(torch.zeros(1), torch.zeros(2))
-    assert not works_on(torch.zeros(1), torch.zeros(1, dtype=torch.float64))
-    assert not works_on(torch.zeros(1, dtype=torch.bfloat16))
-    assert not works_on(torch.zeros(1, device="meta"))
 
 
 def test_a_layer_without_edge_states_takes_it_and_stays_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

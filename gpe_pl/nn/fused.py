@@ -1,0 +1,32 @@
+"""What the passes that are made for a CPU share: when they work, and how many rows they take at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+BLOCK = 512
+"""Rows at a time: at 128 channels in single precision an array of a block takes 256 KiB, and a handful of them fit a core's second-level cache."""
+FASTMATH = {"contract", "nsz", "arcp"}
+"""What compiled loops may do with sums and products; not-a-numbers and infinities stay what they are."""
+
+
+def works_on(*tensors: Tensor) -> bool:
+    """Whether these passes can take the tensors, here and now."""
+    first = tensors[0]
+    alike = all(t.device.type == "cpu" and t.dtype == first.dtype for t in tensors)
+    is_traced = torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu")
+    return alike and first.dtype in (torch.float32, torch.float64) and not is_traced
+
+
+def block_size(num_rows: int) -> int:
+    """Rows of the largest block."""
+    return min(BLOCK, num_rows)
+
+
+def blocks(num_rows: int) -> Iterator[tuple[int, int]]:
+    """First row and number of rows of every block."""
+    for first in range(0, num_rows, BLOCK):
+        yield first, min(BLOCK, num_rows - first)
