@@ -359,10 +359,9 @@ class GPE(nn.Module):
                     at_target, at_source, state = conv(
                         h[source], h[target], edge_index, e[relation], even, update_edges, chunk, is_inference
                     )
-                    if target in receivers:
-                        total[target] = total[target] + at_target if target in total else at_target
-                    if source in receivers and self.type_key(source) in updates:
-                        total[source] = total[source] + at_source if source in total else at_source
+                    for node_type, arriving in ((target, at_target), (source, at_source)):
+                        if arriving is not None and node_type in receivers and self.type_key(node_type) in updates:
+                            total[node_type] = total[node_type] + arriving if node_type in total else arriving
                     if update_edges:
                         e[relation] = state
                 for node_type, rows in receivers.items():

@@ -158,9 +158,11 @@ class _Layer:
         return self.x[:count]
 
 
-def _forward(layer: _Layer, out: tuple[Tensor, Tensor] | None, overwrites: bool) -> tuple[Tensor, Tensor, Tensor | None]:
-    at_target, at_source = torch.zeros_like(layer.a), torch.zeros_like(layer.b)
-    sums = at_target.numpy(), at_source.numpy()
+def _forward(
+    layer: _Layer, out: tuple[Tensor, Tensor] | None, is_joint: bool, overwrites: bool
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    at_target, at_source = torch.zeros_like(layer.a), None if is_joint else torch.zeros_like(layer.b)
+    sums = [(at_target if s is None else s).numpy() for s in (at_target, at_source)]
     ends = layer.source, layer.target
     if out is None:
         for block in blocks(len(layer.e)):
@@ -178,25 +180,26 @@ def _forward(layer: _Layer, out: tuple[Tensor, Tensor] | None, overwrites: bool)
 
 class _FusedLatent(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor, e: Tensor, s: Tensor | None, *others: Tensor) -> Any:
+    def forward(ctx: Any, is_joint: bool, a: Tensor, b: Tensor, e: Tensor, s: Tensor | None, *others: Tensor) -> Any:
         weight, even_weight, slope, out_weight, out_bias, edge_index = others
         ctx.updates = out_weight.numel() > 0
         ctx.save_for_backward(a, b, e, s, *others)
         layer = _Layer(a, b, e, s, weight, even_weight, slope, edge_index)
-        at_target, at_source, new = _forward(layer, (out_weight.detach(), out_bias.detach()) if ctx.updates else None, False)
+        at_target, at_source, new = _forward(layer, (out_weight.detach(), out_bias.detach()) if ctx.updates else None, is_joint, False)
         return at_target, at_source, layer.e[:0] if new is None else new
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad_target: Tensor, grad_source: Tensor, grad_new: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, grad_target: Tensor, grad_source: Tensor | None, grad_new: Tensor) -> Any:  # type: ignore[override]
         a, b, e, s, weight, even_weight, slope, out_weight, out_bias, edge_index = ctx.saved_tensors
         layer = _Layer(a, b, e, s, weight, even_weight, slope, edge_index)
-        ends, arriving = (layer.source, layer.target), (grad_target.contiguous().numpy(), grad_source.contiguous().numpy())
+        ends = layer.source, layer.target
+        arriving = [(grad_target if g is None else g).contiguous().numpy() for g in (grad_target, grad_source)]
         grad_a, grad_b, grad_weight, grad_even_weight, grad_out_weight, grad_out_bias = (
             torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (a, b, weight, even_weight, out_weight, out_bias)
         )
         grad_e, grad_new = torch.empty_like(layer.e), grad_new.contiguous()
-        grad_s = torch.empty_like(s, memory_format=torch.contiguous_format) if s is not None and ctx.needs_input_grad[3] else None
+        grad_s = torch.empty_like(s, memory_format=torch.contiguous_format) if s is not None and ctx.needs_input_grad[4] else None
         below = a.new_zeros(a.shape[1])
         sums = grad_a.numpy(), grad_b.numpy(), below.numpy()
         g, grad_m, even = torch.empty_like(layer.x), torch.empty_like(layer.x), torch.empty_like(layer.x)
@@ -224,7 +227,19 @@ class _FusedLatent(torch.autograd.Function):
                 torch.add(layer.w[:count], grad_new[rows], out=grad_e[rows])
             else:
                 torch.mm(g[:count], weight, out=grad_e[rows])
-        return grad_a, grad_b, grad_e, grad_s, grad_weight, grad_even_weight, below.sum().reshape(1), grad_out_weight, grad_out_bias, None
+        return (
+            None,
+            grad_a,
+            grad_b,
+            grad_e,
+            grad_s,
+            grad_weight,
+            grad_even_weight,
+            below.sum().reshape(1),
+            grad_out_weight,
+            grad_out_bias,
+            None,
+        )
 
 
 def fused_latent(
@@ -237,8 +252,9 @@ def fused_latent(
     slope: Float[Tensor, " 1"],
     out: tuple[Float[Tensor, "hidden hidden"], Float[Tensor, " hidden"] | None] | None,
     edge_index: Int64[Tensor, "2 edge"],
+    is_joint: bool = False,
     overwrites: bool = False,
-) -> tuple[Float[Tensor, "target hidden"], Float[Tensor, "source hidden"], Float[Tensor, "edge state"] | None]:
+) -> tuple[Float[Tensor, "target hidden"], Float[Tensor, "source hidden"] | None, Float[Tensor, "edge state"] | None]:
     """T, S and e' of the module's text, on the CPU in single or double precision; differentiable once in all but ``edge_index``.
 
     ``edge_index`` must hold rows that exist: nothing is checked.
@@ -246,12 +262,13 @@ def fused_latent(
     Args:
         s: for odd messages, which need both ends of an edge to be of one type: a and b then have the same rows; None for the others.
         out: C, and c if there is one; states then have as many channels as the messages. None: T and S are sums of x, and there is no e'.
+        is_joint: both ends are of one type: return T + S, and None in place of S.
         overwrites: e' may take the place of e in memory, where no gradient is asked for.
     """
     c, bias = out if out is not None else (e.new_empty(0, 0), None)
     bias = c.new_zeros(len(c)) if bias is None else bias
     if not torch.is_grad_enabled():
         layer = _Layer(a, b, e, s, weight, even_weight, slope, edge_index)
-        return _forward(layer, None if out is None else (c.detach(), bias.detach()), overwrites)
-    at_target, at_source, new = _FusedLatent.apply(a, b, e, s, weight, even_weight, slope, c, bias, edge_index)  # type: ignore[no-untyped-call]
+        return _forward(layer, None if out is None else (c.detach(), bias.detach()), is_joint, overwrites)
+    at_target, at_source, new = _FusedLatent.apply(is_joint, a, b, e, s, weight, even_weight, slope, c, bias, edge_index)  # type: ignore[no-untyped-call]
     return at_target, at_source, new if out is not None else None

@@ -78,23 +78,24 @@ def _backward(a, b, e, w, slope, source, target, grad_target, grad_source, grad_
 
 class _FusedMessages(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, a: Tensor, b: Tensor, e: Tensor, weight: Tensor, slope: Tensor, edge_index: Tensor) -> Any:
+    def forward(ctx: Any, a: Tensor, b: Tensor, e: Tensor, weight: Tensor, slope: Tensor, edge_index: Tensor, is_joint: bool) -> Any:
         ctx.save_for_backward(a, b, e, weight, slope, edge_index)
-        at_target, at_source = torch.zeros_like(a), torch.zeros_like(b)
-        _forward(*_arrays(a, b, e, weight, slope, edge_index), at_target.numpy(), at_source.numpy())
+        at_target, at_source = torch.zeros_like(a), None if is_joint else torch.zeros_like(b)
+        sums = [(at_target if s is None else s).numpy() for s in (at_target, at_source)]
+        _forward(*_arrays(a, b, e, weight, slope, edge_index), *sums)
         return at_target, at_source
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad_target: Tensor, grad_source: Tensor) -> Any:  # type: ignore[override]
+    def backward(ctx: Any, grad_target: Tensor, grad_source: Tensor | None) -> Any:  # type: ignore[override]
         a, b, e, weight, slope, edge_index = ctx.saved_tensors
         grad_a, grad_b, grad_slope = torch.zeros_like(a), torch.zeros_like(b), torch.zeros_like(slope)
         grad_e = torch.zeros_like(e) if ctx.needs_input_grad[2] else e[:0].detach().clone()
         grad_w = e.new_zeros(e.shape[1], a.shape[1])
-        grads = [g.contiguous().numpy() for g in (grad_target, grad_source)]
+        grads = [(grad_target if g is None else g).contiguous().numpy() for g in (grad_target, grad_source)]
         out = [g.numpy() for g in (grad_a, grad_b, grad_e, grad_w, grad_slope)]
         _backward(*_arrays(a, b, e, weight, slope, edge_index), *grads, *out)
-        return grad_a, grad_b, grad_e if ctx.needs_input_grad[2] else None, grad_w.t(), grad_slope, None
+        return grad_a, grad_b, grad_e if ctx.needs_input_grad[2] else None, grad_w.t(), grad_slope, None, None
 
 
 def _arrays(a: Tensor, b: Tensor, e: Tensor, weight: Tensor, slope: Tensor, edge_index: Tensor) -> tuple[Any, ...]:
@@ -110,9 +111,13 @@ def fused_messages(
     weight: Float[Tensor, "hidden feature"],
     slope: Float[Tensor, " 1"],
     edge_index: Int64[Tensor, "2 edge"],
-) -> tuple[Float[Tensor, "target hidden"], Float[Tensor, "source hidden"]]:
+    is_joint: bool = False,
+) -> tuple[Float[Tensor, "target hidden"], Float[Tensor, "source hidden"] | None]:
     """T and S of the module's text, on the CPU in single or double precision; differentiable once in all but ``edge_index``.
 
     ``edge_index`` must hold rows that exist: nothing is checked.
+
+    Args:
+        is_joint: both ends are of one type: return T + S, and None.
     """
-    return _FusedMessages.apply(a, b, e, weight, slope, edge_index)  # type: ignore[no-untyped-call,return-value]
+    return _FusedMessages.apply(a, b, e, weight, slope, edge_index, is_joint)  # type: ignore[no-untyped-call,return-value]

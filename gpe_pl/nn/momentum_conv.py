@@ -31,6 +31,9 @@ RAW = 32
 """Up to so many edge channels are multiplied where they are used; more go through a matrix product."""
 MaybeTensor = Optional[Tensor]  # noqa: UP045 - PyG's code generator reads the signatures below and does not understand unions written with |
 
+Ends = tuple[Tensor, MaybeTensor]
+"""Sums at targets and at sources; or in one array at both, which are nodes of one type, and None."""
+
 
 def orient(edge_index: Int64[Tensor, "2 edge"], odd: Float[Tensor, "edge odd"]) -> tuple[Tensor, Tensor]:
     """Turn every edge so that its first non-zero odd channel is positive: a rule of geometry, independent of node labels.
@@ -85,16 +88,17 @@ class MomentumConv(MessagePassing):
         update_edges: bool = True,
         edges_at_once: int | None = None,
         overwrites: bool = False,
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    ) -> tuple[Tensor, Tensor | None, Tensor | None]:
         """Sums of messages at the target nodes, at the source nodes, and the new edge states e_ij + m_ij, which need as many channels as the messages.
 
-        Without ``update_edges`` the last linear map is applied after the sum (it commutes), once per node instead of once per edge; the new states are
-        then None. In a relation of one type with itself pass the same tensor twice and add the two sums.
+        In a relation of one type with itself pass the same tensor twice: the first result then has what its nodes get as targets and as sources, and the
+        second is None. Without ``update_edges`` the last linear map is applied after the sum (it commutes), once per node instead of once per edge; the
+        new states are then None.
 
         For inference: with ``edges_at_once``, what is computed on the way exists for so many edges only, and with ``overwrites``, new edge states may take
         the place of the old ones in memory.
         """
-        size = (h_source.shape[0], h_target.shape[0])
+        size, is_joint = (h_source.shape[0], h_target.shape[0]), h_source is h_target
         if self._is_fused(h_source, h_target, e):
             return self._fused(h_source, h_target, edge_index, e, s, update_edges, overwrites)
         w = None
@@ -105,18 +109,17 @@ class MomentumConv(MessagePassing):
             both = self.interaction != "negated"  # also z_ji is needed
             at = functional.linear(h_target, a, self.lin_in.bias)
             bs = functional.linear(h_source, b)
-            same = h_source is h_target
-            as_ = (at if same else functional.linear(h_source, a, self.lin_in.bias)) if both else None
-            bt = (bs if same else functional.linear(h_target, b)) if both else None
+            as_ = (at if is_joint else functional.linear(h_source, a, self.lin_in.bias)) if both else None
+            bt = (bs if is_joint else functional.linear(h_target, b)) if both else None
             terms = {
                 "a": (as_, at),
                 "b": (bs, bt),
                 "s": s if self.is_odd and self.widths[3] else None,
             }
         if edges_at_once is not None and edges_at_once < edge_index.shape[1]:
-            return self._in_parts(edge_index, e, w, terms, size, update_edges, edges_at_once, overwrites)
+            return self._in_parts(edge_index, e, w, terms, size, is_joint, update_edges, edges_at_once, overwrites)
         terms["e"] = e if w is None else functional.linear(e, w)
-        at_target, at_source, messages = self.propagate(edge_index, size=size, with_messages=update_edges, **terms)
+        at_target, at_source, messages = self.propagate(edge_index, size=size, is_joint=is_joint, with_messages=update_edges, **terms)
         return at_target, at_source, e + messages if update_edges else None
 
     def _is_fused(self, h_source: Tensor, h_target: Tensor, e: Tensor) -> bool:
@@ -126,20 +129,21 @@ class MomentumConv(MessagePassing):
 
     def _fused(
         self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, e: Tensor, s: Tensor, update_edges: bool, overwrites: bool
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    ) -> tuple[Tensor, Tensor | None, Tensor | None]:
+        is_joint = h_source is h_target
         a, b, w, v = self.lin_in.weight.split(self.widths, dim=1)
         at, bs = functional.linear(h_target, a, self.lin_in.bias), functional.linear(h_source, b)
         if update_edges or self.is_odd or self.widths[2] > RAW:
             out = (self.lin_out.weight, self.lin_out.bias) if update_edges else None
             even = s if self.is_odd else None
-            at_target, at_source, state = fused_latent(at, bs, e, even, w, v, self.act.weight, out, edge_index, overwrites)
+            at_target, at_source, state = fused_latent(at, bs, e, even, w, v, self.act.weight, out, edge_index, is_joint, overwrites)
         else:
-            at_target, at_source = fused_messages(at, bs, e, w, self.act.weight, edge_index)
+            at_target, at_source = fused_messages(at, bs, e, w, self.act.weight, edge_index, is_joint)
             state = None
         if update_edges:
             return at_target, at_source, state
         j, i = edge_index
-        return self._last_linear(at_target, i, 1), self._last_linear(at_source, j, -1), None
+        return *self._last_linear(at_target, at_source, i, j, -1), None
 
     def _in_parts(
         self,
@@ -148,14 +152,15 @@ class MomentumConv(MessagePassing):
         w: MaybeTensor,
         terms: dict[str, Any],
         size: tuple[int, int],
+        is_joint: bool,
         update_edges: bool,
         chunk: int,
         overwrites: bool,
-    ) -> tuple[Tensor, Tensor, MaybeTensor]:
+    ) -> tuple[Tensor, MaybeTensor, MaybeTensor]:
         """What follows the products per node, for ``chunk`` edges after the other."""
         count, width = edge_index.shape[1], self.lin_out.in_features
-        at_source, at_target = (e.new_zeros(n, width) for n in size)
-        even_source, even_target = (at_source, at_target) if self.lin_even is None else (e.new_zeros(n, width) for n in size)
+        sums = _zeros(e, width, size[1], size[0], is_joint)
+        evens = None if self.lin_even is None else _zeros(e, width, size[1], size[0], is_joint)
         directions, sign = e.split(count), 1  # of ``directed`` two
         new = None if not update_edges else e if overwrites else torch.empty_like(e)
         for first in range(0, count, chunk):
@@ -168,19 +173,13 @@ class MomentumConv(MessagePassing):
             s = None if terms["s"] is None else terms["s"][part]
             forward, reverse = cast(Any, self.message(**ends, e=edge if w is None else functional.linear(edge, w), s=s))
             x, y, sign = self._outgoing(forward, reverse, update_edges)
-            at_target.index_add_(0, i, x)
-            at_source.index_add_(0, j, y, alpha=sign)
+            _add(sums, x, y, i, j, sign)
             if new is not None:
                 for updated, state, message in zip(new.split(count), directions, (x, y), strict=False):
                     torch.add(state[part], message, out=updated[part])
-            if self.lin_even is not None:
-                even_target.index_add_(0, i, forward + reverse)
-                even_source.index_add_(0, j, forward + reverse)
-        if not update_edges:
-            at_target, at_source = self._last_linear(at_target, edge_index[1], 1), self._last_linear(at_source, edge_index[0], sign)
-        if self.lin_even is not None:
-            at_target, at_source = at_target + self.lin_even(even_target), at_source + self.lin_even(even_source)
-        return at_target, at_source, new
+            if evens is not None:
+                _add(evens, forward + reverse, forward + reverse, i, j, 1)
+        return *self._finished(sums, evens, edge_index[1], edge_index[0], sign, update_edges), new
 
     def message(
         self, a_i: MaybeTensor, a_j: MaybeTensor, b_i: MaybeTensor, b_j: MaybeTensor, e: Tensor, s: MaybeTensor
@@ -222,19 +221,20 @@ class MomentumConv(MessagePassing):
         edge_index_j: Tensor,
         size_i: int,
         size_j: int,
+        is_joint: bool,
         with_messages: bool,
-    ) -> tuple[Tensor, Tensor, MaybeTensor]:
+    ) -> tuple[Tensor, MaybeTensor, MaybeTensor]:
         """Sums at targets and sources: +m and −m, or for ``directed`` each its own."""
         forward, reverse = inputs
         x, y, sign = self._outgoing(forward, reverse, with_messages)
         messages = None if not with_messages else torch.cat([x, y]) if self.interaction == "directed" else x
-        at_target = self._sum(x, edge_index_i, size_i, 1, with_messages)
-        at_source = self._sum(y, edge_index_j, size_j, sign, with_messages)
+        i, j, width = edge_index_i, edge_index_j, x.shape[1]
+        sums = _add(_zeros(x, width, size_i, size_j, is_joint), x, y, i, j, sign)
+        evens = None
         if self.lin_even is not None:
             even = forward + reverse
-            at_target = at_target + self.lin_even(even.new_zeros(size_i, even.shape[1]).index_add(0, edge_index_i, even))
-            at_source = at_source + self.lin_even(even.new_zeros(size_j, even.shape[1]).index_add(0, edge_index_j, even))
-        return at_target, at_source, messages
+            evens = _add(_zeros(even, width, size_i, size_j, is_joint), even, even, i, j, 1)
+        return *self._finished(sums, evens, i, j, sign, with_messages), messages
 
     def _outgoing(self, forward: Tensor, reverse: Any, with_messages: bool) -> tuple[Tensor, Tensor, int]:
         """What targets get, and what sources get with a sign: messages, or the activations before the last linear map."""
@@ -245,14 +245,37 @@ class MomentumConv(MessagePassing):
         m = self.lin_out(x)
         return m, self.lin_out(y) if self.interaction == "directed" else m, sign
 
-    def _sum(self, x: Tensor, index: Tensor, size: int, sign: int, are_messages: bool) -> Tensor:
-        """±Σ of messages, or of activations that the last linear map then turns into messages."""
-        total = x.new_zeros(size, x.shape[1]).index_add_(0, index, x, alpha=sign)
-        return total if are_messages else self._last_linear(total, index, sign)
+    def _finished(self, sums: Ends, evens: Ends | None, i: Tensor, j: Tensor, sign: int, are_messages: bool) -> Ends:
+        """Sums of messages, from sums of messages or of activations; and of even activations, where there are any."""
+        at_target, at_source = sums if are_messages else self._last_linear(*sums, i, j, sign)
+        if self.lin_even is None or evens is None:
+            return at_target, at_source
+        even_target, even_source = evens
+        return at_target + self.lin_even(even_target), at_source if even_source is None else at_source + self.lin_even(even_source)
 
-    def _last_linear(self, total: Tensor, index: Tensor, sign: int) -> Tensor:
-        """Sums of messages from sums of activations, of as many edges as ``index`` names a node."""
-        if self.lin_out.bias is None:
-            return functional.linear(total, self.lin_out.weight)
-        degree = total.new_zeros(total.shape[0]).index_add_(0, index, total.new_ones(index.shape[0]), alpha=sign)
-        return torch.addmm(degree[:, None] * self.lin_out.bias, total, self.lin_out.weight.t())
+    def _last_linear(self, at_target: Tensor, at_source: MaybeTensor, i: Tensor, j: Tensor, sign: int) -> Ends:
+        """Sums of messages from sums of activations, of edges with targets i and, with a sign, sources j."""
+        ends = [(at_target, (i, 1), (j, sign))] if at_source is None else [(at_target, (i, 1)), (at_source, (j, sign))]
+        totals = []
+        for total, *edges in ends:
+            y = functional.linear(total, self.lin_out.weight)
+            if self.lin_out.bias is not None:
+                degree = total.new_zeros(total.shape[0])
+                for index, alpha in edges:
+                    degree.index_add_(0, index, total.new_ones(index.shape[0]), alpha=alpha)
+                y = y.addr_(degree, self.lin_out.bias)
+            totals.append(y)
+        return totals[0], None if at_source is None else totals[1]
+
+
+def _zeros(like: Tensor, width: int, num_target: int, num_source: int, is_joint: bool) -> Ends:
+    """Room for sums at targets and sources, or in one array for both."""
+    return like.new_zeros(num_target, width), None if is_joint else like.new_zeros(num_source, width)
+
+
+def _add(sums: Ends, x: Tensor, y: Tensor, i: Tensor, j: Tensor, sign: int) -> Ends:
+    """Adds x at the targets i, and ±y at the sources j, in place."""
+    at_target, at_source = sums
+    at_target.index_add_(0, i, x)
+    (at_target if at_source is None else at_source).index_add_(0, j, y, alpha=sign)
+    return sums

@@ -123,7 +123,7 @@ def test_a_layer_takes_it_and_stays_the_same(interaction: str, update: bool, mon
         h, e, s = (torch.randn(n, w, dtype=torch.float64) for n, w in ((9, WIDTH), (30, WIDTH), (30, EVEN)))
         edges = torch.randint(0, 9, (2, 30))
         found = conv(h, h, edges, e, s, update)
-        (found[0].square().sum() + found[1].sin().sum()).backward()
+        found[0].sin().sum().backward()
         results.append([value for value in found if value is not None] + [p.grad for p in conv.parameters()])
     assert len(calls) == 1
     for x, y in zip(*results, strict=True):

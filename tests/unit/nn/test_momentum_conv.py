@@ -83,6 +83,31 @@ def test_what_one_end_gains_the_other_loses(interaction: str) -> None:
     torch.testing.assert_close(at_target.sum(dim=0), -at_source.sum(dim=0))
 
 
+@pytest.mark.parametrize("update_edges", [True, False])
+@pytest.mark.parametrize("edges_at_once", [None, 7])
+@pytest.mark.parametrize("implementation", ["factored", "plain"])
+@pytest.mark.parametrize("interaction", KINDS)
+def test_nodes_of_one_type_get_both_sums_in_one(
+    interaction: str, implementation: str, edges_at_once: int | None, update_edges: bool
+) -> None:
+    """Equal to the sum of two, also in gradients, and where an edge joins a node to itself."""
+    h, _, edges, e, s = problem(interaction, num_target=7)
+    edges[:, 0] = 2
+    results = []
+    for source in (h, h.clone()):
+        conv = make(interaction, implementation)
+        with torch.set_grad_enabled(edges_at_once is None):
+            at_target, at_source, state = conv(source, h, edges, e, s, update_edges, edges_at_once)
+        assert (at_source is None) == (source is h) and (state is not None) == update_edges
+        total = at_target if at_source is None else at_target + at_source
+        if edges_at_once is None:
+            total.sin().sum().backward()
+        grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in conv.parameters()]
+        results.append([total, *grads, *([state] if update_edges else [])])
+    for found, expected in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-11, atol=1e-12)
+
+
 def test_no_edges_give_zero_sums() -> None:
     for interaction in KINDS:
         hs, ht, _, e, s = problem(interaction, num_edges=0)
