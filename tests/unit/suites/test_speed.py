@@ -34,7 +34,7 @@ def test_products_are_counted_as_by_hand() -> None:
     counted = flop(Case().build(spec, steps, hidden), graph)
     square = 2 * hidden * hidden
     nodes = 50 * (2 * hidden * (1 + spec.node_channels["sand"] + hidden) + square)  # material embedding and encoder
-    nodes += 50 * (steps * 4 * square + 2 * square)  # two factors, two layers of the update; the last product after the sums, at both ends
+    nodes += 50 * (steps * 4 * square + square)  # two factors, two layers of the update; the last product after the sums
     nodes += 50 * (square + 2 * hidden * 2)  # decoder
     per_edge = 2 * features * hidden + square + steps * square + (steps - 1) * square
     assert counted == nodes + edges * per_edge
