@@ -14,19 +14,15 @@ from gpe_pl.schema import node_code, param_names
 from gpe_pl.trajectory import Boundary, Metadata, State
 
 
-def lattice_scene(
-    num_nodes: int, num_edges: int, config: GraphConfig, dim: int = 2, seed: int = 0, is_sorted: bool = False
-) -> tuple[GraphBuilder, State]:
+def lattice_scene(num_nodes: int, num_edges: int, config: GraphConfig, dim: int = 2, seed: int = 0) -> tuple[GraphBuilder, State]:
     """About ``num_edges`` undirected edges between ``num_nodes`` nodes in a unit square or cube.
 
-    Nodes are in random order, as a simulation leaves them, or with ``is_sorted`` so that nodes close in space are mostly close in memory.
+    Nodes are in random order, as a simulation leaves them.
     """
     rng = np.random.default_rng(seed)
     side = int(np.ceil(num_nodes ** (1 / dim)))
     lattice = np.stack(np.meshgrid(*[np.arange(side)] * dim), axis=-1).reshape(-1, dim)
     pos = (rng.permutation(lattice)[:num_nodes] + rng.uniform(-0.25, 0.25, (num_nodes, dim))) / side
-    if is_sorted:
-        pos = pos[cKDTree(pos).indices]
     metadata = Metadata(
         dataset="synthetic",
         materials=("sand",),

@@ -41,7 +41,7 @@ Scene = dict[str, Tensor]
 """Tensors by the names of ``describe``."""
 
 DESCRIPTION = "description.json"
-EVERYTHING = Skips(absent_types=False, isolated_nodes=False, edges_at_once=None)
+EVERYTHING = Skips(absent_types=False, isolated_nodes=False, edges_at_once=None, sorted_from=None)
 """What a program computes cannot depend on the values in its scene."""
 BOUNDARY_FIELDS = ("pos", "vel", "normal", "friction", "restitution")
 

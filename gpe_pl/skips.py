@@ -21,6 +21,7 @@ class Skips:
         static_boundary: exact. The boundary is sorted into a search tree once, not in every step.
         isolated_nodes: exact. Nodes without an edge take no part in message passing.
         edges_at_once: exact. Edge features and messages are computed for so many edges at a time, which bounds the memory; None: all together.
+        sorted_from: exact. Graphs of so many nodes and more are computed with neighbours near each other in memory; None: none.
         stress: leaves out the stress that a model decodes beside the motion; the motion stays as it is.
         sleep_after: approximate. Groups of connected nodes that have been at rest for so many frames stand still until something moves in their
             reach; None: never.
@@ -32,6 +33,7 @@ class Skips:
     static_boundary: bool = True
     isolated_nodes: bool = True
     edges_at_once: Annotated[int, Field(ge=1)] | None = 65536
+    sorted_from: Annotated[int, Field(ge=1)] | None = 5000
     stress: bool = False
     sleep_after: Annotated[int, Field(ge=1)] | None = None
     rest_speed: Annotated[float, Field(gt=0)] = 0.01

@@ -23,7 +23,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl.errors import GpeError
 from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import MLP
-from gpe_pl.nn.connected import Edges, renumbered, touched
+from gpe_pl.nn.connected import Edges, order_of_edges, renumbered, reordered, touched
 from gpe_pl.nn.island_momentum import IslandMomentum, conserve
 from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction, MomentumConv, orient
 from gpe_pl.schema import CELL, DOWN, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
@@ -274,8 +274,9 @@ class GPE(nn.Module):
         edges = {r: (data[r].edge_index, data[r].odd, data[r].even) for r in relations}
         if grid(1) in x and self.level_weights == "shared" and self.schedule == "simultaneous":
             x, edges = _merge_levels(x, edges)
-        apart = self.skips.isolated_nodes and not self.training
-        acceleration, stress = (self._compute_apart if apart else self.compute)(x, params, mass, edges)
+        limit = None if self.training else self.skips.sorted_from
+        is_large = limit is not None and sum(values.shape[0] for values in x.values()) >= limit
+        acceleration, stress = (self._compute_sorted if is_large else self._compute)(x, params, mass, edges)
         if acceleration and self.settings["island_momentum"] != "ignored":
             acceleration = self._conserve(data, acceleration)
         return Prediction(acceleration, stress)
@@ -289,6 +290,27 @@ class GPE(nn.Module):
         angular = self.settings["island_momentum"] == "angular"
         kept = conserve(torch.cat([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
         return dict(zip(acceleration, kept.split([a.shape[0] for a in acceleration.values()]), strict=True))
+
+    def _compute_sorted(
+        self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """``_compute`` of nodes that stand in the order of their edges: what belongs together is found in the cache."""
+        order = order_of_edges({t: values.shape[0] for t, values in x.items()}, edges)
+
+        def in_order(values: dict[str, Tensor]) -> dict[str, Tensor]:
+            return {t: v[order[t]] if t in order else v for t, v in values.items()}
+
+        results = self._compute(in_order(x), in_order(params), in_order(mass), reordered(edges, order))
+        for result in results:
+            for t in result.keys() & order.keys():
+                result[t] = torch.empty_like(result[t]).index_copy(0, order[t], result[t])
+        return results
+
+    def _compute(
+        self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges
+    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        apart = self.skips.isolated_nodes and not self.training
+        return (self._compute_apart if apart else self.compute)(x, params, mass, edges)
 
     def _compute_apart(
         self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges

@@ -1,4 +1,4 @@
-"""Nodes that take part in message passing: those that an edge touches."""
+"""Which nodes edges touch, and in which order: nodes that no edge touches take no part in message passing, and those of one edge should lie near each other."""
 
 from __future__ import annotations
 
@@ -22,9 +22,40 @@ def touched(num_nodes: dict[str, int], edges: Edges) -> dict[str, Tensor]:
     return masks
 
 
+def order_of_edges(num_nodes: dict[str, int], edges: Edges) -> dict[str, Tensor]:
+    """For every node type, its nodes in the order in which the edges come to them, those without an edge last [node].
+
+    Neighbour search goes through space place by place, so that nodes in this order are near in memory where they are near in space, and edges keep theirs:
+    all sums are taken in the same order as before.
+    """
+    never = 2 * sum(index.shape[1] for index, _, _ in edges.values())
+    first: dict[str, Tensor] = {}
+    count = 0
+    for (source, _, target), (index, _, _) in edges.items():
+        for node_type, rows, start in ((source, index[0], count), (target, index[1], count + 1)):
+            if node_type not in first:
+                first[node_type] = torch.full((num_nodes[node_type],), never, device=rows.device)
+            visits = torch.arange(start, start + 2 * len(rows), 2, device=rows.device)
+            first[node_type].scatter_reduce_(0, rows, visits, "amin")
+        count += 2 * index.shape[1]
+    return {t: torch.argsort(visit, stable=True) for t, visit in first.items()}
+
+
+def reordered(edges: Edges, order: dict[str, Tensor]) -> Edges:
+    """The edges between nodes that stand in another order."""
+    number = {}
+    for t, rows in order.items():
+        number[t] = torch.empty_like(rows)
+        number[t][rows] = torch.arange(len(rows), device=rows.device)
+    return _with_numbers(edges, number)
+
+
 def renumbered(edges: Edges, masks: dict[str, Tensor]) -> Edges:
     """The edges between the nodes that ``masks`` keep, by their new numbers."""
-    number = {t: torch.cumsum(mask, dim=0) - 1 for t, mask in masks.items()}
+    return _with_numbers(edges, {t: torch.cumsum(mask, dim=0) - 1 for t, mask in masks.items()})
+
+
+def _with_numbers(edges: Edges, number: dict[str, Tensor]) -> Edges:
     return {
         (source, name, target): (torch.stack([number[source][index[0]], number[target][index[1]]]), odd, even)
         for (source, name, target), (index, odd, even) in edges.items()

@@ -311,6 +311,14 @@ def cost_at_error(points: Sequence[Point], error: float, horizon: str) -> float:
     return float(np.exp(np.interp(np.log(error), errors, costs)))
 
 
+def error_at_cost(points: Sequence[Point], cost: float, horizon: str) -> float:
+    """Error of a solver of that cost, the other way round: that of the most accurate for larger costs, infinite for smaller ones."""
+    best = front(points, horizon)
+    if not best or cost < best[0].cost:
+        return float("inf")
+    return float(np.exp(np.interp(np.log(cost), np.log([p.cost for p in best]), np.log([p.error(horizon) for p in best]))))
+
+
 def break_even(point: Point, solvers: Sequence[Point], horizon: str, duration: float) -> float:
     """Rollouts of a duration [s] after which training has paid off against an error-equivalent solver; infinite if never."""
     saved = (cost_at_error(solvers, point.error(horizon), horizon) - point.cost) * duration
@@ -371,12 +379,36 @@ def _section(case: str, points: Sequence[Point], order: float, num_trajectories:
                 lost.append(f"- {point.name} @{horizon}: a solver of the same error takes {needed / point.cost:.2g} times its time.")
             elif np.isinf(needed):
                 lost.append(f"- {point.name} @{horizon}: more accurate than every solver that was run.")
+            elif point.error(horizon) > front(solvers, horizon)[0].error(horizon):
+                lost.append(f"- {point.name} @{horizon}: cheaper and less accurate than every solver that was run.")
             else:
                 lost.append(
                     f"- {point.name} @{horizon}: wins, {needed / point.cost:.2g} times as fast as a solver of the same error; its training has paid off after "
                     f"{after:.3g} simulated seconds."
                 )
-    return "\n".join([f"### {case}", "", *lines, "", note, *lost])
+    return "\n".join([f"### {case}", "", *lines, "", note, "", "**At equal error**", "", *verdicts(points, horizons), *lost])
+
+
+def verdicts(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:
+    """Of every horizon, whether a learned model passes below the solvers' front; if none does, what the nearest one lacks."""
+    solvers = [p for p in points if p.family == "solver"]
+    learned = [p for p in points if p.family == "learned"]
+    for horizon in horizons:
+        comparable = [p for p in learned if p.error(horizon) <= front(solvers, horizon)[0].error(horizon)]
+        gain = {p.name: cost_at_error(solvers, p.error(horizon), horizon) / p.cost for p in comparable}
+        if not gain:
+            yield f"- @{horizon}: no learned model is as accurate as the coarsest solver."
+            continue
+        nearest = max(comparable, key=lambda p: gain[p.name])
+        if gain[nearest.name] > 1:
+            ahead = [name for name, value in gain.items() if value > 1]
+            yield f"- @{horizon}: **below the solver's curve**: {', '.join(ahead)}."
+            continue
+        error = error_at_cost(solvers, nearest.cost, horizon)
+        yield (
+            f"- @{horizon}: no learned model passes below the solver's curve. Nearest is {nearest.name}: it would have to be "
+            f"{1 / gain[nearest.name]:.2g} times faster, or {nearest.error(horizon) / error:.2g} times more accurate at its cost."
+        )
 
 
 def _interval(values: list[float], scale: float) -> str:

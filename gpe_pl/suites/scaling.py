@@ -18,6 +18,7 @@ from gpe_pl.machine import peak_memory, synchronized
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.momentum_conv import EdgeState
 from gpe_pl.report import table_row
+from gpe_pl.skips import Skips
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,9 +64,9 @@ class Step:
     num_edges: int
 
 
-def prepare(settings: Settings, num_nodes: int, dim: int, is_sorted: bool = False) -> Step:
+def prepare(settings: Settings, num_nodes: int, dim: int, skips: Skips | None = None) -> Step:
     """A step of a lattice: building its graph, and the model's forward pass."""
-    builder, state = lattice_scene(num_nodes, int(EDGES_PER_NODE[dim] * num_nodes), GraphConfig(), dim, is_sorted=is_sorted)
+    builder, state = lattice_scene(num_nodes, int(EDGES_PER_NODE[dim] * num_nodes), GraphConfig(), dim)
     graph = builder(state).to(settings.device)
     model = GPE(
         builder.spec,
@@ -73,6 +74,8 @@ def prepare(settings: Settings, num_nodes: int, dim: int, is_sorted: bool = Fals
         num_message_passing_steps=settings.num_message_passing_steps,
         hidden_channels=settings.hidden_channels,
     ).to(settings.device)
+    model.skips = skips or Skips()
+    model.eval()
     num_edges = sum(graph[r].edge_index.shape[1] for r in builder.spec.relations)
     forward = synchronized(torch.inference_mode()(lambda: model(graph)), settings.device)
     return Step(lambda: builder(state), forward, num_edges)
@@ -122,8 +125,8 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
             )  # fmt: skip
         records += _fit(rows, settings.fitted, dim)
         largest = max(settings.num_nodes)
-        in_order = prepare(settings, largest, dim, is_sorted=True)
-        ratio = _fastest(in_order.forward, settings.budget) / dict(forward_times)[largest]
+        as_they_come = prepare(settings, largest, dim, Skips(sorted_from=None))
+        ratio = dict(forward_times)[largest] / _fastest(as_they_come.forward, settings.budget)
         records.append(
             {"metric": "sorted_time_ratio", "case": f"{dim}d", "dimension": dim, "num_nodes": largest, "value": ratio, "unit": "1"}
         )
@@ -174,7 +177,7 @@ def _table(settings: Settings, lines: list[str], records: list[dict[str, Any]]) 
             "",
             "Graph: neighbour search and features. Peak memory: of a step in inference, beyond weights and the scene. "
             + "; ".join(
-                f"{r['case'].upper()}, {r['num_nodes']:,} nodes: forward pass with nodes sorted in space takes {100 * r['value']:.0f} % of the time"
+                f"{r['case'].upper()}, {r['num_nodes']:,} nodes: in the order of edges, a forward pass takes {100 * r['value']:.0f} % of the time"
                 for r in records
                 if r["metric"] == "sorted_time_ratio"
             )

@@ -22,8 +22,8 @@ from gpe_pl.skips import Skips
 from gpe_pl.trajectory import State, search_tree
 from tests import scenes
 
-NOTHING = Skips(absent_types=False, static_boundary=False, isolated_nodes=False, edges_at_once=None)
-LEVELS: dict[str, Any] = {"absent_types": True, "static_boundary": True, "isolated_nodes": True, "edges_at_once": 7}
+NOTHING = Skips(absent_types=False, static_boundary=False, isolated_nodes=False, edges_at_once=None, sorted_from=None)
+LEVELS: dict[str, Any] = {"absent_types": True, "static_boundary": True, "isolated_nodes": True, "edges_at_once": 7, "sorted_from": 50}
 THREE = ("sand", "snow", "fluid")
 
 
@@ -98,7 +98,7 @@ def test_no_level_changes_what_a_model_says(interaction: Any, edge_state: Any, d
         build, interaction=interaction, decoder=decoder, edge_state=edge_state, node_norm="layer", island_momentum="linear"
     ).model.double()
     predicted = []
-    for skips in (NOTHING, *map(one_level, LEVELS), Skips(edges_at_once=7)):
+    for skips in (NOTHING, *map(one_level, LEVELS), Skips(edges_at_once=7, sorted_from=1)):
         model.skips = skips
         with torch.inference_mode():
             predicted.append(model(data).acceleration)
@@ -128,7 +128,7 @@ def test_no_level_changes_the_motion_of_meshes_and_loose_nodes(schedule: Any, le
     pos = s.pos.copy()
     pos[np.flatnonzero(s.node_type == node_code("sand"))[:5]] += [[20.0 + k, 0.0] for k in range(5)]
     simulated = simulator(build, schedule=schedule, level_weights=level_weights)
-    off, on = (roll(simulated, replace(s, pos=pos).to_torch(), skips) for skips in (NOTHING, Skips(edges_at_once=7)))
+    off, on = (roll(simulated, replace(s, pos=pos).to_torch(), skips) for skips in (NOTHING, Skips(edges_at_once=7, sorted_from=1)))
     torch.testing.assert_close(on.pos, off.pos, rtol=0, atol=1e-6 * scenes.SPACING)
 
 

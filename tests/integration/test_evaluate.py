@@ -169,7 +169,9 @@ def test_levels_of_skipping_change_nothing_or_are_reported_with_what_they_cost(t
         return evaluate(tiny_data, tmp_path / name, checkpoint, "evaluation.num_pictures=0", *(f"rollout.{level}" for level in levels))
 
     usual = of_rollouts(rows("usual"))
-    everything = rows("all", "absent_types=false", "static_boundary=false", "isolated_nodes=false", "edges_at_once=null")
+    everything = rows(
+        "all", "absent_types=false", "static_boundary=false", "isolated_nodes=false", "edges_at_once=null", "sorted_from=null"
+    )
     assert of_rollouts(everything) == pytest.approx(usual, rel=1e-3, abs=1e-9)
     approximate = rows("approximate", "hold=2", "sleep_after=1", "rest_speed=100", "rest_acceleration=1e6")
     shared = of_rollouts(approximate, "learned, exact")

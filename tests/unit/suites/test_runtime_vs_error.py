@@ -22,10 +22,12 @@ from gpe_pl.suites.runtime_vs_error import (
     break_even,
     compare,
     cost_at_error,
+    error_at_cost,
     figures,
     front,
     hypervolume,
     run,
+    verdicts,
 )
 from gpe_pl.suites.trained import Case
 from tests.runs import compose
@@ -50,6 +52,26 @@ def test_equal_error_costs_what_lies_between_two_resolutions() -> None:
     assert cost_at_error(LADDER, 10**-3.5, "full") == pytest.approx(4.0)
     assert cost_at_error(LADDER, 1.0, "full") == 0.5
     assert cost_at_error(LADDER, 1e-5, "full") == float("inf")
+
+
+def test_equal_cost_buys_what_lies_between_two_resolutions() -> None:
+    assert error_at_cost(LADDER, 2.0, "full") == pytest.approx(1e-3)
+    assert error_at_cost(LADDER, 4.0, "full") == pytest.approx(10**-3.5)
+    assert error_at_cost(LADDER, 100.0, "full") == pytest.approx(1e-4)
+    assert error_at_cost(LADDER, 0.1, "full") == float("inf")
+
+
+def test_the_verdict_says_who_is_below_the_curve_or_what_the_nearest_lacks() -> None:
+    def verdict(*models: Point) -> str:
+        (line,) = verdicts([*LADDER, *models], ["full"])
+        return line
+
+    slow, fast = point("slow", 8.0, 10**-3.5, "learned"), point("fast", 1.0, 1e-3, "learned")
+    assert "**below" in verdict(slow, fast) and "fast" in verdict(slow, fast) and "slow" not in verdict(slow, fast)
+    assert "Nearest is slow: it would have to be 2 times faster, or 3.2 times more accurate at its cost" in verdict(slow)
+    assert "**below" in verdict(point("exact", 100.0, 1e-6, "learned"))
+    careless, lost = point("careless", 0.01, 0.5, "learned"), point("lost", 1.0, float("inf"), "learned")
+    assert "no learned model is as accurate" in verdict(careless, lost)
 
 
 def test_training_pays_off_after_what_it_saves() -> None:
