@@ -369,24 +369,23 @@ def _section(case: str, points: Sequence[Point], order: float, num_trajectories:
         f"{order:.1f} (positions, first 20 frames): mean and 95 % interval over scenes. `{DATA}` is the error in the "
         "training data. Times: one core, warm, neighbour search and features included."
     )
-    duration = 1.0
-    lost = ["", "**Where the learned models lose**", ""]
+    lost = ["", "**Where the learned models lose**: time of a solver of the same error over theirs", ""]
+    lost += [table_row(["", *(f"@{h}" for h in horizons)]), "|" + "---|" * (1 + len(horizons))]
     for point in (p for p in points if p.family == "learned"):
-        for horizon in horizons:
-            needed = cost_at_error(solvers, point.error(horizon), horizon)
-            after = break_even(point, solvers, horizon, duration)
-            if needed <= point.cost:
-                lost.append(f"- {point.name} @{horizon}: a solver of the same error takes {needed / point.cost:.2g} times its time.")
-            elif np.isinf(needed):
-                lost.append(f"- {point.name} @{horizon}: more accurate than every solver that was run.")
-            elif point.error(horizon) > front(solvers, horizon)[0].error(horizon):
-                lost.append(f"- {point.name} @{horizon}: cheaper and less accurate than every solver that was run.")
-            else:
-                lost.append(
-                    f"- {point.name} @{horizon}: wins, {needed / point.cost:.2g} times as fast as a solver of the same error; its training has paid off after "
-                    f"{after:.3g} simulated seconds."
-                )
+        lost.append(table_row([point.name, *(_against(point, solvers, h) for h in horizons)]))
     return "\n".join([f"### {case}", "", *lines, "", note, "", "**At equal error**", "", *verdicts(points, horizons), *lost])
+
+
+def _against(point: Point, solvers: Sequence[Point], horizon: str) -> str:
+    """A model's cell: below 1 it loses; where it wins, simulated seconds after which its training has paid off."""
+    needed = cost_at_error(solvers, point.error(horizon), horizon)
+    if needed <= point.cost:
+        return f"{needed / point.cost:.2g}"
+    if np.isinf(needed):
+        return "**more accurate than every solver that was run**"
+    if point.error(horizon) > front(solvers, horizon)[0].error(horizon):
+        return "cheaper and less accurate than every solver that was run"
+    return f"**{needed / point.cost:.2g}**, training pays off after {break_even(point, solvers, horizon, duration=1.0):.3g} s"
 
 
 def verdicts(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:

@@ -115,6 +115,8 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
         *LADDER,
         point("model", 1.0, 2e-3, "learned"),
         point("slow model", 9.0, 2e-3, "learned"),
+        point("exact model", 9.0, 1e-5, "learned"),
+        point("careless model", 0.1, 5e-2, "learned"),
         point("ballistic", 0.01, 0.1, "trivial"),
     ]
     for p in points:
@@ -122,10 +124,12 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(module, "_models", lambda *_: {"model": None})
     monkeypatch.setattr(module, "compare", lambda *_: (points, 1.3))
     records, table = run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec})
-    assert "model @full: wins, 1.3 times as fast" in table and "slow model @full: a solver of the same error takes 0.15 times" in table
+    assert "| model | **1.3**, training pays off after 0 s |" in table and "| slow model | 0.15 |" in table
+    assert "| exact model | **more accurate" in table and "| careless model | cheaper and less accurate" in table
+    assert "@full: **below the solver's curve**: model, exact model." in table
     assert "order of convergence is 1.3" in table
     axes = figures(records)["cost_error_sand"].axes[0]
-    assert axes.get_title() == "all frames" and len(axes.lines) == 4
+    assert axes.get_title() == "all frames" and len(axes.lines) == 6
 
 
 def test_nothing_to_compare_says_so(tmp_path: Path) -> None:
