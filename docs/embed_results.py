@@ -21,7 +21,7 @@ FILES = (
     *("trials.md", "trials.csv"),
     *("validation_loss.png", "error_curve_*.png", "rollout_test_*.png", "rollout_test_00.gif", "stress_*_00.png"),
     *("long_horizon_*.png", "perturbation_*.png", "scaling.png", "cost_error_*.png"),
-    *("showcase.json", "showcase.png"),
+    *("showcase.json", "showcase.md", "showcase.png"),
 )
 
 

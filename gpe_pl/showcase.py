@@ -68,7 +68,7 @@ def run(
     folder: Path,
     on_progress: Callable[[int, int], Any] | None = None,
 ) -> list[Record]:
-    """Roll the simulator out in a scene at rest; writes ``showcase.json``, ``showcase.png`` and ``showcase.gif`` (``.mp4`` where that can be made).
+    """Roll the simulator out in a scene at rest; writes ``showcase.json`` and ``.md``, ``showcase.png`` and ``showcase.gif`` (``.mp4`` where that can be made).
 
     Args:
         simulator: a trained one, of the scene's spacing and materials.
@@ -106,6 +106,7 @@ def run(
     if outside:
         records.append(Record("share_outside_uncontained", float(np.mean(outside)), "1"))
     replace_text(folder / "showcase.json", json.dumps({"records": [vars(r) for r in records], "stopped": stop}, indent=1))
+    replace_text(folder / "showcase.md", table(records, stop))
     film.write(folder / "showcase")
     return records
 
@@ -199,6 +200,12 @@ class _Film:
         strip.savefig(stem.with_suffix(".png"), dpi=220)
         extension = ".mp4" if find_spec("imageio_ffmpeg") else ".gif"
         write_film(stem.with_suffix(extension), "prediction", trajectory, fps=min(25.0, 1 / self.metadata.frame_dt))
+
+
+def table(records: list[Record], stopped: str | None) -> str:
+    """Markdown: a row per number, and why the rollout stopped early if it did."""
+    lines = ["| | value | unit |", "|---|---|---|", *(f"| {r.metric.replace('_', ' ')} | {r.value:.6g} | {r.unit} |" for r in records)]
+    return "\n".join([*lines, *(["", f"Stopped: {stopped}"] if stopped else []), ""])
 
 
 def summary(records: list[Record]) -> str:

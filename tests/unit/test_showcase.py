@@ -40,6 +40,7 @@ def test_a_rollout_from_rest_is_counted_and_drawn(tmp_path: Path) -> None:
     assert found["max_speed"] > 0 and found["peak_memory"] > 1e6 and found["seconds_per_step"] > 0
     assert seen == [(k, 5) for k in range(1, 6)]
     written = json.loads((tmp_path / "showcase.json").read_text())
+    assert f"| num steps | {written['records'][2]['value']:g} | 1 |" in (tmp_path / "showcase.md").read_text()
     assert {r["metric"]: r["value"] for r in written["records"]} == found and written["stopped"] is None
     assert (tmp_path / "showcase.png").stat().st_size > 1000
     assert [*tmp_path.glob("showcase.gif"), *tmp_path.glob("showcase.mp4")]
@@ -55,7 +56,8 @@ def test_without_containment_what_enters_a_wall_is_counted(tmp_path: Path) -> No
 def test_a_rollout_that_explodes_says_so(tmp_path: Path) -> None:
     records = run(simulator(float("inf")), CANYON, SETTINGS, tmp_path)
     assert values(records)["num_steps"] == 0
-    assert "not finite" in json.loads((tmp_path / "showcase.json").read_text())["stopped"]
+    stopped = json.loads((tmp_path / "showcase.json").read_text())["stopped"]
+    assert "not finite" in stopped and f"Stopped: {stopped}" in (tmp_path / "showcase.md").read_text()
 
 
 @pytest.mark.slow
