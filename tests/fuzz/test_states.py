@@ -65,7 +65,10 @@ def test_a_step_is_finite_and_momentum_that_must_be_kept_is_kept(state: State) -
     if len(state.boundary.pos) == 0 and state.num_nodes:
         change = after.vel - tensors.vel - model.builder.metadata.frame_dt * tensors.gravity
         impulse = (tensors.mass[:, None] * change).sum(dim=0).norm()
-        assert impulse <= 1e-5 * (tensors.mass[:, None] * change).norm(dim=1).sum() + 1e-12
+        predicted = (
+            tensors.mass.sum() * model.builder.metadata.frame_dt * model.acceleration_std.max()
+        )  # before a node alone loses all of it
+        assert impulse <= 1e-5 * (tensors.mass[:, None] * change).norm(dim=1).sum() + 1e-6 * predicted
 
 
 @given(states(), seeds)

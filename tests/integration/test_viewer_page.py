@@ -102,6 +102,27 @@ def test_it_plays_to_the_end_and_begins_again(opened: Any) -> None:
     assert viewer.page.get_attribute("#play", "aria-label") == "play"
 
 
+def test_it_does_not_step_back_when_it_begins_to_play(opened: Any) -> None:
+    """A picture that the browser began before the click has an earlier time."""
+    viewer = opened(falling(3), GPE=falling(3, noise=0.3))
+    viewer.page.locator("#frame").fill("6")
+    viewer.page.evaluate(
+        """() => {
+            const next = window.requestAnimationFrame.bind(window);
+            window.requestAnimationFrame = (draw) => next((time) => draw(time - 200));
+            window.lowest = 6;
+            new MutationObserver(() => {
+                const frame = Number(document.querySelector("#time").innerText.split("frame ")[1].split(/\\s/)[0]);
+                window.lowest = Math.min(window.lowest, frame);
+                window.isAtEnd ||= frame === 11;
+            }).observe(document.querySelector("#time"), { childList: true, characterData: true, subtree: true });
+        }"""
+    )
+    viewer.page.click("#play")
+    viewer.page.wait_for_function("() => window.isAtEnd")
+    assert viewer.page.evaluate("() => window.lowest") == 6
+
+
 def test_colours_mean_what_is_chosen(opened: Any) -> None:
     truth = falling(2)
     viewer = opened(replace(truth, node_type=np.full(truth.num_nodes, node_code("snow"), np.uint8)))

@@ -238,7 +238,8 @@ class Viewer {
     this.playback = from;
     const tick = (now) => {
       if (!this.playing || this.playback !== from) return;
-      const frame = from.frame + Math.floor((now - from.time) / 1000 * Number($("rate").value)); // skips frames rather than time
+      const seconds = Math.max(0, now - from.time) / 1000; // the first picture may have begun before the click
+      const frame = from.frame + Math.floor(seconds * Number($("rate").value)); // skips frames rather than time
       if (Math.min(frame, this.truth.frames - 1) !== this.frame) this.#show(frame);
       if (frame >= this.truth.frames - 1 + Number($("rate").value) / 2) Object.assign(from, { frame: 0, time: now }); // from the start, after a look at the end
       requestAnimationFrame(tick);
