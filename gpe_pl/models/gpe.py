@@ -189,11 +189,10 @@ class GPE(nn.Module):
         self.level_weights, self.schedule = level_weights, schedule
         self.num_message_passing_steps = num_message_passing_steps
         hidden, norm = hidden_channels, node_norm == "layer"
-        mlp = partial(MLP, is_fused=implementation == "factored")
+        is_fused = implementation == "factored"
+        mlp = partial(MLP, is_fused=is_fused)
         params = {m: c for m, c in spec.param_channels.items() if c}
-        self.material_embedding = nn.ModuleDict(
-            {m: MaterialEmbedding(c, hidden, material_embedding, implementation == "factored") for m, c in params.items()}
-        )
+        self.material_embedding = nn.ModuleDict({m: MaterialEmbedding(c, hidden, material_embedding, is_fused) for m, c in params.items()})
         readable = self._readable()
         relations = [r for r in spec.relations if {r[0], r[2]} & readable[0]]
         ends = readable[0].union(*({r[0], r[2]} for r in relations))
@@ -274,9 +273,8 @@ class GPE(nn.Module):
         edges = {r: (data[r].edge_index, data[r].odd, data[r].even) for r in relations}
         if grid(1) in x and self.level_weights == "shared" and self.schedule == "simultaneous":
             x, edges = _merge_levels(x, edges)
-        limit = None if self.training else self.skips.sorted_from
-        is_large = limit is not None and sum(values.shape[0] for values in x.values()) >= limit
-        acceleration, stress = (self._compute_sorted if is_large else self._compute)(x, params, mass, edges)
+        apart = self.skips.isolated_nodes and not self.training
+        acceleration, stress = (self._compute_apart if apart else self._compute_in_order)(x, params, mass, edges)
         if acceleration and self.settings["island_momentum"] != "ignored":
             acceleration = self._conserve(data, acceleration)
         return Prediction(acceleration, stress)
@@ -291,26 +289,23 @@ class GPE(nn.Module):
         kept = conserve(torch.cat([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
         return dict(zip(acceleration, kept.split([a.shape[0] for a in acceleration.values()]), strict=True))
 
-    def _compute_sorted(
+    def _compute_in_order(
         self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """``_compute`` of nodes that stand in the order of their edges: what belongs together is found in the cache."""
+        """``compute``, in large scenes of nodes that stand in the order of their edges: what belongs together is found in the cache."""
+        limit = None if self.training else self.skips.sorted_from
+        if limit is None or sum(values.shape[0] for values in x.values()) < limit:
+            return self.compute(x, params, mass, edges)
         order = order_of_edges({t: values.shape[0] for t, values in x.items()}, edges)
 
         def in_order(values: dict[str, Tensor]) -> dict[str, Tensor]:
             return {t: v[order[t]] if t in order else v for t, v in values.items()}
 
-        results = self._compute(in_order(x), in_order(params), in_order(mass), reordered(edges, order))
+        results = self.compute(in_order(x), in_order(params), in_order(mass), reordered(edges, order))
         for result in results:
             for t in result.keys() & order.keys():
                 result[t] = torch.empty_like(result[t]).index_copy(0, order[t], result[t])
         return results
-
-    def _compute(
-        self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        apart = self.skips.isolated_nodes and not self.training
-        return (self._compute_apart if apart else self.compute)(x, params, mass, edges)
 
     def _compute_apart(
         self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges
@@ -318,12 +313,14 @@ class GPE(nn.Module):
         """``compute``, but nodes without an edge pass no messages: what they would receive is nothing."""
         has_edge = touched({t: values.shape[0] for t, values in x.items()}, edges)
         if has_edge.keys() >= x.keys() and all(bool(mask.all()) for mask in has_edge.values()):
-            return self.compute(x, params, mass, edges)
+            return self._compute_in_order(x, params, mass, edges)
 
         def connected(values: dict[str, Tensor]) -> dict[str, Tensor]:
             return {t: v[has_edge[t]] for t, v in values.items() if t in has_edge}
 
-        inner = self.compute(connected(x), connected(params), connected(mass), renumbered(edges, has_edge)) if edges else ({}, {})
+        inner: tuple[dict[str, Tensor], dict[str, Tensor]] = ({}, {})
+        if edges:
+            inner = self._compute_in_order(connected(x), connected(params), connected(mass), renumbered(edges, has_edge))
         acceleration: dict[str, Tensor] = {}
         stress: dict[str, Tensor] = {}
         for m in mass:

@@ -143,7 +143,7 @@ class MomentumConv(MessagePassing):
         if update_edges:
             return at_target, at_source, state
         j, i = edge_index
-        return *self._last_linear(at_target, at_source, i, j, -1), None
+        return *self._to_messages((at_target, at_source), i, j, -1), None
 
     def _in_parts(
         self,
@@ -247,25 +247,28 @@ class MomentumConv(MessagePassing):
 
     def _finished(self, sums: Ends, evens: Ends | None, i: Tensor, j: Tensor, sign: int, are_messages: bool) -> Ends:
         """Sums of messages, from sums of messages or of activations; and of even activations, where there are any."""
-        at_target, at_source = sums if are_messages else self._last_linear(*sums, i, j, sign)
+        at_target, at_source = sums if are_messages else self._to_messages(sums, i, j, sign)
         if self.lin_even is None or evens is None:
             return at_target, at_source
         even_target, even_source = evens
         return at_target + self.lin_even(even_target), at_source if even_source is None else at_source + self.lin_even(even_source)
 
-    def _last_linear(self, at_target: Tensor, at_source: MaybeTensor, i: Tensor, j: Tensor, sign: int) -> Ends:
+    def _to_messages(self, sums: Ends, i: Tensor, j: Tensor, sign: int) -> Ends:
         """Sums of messages from sums of activations, of edges with targets i and, with a sign, sources j."""
-        ends = [(at_target, (i, 1), (j, sign))] if at_source is None else [(at_target, (i, 1)), (at_source, (j, sign))]
-        totals = []
-        for total, *edges in ends:
-            y = functional.linear(total, self.lin_out.weight)
-            if self.lin_out.bias is not None:
-                degree = total.new_zeros(total.shape[0])
-                for index, alpha in edges:
-                    degree.index_add_(0, index, total.new_ones(index.shape[0]), alpha=alpha)
-                y = y.addr_(degree, self.lin_out.bias)
-            totals.append(y)
-        return totals[0], None if at_source is None else totals[1]
+        at_target, at_source = sums
+        if at_source is None:
+            return self._last_linear(at_target, (i, 1), (j, sign)), None
+        return self._last_linear(at_target, (i, 1)), self._last_linear(at_source, (j, sign))
+
+    def _last_linear(self, total: Tensor, *ends: tuple[Tensor, int]) -> Tensor:
+        """The last linear map of a sum, with its bias as often as the ends name a node."""
+        y = functional.linear(total, self.lin_out.weight)
+        if self.lin_out.bias is None:
+            return y
+        degree = total.new_zeros(total.shape[0])
+        for index, sign in ends:
+            degree.index_add_(0, index, total.new_ones(index.shape[0]), alpha=sign)
+        return y.addr_(degree, self.lin_out.bias)
 
 
 def _zeros(like: Tensor, width: int, num_target: int, num_source: int, is_joint: bool) -> Ends:
