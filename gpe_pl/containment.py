@@ -36,9 +36,13 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
     rows = xp.nonzero(inside)[0]
     moved = pos[rows]
     for _ in range(4):  # corners need a pass per surface
+        before = moved
         for shape in shapes:
             depth = xp.clip(-shape.signed_distance(moved), 0.0, None)
-            moved = moved + depth[:, None] * outward_normal(shape, moved, step=1e-6)
+            if bool(xp.any(depth > 0)):  # finding normals of shapes that nothing is in would take most of the time
+                moved = moved + depth[:, None] * outward_normal(shape, moved, step=1e-6)
+        if moved is before:
+            break
     caught = signed_distance(shapes, moved) < -TOLERANCE
     moved = xp.where(caught[:, None], pos[rows] - state.vel[rows] * dt, moved)
     new_pos, vel = xp.asarray(pos, copy=True), xp.asarray(state.vel, copy=True)

@@ -7,6 +7,7 @@ and Hakim 2024 (arXiv 2407.07218): a solver always has a resolution to turn down
 
 from __future__ import annotations
 
+import copy
 import logging
 import time
 from collections.abc import Iterator, Sequence
@@ -17,12 +18,14 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from gpe_pl.approximate import approximate
 from gpe_pl.baselines import Ballistic, ConstantVelocity
 from gpe_pl.containment import Contained
 from gpe_pl.errors import GpeError
 from gpe_pl.generation import DatasetSpec, generate_trajectory, initial_state
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import bootstrap_interval, energy_distance
+from gpe_pl.models.gpe import GPE
 from gpe_pl.report import Run, table_row
 from gpe_pl.rollout import SimulationError, Simulator
 from gpe_pl.schema import Split
@@ -36,6 +39,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Family = Literal["solver", "learned", "trivial"]
+Frame = tuple[np.ndarray, np.ndarray]
+"""Positions [node, dim] in m and velocities [node, dim] in m/s."""
+
 DATA = "solver, as for the data"
 BALLISTIC = "ballistic"
 
@@ -52,6 +58,8 @@ class Settings:
         cases: data sets, by name.
         runs: folders of finished runs; the models among them that were trained on a case's data set take part.
         factors: how many times coarser than the data the solver is also run.
+        step_factors: how many times longer its steps may also be, at the spacing of the data.
+        holds: frames for which a prediction is held, in further rungs of GPE (``Skips.hold``).
         split, num_trajectories: scenes.
         horizons: frames over which errors are averaged; the full length is always added.
         num_threads: of PyTorch; the solvers use one.
@@ -60,6 +68,8 @@ class Settings:
     cases: dict[str, Case]
     runs: list[str]
     factors: list[Annotated[float, Field(gt=1)]] = field(default_factory=lambda: [1.5, 2.0, 3.0])
+    step_factors: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
+    holds: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
     split: Split = "test_unseen"
     num_trajectories: Annotated[int, Field(ge=1)] = 5
     horizons: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [20, 50, 100])
@@ -102,7 +112,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
     parts = []
     finished = runs_in(settings.runs)
     for name, spec in specs.items():
-        models = _models(finished, spec)
+        models = _models(finished, spec, settings.holds)
         if not models:
             raise ComparisonError(
                 f"{' and '.join(settings.runs)}: no finished run that was trained on the data set {spec.name!r} of size {spec.size!r}; train with "
@@ -115,12 +125,17 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
     return records, "\n\n".join(parts)
 
 
-def _models(runs: Sequence[Run], spec: DatasetSpec) -> dict[str, tuple[LearnedSimulator, float]]:
-    """Trained simulators and the seconds of their training, by label."""
-    return {
-        label: (simulator, 60 * float(run.config.get("size.comparison.budget_minutes") or "nan"))
-        for label, (simulator, run) in trained_on(spec, runs).items()
-    }
+def _models(runs: Sequence[Run], spec: DatasetSpec, holds: Sequence[int]) -> dict[str, tuple[LearnedSimulator, float]]:
+    """Trained simulators, GPE also with predictions held for some frames, and the seconds of their training, by label."""
+    found = {}
+    for label, (simulator, run) in trained_on(spec, runs).items():
+        seconds = 60 * float(run.config.get("size.comparison.budget_minutes") or "nan")
+        found[label] = simulator, seconds
+        for hold in holds if isinstance(simulator.model, GPE) else ():
+            holding = copy.copy(simulator)
+            holding.skips = replace(simulator.skips, hold=hold)
+            found[f"{label}, held for {hold} frames"] = holding, seconds
+    return found
 
 
 def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]], settings: Settings) -> tuple[list[Point], float]:
@@ -153,10 +168,11 @@ def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]]
 
 @dataclass(frozen=True)
 class _Restricted:
-    """Where a simulator starts, and how the positions of its nodes become those of the scene's."""
+    """Where a simulator starts, how the positions of its nodes become those of the scene's, and for how many frames a step of it is."""
 
     resolved: Resolved
     from_start: bool
+    frames_per_step: int = 1
 
 
 def _simulators(
@@ -179,10 +195,13 @@ def _simulators(
             continue
         if solver is not None:
             yield f"solver, spacing × {factor:g}", "solver", solver, _Restricted(resolved, True)
+    for steps in settings.step_factors:
+        if (solver := _with_longer_steps(spec, steps)) is not None:
+            yield f"solver, steps × {steps}", "solver", solver, _Restricted(same, True, steps)
     dt = spec.solver.frame_dt
     for label, (simulator, _) in models.items():
-        state = simulator.initial_state(data, history)
-        yield label, "learned", Contained(simulator, dt), _Restricted(Resolved(state, lambda pos: pos), False)
+        at = _Restricted(Resolved(simulator.initial_state(data, history), lambda pos: pos), False)
+        yield label, "learned", Contained(approximate(simulator), dt), at
     for name, baseline in ((BALLISTIC, Ballistic(dt)), ("constant velocity", ConstantVelocity(dt))):
         state = data.state(history, history)
         yield name, "trivial", baseline, _Restricted(Resolved(state, lambda pos: pos), False)
@@ -201,6 +220,16 @@ def _solver(spec: DatasetSpec, factor: float) -> Any | None:
     except ValueError as error:
         log.info("%s: no grid %g times coarser (%s)", spec.name, factor, error)
         return None
+
+
+def _with_longer_steps(spec: DatasetSpec, factor: int) -> Any | None:
+    """The solver with frames, and by its own criterion substeps, so many times as long, up to one cell; None for one without a grid, whose substeps are as long
+    as is stable.
+    """
+    solver: Any = spec.solver
+    if getattr(solver, "grid_spacing", None) is None:
+        return None
+    return replace(solver, frame_dt=factor * solver.frame_dt, cfl=min(1.0, factor * solver.cfl))
 
 
 def _reference(spec: DatasetSpec, start: State, data: Trajectory) -> Trajectory:
@@ -233,15 +262,17 @@ def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Traject
 def _timed(simulator: Any, at: _Restricted, data: Trajectory, history: int) -> tuple[Trajectory, float]:
     """A rollout from frame ``history`` to the end of the data, at the nodes of the scene, and its wall time over its simulated time.
 
-    The first step is taken twice and timed once: compilation and first use of memory are not part of it. A rollout that fails ends there.
+    The first step is taken twice and timed once: compilation and first use of memory are not part of it. A rollout that fails ends there. Frames within a step
+    are interpolated.
     """
     state: Any = at.resolved.state
     dt = data.metadata.frame_dt
-    first = 0 if at.from_start else history
+    first, every = 0 if at.from_start else history, at.frames_per_step
+    wanted = data.num_frames - first
     frames, seconds, steps = [_numpy(state)], 0.0, 0
     try:
         simulator.step(state)
-        for _ in range(data.num_frames - 1 - first):
+        for _ in range(-(-(wanted - 1) // every)):
             begun = time.perf_counter()
             state = simulator.step(state)
             seconds += time.perf_counter() - begun
@@ -249,16 +280,20 @@ def _timed(simulator: Any, at: _Restricted, data: Trajectory, history: int) -> t
             pos, vel = _numpy(state)
             if not np.isfinite(pos).all():
                 break
-            frames.append((pos, vel))
+            frames += [_between(frames[-1], (pos, vel), k / every) for k in range(1, every)] + [(pos, vel)]
     except SimulationError as error:
         log.info("%s stopped: %s", type(simulator).__name__, error)
-    pos = np.stack([at.resolved.restrict(p) for p, _ in frames])
-    vel = np.stack([(at.resolved.restrict(p + dt * v) - at.resolved.restrict(p)) / dt for p, v in frames])
+    pos = np.stack([at.resolved.restrict(p) for p, _ in frames[:wanted]])
+    vel = np.stack([(at.resolved.restrict(p + dt * v) - at.resolved.restrict(p)) / dt for p, v in frames[:wanted]])
     trajectory = replace(data, pos=pos, vel=vel, stress=None).frames(history - first)
-    return trajectory, seconds / max(1, steps) / dt
+    return trajectory, seconds / max(1, steps) / (every * dt)
 
 
-def _numpy(state: State) -> tuple[np.ndarray, np.ndarray]:
+def _between(before: Frame, after: Frame, share: float) -> Frame:
+    return before[0] + share * (after[0] - before[0]), before[1] + share * (after[1] - before[1])
+
+
+def _numpy(state: State) -> Frame:
     pos, vel = (x.detach().cpu().numpy() if isinstance(x, torch.Tensor) else x for x in (state.pos, state.vel))
     return np.array(pos, dtype=np.float64), np.array(vel, dtype=np.float64)
 

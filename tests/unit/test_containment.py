@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from gpe_pl.containment import TOLERANCE, Contained, contain
-from gpe_pl.geometry import Box, Polygon, Shape, Sphere, domain_walls, signed_distance
+from gpe_pl.geometry import Box, Polygon, Shape, Sphere, domain_walls, outward_normal, signed_distance
 from gpe_pl.trajectory import Boundary, State
 from tests import scenes
 
@@ -144,3 +144,18 @@ def test_contained_states_know_how_many_nodes_were_corrected() -> None:
         counts.append(state.num_corrected)
     # the third step would end 5 mm inside: it goes only half as far, and that speed is lost on the wall in the fourth
     assert counts == [0, 0, 2, 2, 0, 0]
+
+
+@pytest.mark.parametrize("shapes", [WALLS, WALLS + OBSTACLES + HOUSES, WALLS + WEDGES], ids=["walls", "obstacles", "wedges"])
+def test_shapes_that_nothing_is_in_are_skipped_without_a_difference(shapes: tuple[Shape, ...]) -> None:
+    before, after = steps_from_free_space(shapes, 0.05, count=500)
+    state = moved(shapes, before, after)
+    result, corrected = contain(state, DT)
+    everywhere = after[corrected]
+    for _ in range(4):
+        for shape in shapes:
+            depth = np.maximum(-shape.signed_distance(everywhere), 0.0)
+            everywhere = everywhere + depth[:, None] * outward_normal(shape, everywhere, step=1e-6)
+    caught = signed_distance(shapes, everywhere) < -TOLERANCE
+    assert corrected.sum() > 20
+    np.testing.assert_array_equal(result.pos[corrected], np.where(caught[:, None], after[corrected] - state.vel[corrected] * DT, everywhere))

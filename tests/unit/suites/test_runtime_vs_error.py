@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from gpe_pl.baselines import ConstantVelocity
+from gpe_pl.generation import generate_trajectory, initial_state, trajectory_metadata
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.simulate import dataset_spec
+from gpe_pl.solvers.resolution import Resolved
 from gpe_pl.suites import runtime_vs_error as module
 from gpe_pl.suites.runtime_vs_error import (
     DATA,
@@ -19,6 +23,10 @@ from gpe_pl.suites.runtime_vs_error import (
     Family,
     Point,
     Settings,
+    _models,
+    _Restricted,
+    _timed,
+    _with_longer_steps,
     break_even,
     compare,
     cost_at_error,
@@ -91,22 +99,53 @@ def test_hypervolume_is_the_area_of_steps() -> None:
 
 def untrained() -> LearnedSimulator:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
-    from gpe_pl.generation import trajectory_metadata
-
     builder = GraphBuilder(GraphConfig(history=2), trajectory_metadata(spec, "test", 0))
     return LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder)
 
 
 def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
-    settings = Settings({}, [], factors=[2.0], num_trajectories=1, horizons=[10])
+    settings = Settings({}, [], factors=[2.0], step_factors=[2], num_trajectories=1, horizons=[10])
     points, order = compare(spec, {"GPE 1 × 8": (untrained(), 60.0)}, settings)
     by_name = {p.name: p for p in points}
     assert {DATA, "GPE 1 × 8", "ballistic", "constant velocity"} < set(by_name)
     assert by_name[DATA].error("10") < by_name["solver, spacing × 2"].error("10") < by_name["constant velocity"].error("10")
+    assert by_name[DATA].error("10") < by_name["solver, steps × 2"].error("10") < by_name["constant velocity"].error("10")
     assert all(p.cost > 0 and set(p.mse) == {"10", "full"} for p in points)
     assert by_name["GPE 1 × 8"].overhead > 60.0
     assert np.isfinite(order)
+
+
+def test_longer_steps_are_as_many_frames_and_what_lies_between_is_interpolated() -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    data, start = generate_trajectory(spec, "test", 0), initial_state(spec, "test", 0)
+    dt = data.metadata.frame_dt
+    for every in (1, 3):
+        at = _Restricted(Resolved(start, lambda pos: pos), True, every)
+        prediction, _ = _timed(ConstantVelocity(every * dt), at, data, 0)
+        times = dt * np.arange(data.num_frames)[:, None, None]
+        assert prediction.num_frames == data.num_frames
+        np.testing.assert_allclose(prediction.pos, start.pos + times * start.vel, rtol=1e-6, atol=1e-9)
+
+
+def test_solvers_on_a_grid_have_longer_steps_up_to_a_cell() -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    longer = _with_longer_steps(spec, 4)
+    assert longer is not None
+    assert (longer.frame_dt, longer.cfl) == (4 * spec.solver.frame_dt, 1.0)
+    assert _with_longer_steps(dataset_spec(compose("simulate", "data=fem", "size=tiny")), 4) is None
+
+
+def test_gpe_also_holds_its_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulator, trained = untrained(), SimpleNamespace(config={"size.comparison.budget_minutes": 2})
+    monkeypatch.setattr(module, "trained_on", lambda *_: {"GPE": (simulator, trained)})
+    models = _models([], dataset_spec(compose("simulate", *OVERRIDES)), [2, 4])
+    assert {label: (s.skips.hold, seconds) for label, (s, seconds) in models.items()} == {
+        "GPE": (1, 120.0),
+        "GPE, held for 2 frames": (2, 120.0),
+        "GPE, held for 4 frames": (4, 120.0),
+    }
+    assert all(s.model is simulator.model for s, _ in models.values())
 
 
 def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
