@@ -158,4 +158,6 @@ def test_shapes_that_nothing_is_in_are_skipped_without_a_difference(shapes: tupl
             everywhere = everywhere + depth[:, None] * outward_normal(shape, everywhere, step=1e-6)
     caught = signed_distance(shapes, everywhere) < -TOLERANCE
     assert corrected.sum() > 20
-    np.testing.assert_array_equal(result.pos[corrected], np.where(caught[:, None], after[corrected] - state.vel[corrected] * DT, everywhere))
+    np.testing.assert_array_equal(
+        result.pos[corrected], np.where(caught[:, None], after[corrected] - state.vel[corrected] * DT, everywhere)
+    )
