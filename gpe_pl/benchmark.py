@@ -4,37 +4,18 @@ from __future__ import annotations
 
 import importlib
 import json
-import os
 import pkgutil
-import platform
-import subprocess
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gpe_pl.suites
 from gpe_pl.atomic import replace_text
 from gpe_pl.config import ConfigError, construct, entry_point
+from gpe_pl.machine import environment
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
-
-
-def environment() -> dict[str, Any]:
-    """What a number depends on besides the code: machine, library versions, commit."""
-    import torch
-
-    here = Path(__file__).resolve().parent
-    git = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=here, capture_output=True, text=True, check=False)
-    return {
-        "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        "commit": git.stdout.strip() or "unknown",
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "machine": platform.machine(),
-        "cores": os.cpu_count(),
-    }
 
 
 def without_folder(value: Any, runs: str) -> Any:

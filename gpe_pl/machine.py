@@ -1,12 +1,18 @@
-"""What the machine can do at best: rates of matrix products and copies, from which floors of run times follow, and the memory that a function needs."""
+"""What numbers depend on besides the code, and what the machine can do at best: rates of matrix products and copies, from which floors of run times follow, and
+the memory that a function needs.
+"""
 
 from __future__ import annotations
 
 import multiprocessing
+import os
+import platform
 import resource
+import subprocess
 import sys
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +22,29 @@ import torch
 BYTES_PER_UNIT = 1 if sys.platform == "darwin" else 1024
 """Of ``ru_maxrss``."""
 CLEAR_REFS = Path("/proc/self/clear_refs")
+
+
+def environment() -> dict[str, Any]:
+    """What a number depends on besides the code: machine, library versions, commit."""
+    return {
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        "commit": commit(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+        "machine": platform.machine(),
+        "cores": os.cpu_count(),
+    }
+
+
+def commit() -> str:
+    """Of the running code, ``-dirty`` where files differ from it; ``unknown`` where it is not in a repository of its own, or git is not installed."""
+    here = Path(__file__).resolve()
+    try:
+        tracked = subprocess.run(["git", "ls-files", "--error-unmatch", here.name], cwd=here.parent, capture_output=True, check=False)
+        described = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=here.parent, capture_output=True, text=True, check=False)
+    except OSError:
+        return "unknown"
+    return (not tracked.returncode and described.stdout.strip()) or "unknown"
 
 
 def synchronized(function: Callable[[], Any], device: str) -> Callable[[], Any]:

@@ -22,7 +22,7 @@ from gpe_pl.atomic import replace_text
 from gpe_pl.containment import TOLERANCE, Contained
 from gpe_pl.geometry import signed_distance
 from gpe_pl.learned_simulator import LearnedSimulator
-from gpe_pl.machine import peak_resident
+from gpe_pl.machine import environment, peak_resident
 from gpe_pl.rollout import Guard, Simulator, Start, frames
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.trajectory import Metadata, State, Termination, Trajectory
@@ -105,7 +105,8 @@ def run(
     records = tally.records()
     if outside:
         records.append(Record("share_outside_uncontained", float(np.mean(outside)), "1"))
-    replace_text(folder / "showcase.json", json.dumps({"records": [vars(r) for r in records], "stopped": stop}, indent=1))
+    written = {"environment": environment(), "records": [vars(r) for r in records], "stopped": stop}
+    replace_text(folder / "showcase.json", json.dumps(written, indent=1))
     replace_text(folder / "showcase.md", table(records, stop))
     film.write(folder / "showcase")
     return records

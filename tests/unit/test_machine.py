@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gpe_pl.machine import copy_rate, gemm_rate, peak_memory
+from gpe_pl import machine
+from gpe_pl.machine import commit, copy_rate, environment, gemm_rate, peak_memory
 
 
 def filling(num_bytes: int) -> Callable[[], int]:
@@ -16,6 +20,22 @@ def filling(num_bytes: int) -> Callable[[], int]:
 
 def failing() -> Callable[[], int]:
     raise RuntimeError("no")
+
+
+def test_numbers_know_the_commit_of_their_code() -> None:
+    assert re.fullmatch(r"[0-9a-f]{7,40}(-dirty)?|unknown", commit())
+    assert environment()["commit"] == commit()
+
+
+def test_a_copy_in_a_repository_of_something_else_has_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    subprocess.run(["git", "init", "-q", tmp_path], check=True)
+    subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b", "commit", "-qm", "x", "--allow-empty"], cwd=tmp_path, check=True)
+    copy = tmp_path / "machine.py"
+    copy.touch()
+    monkeypatch.setattr(machine, "__file__", str(copy))
+    assert commit() == "unknown"
+    monkeypatch.setenv("PATH", str(tmp_path))  # without git
+    assert commit() == "unknown"
 
 
 def test_rates_are_positive() -> None:

@@ -42,6 +42,7 @@ def test_a_rollout_from_rest_is_counted_and_drawn(tmp_path: Path) -> None:
     written = json.loads((tmp_path / "showcase.json").read_text())
     assert f"| num steps | {written['records'][2]['value']:g} | 1 |" in (tmp_path / "showcase.md").read_text()
     assert {r["metric"]: r["value"] for r in written["records"]} == found and written["stopped"] is None
+    assert written["environment"]["commit"]
     assert (tmp_path / "showcase.png").stat().st_size > 1000
     assert [*tmp_path.glob("showcase.gif"), *tmp_path.glob("showcase.mp4")]
 
