@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import importlib
 import json
-import pkgutil
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import gpe_pl.suites
 from gpe_pl.atomic import replace_text
-from gpe_pl.config import ConfigError, construct, entry_point
+from gpe_pl.config import CONF, ConfigError, construct, entry_point
 from gpe_pl.machine import environment
 
 if TYPE_CHECKING:
@@ -29,16 +27,19 @@ def without_folder(value: Any, runs: str) -> Any:
 
 def benchmark(cfg: DictConfig) -> None:
     """Run one suite and write ``results.json``, ``table.md`` and its figures."""
+    import torch
     from omegaconf import OmegaConf
 
     from gpe_pl.simulate import dataset
 
-    suites = sorted(m.name for m in pkgutil.iter_modules(gpe_pl.suites.__path__))
+    suites = sorted(path.stem for path in (CONF / "suite").glob("*.yaml"))
     if cfg.suite.name not in suites:
         raise ConfigError(f"suite.name={cfg.suite.name!r}: must be one of {', '.join(suites)}")
     suite = importlib.import_module(f"gpe_pl.suites.{cfg.suite.name}")
     values: Any = OmegaConf.to_container(cfg.suite, resolve=True)
     settings = construct(suite.Settings, {k: v for k, v in values.items() if k != "name"}, "suite")
+    if getattr(settings, "accelerator", "cpu") == "gpu" and not torch.cuda.is_available():
+        raise ConfigError("trainer.accelerator=gpu: PyTorch finds no GPU here; choose trainer=cpu")
     cases = getattr(settings, "cases", None)  # of a suite about data sets
     records, table = suite.run(settings) if cases is None else suite.run(settings, {k: dataset(*c.overrides) for k, c in cases.items()})
     folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name

@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpe_pl.config import CONF, ConfigError, construct, construct_target, entry_point
+from gpe_pl.errors import GpeError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from omegaconf import DictConfig
 
     from gpe_pl.learned_simulator import LearnedSimulator
@@ -39,14 +42,15 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     scene = scene_metadata(evaluated, cfg.split)
     if not simulator.fits(scene):
         simulator.check_scene(scene, _own_data(simulator) or "data=… size=…")
+    shown = None if cfg.data.get("showcase") is None else _showcase(cfg, simulator)
     folder = Path(cfg.paths.runs) / cfg.name
     claim(folder, _identity(evaluated), results=["*"])
     try:
         evaluate(simulator, ensure_split(evaluated, cfg.split), settings, folder)
     finally:
         release(folder)
-    if cfg.data.get("showcase") is not None:
-        _show(cfg, simulator, folder)
+    if shown is not None:
+        shown(folder)
     print(conclusion(folder))
     print(folder)
 
@@ -81,15 +85,26 @@ def _own_data(simulator: LearnedSimulator) -> str:
     return ""
 
 
-def _show(cfg: DictConfig, simulator: LearnedSimulator, folder: Path) -> None:
+def _showcase(cfg: DictConfig, simulator: LearnedSimulator) -> Callable[[Path], None]:
+    """Rolls the simulator out in the showcase's scene, which is made first: what is wrong with it is said before the evaluation, not after it."""
     from gpe_pl import showcase
     from gpe_pl.progress import progress_bar
 
     settings = construct(showcase.ShowcaseSettings, {k: v for k, v in cfg.data.showcase.items() if k != "scene"}, "data.showcase")
     scene = construct_target(cfg.data.showcase.scene, "data.showcase.scene", "gpe_pl.solvers.")
-    with progress_bar("showcase") as on_progress:
-        records = showcase.run(simulator, scene, settings, folder, on_progress)
-    print(showcase.summary(records))
+    try:
+        state, metadata = showcase.start(simulator, scene, settings)
+    except ValueError as error:
+        if isinstance(error, GpeError):
+            raise
+        raise ConfigError(f"data.showcase.scene: {error}") from None
+
+    def show(folder: Path) -> None:
+        with progress_bar("showcase") as on_progress:
+            records = showcase.run(simulator, state, metadata, settings, folder, on_progress)
+        print(showcase.summary(records))
+
+    return show
 
 
 main = entry_point("evaluate")(evaluate_checkpoint)

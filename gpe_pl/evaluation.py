@@ -101,8 +101,8 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     its nodes only.
 
     Where ``simulator.skips`` has approximate levels, the rollout without them is evaluated beside, and what they cost is reported: ``skipping_mse`` [m²] is
-    the distance between the two rollouts, ``share_asleep`` that of particle-steps that were not computed, ``lost_impulse`` [kg m/s] the momentum that
-    falling asleep took away.
+    the distance between the two rollouts, as far as the exact one came, ``share_asleep`` that of particle-steps that were not computed, ``lost_impulse``
+    [kg m/s] the momentum that falling asleep took away.
 
     Raises:
         ExportError: a format in ``settings.export`` needs a package that is not installed.
@@ -186,7 +186,8 @@ def _predict(
             if scene < len(free):
                 extra["share_outside_uncontained"] = _share_outside(free[scene], 1, steps, tolerance=1e-3 * spacing)
         if exact is not None:
-            extra["skipping_mse"] = float(per_frame_mse(prediction, exact[scene])[1:].mean())
+            shared = prediction.frames(0, min(prediction.num_frames, exact[scene].num_frames))
+            extra["skipping_mse"] = float(per_frame_mse(shared, exact[scene])[1:].mean())
             extra["share_asleep"], extra["lost_impulse"] = totals[scene]["num_asleep"] / num_steps, totals[scene]["lost_impulse"]
         yield predictions, extra
 

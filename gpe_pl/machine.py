@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import platform
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -32,8 +33,17 @@ def environment() -> dict[str, Any]:
         "python": platform.python_version(),
         "torch": torch.__version__,
         "machine": platform.machine(),
+        "processor": _processor(),
         "cores": os.cpu_count(),
+        "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
     }
+
+
+def _processor() -> str:
+    """Its name, as far as the system tells."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor())
 
 
 def commit() -> str:
@@ -45,6 +55,11 @@ def commit() -> str:
     except OSError:
         return "unknown"
     return (not tracked.returncode and described.stdout.strip()) or "unknown"
+
+
+def has_cpp_compiler() -> bool:
+    """Whether there is one, which ``torch.compile`` needs on a CPU."""
+    return any(shutil.which(name) for name in ("c++", "g++", "clang++", "cl"))
 
 
 def synchronized(function: Callable[[], Any], device: str) -> Callable[[], Any]:
@@ -90,10 +105,20 @@ def copy_rate(device: str, num_bytes: int = 2**28) -> float:
     return 2 * num_bytes / best_time(lambda: target.copy_(source), device, 5)
 
 
+def peak_on_gpu(function: Callable[[], Any]) -> int:
+    """Bytes of a GPU's memory that a call needs beyond what is there before it."""
+    function()
+    torch.cuda.synchronize()
+    before = torch.cuda.memory_allocated()
+    torch.cuda.reset_peak_memory_stats()
+    synchronized(function, "cuda")()
+    return torch.cuda.max_memory_allocated() - before
+
+
 def peak_memory(function: Callable[..., Callable[[], Any]], *arguments: Any) -> int:
     """Bytes that the function which ``function(*arguments)`` returns needs beyond what was there when it was called, in a process of its own.
 
-    On a GPU use ``torch.cuda.max_memory_allocated`` instead.
+    On a GPU use ``peak_on_gpu`` instead.
     """
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)

@@ -61,32 +61,40 @@ class Record:
     unit: str
 
 
+def start(simulator: LearnedSimulator, scene: Scene, settings: ShowcaseSettings) -> tuple[State, Metadata]:
+    """The scene at rest, as the simulator takes it.
+
+    Raises:
+        SceneError: the scene does not fit the simulator.
+        ValueError: there is no such scene.
+    """
+    metadata = replace(describe(scene, simulator.builder.metadata.frame_dt, seed=settings.seed), dataset="showcase")
+    return simulator.standing(scene.sample(settings.values, settings.seed), metadata), metadata
+
+
 def run(
     simulator: LearnedSimulator,
-    scene: Scene,
+    state: State,
+    metadata: Metadata,
     settings: ShowcaseSettings,
     folder: Path,
     on_progress: Callable[[int, int], Any] | None = None,
 ) -> list[Record]:
-    """Roll the simulator out in a scene at rest; writes ``showcase.json`` and ``.md``, ``showcase.png`` and ``showcase.gif`` (``.mp4`` where that can be made).
+    """Roll the simulator out from a ``start``; writes ``showcase.json`` and ``.md``, ``showcase.png`` and ``showcase.gif`` (``.mp4`` where that can be made).
 
     Args:
         simulator: a trained one, of the scene's spacing and materials.
-        scene: where.
+        state, metadata: where.
         settings: how long.
         folder: for the files.
         on_progress: called with the frames done and their total.
 
     Returns:
         Numbers of nodes, steps done and seconds per step; peak memory of the process; shares of particle-steps that containment corrected, and
-        of those faster than gravity can explain, of particles in a wall at the end, and of particle-frames in one without containment; largest speed.
-
-    Raises:
-        SceneError: the scene does not fit the simulator.
+        of those faster than gravity can explain, of particles in a wall at the end, and of particle-frames in one without containment, from the same start;
+        largest speed. Where the simulator skips approximately, also the share of particle-steps that were not computed and the momentum [kg m/s] that was lost.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    metadata = replace(describe(scene, simulator.builder.metadata.frame_dt, seed=settings.seed), dataset="showcase")
-    state = simulator.standing(scene.sample(settings.values, settings.seed), metadata)
     runner, total = approximate(simulator), settings.num_steps + settings.num_uncontained_steps
     film, tally, stop, outside = _Film(state, metadata, settings.num_steps), _Tally(state, metadata), None, []
     for frame, item in _frames(Contained(runner, metadata.frame_dt), state, settings.num_steps, metadata):
@@ -103,7 +111,10 @@ def run(
         if on_progress is not None:
             on_progress(settings.num_steps + frame, total)
     records = tally.records()
+    if runner is not simulator:
+        records += tally.skipped()
     if outside:
+        records.append(Record("num_uncontained_steps", float(len(outside)), "1"))
         records.append(Record("share_outside_uncontained", float(np.mean(outside)), "1"))
     written = {"environment": environment(), "records": [vars(r) for r in records], "stopped": stop}
     replace_text(folder / "showcase.json", json.dumps(written, indent=1))
@@ -118,6 +129,7 @@ class _Tally:
     def __init__(self, state: State, metadata: Metadata) -> None:
         self.end, self.limit = state, MAX_SPEED_FACTOR * _fall_speed(state, metadata)
         self.num_corrected, self.num_too_fast, self.top_speed = 0, 0, 0.0
+        self.num_asleep, self.lost_impulse = 0, 0.0
         self.seconds: list[float] = []
         self.resume()
 
@@ -131,7 +143,13 @@ class _Tally:
         speed = state.vel.norm(dim=1)
         self.end, self.top_speed = state, max(self.top_speed, float(speed.max()))
         self.num_corrected += state.num_corrected
+        self.num_asleep += state.num_asleep
+        self.lost_impulse += state.lost_impulse
         self.num_too_fast += int((speed > self.limit).sum())
+
+    def skipped(self) -> list[Record]:
+        particle_steps = len(self.seconds) * self.end.num_nodes or math.nan
+        return [Record("share_asleep", self.num_asleep / particle_steps, "1"), Record("lost_impulse", self.lost_impulse, "kg m/s")]
 
     def records(self) -> list[Record]:
         num_steps, size = len(self.seconds), self.end.num_nodes

@@ -1,8 +1,10 @@
-"""What the passes that are made for a CPU share: when they work, and how many rows they take at a time."""
+"""What the passes that are made for a CPU share: when they work, whether they are wanted, and how many rows they take at a time."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 import torch
 from torch import Tensor
@@ -11,14 +13,26 @@ BLOCK = 512
 """Rows at a time: at 128 channels in single precision an array of a block takes 256 KiB, and a handful of them fit a core's second-level cache."""
 FASTMATH = {"contract", "nsz", "arcp"}
 """What compiled loops may do with sums and products; not-a-numbers and infinities stay what they are."""
+_is_wanted = ContextVar("_is_wanted", default=True)
+
+
+@contextmanager
+def unfused() -> Iterator[None]:
+    """Forward passes inside use PyTorch's operations alone, and so do their backward passes: to compare with."""
+    token = _is_wanted.set(False)
+    try:
+        yield
+    finally:
+        _is_wanted.reset(token)
 
 
 def works_on(*tensors: Tensor) -> bool:
     """Whether these passes can take the tensors, here and now."""
+    if torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu") or not _is_wanted.get():
+        return False
     first = tensors[0]
     alike = all(t.device.type == "cpu" and t.dtype == first.dtype for t in tensors)
-    is_traced = torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu")
-    return alike and first.dtype in (torch.float32, torch.float64) and not is_traced
+    return alike and first.dtype in (torch.float32, torch.float64)
 
 
 def block_size(num_rows: int) -> int:

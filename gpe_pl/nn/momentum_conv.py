@@ -211,7 +211,8 @@ class MomentumConv(MessagePassing):
         z = a_self + b_other
         z.add_(e, alpha=sign)  # in place: at these sizes a new buffer costs more than the sum
         if s is not None:
-            z.addmm_(s, self.lin_in.weight[:, -self.widths[3] :].t())
+            v = self.lin_in.weight[:, -self.widths[3] :]
+            z.addmm_(s.to(z.dtype), v.t().to(z.dtype))  # which autocast leaves as they are
         return self.act(z)
 
     def aggregate(

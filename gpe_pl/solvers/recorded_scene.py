@@ -103,6 +103,8 @@ def read_recording(path: Path | str) -> Recording:
             raise RecordingError(f"{path}: {name} of the first frame is {arrays[name].shape}, expected {shape}, all finite")
     if min(shape[0] for shape in wanted.values()) < 1 or arrays["m"].min() <= 0 or arrays["viscosity"].min() <= 0:
         raise RecordingError(f"{path}: the first frame must have walls, and particles with positive mass and viscosity")
+    if np.abs(np.linalg.norm(arrays["box_normals"], axis=1) - 1.0).max() > 1e-3:
+        raise RecordingError(f"{path}: box_normals of the first frame are not unit vectors")
     up = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     walls, normals, pos, vel = (arrays[name] @ up.T for name in ("box", "box_normals", "pos", "vel"))
     return Recording(walls, normals, pos, vel, float(np.median(arrays["viscosity"])), float(np.cbrt(np.median(arrays["m"]) / WATER)))
@@ -197,7 +199,11 @@ class RecordedScene:
         """
         recording, bounds = self.recording, self.bounds
         sides = domain_walls(bounds, self.friction)[:4]
-        shapes: tuple[Shape, ...] = (*sides, ground_of(recording.walls, recording.normals, bounds, self.grid_spacing, self.friction))
+        try:
+            ground = ground_of(recording.walls, recording.normals, bounds, self.grid_spacing, self.friction)
+        except ValueError as error:
+            raise RecordingError(f"{self.file}: its walls make no ground ({error})") from None
+        shapes: tuple[Shape, ...] = (*sides, ground)
         pos, vel = recording.pos, recording.vel
         if self.num_particles is not None:
             pos = self._flood(self.num_particles, shapes, bounds, seed)

@@ -8,7 +8,9 @@ and Hakim 2024 (arXiv 2407.07218): a solver always has a resolution to turn down
 from __future__ import annotations
 
 import copy
+import json
 import logging
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -63,6 +65,7 @@ class Settings:
         split, num_trajectories: scenes.
         horizons: frames over which errors are averaged; the full length is always added.
         num_threads: of PyTorch; the solvers use one.
+        accelerator: where models run; the solvers run on the CPU.
     """
 
     cases: dict[str, Case]
@@ -74,6 +77,11 @@ class Settings:
     num_trajectories: Annotated[int, Field(ge=1)] = 5
     horizons: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [20, 50, 100])
     num_threads: Annotated[int, Field(ge=1)] = 1
+    accelerator: Literal["cpu", "gpu"] = "cpu"
+
+    @property
+    def device(self) -> str:
+        return "cuda" if self.accelerator == "gpu" else "cpu"
 
 
 @dataclass
@@ -112,7 +120,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
     parts = []
     finished = runs_in(settings.runs)
     for name, spec in specs.items():
-        models = _models(finished, spec, settings.holds)
+        models = _models(finished, spec, settings)
         if not models:
             raise ComparisonError(
                 f"{' and '.join(settings.runs)}: no finished run that was trained on the data set {spec.name!r} of size {spec.size!r}; train with "
@@ -120,22 +128,32 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
             )
         log.info("%s: %d models", name, len(models))
         points, order = compare(spec, models, settings)
-        records += list(_records(name, points, order))
+        records += [{**record, "seed": spec.seed} for record in _records(name, points, order)]
         parts.append(_section(name, points, order, settings.num_trajectories))
     return records, "\n\n".join(parts)
 
 
-def _models(runs: Sequence[Run], spec: DatasetSpec, holds: Sequence[int]) -> dict[str, tuple[LearnedSimulator, float]]:
+def _models(runs: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[str, tuple[LearnedSimulator, float]]:
     """Trained simulators, GPE also with predictions held for some frames, and the seconds of their training, by label."""
     found = {}
     for label, (simulator, run) in trained_on(spec, runs).items():
-        seconds = 60 * float(run.config.get("size.comparison.budget_minutes") or "nan")
-        found[label] = simulator, seconds
-        for hold in holds if isinstance(simulator.model, GPE) else ():
+        seconds = training_seconds(run)
+        found[label] = simulator.to(settings.device), seconds
+        for hold in settings.holds if isinstance(simulator.model, GPE) else ():
             holding = copy.copy(simulator)
             holding.skips = replace(simulator.skips, hold=hold)
             found[f"{label}, held for {hold} frames"] = holding, seconds
     return found
+
+
+def training_seconds(run: Run) -> float:
+    """Steps of a run times the step time that its sweep measured, for which its budget was enough; NaN where none was measured."""
+    path = next((p for folder in run.folder.parents if (p := folder / "step_times.json").exists()), None)
+    model = str(run.config["model._target_"]).rpartition(".")[2]
+    about = f"{run.config['data.name']} {run.config['size.name']} {model} "
+    steps, budget = float(run.config["training.num_steps"]), 60 * float(run.config.get("size.comparison.budget_minutes") or math.inf)
+    times = {} if path is None else json.loads(path.read_text())
+    return max((steps * t for key, t in times.items() if key.startswith(about) and steps * t <= budget), default=math.nan)
 
 
 def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]], settings: Settings) -> tuple[list[Point], float]:
@@ -275,6 +293,8 @@ def _timed(simulator: Any, at: _Restricted, data: Trajectory, history: int) -> t
         for _ in range(-(-(wanted - 1) // every)):
             begun = time.perf_counter()
             state = simulator.step(state)
+            if isinstance(state.pos, torch.Tensor) and state.pos.is_cuda:
+                torch.cuda.synchronize()
             seconds += time.perf_counter() - begun
             steps += 1
             pos, vel = _numpy(state)
@@ -364,6 +384,7 @@ def break_even(point: Point, solvers: Sequence[Point], horizon: str, duration: f
 
 def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[str, Any]]:
     yield {"metric": "observed_order", "case": case, "value": order, "unit": "1"}
+    solvers = [p for p in points if p.family == "solver"]
     for point in points:
         about = {"case": case, "simulator": point.name, "family": point.family}
         yield {"metric": "time_per_simulated_second", **about, "value": point.cost, "values": point.seconds, "unit": "1"}
@@ -371,6 +392,16 @@ def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[
         for horizon, values in point.mse.items():
             yield {"metric": "rollout_mse", **about, "horizon": horizon, "value": float(np.mean(values)), "values": values, "unit": "m²"}
         yield {"metric": "overhead", **about, "value": point.overhead, "unit": "s"}
+        for horizon in point.mse if point.family == "learned" else ():
+            ratio = cost_at_error(solvers, point.error(horizon), horizon) / point.cost
+            yield {"metric": "time_ratio_at_equal_error", **about, "horizon": horizon, "value": ratio, "unit": "1"}
+            yield {
+                "metric": "break_even",
+                **about,
+                "horizon": horizon,
+                "value": break_even(point, solvers, horizon, duration=1.0),
+                "unit": "s",
+            }
     for horizon in points[0].mse:
         worst = max(p.cost for p in points), max(p.error(horizon) for p in points if p.name == BALLISTIC)
         for family in ("solver", "learned"):
@@ -408,11 +439,23 @@ def _section(case: str, points: Sequence[Point], order: float, num_trajectories:
     lost += [table_row(["", *(f"@{h}" for h in horizons)]), "|" + "---|" * (1 + len(horizons))]
     for point in (p for p in points if p.family == "learned"):
         lost.append(table_row([point.name, *(_against(point, solvers, h) for h in horizons)]))
+    lost += [
+        "",
+        "**Break-even**: seconds of simulation after which training and its data have paid off, against a solver of the same error",
+        "",
+    ]
+    lost += [table_row(["", *(f"@{h}" for h in horizons)]), "|" + "---|" * (1 + len(horizons))]
+    for point in (p for p in points if p.family == "learned"):
+        lost.append(table_row([point.name, *(_pays_off(break_even(point, solvers, h, duration=1.0)) for h in horizons)]))
     return "\n".join([f"### {case}", "", *lines, "", note, "", "**At equal error**", "", *verdicts(points, horizons), *lost])
 
 
+def _pays_off(seconds: float) -> str:
+    return "never" if math.isinf(seconds) else "not known" if math.isnan(seconds) else f"{seconds:.3g}"
+
+
 def _against(point: Point, solvers: Sequence[Point], horizon: str) -> str:
-    """A model's cell: below 1 it loses; where it wins, simulated seconds after which its training has paid off."""
+    """A model's cell: below 1 it loses."""
     needed = cost_at_error(solvers, point.error(horizon), horizon)
     if needed <= point.cost:
         return f"{needed / point.cost:.2g}"
@@ -420,7 +463,7 @@ def _against(point: Point, solvers: Sequence[Point], horizon: str) -> str:
         return "**more accurate than every solver that was run**"
     if point.error(horizon) > front(solvers, horizon)[0].error(horizon):
         return "cheaper and less accurate than every solver that was run"
-    return f"**{needed / point.cost:.2g}**, training pays off after {break_even(point, solvers, horizon, duration=1.0):.3g} s"
+    return f"**{needed / point.cost:.2g}**"
 
 
 def verdicts(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.lattice import lattice_scene
 from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.machine import synchronized
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.momentum_conv import EdgeState
 from gpe_pl.report import table_row
@@ -38,18 +39,27 @@ class Settings:
         num_boundary: boundary nodes out of reach.
         num_falling: particles in free fall without neighbours.
         num_settled: copies of the scene at rest, far from each other.
+        holds: frames for which one prediction is held.
+        seed: of the weights.
     """
 
     num_nodes: Annotated[int, Field(ge=10)] = 2500
     num_edges: Annotated[int, Field(ge=10)] = 24000
     num_message_passing_steps: Annotated[int, Field(ge=1)] = 12
     hidden_channels: Annotated[int, Field(ge=1)] = 128
-    edge_states: list[EdgeState] = field(default_factory=lambda: ["latent", "geometry"])
+    edge_states: Annotated[list[EdgeState], Field(min_length=1)] = field(default_factory=lambda: ["latent", "geometry"])
     num_boundary: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [5000, 50000])
-    num_falling: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [2500, 10000])
+    num_falling: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)] = field(default_factory=lambda: [2500, 10000])
     num_settled: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [1, 4])
+    holds: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
     num_rounds: Annotated[int, Field(ge=1)] = 11
     num_threads: Annotated[int, Field(ge=1)] = 1
+    accelerator: Literal["cpu", "gpu"] = "cpu"
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @property
+    def device(self) -> str:
+        return "cuda" if self.accelerator == "gpu" else "cpu"
 
 
 @dataclass(frozen=True)
@@ -75,7 +85,7 @@ class Growth:
 def scene_of(settings: Settings) -> tuple[GraphBuilder, State]:
     """What matters: a moving lattice without gravity, so that what is put beside it can rest."""
     builder, scene = lattice_scene(settings.num_nodes, settings.num_edges, GraphConfig())
-    return builder, replace(scene, gravity=torch.zeros_like(scene.gravity))
+    return builder, replace(scene, gravity=torch.zeros_like(scene.gravity)).to_torch(settings.device)
 
 
 def growths(settings: Settings, builder: GraphBuilder, scene: State) -> list[Growth]:
@@ -100,17 +110,34 @@ def growths(settings: Settings, builder: GraphBuilder, scene: State) -> list[Gro
 
 def simulator(settings: Settings, edge_state: EdgeState, builder: GraphBuilder, skips: Skips) -> LearnedSimulator:
     """A model with random weights; its accelerations are so small that what rests stays at rest."""
-    torch.manual_seed(0)
+    torch.manual_seed(settings.seed)
     model = GPE(
         builder.spec,
         edge_state=edge_state,
         num_message_passing_steps=settings.num_message_passing_steps,
         hidden_channels=settings.hidden_channels,
     )
-    made = LearnedSimulator(model, copy.copy(builder)).eval()
+    made = LearnedSimulator(model, copy.copy(builder)).to(settings.device).eval()
     made.acceleration_std.fill_(1e-9)
     made.skips = skips
     return made
+
+
+def absent_material_calls(settings: Settings, skips: Skips) -> int:
+    """Calls of what belongs to a material that the scene has none of, in a step of a model that knows it."""
+    builder, state = _with_absent_materials(*scene_of(settings))
+    made = simulator(settings, settings.edge_states[0], builder, skips)
+    absent, count = MATERIALS[1:], 0
+
+    def see(*_: Any) -> None:
+        nonlocal count
+        count += 1
+
+    for path, module in made.named_modules():
+        if any(material in part.split("__") for material in absent for part in path.split(".")) and not any(module.children()):
+            module.register_forward_pre_hook(see)
+    made.step(state)
+    return count
 
 
 def message_passing_calls(settings: Settings, builder: GraphBuilder, scene: State, skips: Skips) -> int:
@@ -139,10 +166,10 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
     for edge_state in settings.edge_states:
         for growth in growths(settings, builder, scene):
             small = simulator(settings, edge_state, builder, Skips())
-            alternatives = {"small": _step(small, scene)}
+            alternatives = {"small": synchronized(_step(small, scene), settings.device)}
             for level in ("on", "off"):
                 runner = simulator(settings, edge_state, growth.builder, getattr(growth, level))
-                alternatives[level] = _step(approximate(runner), growth.state)
+                alternatives[level] = synchronized(_step(approximate(runner), growth.state), settings.device)
             times = paired_times(alternatives, settings.num_rounds, what=f"{edge_state}, {growth.amount}")
             cells = [edge_state, growth.amount]
             for level in ("on", "off"):
@@ -153,14 +180,40 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
                 cells += [f"{1e3 * np.median(times[level]):.1f}", f"{100 * overhead:+.1f} %"]
             cells.insert(2, f"{1e3 * np.median(times['small']):.1f}")
             lines.append(table_row(cells))
+        for hold in settings.holds:
+            ratio = _hold_time_ratio(settings, edge_state, builder, scene, hold)
+            records.append({"metric": "hold_time_ratio", "case": f"{hold} frames, {edge_state}", "value": ratio, "unit": "1"})
     for level, skips in (("on", Skips()), ("off", Skips(isolated_nodes=False))):
         calls = message_passing_calls(settings, builder, scene, skips)
         records.append({"metric": "falling_message_passing_calls", "case": level, "value": calls, "unit": "1"})
+    for level, skips in (("on", Skips()), ("off", Skips(absent_types=False))):
+        calls = absent_material_calls(settings, skips)
+        records.append({"metric": "absent_material_calls", "case": level, "value": calls, "unit": "1"})
     return records, _table(settings, lines, records)
 
 
+def _hold_time_ratio(settings: Settings, edge_state: EdgeState, builder: GraphBuilder, scene: State, hold: int) -> float:
+    """Time of ``hold`` frames with one prediction over that with a prediction for each."""
+
+    def frames(skips: Skips) -> Callable[[], State]:
+        runner = approximate(simulator(settings, edge_state, builder, skips))
+
+        def call() -> State:
+            state = scene
+            for _ in range(hold):
+                state = runner.step(state)
+            return state
+
+        return synchronized(call, settings.device)
+
+    times = paired_times({"held": frames(Skips(hold=hold)), "exact": frames(Skips())}, settings.num_rounds)
+    return paired_ratio(times, "held", "exact")
+
+
 def _table(settings: Settings, lines: list[str], records: list[dict[str, Any]]) -> str:
-    calls = {r["case"]: r["value"] for r in records if r["metric"] == "falling_message_passing_calls"}
+    calls = {(r["metric"], r["case"]): r["value"] for r in records if r["metric"].endswith("_calls")}
+    shares = [f"{r['case']} {100 * r['value']:.0f} %" for r in records if r["metric"] == "hold_time_ratio"]
+    held = f" Frames for which one prediction is held, another approximate level, take of the time: {', '.join(shares)}." if shares else ""
     header = ["edge state", "added", "without it [ms]", "level on [ms]", "longer by", "level off [ms]", "longer by"]
     return "\n".join(
         [
@@ -171,8 +224,11 @@ def _table(settings: Settings, lines: list[str], records: list[dict[str, Any]]) 
             "|" + "---|" * len(header),
             *lines,
             "",
-            f"A step of {settings.num_falling[0]} falling nodes alone calls {calls['on']} layers with more than one row, with the level off {calls['off']}. "
-            "Settled piles are left alone by an approximate level, which evaluation measures the error of; all others are exact.",
+            f"A step of {settings.num_falling[0]} falling nodes alone calls {calls['falling_message_passing_calls', 'on']} layers with more than one row, "
+            f"with the level off {calls['falling_message_passing_calls', 'off']}; a step without snow and liquid calls "
+            f"{calls['absent_material_calls', 'on']} modules of theirs, with the level off {calls['absent_material_calls', 'off']}. Settled piles are at "
+            "perfect rest here, without gravity and with accelerations next to nothing; they are left alone by an approximate level, which evaluation measures "
+            f"the error of. All others are exact.{held}",
         ]
     )
 
@@ -190,7 +246,7 @@ NODE_FIELDS = ("pos", "vel", "velocity_history", "node_type", "mass", "material_
 def _joined(scene: State, pos: torch.Tensor, vel: torch.Tensor) -> State:
     """The scene and further nodes of sand, which have always moved as they do."""
     assert scene.velocity_history is not None
-    rows = torch.zeros(len(pos), dtype=torch.int64)
+    rows = torch.zeros(len(pos), dtype=torch.int64, device=pos.device)
     more = {name: getattr(scene, name)[rows] for name in NODE_FIELDS}
     more |= {"pos": pos, "vel": vel, "velocity_history": vel[:, None].expand(-1, scene.velocity_history.shape[1], -1)}
     joined: dict[str, Any] = {name: torch.cat([getattr(scene, name), values]) for name, values in more.items()}
@@ -199,15 +255,17 @@ def _joined(scene: State, pos: torch.Tensor, vel: torch.Tensor) -> State:
 
 def _with_walls(scene: State, count: int) -> State:
     rng = np.random.default_rng(0)
-    pos = torch.from_numpy(rng.uniform(FAR, FAR + 1, (count, scene.dim)))
-    normal = torch.nn.functional.one_hot(torch.ones(count, dtype=torch.int64), scene.dim).double()
-    return replace(scene, boundary=Boundary(pos, torch.zeros_like(pos), normal, torch.ones(count).double(), torch.zeros(count).double()))
+    pos = torch.from_numpy(rng.uniform(FAR, FAR + 1, (count, scene.dim))).to(scene.pos.device)
+    normal = torch.zeros_like(pos)
+    normal[:, 1] = 1.0
+    return replace(scene, boundary=Boundary(pos, torch.zeros_like(pos), normal, pos.new_ones(count), pos.new_zeros(count)))
 
 
 def _falling(scene: State, count: int) -> State:
     """Nothing but nodes in free fall, one spacing of the unit apart."""
     side = int(np.ceil(count ** (1 / scene.dim)))
-    pos = FAR + torch.from_numpy(np.stack(np.unravel_index(np.arange(count), (side,) * scene.dim), axis=-1).astype(float))
+    lattice = np.stack(np.unravel_index(np.arange(count), (side,) * scene.dim), axis=-1)
+    pos = FAR + torch.from_numpy(lattice.astype(float)).to(scene.pos.device)
     joined = _joined(scene, pos, torch.zeros_like(pos))
     last: dict[str, Any] = {name: getattr(joined, name)[scene.num_nodes :] for name in NODE_FIELDS}
     return replace(joined, **last)
@@ -220,7 +278,7 @@ def _with_falling(scene: State, count: int) -> State:
 
 def _with_absent_materials(builder: GraphBuilder, scene: State) -> tuple[GraphBuilder, State]:
     names = param_names(MATERIALS)
-    params = torch.full((scene.num_nodes, len(names)), torch.nan, dtype=torch.float64)
+    params = torch.full((scene.num_nodes, len(names)), torch.nan, dtype=torch.float64, device=scene.pos.device)
     params[:, :1] = scene.material_params
     metadata = replace(builder.metadata, materials=MATERIALS, param_names=names)
     return GraphBuilder(builder.config, metadata), replace(scene, material_params=params)

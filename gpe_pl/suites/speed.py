@@ -6,7 +6,9 @@ time of moving every edge state in and out once per layer.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -20,15 +22,18 @@ from torch_geometric.data import HeteroData
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.neighbors import radius_pairs
 from gpe_pl.lattice import lattice_graph, lattice_scene
-from gpe_pl.machine import copy_rate, gemm_rate, peak_memory, synchronized
+from gpe_pl.machine import copy_rate, gemm_rate, has_cpp_compiler, peak_memory, peak_on_gpu, synchronized
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
+from gpe_pl.nn.fused import unfused
 from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction
 from gpe_pl.report import table_row
 from gpe_pl.schema import FeatureSpec
 from gpe_pl.timing import paired_ratio, paired_times
+
+log = logging.getLogger(__name__)
 
 INTERACTIONS: tuple[Interaction, ...] = ("directed", "negated", "odd", "odd_even")
 REFERENCE = "directed, plain"
@@ -49,6 +54,7 @@ class Settings:
     num_threads: Annotated[int, Field(ge=1)] = 1
     accelerator: Literal["cpu", "gpu"] = "cpu"
     compile: bool = True
+    seed: Annotated[int, Field(ge=0)] = 0
 
     @property
     def device(self) -> str:
@@ -63,12 +69,38 @@ class Case:
     interaction: Interaction = "negated"
     implementation: Implementation = "factored"
     edge_state: EdgeState = "latent"
+    is_fused: bool = True
     compiled: bool = False
     precision: Literal["highest", "medium"] = "highest"
 
-    def build(self, spec: FeatureSpec, num_steps: int, hidden: int) -> nn.Module:
+    def runs(self, function: Callable[[], Any]) -> Callable[[], Any]:
+        """The function as this case has it: with its precision of single-precision products (``medium`` allows bfloat16 inside), and without fused passes
+        where it has none.
+        """
+
+        def call() -> Any:
+            before = torch.get_float32_matmul_precision()
+            torch.set_float32_matmul_precision(self.precision)
+            try:
+                with nullcontext() if self.is_fused else unfused():
+                    return function()
+            finally:
+                torch.set_float32_matmul_precision(before)
+
+        return call
+
+    @property
+    def saves_against(self) -> str | None:
+        """The case which computes both directions of an edge in the same way otherwise."""
+        if self.model != "GPE" or self.edge_state != "latent" or self.compiled or self.precision != "highest":
+            return None
+        if self.implementation == "plain":
+            return "directed, plain"
+        return None if self.is_fused else "directed, factored"
+
+    def build(self, spec: FeatureSpec, num_steps: int, hidden: int, seed: int = 0) -> nn.Module:
         """The model, with the same weights for the same parameters."""
-        torch.manual_seed(0)
+        torch.manual_seed(seed)
         if self.model == "GNS":
             return GNS(spec, num_steps, hidden)
         if self.model == "DPINet":
@@ -88,7 +120,7 @@ class Case:
 def cases(compiled: bool) -> dict[str, Case]:
     """All that is timed, by name; the reference first."""
     found = {f"{i}, plain": Case(interaction=i, implementation="plain") for i in INTERACTIONS}
-    found |= {f"{i}, factored": Case(interaction=i) for i in ("directed", "odd_even")}
+    found |= {f"{i}, factored": Case(interaction=i, is_fused=False) for i in INTERACTIONS}
     found |= {i: Case(interaction=i) for i in ("negated", "odd")}
     if compiled:
         found |= {f"{i}, compiled": Case(interaction=i, compiled=True) for i in ("negated", "odd")}
@@ -117,30 +149,16 @@ def edge_bytes(case: Case, spec: FeatureSpec, graph: HeteroData, settings: Setti
 def forward_pass(case: Case, settings: Settings) -> Callable[[], Any]:
     """A forward pass in inference, its graph and model built."""
     builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
-    model = case.build(builder.spec, settings.num_message_passing_steps, settings.hidden_channels)
-    return torch.inference_mode()(lambda: model(graph))
-
-
-def with_precision(function: Callable[[], Any], precision: str) -> Callable[[], Any]:
-    """The function with PyTorch's precision of single-precision products: ``medium`` allows bfloat16 inside."""
-    if precision == "highest":
-        return function
-
-    def call() -> Any:
-        before = torch.get_float32_matmul_precision()
-        torch.set_float32_matmul_precision(precision)
-        try:
-            return function()
-        finally:
-            torch.set_float32_matmul_precision(before)
-
-    return call
+    model = case.build(builder.spec, settings.num_message_passing_steps, settings.hidden_channels, settings.seed)
+    return case.runs(torch.inference_mode()(lambda: model(graph)))
 
 
 def training_pass(case: Case, settings: Settings) -> Callable[[], Any]:
     """A training step, its graph and model built."""
     builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
-    return training_step(case.build(builder.spec, settings.num_message_passing_steps, settings.hidden_channels), graph)
+    return case.runs(
+        training_step(case.build(builder.spec, settings.num_message_passing_steps, settings.hidden_channels, settings.seed), graph)
+    )
 
 
 def training_step(model: nn.Module, graph: HeteroData) -> Callable[[], Any]:
@@ -170,15 +188,18 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
     torch.set_num_threads(settings.num_threads)
     device = settings.device
     builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
-    spec, size = builder.spec, (settings.num_message_passing_steps, settings.hidden_channels)
+    spec, size = builder.spec, (settings.num_message_passing_steps, settings.hidden_channels, settings.seed)
     num_edges = sum(graph[r].edge_index.shape[1] for r in spec.relations)
     on_device = graph.clone().to(device)
-    todo = cases(settings.compile)
+    compiles = settings.compile and (device != "cpu" or has_cpp_compiler())
+    if settings.compile and not compiles:
+        log.warning("suite.compile: no C++ compiler here, so nothing is timed with torch.compile")
+    todo = cases(compiles)
     models = {name: case.build(spec, *size).to(device) for name, case in todo.items()}
     models = {name: _compiled(model, device) if todo[name].compiled else model for name, model in models.items()}
-    passes = {n: with_precision(torch.inference_mode()(lambda m=m: m(on_device)), todo[n].precision) for n, m in models.items()}
+    passes = {n: todo[n].runs(torch.inference_mode()(lambda m=m: m(on_device))) for n, m in models.items()}
     forward = {n: synchronized(function, device) for n, function in passes.items()}
-    step = {n: synchronized(with_precision(training_step(m, on_device), todo[n].precision), device) for n, m in models.items()}
+    step = {n: synchronized(todo[n].runs(training_step(m, on_device)), device) for n, m in models.items()}
     exact = {n.removesuffix(MEDIUM): forward[n.removesuffix(MEDIUM)]() for n in todo if n.endswith(MEDIUM)}
     forward_times = paired_times(forward, settings.num_rounds, num_warmups=3, what="forward passes")
     training_times = paired_times(step, max(1, settings.num_rounds // 3), num_warmups=3, what="training steps")
@@ -201,13 +222,16 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
             found, expected = (p.acceleration[SAND] for p in (forward[name](), exact[name.removesuffix(MEDIUM)]))
             values["forward_difference"] = (float((found - expected).norm() / expected.norm()), "1")
         elif case.model == "GPE":
-            counterpart = {"plain": "directed, plain", "factored": "directed, factored"}[case.implementation]
-            values["forward_time_saved"] = (1 - paired_ratio(forward_times, name, counterpart), "1")
+            if case.saves_against is not None:
+                values["forward_time_saved"] = (1 - paired_ratio(forward_times, name, case.saves_against), "1")
             values["flop"] = (flop(case.build(spec, *size), graph), "FLOP")
             values["flop_floor"] = (values["flop"][0] / gemm, "s")
             values["byte_floor"] = (edge_bytes(case, spec, graph, settings) / copy, "s")
             values["floor_ratio"] = (values["forward_time"][0] / values["flop_floor"][0], "1")
-        if device == "cpu" and not case.compiled and case.precision == "highest":
+        if device != "cpu":
+            values["peak_memory"] = (peak_on_gpu(forward[name]), "B")
+            values["training_peak_memory"] = (peak_on_gpu(step[name]), "B")
+        elif not case.compiled and case.precision == "highest":
             values["peak_memory"] = (peak_memory(forward_pass, case, settings), "B")
             values["training_peak_memory"] = (peak_memory(training_pass, case, settings), "B")
         records += [{"metric": metric, "case": name, "value": value, "unit": unit} for metric, (value, unit) in values.items()]
@@ -263,10 +287,12 @@ def _table(settings: Settings, num_edges: int, gemm: float, copy: float, lines: 
             "|" + "---|" * len(header),
             *lines,
             "",
-            f"Times: medians. Faster: median of paired ratios to `{REFERENCE}`, which multiplies the concatenated features of every directed edge. Saved: time "
-            "saved against `directed` of the same implementation; the paper reports 37 % for `negated`. Product floor: the case's own matrix products at the "
-            "measured rate; byte floor: its edge states in and out once per layer at the copy rate. Geometry: raw edge features instead of latent edge "
-            "states. Memory: beyond weights and graph. Medium: products may use bfloat16 inside (`trainer.matmul_precision=medium`), which changes the "
+            f"Times: medians. Faster: median of paired ratios to `{REFERENCE}`, which multiplies the concatenated features of every directed edge. "
+            "Factored: node features are multiplied before they go to the edges, by PyTorch's operations; below, by passes of our own where a name has no "
+            "addition. Saved: time saved against `directed` of the same implementation; the paper reports 37 % for `negated`. Product floor: the case's own "
+            "matrix products at the measured rate; byte floor: its edge states in and out once per layer at the copy rate. Geometry: raw edge features instead "
+            "of latent edge states. Memory: beyond weights and graph. Medium: products may use bfloat16 inside (`trainer.matmul_precision=medium`), which "
+            "changes the "
             + ", ".join(
                 f"{r['case'].removesuffix(MEDIUM)} output by {100 * r['value']:.1g} %"
                 for r in records

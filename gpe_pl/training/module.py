@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import shutil
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -21,6 +20,7 @@ from gpe_pl import ranks
 from gpe_pl.data.dataset import Samples
 from gpe_pl.errors import GpeError
 from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.machine import has_cpp_compiler
 from gpe_pl.metrics import OneStepNMSE
 from gpe_pl.training.push_forward import Excursions
 
@@ -115,7 +115,7 @@ class TrainingModule(L.LightningModule):
         is_long = self.num_steps - self.global_step >= COMPILE_PAYS_AFTER
         is_fast_already = self.device.type == "cpu" and getattr(model, "is_fused", False)
         wanted = self.compile_mode == "on" or (self.compile_mode == "auto" and is_long and not is_fast_already)
-        if wanted and self.compile_mode == "auto" and not any(shutil.which(c) for c in ("c++", "g++", "clang++", "cl")):
+        if wanted and self.compile_mode == "auto" and not has_cpp_compiler():
             log.warning("compile: auto found no C++ compiler, training runs without torch.compile")
             wanted = False
         if not wanted:

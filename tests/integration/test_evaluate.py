@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import jaxtyping
+import numpy as np
 import pytest
 import torch
 
@@ -179,6 +180,18 @@ def test_levels_of_skipping_change_nothing_or_are_reported_with_what_they_cost(t
     costs = {k: v for k, v in of_rollouts(approximate).items() if k[1] in ("skipping_mse", "share_asleep", "lost_impulse")}
     assert len(costs) == 6 and all(v > 0 for v in costs.values())
     assert not any(metric in ("skipping_mse", "share_asleep", "lost_impulse") for _, metric, _ in usual)
+
+
+@pytest.mark.slow
+def test_an_exact_rollout_that_stops_first_is_compared_as_far_as_it_came(tiny_data: Path, tmp_path: Path) -> None:
+    fit(tiny(tiny_data, tmp_path))
+    wild = LearnedSimulator.from_checkpoint(tmp_path / "fit" / "checkpoints" / "best.ckpt")
+    wild.acceleration_std.mul_(300)
+    wild.save(tmp_path / "wild.ckpt")
+    rows = evaluate(tiny_data, tmp_path / "runs", tmp_path / "wild.ckpt", "evaluation.num_pictures=0", "rollout.hold=3")
+    lengths = {model: [r.value for r in rows if (r.model, r.metric) == (model, "rollout_mse")] for model in ("learned", "learned, exact")}
+    assert not np.isfinite(lengths["learned, exact"]).all()
+    assert sum(r.metric == "skipping_mse" for r in rows) == 2
 
 
 @pytest.mark.slow

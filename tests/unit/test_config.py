@@ -238,6 +238,16 @@ def call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, task: Callable[[DictCo
     entry_point("benchmark")(task)()
 
 
+@pytest.mark.parametrize("suite", ["speed", "scaling", "skip", "runtime_vs_error"])
+def test_a_suite_for_a_gpu_says_that_there_is_none(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, suite: str
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(SystemExit):
+        call(monkeypatch, tmp_path, benchmark, f"suite={suite}", "trainer=gpu")
+    assert capsys.readouterr().err.startswith("error: trainer.accelerator=gpu: PyTorch finds no GPU here")
+
+
 @pytest.mark.parametrize(
     ("task", "arguments", "line"),
     [
@@ -247,6 +257,9 @@ def call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, task: Callable[[DictCo
         (lambda cfg: None, ["paths.data=null"], "error: paths.data=None: input should be a valid string"),
         (lambda cfg: None, ["+foo=1"], "error: foo: unknown or missing key; valid keys: paths, size, suite, trainer"),
         (benchmark, ["suite.name=nope"], "error: suite.name='nope': must be one of "),
+        (benchmark, ["suite.name=trained"], "error: suite.name='trained': must be one of faults, "),
+        (benchmark, ["suite=skip", "suite.edge_states=[]"], "error: suite.edge_states=[]: "),
+        (benchmark, ["suite=scaling", "suite.num_nodes=[]"], "error: suite.num_nodes=[]: "),
         (lambda cfg: None, ["suite.name=${nothing}"], "error: Interpolation key 'nothing' not found"),
         (lambda cfg: construct(Inner, {"size": cfg.suite.num_nodes}, "suite"), ["suite.num_nodes=0"], "error: suite.size=0: input should"),
     ],

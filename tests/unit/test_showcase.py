@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,10 @@ import torch
 from gpe_pl import showcase
 from gpe_pl.learned_simulator import LearnedSimulator, SceneError
 from gpe_pl.models.gpe import GPE
-from gpe_pl.showcase import Record, ShowcaseSettings, run
+from gpe_pl.showcase import Record, ShowcaseSettings, start
+from gpe_pl.skips import Skips
 from gpe_pl.solvers.fluid_scenes import FluidScene
+from gpe_pl.solvers.scenes import Scene
 from tests import scenes
 
 CANYON = FluidScene("canyon", ((0.0, 3.0), (0.0, 1.5), (0.0, 1.5)), 2 * scenes.SPACING, 60)
@@ -27,6 +30,16 @@ def simulator(accelerations: float = 1.0) -> LearnedSimulator:
     return simulated
 
 
+def run(
+    simulated: LearnedSimulator,
+    scene: Scene,
+    settings: ShowcaseSettings,
+    folder: Path,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> list[Record]:
+    return showcase.run(simulated, *start(simulated, scene, settings), settings, folder, on_progress)
+
+
 def values(records: list[Record]) -> dict[str, float]:
     return {r.metric: r.value for r in records}
 
@@ -37,6 +50,7 @@ def test_a_rollout_from_rest_is_counted_and_drawn(tmp_path: Path) -> None:
     found = values(records)
     assert found["num_nodes"] == 60 and found["num_steps"] == 3 and found["num_boundary_nodes"] > 1000
     assert found["share_outside_at_end"] == 0 and 0 <= found["share_corrected"] < 1
+    assert found["num_uncontained_steps"] == 2 and "share_asleep" not in found
     assert found["max_speed"] > 0 and found["peak_memory"] > 1e6 and found["seconds_per_step"] > 0
     assert seen == [(k, 5) for k in range(1, 6)]
     written = json.loads((tmp_path / "showcase.json").read_text())
@@ -81,3 +95,10 @@ def test_a_scene_of_another_spacing_is_refused(tmp_path: Path) -> None:
     coarse = FluidScene("canyon", CANYON.bounds, 3 * scenes.SPACING, 20)
     with pytest.raises(SceneError, match=r"the scene has .* spacing=0\.075 m"):
         run(simulator(), coarse, SETTINGS, tmp_path)
+
+
+def test_what_approximate_levels_leave_out_is_counted(tmp_path: Path) -> None:
+    simulated = simulator()
+    simulated.skips = Skips(sleep_after=1, rest_speed=1e3, rest_acceleration=1e6)
+    found = values(run(simulated, CANYON, SETTINGS, tmp_path))
+    assert found["share_asleep"] > 0 and found["lost_impulse"] > 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 from torch_geometric.nn import MessagePassing
@@ -124,3 +126,16 @@ def test_orientation_rule() -> None:
     assert out.tolist() == [[1.0, -2.0], [1.0, -2.0], [0.0, 3.0], [0.0, 3.0], [0.0, 0.0]]
     again, same = orient(index.flip(0), -out)
     assert torch.equal(again[:, :4], index[:, :4]) and torch.equal(same[:4], out[:4])
+
+
+@pytest.mark.parametrize("update_edges", [True, False])
+@pytest.mark.parametrize("interaction", ["negated", "odd", "odd_even", "directed"])
+def test_autocast_changes_no_more_than_its_precision(interaction: Any, update_edges: bool) -> None:
+    torch.manual_seed(0)
+    conv = MomentumConv(8, 8, 3, interaction)
+    edge_index, h = torch.tensor([[0, 1, 2], [1, 2, 0]]), torch.randn(3, 8)
+    e, s = torch.randn(6 if interaction == "directed" else 3, 8), torch.randn(3, 3)
+    expected = conv(h, h, edge_index, e, s, update_edges)[0]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = conv(h, h, edge_index, e, s, update_edges)[0]
+    torch.testing.assert_close(found.float(), expected, rtol=0.05, atol=0.05)

@@ -120,6 +120,7 @@ def test_a_flood_fills_the_lowest_free_places_upstream(file: str) -> None:
         ([frame(vel=np.full((8, 3), np.nan))], "vel of the first frame"),
         ([frame(box=np.zeros((0, 3)), box_normals=np.zeros((0, 3)))], "must have walls"),
         ([frame(m=np.zeros(8))], "positive mass"),
+        ([frame(box_normals=np.ones((81 * 41, 3)))], "box_normals of the first frame are not unit vectors"),
         ([{**frame(), "m": {**packed(np.zeros(8)), b"type": "|O"}}], "not an array of numbers"),
         ([{**frame(), "m": {**packed(np.zeros(8)), b"shape": [9]}}], "cannot reshape"),
     ],

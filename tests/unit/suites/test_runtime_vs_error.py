@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import math
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
+from gpe_pl.report import Run
 from gpe_pl.simulate import dataset_spec
 from gpe_pl.solvers.resolution import Resolved
 from gpe_pl.suites import runtime_vs_error as module
@@ -35,6 +37,7 @@ from gpe_pl.suites.runtime_vs_error import (
     front,
     hypervolume,
     run,
+    training_seconds,
     verdicts,
 )
 from gpe_pl.suites.trained import Case
@@ -116,6 +119,18 @@ def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
     assert np.isfinite(order)
 
 
+def test_training_took_its_steps_at_the_step_time_of_its_sweep(tmp_path: Path) -> None:
+    config = {"data.name": "sand", "size.name": "tiny", "model._target_": "gpe_pl.models.gpe.GPE", "training.num_steps": 100}
+    config |= {"size.comparison.budget_minutes": 1}
+    sweep = tmp_path / "sweep"
+    sweep.mkdir()
+    trained = Run(sweep / "seed=0", config, [])
+    assert math.isnan(training_seconds(trained))
+    times = {"sand tiny GPE 1": 0.5, "sand tiny GPE 2": 0.1, "sand tiny GPE 3": 0.7, "sand small GPE 1": 0.55, "sand tiny GNS 1": 0.58}
+    (sweep / "step_times.json").write_text(json.dumps(times))
+    assert training_seconds(trained) == 50.0  # 70 s were more than it had
+
+
 def test_longer_steps_are_as_many_frames_and_what_lies_between_is_interpolated() -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
     data, start = generate_trajectory(spec, "test", 0), initial_state(spec, "test", 0)
@@ -137,9 +152,10 @@ def test_solvers_on_a_grid_have_longer_steps_up_to_a_cell() -> None:
 
 
 def test_gpe_also_holds_its_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
-    simulator, trained = untrained(), SimpleNamespace(config={"size.comparison.budget_minutes": 2})
-    monkeypatch.setattr(module, "trained_on", lambda *_: {"GPE": (simulator, trained)})
-    models = _models([], dataset_spec(compose("simulate", *OVERRIDES)), [2, 4])
+    simulator = untrained()
+    monkeypatch.setattr(module, "trained_on", lambda *_: {"GPE": (simulator, None)})
+    monkeypatch.setattr(module, "training_seconds", lambda _: 120.0)
+    models = _models([], dataset_spec(compose("simulate", *OVERRIDES)), Settings({}, [], holds=[2, 4]))
     assert {label: (s.skips.hold, seconds) for label, (s, seconds) in models.items()} == {
         "GPE": (1, 120.0),
         "GPE, held for 2 frames": (2, 120.0),
@@ -163,7 +179,9 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
     monkeypatch.setattr(module, "_models", lambda *_: {"model": None})
     monkeypatch.setattr(module, "compare", lambda *_: (points, 1.3))
     records, table = run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec})
-    assert "| model | **1.3**, training pays off after 0 s |" in table and "| slow model | 0.15 |" in table
+    assert "| model | **1.3** |" in table and "| slow model | 0.15 |" in table
+    assert "| slow model | never |" in table
+    assert {(r["simulator"], r["value"]) for r in records if r["metric"] == "break_even"} >= {("slow model", float("inf")), ("model", 0.0)}
     assert "| exact model | **more accurate" in table and "| careless model | cheaper and less accurate" in table
     assert "@full: **below the solver's curve**: model, exact model." in table
     assert "order of convergence is 1.3" in table

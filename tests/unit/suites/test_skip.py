@@ -11,14 +11,14 @@ from omegaconf import OmegaConf
 from gpe_pl.approximate import approximate
 from gpe_pl.config import CONF
 from gpe_pl.suites import skip
-from gpe_pl.suites.skip import Settings, growths, message_passing_calls, run, scene_of, simulator
+from gpe_pl.suites.skip import Settings, absent_material_calls, growths, message_passing_calls, run, scene_of, simulator
 
-TINY = Settings(40, 150, 2, 8, ["latent"], num_boundary=[30], num_falling=[10], num_settled=[2], num_rounds=1)
+TINY = Settings(40, 150, 2, 8, ["latent"], num_boundary=[30], num_falling=[10], num_settled=[2], holds=[3], num_rounds=1)
 
 
 def test_the_config_has_the_settings() -> None:
     values: Any = OmegaConf.to_container(OmegaConf.load(CONF / "suite" / "skip.yaml"))
-    assert values.pop("name") == "skip"
+    assert values.pop("name") == "skip" and values.pop("accelerator") == "${trainer.accelerator}"
     assert Settings(**values).num_boundary[-1] == 50_000
 
 
@@ -48,6 +48,11 @@ def test_falling_nodes_call_no_message_passing() -> None:
     assert on == 0 and off == TINY.num_message_passing_steps
 
 
+def test_absent_materials_call_nothing_of_theirs() -> None:
+    on, off = (absent_material_calls(TINY, skip.Skips(absent_types=level)) for level in (True, False))
+    assert on == 0 and off > 0
+
+
 def test_the_table_has_a_row_per_growth() -> None:
     records, table = run(TINY)
     assert {r["metric"] for r in records} >= {
@@ -58,3 +63,4 @@ def test_the_table_has_a_row_per_growth() -> None:
     }
     assert all(r["value"] > 0 for r in records if r["metric"] == "step_time")
     assert table.count("| latent |") == 4 and "alone calls 0 layers" in table
+    assert [r["case"] for r in records if r["metric"] == "hold_time_ratio"] == ["3 frames, latent"] and "3 frames, latent" in table

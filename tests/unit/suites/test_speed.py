@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.lattice import lattice_graph
-from gpe_pl.suites.speed import REFERENCE, Case, Settings, cases, flop, run, training_step, with_precision
+from gpe_pl.nn.fused import works_on
+from gpe_pl.suites.speed import REFERENCE, Case, Settings, cases, flop, run, training_step
 
 SMALL = Settings(num_nodes=40, num_edges=100, num_message_passing_steps=2, hidden_channels=8, num_rounds=1, compile=False)
 
@@ -60,10 +63,9 @@ def test_every_case_has_its_records_and_its_row(monkeypatch: pytest.MonkeyPatch)
         if case.precision != "highest":
             wanted |= {"forward_difference"}
         else:
-            wanted |= {"peak_memory"} | (
-                {"forward_time_saved", "flop_floor", "byte_floor", "floor_ratio"} if case.model == "GPE" else set()
-            )
-        assert all(found[metric, name] >= 0 or metric == "forward_time_saved" for metric in wanted)
+            wanted |= {"peak_memory"} | ({"flop_floor", "byte_floor", "floor_ratio"} if case.model == "GPE" else set())
+        assert (("forward_time_saved", name) in found) == (case.saves_against is not None)
+        assert all(found[metric, name] >= 0 for metric in wanted)
         assert f"| {name} |" in table
     assert found["forward_speedup", REFERENCE] == 1 and found["forward_speedup_vs_gns", "GNS"] == 1
     assert found["neighbor_time", "cpu"] > 0
@@ -73,5 +75,39 @@ def test_every_case_has_its_records_and_its_row(monkeypatch: pytest.MonkeyPatch)
 def test_precision_holds_within_a_pass_alone() -> None:
     seen: list[str] = []
     before = torch.get_float32_matmul_precision()
-    with_precision(lambda: seen.append(torch.get_float32_matmul_precision()), "medium")()
+    Case(precision="medium").runs(lambda: seen.append(torch.get_float32_matmul_precision()))()
     assert seen == ["medium"] and torch.get_float32_matmul_precision() == before == "highest"
+
+
+def test_fused_passes_are_left_out_where_a_case_has_none() -> None:
+    x, seen = torch.zeros(2, 2), list[bool]()
+    for case in (Case(), Case(is_fused=False), Case()):
+        case.runs(lambda: seen.append(works_on(x)))()
+    assert seen == [True, False, True]
+
+
+def test_time_is_saved_against_the_same_implementation() -> None:
+    found = {name: case.saves_against for name, case in cases(compiled=True).items()}
+    assert found["negated, plain"] == "directed, plain" and found["odd, factored"] == "directed, factored"
+    assert {name for name, against in found.items() if against is None} >= {
+        "negated",
+        "odd, compiled",
+        "negated, geometry",
+        "negated, medium",
+        "GNS",
+    }
+    assert not cases(compiled=True)["directed, factored"].is_fused
+
+
+def test_without_a_compiler_nothing_is_compiled(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    class Chosen(Exception):
+        pass
+
+    def see(compiled: bool) -> None:
+        raise Chosen(compiled)
+
+    monkeypatch.setattr("gpe_pl.suites.speed.cases", see)
+    monkeypatch.setattr("gpe_pl.suites.speed.has_cpp_compiler", lambda: False)
+    with pytest.raises(Chosen, match="False"):
+        run(replace(SMALL, compile=True))
+    assert "no C++ compiler" in caplog.text
