@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from gpe_pl.atomic import replace_text
 from gpe_pl.config import CONF, ConfigError, construct, entry_point
-from gpe_pl.machine import environment
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -30,6 +29,7 @@ def benchmark(cfg: DictConfig) -> None:
     import torch
     from omegaconf import OmegaConf
 
+    from gpe_pl.machine import environment
     from gpe_pl.simulate import dataset
 
     suites = sorted(path.stem for path in (CONF / "suite").glob("*.yaml"))

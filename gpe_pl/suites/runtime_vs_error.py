@@ -45,7 +45,9 @@ Frame = tuple[np.ndarray, np.ndarray]
 """Positions [node, dim] in m and velocities [node, dim] in m/s."""
 
 DATA = "solver, as for the data"
+SPACING, STEPS = "spacing × ", "steps × "
 BALLISTIC = "ballistic"
+HELD = ", held predictions"
 
 
 class ComparisonError(GpeError, ValueError):
@@ -142,7 +144,7 @@ def _models(runs: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[
         for hold in settings.holds if isinstance(simulator.model, GPE) else ():
             holding = copy.copy(simulator)
             holding.skips = replace(simulator.skips, hold=hold)
-            found[f"{label}, held for {hold} frames"] = holding, seconds
+            found[f"{label}{HELD} × {hold}"] = holding, seconds
     return found
 
 
@@ -212,10 +214,10 @@ def _simulators(
             log.info("%s: no scene %g times coarser (%s)", spec.name, factor, error)
             continue
         if solver is not None:
-            yield f"solver, spacing × {factor:g}", "solver", solver, _Restricted(resolved, True)
+            yield f"solver, {SPACING}{factor:g}", "solver", solver, _Restricted(resolved, True)
     for steps in settings.step_factors:
         if (solver := _with_longer_steps(spec, steps)) is not None:
-            yield f"solver, steps × {steps}", "solver", solver, _Restricted(same, True, steps)
+            yield f"solver, {STEPS}{steps}", "solver", solver, _Restricted(same, True, steps)
     dt = spec.solver.frame_dt
     for label, (simulator, _) in models.items():
         at = _Restricted(Resolved(simulator.initial_state(data, history), lambda pos: pos), False)
@@ -419,6 +421,10 @@ def _points(records: Sequence[dict[str, Any]], case: str) -> list[Point]:
                 point.seconds = r["values"]
             elif r["metric"] == "rollout_mse":
                 point.mse[r["horizon"]] = r["values"]
+            elif r["metric"] == "energy_distance":
+                point.distance = r["values"]
+            elif r["metric"] == "overhead":
+                point.overhead = r["value"]
     return [*points.values()]
 
 
@@ -444,9 +450,12 @@ def _section(case: str, points: Sequence[Point], order: float, num_trajectories:
         "**Break-even**: seconds of simulation after which training and its data have paid off, against a solver of the same error",
         "",
     ]
-    lost += [table_row(["", *(f"@{h}" for h in horizons)]), "|" + "---|" * (1 + len(horizons))]
-    for point in (p for p in points if p.family == "learned"):
-        lost.append(table_row([point.name, *(_pays_off(break_even(point, solvers, h, duration=1.0)) for h in horizons)]))
+    after = {p.name: [break_even(p, solvers, h, duration=1.0) for h in horizons] for p in points if p.family == "learned"}
+    if np.isinf([*after.values()]).all():
+        lost.append("Never, for any of the models.")
+    else:
+        lost += [table_row(["", *(f"@{h}" for h in horizons)]), "|" + "---|" * (1 + len(horizons))]
+        lost += [table_row([name, *map(_pays_off, values)]) for name, values in after.items()]
     return "\n".join([f"### {case}", "", *lines, "", note, "", "**At equal error**", "", *verdicts(points, horizons), *lost])
 
 
@@ -474,7 +483,7 @@ def verdicts(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:
         comparable = [p for p in learned if p.error(horizon) <= front(solvers, horizon)[0].error(horizon)]
         gain = {p.name: cost_at_error(solvers, p.error(horizon), horizon) / p.cost for p in comparable}
         if not gain:
-            yield f"- @{horizon}: no learned model is as accurate as the coarsest solver."
+            yield f"- @{horizon}: {_none_as_accurate(learned, front(solvers, horizon)[0], horizon)}"
             continue
         nearest = max(comparable, key=lambda p: gain[p.name])
         if gain[nearest.name] > 1:
@@ -484,8 +493,21 @@ def verdicts(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:
         error = error_at_cost(solvers, nearest.cost, horizon)
         yield (
             f"- @{horizon}: no learned model passes below the solver's curve. Nearest is {nearest.name}: it would have to be "
-            f"{1 / gain[nearest.name]:.2g} times faster, or {nearest.error(horizon) / error:.2g} times more accurate at its cost."
+            f"{_rounded(1 / gain[nearest.name])} times faster, or {_rounded(nearest.error(horizon) / error)} times more accurate at its cost."
         )
+
+
+def _none_as_accurate(learned: Sequence[Point], cheapest: Point, horizon: str) -> str:
+    nearest = min(learned, key=lambda p: p.error(horizon))
+    return (
+        f"no learned model is as accurate as the cheapest of the solvers ({cheapest.name}). Nearest is {nearest.name}: it would have to be "
+        f"{_rounded(nearest.error(horizon) / cheapest.error(horizon))} times more accurate and {_rounded(nearest.cost / cheapest.cost)} times faster."
+    )
+
+
+def _rounded(factor: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{float(f'{factor:.2g}'):g}"
 
 
 def _interval(values: list[float], scale: float) -> str:
@@ -497,16 +519,26 @@ def _interval(values: list[float], scale: float) -> str:
 
 def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
     """Cost against error, a figure per case."""
-    from gpe_pl.viz.comparison import cost_error_figure
+    from gpe_pl.viz.comparison import CostAndError, cost_error_figure
 
     found = {}
     for case in dict.fromkeys(r["case"] for r in records):
         points = _points(records, case)
         panels = {}
         for horizon in points[0].mse:
-            panels[f"frames 1 – {horizon}" if horizon != "full" else "all frames"] = {
-                family: [(p.name, p.cost, p.error(horizon)) for p in points if p.family == family]
-                for family in ("solver", "learned", "trivial")
-            }
+            lines: dict[str, list[tuple[float, float]]] = {"solver, coarser to the left": [], "solver, longer steps": []}
+            marks: dict[str, list[tuple[float, float]]] = {}
+            for point in points:
+                place = point.cost, point.error(horizon)
+                if point.family == "solver":
+                    for label, others in zip(lines, (STEPS, SPACING), strict=True):
+                        if others not in point.name:
+                            lines[label].append(place)
+                elif point.family == "learned":
+                    marks.setdefault(point.name.partition(" ")[0] + (HELD if HELD in point.name else ""), []).append(place)
+            levels = {p.name: p.error(horizon) for p in points if p.family == "trivial"}
+            panels[f"frames 1 – {horizon}" if horizon != "full" else "all frames"] = CostAndError(
+                {label: places for label, places in lines.items() if len(places) > 1}, marks, levels
+            )
         found[f"cost_error_{case}".replace(" ", "_")] = cost_error_figure(panels, "wall time per simulated second", "rollout MSE [m²]")
     return found

@@ -1,6 +1,7 @@
 """Figures that compare models over domains: errors with their intervals, and errors against the material parameter."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -93,37 +94,45 @@ def parameter_figure(
     return figure
 
 
-def cost_error_figure(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float, float]]]], x_label: str, y_label: str) -> Figure:
+@dataclass(frozen=True)
+class CostAndError:
+    """What a panel shows, by label: infinite errors are left out.
+
+    Attributes:
+        lines: costs and errors that belong together, such as the resolutions of a solver.
+        marks: costs and errors each for itself; hollow where the label is that of an earlier one and an addition after a comma.
+        levels: errors of what costs nothing.
+    """
+
+    lines: Mapping[str, Sequence[tuple[float, float]]]
+    marks: Mapping[str, Sequence[tuple[float, float]]]
+    levels: Mapping[str, float]
+
+
+def cost_error_figure(panels: Mapping[str, CostAndError], x_label: str, y_label: str) -> Figure:
     """Cost against error on logarithmic axes, a panel per horizon.
 
-    A line goes through the solver's resolutions; a learned model is a mark; what costs nothing is a horizontal line.
-
     Args:
-        panels: by title, then by family ``solver``, ``learned`` and ``trivial``: name, cost and error; infinite errors are left out.
+        panels: by title.
         x_label: of the costs.
         y_label: of the errors.
     """
     figure = new_figure(TEXT_WIDTH, 2.8)
     figure.set_layout_engine("constrained")
     all_axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    for axes, (title, families) in zip(all_axes, panels.items(), strict=True):
+    for axes, (title, panel) in zip(all_axes, panels.items(), strict=True):
         axes.set_xscale("log")
         axes.set_yscale("log")
-        solver = sorted((c, e) for _, c, e in families.get("solver", ()) if np.isfinite(e))
-        axes.plot(
-            [c for c, _ in solver],
-            [e for _, e in solver],
-            "s-",
-            markersize=4,
-            linewidth=1,
-            color="0.3",
-            label="solver, coarser to the left",
-        )
-        for k, (name, cost, error) in enumerate(families.get("learned", ())):
-            if np.isfinite(error):
-                axes.plot([cost], [error], "o", markersize=5, color=PALETTE[k % len(PALETTE)], label=name)
-        for style, (name, _, error) in zip((":", "--"), families.get("trivial", ()), strict=False):
-            axes.axhline(error, linestyle=style, linewidth=1, color="0.6", label=name)
+        for style, (label, points) in zip(("s-", "D--"), panel.lines.items(), strict=False):
+            shown = sorted(p for p in points if np.isfinite(p[1]))
+            axes.plot([c for c, _ in shown], [e for _, e in shown], style, markersize=3.5, linewidth=1, color="0.3", label=label)
+        colors = {name: PALETTE[k % len(PALETTE)] for k, name in enumerate(dict.fromkeys(label.partition(",")[0] for label in panel.marks))}
+        for label, points in panel.marks.items():
+            shown, color = [p for p in points if np.isfinite(p[1])], colors[label.partition(",")[0]]
+            face = "none" if "," in label else color
+            axes.plot([c for c, _ in shown], [e for _, e in shown], "o", markersize=4.5, color=color, markerfacecolor=face, label=label)
+        for style, (label, error) in zip((":", "--"), panel.levels.items(), strict=False):
+            axes.axhline(error, linestyle=style, linewidth=1, color="0.6", label=label)
         low, high = np.log10(axes.get_xlim())
         axes.set_xlim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))  # whole decades, since labels of their parts would overlap
         axes.xaxis.set_minor_formatter(NullFormatter())

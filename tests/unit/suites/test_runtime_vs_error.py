@@ -82,7 +82,9 @@ def test_the_verdict_says_who_is_below_the_curve_or_what_the_nearest_lacks() -> 
     assert "Nearest is slow: it would have to be 2 times faster, or 3.2 times more accurate at its cost" in verdict(slow)
     assert "**below" in verdict(point("exact", 100.0, 1e-6, "learned"))
     careless, lost = point("careless", 0.01, 0.5, "learned"), point("lost", 1.0, float("inf"), "learned")
-    assert "no learned model is as accurate" in verdict(careless, lost)
+    assert "as the cheapest of the solvers (coarse). Nearest is careless: it would have to be 50 times more accurate" in verdict(
+        careless, lost
+    )
 
 
 def test_training_pays_off_after_what_it_saves() -> None:
@@ -158,8 +160,8 @@ def test_gpe_also_holds_its_predictions(monkeypatch: pytest.MonkeyPatch) -> None
     models = _models([], dataset_spec(compose("simulate", *OVERRIDES)), Settings({}, [], holds=[2, 4]))
     assert {label: (s.skips.hold, seconds) for label, (s, seconds) in models.items()} == {
         "GPE": (1, 120.0),
-        "GPE, held for 2 frames": (2, 120.0),
-        "GPE, held for 4 frames": (4, 120.0),
+        "GPE, held predictions × 2": (2, 120.0),
+        "GPE, held predictions × 4": (4, 120.0),
     }
     assert all(s.model is simulator.model for s, _ in models.values())
 
@@ -186,7 +188,8 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
     assert "@full: **below the solver's curve**: model, exact model." in table
     assert "order of convergence is 1.3" in table
     axes = figures(records)["cost_error_sand"].axes[0]
-    assert axes.get_title() == "all frames" and len(axes.lines) == 6
+    labels = ["solver, coarser to the left", "solver, longer steps", "model", "slow", "exact", "careless", "ballistic"]
+    assert axes.get_title() == "all frames" and [line.get_label() for line in axes.lines] == labels
 
 
 def test_nothing_to_compare_says_so(tmp_path: Path) -> None:
