@@ -10,6 +10,7 @@ import logging
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -31,7 +32,7 @@ from gpe_pl.nn.fused import unfused
 from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction
 from gpe_pl.report import table_row
 from gpe_pl.schema import FeatureSpec
-from gpe_pl.timing import paired_ratio, paired_times
+from gpe_pl.timing import apart, paired_ratio, paired_times
 
 log = logging.getLogger(__name__)
 
@@ -148,17 +149,20 @@ def edge_bytes(case: Case, spec: FeatureSpec, graph: HeteroData, settings: Setti
 
 def forward_pass(case: Case, settings: Settings) -> Callable[[], Any]:
     """A forward pass in inference, its graph and model built."""
-    builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
-    model = case.build(builder.spec, settings.num_message_passing_steps, settings.hidden_channels, settings.seed)
-    return case.runs(torch.inference_mode()(lambda: model(graph)))
+    model, graph = _built(case, settings)
+    return synchronized(case.runs(torch.inference_mode()(lambda: model(graph))), settings.device)
 
 
 def training_pass(case: Case, settings: Settings) -> Callable[[], Any]:
     """A training step, its graph and model built."""
+    return synchronized(case.runs(training_step(*_built(case, settings))), settings.device)
+
+
+def _built(case: Case, settings: Settings) -> tuple[nn.Module, HeteroData]:
+    torch.set_num_threads(settings.num_threads)
     builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
-    return case.runs(
-        training_step(case.build(builder.spec, settings.num_message_passing_steps, settings.hidden_channels, settings.seed), graph)
-    )
+    model = case.build(builder.spec, settings.num_message_passing_steps, settings.hidden_channels, settings.seed).to(settings.device)
+    return _compiled(model, settings.device) if case.compiled else model, graph.to(settings.device)
 
 
 def training_step(model: nn.Module, graph: HeteroData) -> Callable[[], Any]:
@@ -190,19 +194,14 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
     builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
     spec, size = builder.spec, (settings.num_message_passing_steps, settings.hidden_channels, settings.seed)
     num_edges = sum(graph[r].edge_index.shape[1] for r in spec.relations)
-    on_device = graph.clone().to(device)
     compiles = settings.compile and (device != "cpu" or has_cpp_compiler())
     if settings.compile and not compiles:
         log.warning("suite.compile: no C++ compiler here, so nothing is timed with torch.compile")
     todo = cases(compiles)
-    models = {name: case.build(spec, *size).to(device) for name, case in todo.items()}
-    models = {name: _compiled(model, device) if todo[name].compiled else model for name, model in models.items()}
-    passes = {n: todo[n].runs(torch.inference_mode()(lambda m=m: m(on_device))) for n, m in models.items()}
-    forward = {n: synchronized(function, device) for n, function in passes.items()}
-    step = {n: synchronized(todo[n].runs(training_step(m, on_device)), device) for n, m in models.items()}
-    exact = {n.removesuffix(MEDIUM): forward[n.removesuffix(MEDIUM)]() for n in todo if n.endswith(MEDIUM)}
-    forward_times = paired_times(forward, settings.num_rounds, num_warmups=3, what="forward passes")
-    training_times = paired_times(step, max(1, settings.num_rounds // 3), num_warmups=3, what="training steps")
+    with apart({name: partial(forward_pass, case, settings) for name, case in todo.items()}) as passes:
+        forward_times = paired_times(passes, settings.num_rounds, num_warmups=3, what="forward passes")
+    with apart({name: partial(training_pass, case, settings) for name, case in todo.items()}) as steps:
+        training_times = paired_times(steps, max(1, settings.num_rounds // 3), num_warmups=3, what="training steps")
 
     gemm, copy = gemm_rate(num_edges, settings.hidden_channels, device), copy_rate(device)
     records: list[dict[str, Any]] = [
@@ -219,7 +218,7 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
             "training_speedup": (1 / paired_ratio(training_times, name, REFERENCE), "1"),
         }
         if case.precision != "highest":
-            found, expected = (p.acceleration[SAND] for p in (forward[name](), exact[name.removesuffix(MEDIUM)]))
+            found, expected = (forward_pass(todo[n], settings)().acceleration[SAND] for n in (name, name.removesuffix(MEDIUM)))
             values["forward_difference"] = (float((found - expected).norm() / expected.norm()), "1")
         elif case.model == "GPE":
             if case.saves_against is not None:
@@ -229,8 +228,8 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
             values["byte_floor"] = (edge_bytes(case, spec, graph, settings) / copy, "s")
             values["floor_ratio"] = (values["forward_time"][0] / values["flop_floor"][0], "1")
         if device != "cpu":
-            values["peak_memory"] = (peak_on_gpu(forward[name]), "B")
-            values["training_peak_memory"] = (peak_on_gpu(step[name]), "B")
+            values["peak_memory"] = (peak_on_gpu(forward_pass(case, settings)), "B")
+            values["training_peak_memory"] = (peak_on_gpu(training_pass(case, settings)), "B")
         elif not case.compiled and case.precision == "highest":
             values["peak_memory"] = (peak_memory(forward_pass, case, settings), "B")
             values["training_peak_memory"] = (peak_memory(training_pass, case, settings), "B")
@@ -287,12 +286,12 @@ def _table(settings: Settings, num_edges: int, gemm: float, copy: float, lines: 
             "|" + "---|" * len(header),
             *lines,
             "",
-            f"Times: medians. Faster: median of paired ratios to `{REFERENCE}`, which multiplies the concatenated features of every directed edge. "
-            "Factored: node features are multiplied before they go to the edges, by PyTorch's operations; below, by passes of our own where a name has no "
-            "addition. Saved: time saved against `directed` of the same implementation; the paper reports 37 % for `negated`. Product floor: the case's own "
-            "matrix products at the measured rate; byte floor: its edge states in and out once per layer at the copy rate. Geometry: raw edge features instead "
-            "of latent edge states. Memory: beyond weights and graph. Medium: products may use bfloat16 inside (`trainer.matmul_precision=medium`), which "
-            "changes the "
+            f"Times: medians, each model in a process of its own. Faster: median of paired ratios to `{REFERENCE}`, which multiplies the concatenated features "
+            "of every directed edge. Factored: node features are multiplied before they go to the edges, by PyTorch's operations; below, by passes of our own "
+            "where a name has no addition. Saved: time saved against `directed` of the same implementation; the paper reports 37 % for `negated`. Product "
+            "floor: the case's own matrix products at the measured rate; byte floor: its edge states in and out once per layer at the copy rate. Geometry: raw "
+            "edge features instead of latent edge states. Memory: beyond weights and graph. Medium: products may use bfloat16 inside "
+            "(`trainer.matmul_precision=medium`), which changes the "
             + ", ".join(
                 f"{r['case'].removesuffix(MEDIUM)} output by {100 * r['value']:.1g} %"
                 for r in records
