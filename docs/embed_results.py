@@ -42,7 +42,8 @@ def collect(run: Path, name: str) -> None:
             if (metrics.parent / "config.json").exists():
                 kept = target / "runs" / metrics.parent.relative_to(run)
                 kept.mkdir(parents=True, exist_ok=True)
-                shutil.copy(metrics, kept)
+                for file in metrics.parent.glob("metrics.csv*"):  # with its digest
+                    shutil.copy(file, kept)
                 shutil.copy(metrics.parent / "config.json", kept)
         for picture in sorted(run.glob("data=*/model=gpe_tuned/seed=0/rollout_test_unseen_00.png")):
             shutil.copy(picture, target / f"rollout_{picture.parts[-4].removeprefix('data=')}.png")

@@ -16,8 +16,8 @@ import numpy as np
 
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.evaluation import LEARNED
-from gpe_pl.metrics import Interval, bootstrap_interval
-from gpe_pl.report import Run, finished_runs, groups_of, table_row, values_by_seed
+from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio
+from gpe_pl.report import Run, distinct_runs, finished_runs, groups_of, table_row, values_by_seed
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +41,9 @@ JUDGED_GROUP = {"fem": "test_unseen"}
 
 @dataclass(frozen=True)
 class Cell:
-    """A model in a domain: its interval [m²], the errors of single rollouts [m²], infinite for failed ones, and that of ballistic flight [m²]."""
+    """A model in a domain: its interval [m²], the errors of single rollouts [seed, trajectory] [m²], infinite for failed ones, and that of ballistic
+    flight [m²].
+    """
 
     interval: Interval
     errors: np.ndarray
@@ -69,7 +71,7 @@ def compares_models(folder: Path) -> bool:
 
 def report_domains(folder: Path) -> None:
     """Write table and figures of all finished runs below a folder."""
-    runs = finished_runs(folder)
+    runs = distinct_runs(finished_runs(folder))
     if not runs:
         log.warning("%s: no finished run", folder)
         return
@@ -97,10 +99,12 @@ def model_of(run: Run) -> str:
 def _cell(runs: list[Run], domain: str) -> Cell | None:
     group = judged_group(domain)
     values = values_by_seed(runs, LEARNED, group, "rollout_mse", "full")
-    trivial = values_by_seed(runs[:1], "ballistic", group, "rollout_mse", "full")
+    trivial = values_by_seed(runs, "ballistic", group, "rollout_mse", "full")
     if not values or not trivial:
         return None
-    return Cell(bootstrap_interval(values, statistic=_median_of_means), np.concatenate(values), float(np.mean(trivial[0])))
+    shared = min(map(len, values))  # runs may have evaluated different numbers of trajectories
+    errors = np.array([v[:shared] for v in values])
+    return Cell(bootstrap_interval(errors, statistic=_median_of_means), errors, float(np.mean(trivial[0][:shared])))
 
 
 def _median_of_means(table: np.ndarray) -> float:
@@ -143,8 +147,8 @@ def _markdown(domains: list[str], models: list[str], cells: dict[tuple[str, str]
     note = (
         "Rollout MSE ×1e-3 [m²] over all frames on material parameters not seen in training (between the trained ones; FEM also outside): mean over "
         "trajectories, median over seeds, 95 % bootstrap interval over both; a rollout that had to be stopped has failed, and the mean with it. A model "
-        "that is not twice as good as ballistic flight is *not learned* and wins nothing. Last column: the paper's ratio, from its table 1; its units are "
-        "not ours."
+        "that is not twice as good as ballistic flight is *not learned* and wins nothing. Ratio: over the best baseline that has learned, with its "
+        "interval, on the same trajectories; bold where that excludes 1. Last column: the paper's ratio, from its table 1; its units are not ours."
     )
     return "\n".join([*lines, "", note, *_medians(domains, models, cells), *budget, ""])
 
@@ -168,18 +172,22 @@ def _text(cell: Cell | None) -> str:
     numbers = f"{1e3 * i.estimate:.3g} [{1e3 * i.low:.3g}, {1e3 * i.high:.3g}]"
     failed = int((~np.isfinite(cell.errors)).sum())
     if failed:
-        numbers = f"{failed} of {len(cell.errors)} failed, median {1e3 * cell.median:.3g}"
+        numbers = f"{failed} of {cell.errors.size} failed, median {1e3 * cell.median:.3g}"
     return numbers if cell.is_learned else f"*not learned* ({numbers})"
 
 
 def _ratio(cells: dict[str, Cell]) -> str:
-    baselines = [c for m, c in cells.items() if m != OWN and c.is_learned]
-    own = cells.get(OWN)
-    if own is None or not own.is_learned or len(cells) == 1:
+    """GPE's error over that of the best baseline that has learned something, with the interval; bold where that excludes 1."""
+    own, others = cells.get(OWN), [c for m, c in cells.items() if m != OWN]
+    baselines = [c for c in others if c.is_learned]
+    if own is None or not others:
         return "–"
     if not baselines:
-        return "no baseline learned"
-    return f"**{own.interval.estimate / min(c.interval.estimate for c in baselines):.2f}**"
+        return "no baseline learned" if own.is_learned else "no model learned"
+    best = min(baselines, key=lambda c: c.interval.estimate)
+    i = bootstrap_ratio(own.errors, best.errors, statistic=_median_of_means)
+    estimate = f"**{i.estimate:.2f}**" if i.low > 1 or i.high < 1 else f"{i.estimate:.2f}"
+    return f"{estimate} [{i.low:.2f}, {i.high:.2f}]" + ("" if own.is_learned else ", not learned")
 
 
 def _paper_ratio(domain: str) -> str:

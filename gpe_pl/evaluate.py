@@ -66,7 +66,7 @@ def _identity(cfg: DictConfig) -> dict[str, Any]:
     digest = sha256(path.read_bytes()).hexdigest()[:12]
     without = {"evaluation": ("splits", "data", "num_pictures", "export"), "data": ("comparison",)}  # more pictures may be asked for later
     parts = {part: {k: v for k, v in values[part].items() if k not in without.get(part, ())} for part in ("data", "evaluation", "rollout")}
-    return {"checkpoint": f"{path if path.stem != cfg.checkpoint else cfg.checkpoint} (sha256 {digest})", "split": cfg.split, **parts}
+    return {"checkpoint": f"{path.name} (sha256 {digest})", "split": cfg.split, **parts}  # wherever it lies now
 
 
 def _own_data(simulator: LearnedSimulator) -> str:

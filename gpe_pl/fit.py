@@ -28,7 +28,7 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
     from gpe_pl.run_folder import RunError, claim
     from gpe_pl.simulate import ensure_data, evaluated_config
-    from gpe_pl.training.budget import digest, mean_step_time, within_budget
+    from gpe_pl.training.budget import PauseForMeasurements, digest, mean_step_time, within_budget
     from gpe_pl.training.module import TrainingModule
     from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, set_up, train
     from gpe_pl.training.tracking import LoggerSettings, publish
@@ -70,12 +70,14 @@ def fit(cfg: DictConfig) -> float:
     settings: Any = OmegaConf.to_container(cfg, resolve=True)
     settings["data"].pop("comparison", None)  # what is taken of it is in graph and training
     unusual = {"batching": settings["batching"]} if batch_size.max_nodes is not None else {}  # as runs had it before there was a choice
+    callbacks: list[L.Callback] = []
     if training.budget_minutes is not None:
         parts = {k: settings[k] for k in ("graph", "model", "data")} | {"batch_size": training.batch_size, "device": device}
         parts |= unusual
         parts |= {"push_forward": [training.push_share, training.push_steps]} if training.push_share else {}
         key = f"{cfg.data.name} {cfg.size.name} {cfg.model._target_.rpartition('.')[2]} {digest(parts)}"
         times = Path(cfg.paths.runs) / (cfg.reuse or cfg.name) / "step_times.json"
+        callbacks.append(PauseForMeasurements(times))
         training = within_budget(
             training,
             times,
@@ -93,7 +95,7 @@ def fit(cfg: DictConfig) -> float:
         for split in evaluation.splits:  # what cannot be evaluated is said before the training, not after it
             window_counts(open_split(evaluated, split, cache_bytes=0), graph.history)
         loggers = logger.loggers(run_dir, cfg.name, config)
-        best = best or train(new_module(training), data(), training, trainer, loggers, run_dir)
+        best = best or train(new_module(training), data(), training, trainer, loggers, run_dir, callbacks)
         rows = evaluate(LearnedSimulator.from_checkpoint(best, device), evaluated, evaluation, run_dir)
         publish(loggers, run_dir, means(rows))
 

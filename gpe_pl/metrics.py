@@ -391,11 +391,45 @@ def bootstrap_interval(
         raise ValueError(f"confidence lies between 0 and 1, got {confidence}")
     rng = np.random.default_rng(seed)
     num_seeds, num_trajectories = table.shape
-    resampled = [
-        statistic(table[np.ix_(rng.integers(num_seeds, size=num_seeds), rng.integers(num_trajectories, size=num_trajectories))])
-        for _ in range(num_resamples)
-    ]
+    resampled = [statistic(table[np.ix_(_drawn(num_seeds, rng), _drawn(num_trajectories, rng))]) for _ in range(num_resamples)]
+    return _interval(float(statistic(table)), resampled, confidence)
+
+
+def bootstrap_ratio(
+    values: np.ndarray,
+    reference: np.ndarray,
+    statistic: Callable[[Any], Any] = np.median,
+    confidence: float = 0.95,
+    num_resamples: int = 2000,
+    seed: int = 0,
+) -> Interval:
+    """Percentile interval of the ratio of a statistic of two models on the same trajectories, which are resampled for both alike; as ``bootstrap_interval``.
+
+    Args:
+        values, reference: of either model, one row per training seed, one column per test trajectory; where one has more columns, these are left out.
+            Both may be infinite, which makes a ratio of 1.
+    """
+    shared = min(values.shape[1], reference.shape[1])
+    values, reference = values[:, :shared], reference[:, :shared]
+    rng = np.random.default_rng(seed)
+
+    def ratio(a: np.ndarray, b: np.ndarray) -> float:
+        own, other = float(statistic(a)), float(statistic(b))
+        return 1.0 if own == other else own / other if other else np.inf
+
+    resampled = []
+    for _ in range(num_resamples):
+        columns = _drawn(shared, rng)
+        resampled.append(ratio(*(table[np.ix_(_drawn(len(table), rng), columns)] for table in (values, reference))))
+    return _interval(ratio(values, reference), resampled, confidence)
+
+
+def _drawn(count: int, rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(count, size=count)
+
+
+def _interval(estimate: float, resampled: list[float], confidence: float) -> Interval:
     # Order statistics, because interpolation between infinities is not a number.
     tail = (1 - confidence) / 2
     low, high = np.quantile(resampled, [tail, 1 - tail], method="inverted_cdf")
-    return Interval(float(statistic(table)), float(low), float(high))
+    return Interval(estimate, float(low), float(high))

@@ -18,6 +18,7 @@ from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.evaluation import LEARNED, Row, read_rows
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import bootstrap_interval
+from gpe_pl.nn.fused import unfused
 from gpe_pl.run_folder import config_in
 from gpe_pl.timing import paired_ratio, paired_times
 
@@ -41,14 +42,36 @@ UNSAID: dict[str, Any] = {"training.sampling": "uniform", "training.push_share":
 """What the ``config.json`` of a run leaves out where it is not used, as runs did before there was a choice."""
 
 
+TRAINED = {"data.name", "model._target_", "training.num_steps"}
+"""What the configuration of every training run says."""
+
+
 def finished_runs(folder: Path) -> list[Run]:
-    """All finished runs below a folder, in order of their paths."""
+    """All finished training runs below a folder, in order of their paths; evaluations beside them are none."""
     runs = []
     for path in sorted(folder.rglob("metrics.csv")):
         config = path.parent / "config.json"
         if config.exists():
-            runs.append(Run(path.parent, UNSAID | dict(_flatten(config_in(config))), list(read_rows(path))))
+            values = UNSAID | dict(_flatten(config_in(config)))
+            if values.keys() >= TRAINED:
+                runs.append(Run(path.parent, values, list(read_rows(path))))
+            else:
+                log.warning(
+                    "%s is not of a training run (%s) and is left out of the report",
+                    path.parent,
+                    ", ".join(sorted(TRAINED - values.keys())),
+                )
     return runs
+
+
+def distinct_runs(runs: list[Run]) -> list[Run]:
+    """Runs of the same configuration count once."""
+    first: dict[str, Run] = {}
+    for run in runs:
+        kept = first.setdefault(json.dumps(run.config, sort_keys=True), run)
+        if kept is not run:
+            log.warning("%s repeats %s and is left out of the report", run.folder, kept.folder)
+    return list(first.values())
 
 
 def _flatten(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
@@ -67,13 +90,8 @@ def axes_of(runs: list[Run]) -> list[str]:
 
 
 def report_sweep(folder: Path) -> None:
-    """Compare all finished runs below a folder; runs of the same configuration count once."""
-    runs: dict[str, Run] = {}
-    for run in finished_runs(folder):
-        first = runs.setdefault(json.dumps(run.config, sort_keys=True), run)
-        if first is not run:
-            log.warning("%s repeats %s and is left out of the report", run.folder, first.folder)
-    _report(folder, list(runs.values()))
+    """Compare all finished runs below a folder."""
+    _report(folder, distinct_runs(finished_runs(folder)))
 
 
 def report(folder: Path) -> None:
@@ -187,7 +205,9 @@ def _interval(values: list[list[float]], scale: float = 1.0) -> str:
 
 
 def forward_time_ratios(variants: dict[tuple[str, ...], list[Run]], num_rounds: int = 30) -> dict[tuple[str, ...], float]:
-    """Forward time of each variant's trained model over that of the first, as the median of paired ratios on one graph; empty for a single variant."""
+    """Forward time of each variant's trained model over that of the first, by PyTorch's operations alone, which all variants have in common: the median of
+    paired ratios on one graph; empty for a single variant.
+    """
     from gpe_pl.lattice import lattice_graph
 
     if len(variants) < 2:
@@ -199,7 +219,7 @@ def forward_time_ratios(variants: dict[tuple[str, ...], list[Run]], num_rounds: 
         if simulator.builder.spec.materials != ("sand",) or simulator.builder.spec.dim != 2:
             return {}  # the graph below is one layer of sand
         _, graph = lattice_graph(600, 6000, simulator.builder.config)
-        alternatives[names[v]] = torch.inference_mode()(lambda s=simulator, g=graph: s(g))
+        alternatives[names[v]] = unfused()(torch.inference_mode()(lambda s=simulator, g=graph: s(g)))
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     times = paired_times(alternatives, num_rounds)
@@ -242,7 +262,8 @@ def _training_table(names: list[str], variants: dict[tuple[str, ...], list[Run]]
             )
         )
     note = (
-        "Validation loss: last value, mean over seeds (range). Forward time: trained models on one graph, median of paired ratios to the first row. "
+        "Validation loss: last value, mean over seeds (range). Forward time: trained models on one graph, by PyTorch's operations alone, "
+        "median of paired ratios to the first row. "
         "Outside: share of particle-frames inside a wall or obstacle when containment is off; corrected: share of particle-steps that containment moves."
     )
     return [*lines, *rows, "", note]

@@ -76,7 +76,7 @@ class MultiscaleGraph:
 
 
 def levels_of(extent: float, spacing: float) -> int:
-    """Levels up to one root for any body inside a domain whose longest side is ``extent`` [m]."""
+    """Levels up to one root for any body that is at least ``spacing`` shorter than a domain whose longest side is ``extent`` [m]."""
     return max(1, math.ceil(math.log2(extent / spacing)))
 
 
@@ -177,7 +177,8 @@ def _smallest_boxes(
 def cell_edges(cells: Int64[np.ndarray, "cell corner"], num_nodes: int) -> Int64[np.ndarray, "2 edge"]:
     """Pairs of nodes that share a cell, each once, the lower node first."""
     pairs = [cells[:, [a, b]].T for a, b in itertools.combinations(range(cells.shape[1]), 2)]
-    return _unique_pairs(np.concatenate([np.empty((2, 0), dtype=np.int64), *pairs], axis=1), num_nodes)
+    both = np.concatenate([np.empty((2, 0), dtype=np.int64), *pairs], axis=1)
+    return _unique_pairs(both[:, both[0] != both[1]], num_nodes)  # a cell may name a node twice: a triangle among quadrilaterals
 
 
 def _keys(pairs: np.ndarray, count: int) -> Any:

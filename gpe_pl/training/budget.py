@@ -9,11 +9,13 @@ import hashlib
 import json
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import lightning as L
 import torch
 from filelock import FileLock
 
@@ -21,8 +23,9 @@ from gpe_pl.atomic import replace_text
 from gpe_pl.data.dataset import Samples, WindowDataset, collated
 from gpe_pl.data.sampling import NUM_LANES, BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
+from gpe_pl.machine import has_cpp_compiler
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
-from gpe_pl.training.run import TrainingSettings
+from gpe_pl.training.run import TrainingSettings, WayToCompile
 
 log = logging.getLogger(__name__)
 
@@ -85,11 +88,11 @@ def _on(device: torch.device, samples: Samples) -> Samples:
 def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Callable[[TrainingSettings], float]) -> TrainingSettings:
     """Settings with the number of steps that ``settings.budget_minutes`` allow, and as many validations as before.
 
-    The time of compiling, where a run is long enough for it, is not part of the budget.
+    The time of compiling is not part of the budget. ``compile: fastest`` becomes ``on`` or ``off``, by what was measured.
 
     Args:
         settings: with a budget.
-        path: JSON file of step times [s], shared by the runs of a sweep.
+        path: JSON file of step times [s], shared by the runs of a sweep, whose trainings pause meanwhile (``PauseForMeasurements``).
         key: in that file, what the step time depends on.
         measure: step time [s] under given settings; called if the file does not have it yet.
 
@@ -98,15 +101,21 @@ def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Cal
     """
     assert settings.budget_minutes is not None
     path.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(path.with_suffix(".lock")):
+    keys: dict[WayToCompile, str] = {"off" if settings.compile == "fastest" else settings.compile: key}
+    if settings.compile == "fastest" and has_cpp_compiler():
+        keys["on"] = f"{key} compiled"
+    with FileLock(_lock(path)):
         times = _read(path)
-        if key not in times:
-            times[key] = _measured(settings, measure)
-            log.info("%s: %.1f ms per training step", key, 1e3 * times[key])
-            replace_text(path, json.dumps(times, indent=1))
+        for compile, its_key in keys.items():
+            if its_key not in times:
+                with _announced(path):
+                    times[its_key] = _measured(replace(settings, compile=compile), measure)
+                log.info("%s: %.1f ms per training step", its_key, 1e3 * times[its_key])
+                replace_text(path, json.dumps(times, indent=1))
+    fastest = min(keys, key=lambda compile: times[keys[compile]])
     validations = max(1, settings.num_steps // settings.val_interval)
-    interval = max(1, int(60 * settings.budget_minutes / times[key] / validations))
-    return replace(settings, num_steps=interval * validations, val_interval=interval, budget_minutes=None)
+    interval = max(1, int(60 * settings.budget_minutes / times[keys[fastest]] / validations))
+    return replace(settings, num_steps=interval * validations, val_interval=interval, budget_minutes=None, compile=fastest)
 
 
 def _measured(settings: TrainingSettings, measure: Callable[[TrainingSettings], float]) -> float:
@@ -117,6 +126,40 @@ def _measured(settings: TrainingSettings, measure: Callable[[TrainingSettings], 
     plain = measure(replace(settings, compile="off"))
     num_steps = int(60 * settings.budget_minutes / plain)
     return measure(replace(settings, num_steps=num_steps, val_interval=num_steps)) if num_steps >= COMPILE_PAYS_AFTER else plain
+
+
+class PauseForMeasurements(L.Callback):
+    """Holds a training while another run of its sweep measures a step time, which it would lengthen.
+
+    Args:
+        path: of the sweep's step times.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def on_train_batch_start(self, *_: Any) -> None:
+        if _announcement(self.path).exists():
+            with FileLock(_lock(self.path)):  # free once it is measured, or its process gone
+                _announcement(self.path).unlink(missing_ok=True)
+
+
+@contextmanager
+def _announced(path: Path) -> Iterator[None]:
+    """Inside, other trainings of the sweep pause before their next step."""
+    _announcement(path).touch()
+    try:
+        yield
+    finally:
+        _announcement(path).unlink(missing_ok=True)
+
+
+def _lock(path: Path) -> Path:
+    return path.with_suffix(".lock")
+
+
+def _announcement(path: Path) -> Path:
+    return path.with_suffix(".measuring")
 
 
 def _read(path: Path) -> dict[str, float]:

@@ -7,6 +7,7 @@ import os
 import shutil
 import sys
 import warnings
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -26,18 +27,22 @@ from gpe_pl.data.sampling import PushForward, Sampling
 from gpe_pl.run_folder import CONFIG, RunError, config_in, differences
 from gpe_pl.training.callbacks import RolloutValidation, StepProgress, WarmAverage
 from gpe_pl.training.checkpoints import AtomicCheckpoints
-from gpe_pl.training.module import Compile, Schedule, TrainingModule
+from gpe_pl.training.module import Schedule, TrainingModule
 from gpe_pl.training.parallel import SummedGradients
 
 log = logging.getLogger(__name__)
+
+WayToCompile = Literal["auto", "on", "off", "fastest"]
+"""``Compile``, or whichever of on and off takes less time per step."""
 
 
 @dataclass(frozen=True)
 class TrainingSettings:
     """Everything about the optimisation; see ``TrainingModule``, ``TrajectoryDataModule``, ``data.noise`` and ``data.sampling`` for the meaning of each value.
 
-    ``budget_minutes``, of one core or GPU, replaces ``num_steps`` (see ``training.budget``). The last ``push_share`` of the steps start where the model has
-    come to in up to ``push_steps`` steps of its own; ``push_correction`` of the way that its velocity has gone astray is to be taken back within a step.
+    ``budget_minutes``, of one core or GPU, replaces ``num_steps`` (see ``training.budget``), and then ``compile`` may be ``fastest``. The last ``push_share``
+    of the steps start where the model has come to in up to ``push_steps`` steps of its own; ``push_correction`` of the way that its velocity has gone astray
+    is to be taken back within a step.
     """
 
     num_steps: Annotated[int, Field(ge=1)]
@@ -57,12 +62,14 @@ class TrainingSettings:
     push_steps: Annotated[int, Field(ge=1)] = 20
     push_correction: Annotated[float, Field(ge=0, le=1)] = 1.0
     stress_weight: Annotated[float, Field(gt=0)] = 1.0
-    compile: Compile = "auto"
+    compile: WayToCompile = "auto"
     val_interval: Annotated[int, Field(ge=1)] = 1000
     num_val_rollouts: Annotated[int, Field(ge=1)] = 4
     val_rollout_steps: Annotated[int, Field(ge=1)] = 100
 
     def __post_init__(self) -> None:
+        if self.compile == "fastest" and self.budget_minutes is None:
+            raise ValueError("compile=fastest: needs budget_minutes, for which it is measured; else auto, on or off")
         if self.num_steps > self.val_interval and self.num_steps % self.val_interval:
             raise ValueError(
                 f"val_interval={self.val_interval} must divide num_steps={self.num_steps}: the last steps would be neither validated nor saved"
@@ -140,6 +147,7 @@ def train(
     trainer_settings: TrainerSettings,
     loggers: list[Logger],
     run_dir: Path,
+    callbacks: Sequence[Callback] = (),
 ) -> Path:
     """Train to ``num_steps``, resuming from ``checkpoints/last.ckpt`` if there is one; returns the checkpoint with the best validation rollout.
 
@@ -154,7 +162,7 @@ def train(
     # not save_last, which writes only when the best one changes; and after it, so that it knows the best one so far
     latest = ModelCheckpoint(folder, filename="last", **options)
     steps = min(training.val_rollout_steps, datamodule.val_trajectories(1)[0].num_frames - datamodule.builder.config.history - 1)
-    callbacks: list[Callback] = [
+    own: list[Callback] = [
         RolloutValidation(datamodule.val_trajectories(training.num_val_rollouts), steps),
         WarmAverage(training.ema_decay),
         LearningRateMonitor(),
@@ -162,7 +170,7 @@ def train(
         latest,
     ]
     if trainer_settings.progress:
-        callbacks.append(StepProgress())
+        own.append(StepProgress())
     is_parallel = trainer_settings.num_processes > 1
     if is_parallel:
         os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # else Lightning shares out all cores
@@ -180,7 +188,7 @@ def train(
             check_val_every_n_epoch=None,
             gradient_clip_val=training.gradient_clip,
             num_sanity_val_steps=0,
-            callbacks=callbacks,
+            callbacks=[*own, *callbacks],
             logger=loggers,
             log_every_n_steps=min(50, training.num_steps),
             enable_progress_bar=False,

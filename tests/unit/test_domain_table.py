@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -59,13 +60,15 @@ def test_the_table_judges_medians_over_seeds_on_unseen_parameters(sweep: Path) -
     sand, fem = cells(text, "sand"), cells(text, "fem")
     assert sand["GPE"].startswith("2 [")
     assert sand["GNS"].startswith("4 [4, 4]")
-    assert sand["GPE / best baseline"] == "**0.50**"
+    assert (
+        sand["GPE / best baseline"] == "0.50 [0.25, 2.00]"
+    )  # of the medians of [1, 3], [2, 2], [8, 8] over 4, either trajectory, any seeds
     assert sand["DPINet"].startswith("*not learned* (20 ")  # 30 / 20 is less than two
     assert sand["ballistic"] == "30"
     assert sand["paper"] == "0.68"
     assert fem["GPE"].startswith("*not learned* (5 [5, 5])")
     assert fem["GNS"] == "*not learned* (1 of 3 failed, median 5)"
-    assert fem["GPE / best baseline"] == "–"
+    assert fem["GPE / best baseline"] == "no model learned"
     assert "1,000, 1,001, 1,002 × 3" in text
 
 
@@ -103,3 +106,48 @@ def test_only_sweeps_over_models_or_domains_compare_models(sweep: Path) -> None:
     assert compares_models(sweep)
     assert not compares_models(sweep / "sand" / "GPE")
     assert not compares_models(sweep / "nothing")
+
+
+@pytest.mark.parametrize(
+    ("own", "baseline", "cell"),
+    [
+        ([1e-3, 2e-3], [4e-3, 8e-3], "**0.25** [0.25, 0.25]"),
+        ([8e-3, 16e-3], [4e-3, 8e-3], "**2.00** [2.00, 2.00]"),
+        ([20e-3, 20e-3], [5e-3, 10e-3], "**2.67** [2.00, 4.00], not learned"),
+        ([float("inf"), 1e-3], [4e-3, 4e-3], "inf [0.25, inf], not learned"),
+        ([1e-3, 1e-3], [20e-3, 20e-3], "no baseline learned"),
+        ([20e-3, 20e-3], [20e-3, 20e-3], "no model learned"),
+    ],
+)
+def test_a_comparison_that_is_lost_is_said(tmp_path: Path, own: list[float], baseline: list[float], cell: str) -> None:
+    write_run(tmp_path / "a", "sand", "GPE", 0, own)
+    write_run(tmp_path / "b", "sand", "GNS", 0, baseline)
+    report_domains(tmp_path)
+    assert cells((tmp_path / "table1.md").read_text(), "sand")["GPE / best baseline"] == cell
+
+
+def test_what_is_no_training_run_and_what_is_there_twice_is_left_out(sweep: Path, caplog: pytest.LogCaptureFixture) -> None:
+    report_domains(sweep)
+    before = (sweep / "table1.md").read_text()
+    shutil.copytree(sweep / "sand" / "GPE" / "0", sweep / "sand" / "GPE" / "0 copy")
+    evaluation = shutil.copytree(sweep / "sand" / "GPE" / "0", sweep / "evaluated")
+    (evaluation / "config.json").write_text('{"checkpoint": "best.ckpt"}')
+    report_domains(sweep)
+    assert (sweep / "table1.md").read_text() == before
+    assert "0 copy repeats" in caplog.text and "evaluated is not of a training run (data.name, model._target_" in caplog.text
+
+
+def test_trajectories_that_a_seed_lacks_are_left_out(tmp_path: Path) -> None:
+    write_run(tmp_path / "0", "sand", "GPE", 0, [1e-3, 3e-3, 50e-3])
+    write_run(tmp_path / "1", "sand", "GPE", 1, [1e-3, 3e-3])
+    write_run(tmp_path / "2", "sand", "GNS", 0, [2e-3, 6e-3, 1e-3])
+    report_domains(tmp_path)
+    row = cells((tmp_path / "table1.md").read_text(), "sand")
+    assert row["GPE"].startswith("2 [") and row["GPE / best baseline"] == "**0.50** [0.50, 0.50]"
+
+
+def test_a_run_without_the_judged_split_does_not_hide_the_others(tmp_path: Path) -> None:
+    write_run(tmp_path / "0", "sand", "GPE", 0, [])
+    write_run(tmp_path / "1", "sand", "GPE", 1, [2e-3, 2e-3])
+    report_domains(tmp_path)
+    assert cells((tmp_path / "table1.md").read_text(), "sand")["GPE"].startswith("2 [2, 2]")

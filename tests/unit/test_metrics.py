@@ -7,7 +7,16 @@ import torch
 from jaxtyping import TypeCheckError
 
 from gpe_pl.geometry import domain_walls
-from gpe_pl.metrics import UNITS, OneStepNMSE, RolloutMSE, bootstrap_interval, energy_distance, per_frame_mse, rollout_metrics
+from gpe_pl.metrics import (
+    UNITS,
+    OneStepNMSE,
+    RolloutMSE,
+    bootstrap_interval,
+    bootstrap_ratio,
+    energy_distance,
+    per_frame_mse,
+    rollout_metrics,
+)
 from gpe_pl.trajectory import Boundary, Metadata, Stress, Termination, Trajectory
 
 DT = 0.1
@@ -304,3 +313,21 @@ def test_bootstrap_with_failures_is_never_nan():
 def test_bootstrap_refuses_what_is_no_table(values):
     with pytest.raises(ValueError):
         bootstrap_interval(values)
+
+
+def test_a_ratio_knows_that_both_models_met_the_same_trajectories():
+    hard = np.exp(np.random.default_rng(0).normal(0, 2, (1, 20)))
+    own, other = np.repeat(0.5 * hard, 3, axis=0), np.repeat(hard, 3, axis=0)
+    interval = bootstrap_ratio(own, other, np.mean)
+    assert (interval.estimate, interval.low, interval.high) == pytest.approx((0.5, 0.5, 0.5))
+    apart = [bootstrap_interval(v, np.mean) for v in (own, other)]
+    assert apart[0].low / apart[1].high < 0.3 and apart[0].high / apart[1].low > 0.8
+
+
+def test_a_ratio_of_failures_is_never_nan():
+    failed, fine = np.array([[math.inf, 1.0]]), np.array([[2.0, 2.0, 5.0]])
+    interval = bootstrap_ratio(failed, fine, np.mean)
+    assert (interval.estimate, interval.low, interval.high) == (math.inf, 0.5, math.inf)
+    assert bootstrap_ratio(fine, failed, np.mean).estimate == 0
+    assert bootstrap_ratio(failed, failed, np.mean).estimate == 1
+    assert bootstrap_ratio(fine, np.zeros((1, 3)), np.mean).estimate == math.inf

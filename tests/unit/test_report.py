@@ -23,7 +23,8 @@ ERRORS = {  # of two test scenes; free flight has 2e-3 and 6e-3
 
 def write_run(folder: Path, interaction: str, seed: int) -> None:
     folder.mkdir(parents=True)
-    (folder / "config.json").write_text(json.dumps({"seed": seed, "model": {"interaction": interaction}}))
+    model = {"_target_": "gpe_pl.models.gpe.GPE", "interaction": interaction}
+    (folder / "config.json").write_text(json.dumps({"seed": seed, "data": {"name": "sand"}, "model": model, "training": {"num_steps": 10}}))
     groups = ("interpolated", "extrapolated")
     rows = [Row(LEARNED, "test_unseen", k, groups[k], 20.0, "rollout_mse", "full", v) for k, v in enumerate(ERRORS[interaction, seed])]
     rows += [Row("ballistic", "test_unseen", k, groups[k], 20.0, "rollout_mse", "full", v) for k, v in enumerate((2e-3, 6e-3))]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.training import budget
-from gpe_pl.training.budget import BudgetError, digest, step_time, within_budget
+from gpe_pl.training.budget import BudgetError, PauseForMeasurements, digest, step_time, within_budget
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
 from gpe_pl.training.run import TrainingSettings
 
@@ -56,6 +58,65 @@ def test_the_step_is_measured_as_the_run_will_take_it(tmp_path: Path, plain: flo
     result = within_budget(SETTINGS, tmp_path / "t.json", "sand", measure)
     assert seen == asked
     assert result.num_steps == (300 if plain == 0.1 else 60_000)
+
+
+@pytest.mark.parametrize(("compiled", "way", "num_steps"), [(0.05, "on", 600), (0.2, "off", 300)])
+def test_the_faster_of_compiled_and_plain_is_used_and_both_are_kept(tmp_path: Path, compiled: float, way: str, num_steps: int) -> None:
+    settings, path, seen = replace(SETTINGS, compile="fastest"), tmp_path / "t.json", []
+
+    def measure(settings: TrainingSettings) -> float:
+        seen.append(settings.compile)
+        return compiled if settings.compile == "on" else 0.1
+
+    results = [within_budget(settings, path, "sand GNS", measure) for _ in range(2)]
+    assert seen == ["off", "on"] and results[0] == results[1]
+    assert (results[0].compile, results[0].num_steps) == (way, num_steps)
+    assert json.loads(path.read_text()) == {"sand GNS": 0.1, "sand GNS compiled": compiled}
+
+
+def test_without_a_compiler_nothing_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(budget, "has_cpp_compiler", lambda: False)
+    result = within_budget(replace(SETTINGS, compile="fastest"), tmp_path / "t.json", "sand", lambda s: 0.1 if s.compile == "off" else 0.0)
+    assert result.compile == "off"
+
+
+def test_the_fastest_way_to_compile_needs_a_budget() -> None:
+    with pytest.raises(ValueError, match="compile=fastest: needs budget_minutes"):
+        replace(SETTINGS, compile="fastest", budget_minutes=None)
+
+
+def test_trainings_pause_while_a_step_is_measured(tmp_path: Path) -> None:
+    path, events = tmp_path / "step_times.json", []
+    measuring, may_end = threading.Event(), threading.Event()
+
+    def measure(_: TrainingSettings) -> float:
+        measuring.set()
+        may_end.wait(30)
+        events.append("measured")
+        return 0.1
+
+    def train() -> None:
+        PauseForMeasurements(path).on_train_batch_start()
+        events.append("trained")
+
+    measurer = threading.Thread(target=within_budget, args=(SETTINGS, path, "sand", measure))
+    measurer.start()
+    assert measuring.wait(30)
+    trainer = threading.Thread(target=train)
+    trainer.start()
+    trainer.join(0.2)
+    assert events == []
+    may_end.set()
+    measurer.join(30)
+    trainer.join(30)
+    assert events == ["measured", "trained"]
+
+
+def test_a_measurement_that_was_killed_holds_nobody_up(tmp_path: Path) -> None:
+    path = tmp_path / "step_times.json"
+    (tmp_path / "step_times.measuring").touch()
+    PauseForMeasurements(path).on_train_batch_start()
+    assert not (tmp_path / "step_times.measuring").exists()
 
 
 @pytest.mark.parametrize("content", ["", "[1]", '{"a": "fast"}', "\x00"])
