@@ -13,7 +13,7 @@ import torch
 from torch_geometric.data import Batch, HeteroData
 
 from gpe_pl.graphs.builder import GraphBuilder, GraphError
-from gpe_pl.graphs.multiscale import MeshError, MultiscaleGraph, _cached, build, levels_of, multiscale_graph
+from gpe_pl.graphs.multiscale import MeshError, MultiscaleGraph, _cached, build, cell_edges, levels_of, multiscale_graph
 from gpe_pl.learned_simulator import GraphStandardizer
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import BOUNDARY, grid, is_symmetric, node_code
@@ -150,6 +150,11 @@ def test_every_child_has_one_parent_and_every_body_one_root(kind: str) -> None:
     for edges in (graph.cell_edges, graph.same_edges):
         assert (graph.level[edges[0]] == graph.level[edges[1]]).all()
         assert (graph.body[edges[0]] == graph.body[edges[1]]).all()
+
+
+def test_a_cell_that_names_a_node_twice_is_a_triangle() -> None:
+    cells = np.array([[0, 1, 2, 2], [1, 1, 1, 1]])
+    assert cell_edges(cells, 3).T.tolist() == [[0, 1], [0, 2], [1, 2]]
 
 
 def test_a_lattice_merges_two_by_two() -> None:

@@ -65,9 +65,13 @@ def test_a_folder_keeps_the_evaluation_that_it_holds(tiny_data: Path, tmp_path: 
     assert (folder / "rollout_test_unseen_00.png").exists()
     before = (folder / "metrics.csv").read_bytes()
     with pytest.raises(
-        RunError, match=r"evaluation_test_unseen holds a run with another configuration \(checkpoint: .*fit/checkpoints/best.ckpt"
+        RunError,
+        match=r"evaluation_test_unseen holds a run with another configuration \(checkpoint: 'best.ckpt .* there, 'last.ckpt .* now",
     ):
         evaluate(tiny_data, tmp_path, run / "checkpoints" / "last.ckpt")
+    run = run.rename(tmp_path / "moved")
+    assert {key(r) for r in evaluate(tiny_data, tmp_path, run, "evaluation.num_pictures=0")} == {key(r) for r in rows}
+    before = (folder / "metrics.csv").read_bytes()
     with pytest.raises(RunError, match=r"evaluation\.containment: True there, False now.*choose another name=… or delete the folder"):
         evaluate(tiny_data, tmp_path, run, "evaluation.containment=false")
     assert (folder / "metrics.csv").read_bytes() == before
