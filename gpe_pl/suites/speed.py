@@ -310,8 +310,7 @@ def _table(settings: Settings, num_edges: int, gemm: float, copy: float, lines: 
             "the concatenated features of every directed edge. Factored: node features are multiplied before they go to the edges, by PyTorch's operations; "
             "below, by passes of our own where a name has no addition. Saved: time saved against `directed` of the same implementation; the paper reports 37 % "
             "for `negated`. Product floor: the case's own matrix products at the measured rate; byte floor: its edge states in and out once per layer at the "
-            "copy rate. "
-            "Geometry: raw edge features instead of latent edge states. Memory: beyond weights and graph. Medium: products may use bfloat16 inside "
+            "copy rate. Geometry: raw edge features instead of latent edge states. Memory: beyond weights and graph. Medium: products may use bfloat16 inside "
             "(`trainer.matmul_precision=medium`), which changes the "
             + ", ".join(
                 f"{r['case'].removesuffix(MEDIUM)} output by {100 * r['value']:.1g} %"
