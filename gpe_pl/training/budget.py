@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -88,7 +89,8 @@ def _on(device: torch.device, samples: Samples) -> Samples:
 def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Callable[[TrainingSettings], float]) -> TrainingSettings:
     """Settings with the number of steps that ``settings.budget_minutes`` allow, and as many validations as before.
 
-    The time of compiling is not part of the budget. ``compile: fastest`` becomes ``on`` or ``off``, by what was measured.
+    The time of compiling is not part of the budget. ``compile: fastest`` becomes ``on`` or ``off``, by what was measured;
+    ``off`` where compiling fails, which is written down as an infinite time.
 
     Args:
         settings: with a budget.
@@ -109,7 +111,13 @@ def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Cal
         for compile, its_key in keys.items():
             if its_key not in times:
                 with _announced(path):
-                    times[its_key] = _measured(replace(settings, compile=compile), measure)
+                    try:
+                        times[its_key] = _measured(replace(settings, compile=compile), measure)
+                    except Exception as error:  # whatever the machine's tool chain lacks
+                        if its_key == key:
+                            raise
+                        log.warning("compile: fastest does without torch.compile (%s)", type(error).__name__)
+                        times[its_key] = math.inf
                 log.info("%s: %.1f ms per training step", its_key, 1e3 * times[its_key])
                 replace_text(path, json.dumps(times, indent=1))
     fastest = min(keys, key=lambda compile: times[keys[compile]])

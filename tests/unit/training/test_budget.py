@@ -74,6 +74,21 @@ def test_the_faster_of_compiled_and_plain_is_used_and_both_are_kept(tmp_path: Pa
     assert json.loads(path.read_text()) == {"sand GNS": 0.1, "sand GNS compiled": compiled}
 
 
+def test_a_model_that_does_not_compile_runs_without(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    settings, seen = replace(SETTINGS, compile="fastest"), []
+
+    def measure(settings: TrainingSettings) -> float:
+        seen.append(settings.compile)
+        if settings.compile == "on":
+            raise RuntimeError("no")
+        return 0.1
+
+    results = [within_budget(settings, tmp_path / "t.json", "sand GNS", measure) for _ in range(2)]
+    assert [(r.compile, r.num_steps) for r in results] == [("off", 300)] * 2
+    assert seen == ["off", "on"]
+    assert "compile: fastest does without torch.compile (RuntimeError)" in caplog.text
+
+
 def test_without_a_compiler_nothing_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(budget, "has_cpp_compiler", lambda: False)
     result = within_budget(replace(SETTINGS, compile="fastest"), tmp_path / "t.json", "sand", lambda s: 0.1 if s.compile == "off" else 0.0)
