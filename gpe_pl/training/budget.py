@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,9 +23,8 @@ from gpe_pl.atomic import replace_text
 from gpe_pl.data.dataset import Samples, WindowDataset, collated
 from gpe_pl.data.sampling import NUM_LANES, BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
-from gpe_pl.machine import has_cpp_compiler
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
-from gpe_pl.training.run import TrainingSettings, WayToCompile
+from gpe_pl.training.run import TrainingSettings
 
 log = logging.getLogger(__name__)
 
@@ -89,8 +87,7 @@ def _on(device: torch.device, samples: Samples) -> Samples:
 def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Callable[[TrainingSettings], float]) -> TrainingSettings:
     """Settings with the number of steps that ``settings.budget_minutes`` allow, and as many validations as before.
 
-    The time of compiling is not part of the budget. ``compile: fastest`` becomes ``on`` or ``off``, by what was measured;
-    ``off`` where compiling fails, which is written down as an infinite time.
+    The time of compiling is not part of the budget.
 
     Args:
         settings: with a budget.
@@ -103,27 +100,16 @@ def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Cal
     """
     assert settings.budget_minutes is not None
     path.parent.mkdir(parents=True, exist_ok=True)
-    keys: dict[WayToCompile, str] = {"off" if settings.compile == "fastest" else settings.compile: key}
-    if settings.compile == "fastest" and has_cpp_compiler():
-        keys["on"] = f"{key} compiled"
     with FileLock(_lock(path)):
         times = _read(path)
-        for compile, its_key in keys.items():
-            if its_key not in times:
-                with _announced(path):
-                    try:
-                        times[its_key] = _measured(replace(settings, compile=compile), measure)
-                    except Exception as error:  # whatever the machine's tool chain lacks
-                        if its_key == key:
-                            raise
-                        log.warning("compile: fastest does without torch.compile (%s)", type(error).__name__)
-                        times[its_key] = math.inf
-                log.info("%s: %.1f ms per training step", its_key, 1e3 * times[its_key])
-                replace_text(path, json.dumps(times, indent=1))
-    fastest = min(keys, key=lambda compile: times[keys[compile]])
+        if key not in times:
+            with _announced(path):
+                times[key] = _measured(settings, measure)
+            log.info("%s: %.1f ms per training step", key, 1e3 * times[key])
+            replace_text(path, json.dumps(times, indent=1))
     validations = max(1, settings.num_steps // settings.val_interval)
-    interval = max(1, int(60 * settings.budget_minutes / times[keys[fastest]] / validations))
-    return replace(settings, num_steps=interval * validations, val_interval=interval, budget_minutes=None, compile=fastest)
+    interval = max(1, int(60 * settings.budget_minutes / times[key] / validations))
+    return replace(settings, num_steps=interval * validations, val_interval=interval, budget_minutes=None)
 
 
 def _measured(settings: TrainingSettings, measure: Callable[[TrainingSettings], float]) -> float:

@@ -27,22 +27,17 @@ from gpe_pl.data.sampling import PushForward, Sampling
 from gpe_pl.run_folder import CONFIG, RunError, config_in, differences
 from gpe_pl.training.callbacks import RolloutValidation, StepProgress, WarmAverage
 from gpe_pl.training.checkpoints import AtomicCheckpoints
-from gpe_pl.training.module import Schedule, TrainingModule
+from gpe_pl.training.module import Compile, Schedule, TrainingModule
 from gpe_pl.training.parallel import SummedGradients
 
 log = logging.getLogger(__name__)
-
-WayToCompile = Literal["auto", "on", "off", "fastest"]
-"""``Compile``, or whichever of on and off takes less time per step."""
-
 
 @dataclass(frozen=True)
 class TrainingSettings:
     """Everything about the optimisation; see ``TrainingModule``, ``TrajectoryDataModule``, ``data.noise`` and ``data.sampling`` for the meaning of each value.
 
-    ``budget_minutes``, of one core or GPU, replaces ``num_steps`` (see ``training.budget``), and then ``compile`` may be ``fastest``. The last ``push_share``
-    of the steps start where the model has come to in up to ``push_steps`` steps of its own; ``push_correction`` of the way that its velocity has gone astray
-    is to be taken back within a step.
+    ``budget_minutes``, of one core or GPU, replaces ``num_steps`` (see ``training.budget``). The last ``push_share`` of the steps start where the model
+    has come to in up to ``push_steps`` steps of its own; ``push_correction`` of the way that its velocity has gone astray is to be taken back within a step.
     """
 
     num_steps: Annotated[int, Field(ge=1)]
@@ -62,14 +57,12 @@ class TrainingSettings:
     push_steps: Annotated[int, Field(ge=1)] = 20
     push_correction: Annotated[float, Field(ge=0, le=1)] = 1.0
     stress_weight: Annotated[float, Field(gt=0)] = 1.0
-    compile: WayToCompile = "auto"
+    compile: Compile = "auto"
     val_interval: Annotated[int, Field(ge=1)] = 1000
     num_val_rollouts: Annotated[int, Field(ge=1)] = 4
     val_rollout_steps: Annotated[int, Field(ge=1)] = 100
 
     def __post_init__(self) -> None:
-        if self.compile == "fastest" and self.budget_minutes is None:
-            raise ValueError("compile=fastest: needs budget_minutes, for which it is measured; else auto, on or off")
         if self.num_steps > self.val_interval and self.num_steps % self.val_interval:
             raise ValueError(
                 f"val_interval={self.val_interval} must divide num_steps={self.num_steps}: the last steps would be neither validated nor saved"

@@ -60,46 +60,6 @@ def test_the_step_is_measured_as_the_run_will_take_it(tmp_path: Path, plain: flo
     assert result.num_steps == (300 if plain == 0.1 else 60_000)
 
 
-@pytest.mark.parametrize(("compiled", "way", "num_steps"), [(0.05, "on", 600), (0.2, "off", 300)])
-def test_the_faster_of_compiled_and_plain_is_used_and_both_are_kept(tmp_path: Path, compiled: float, way: str, num_steps: int) -> None:
-    settings, path, seen = replace(SETTINGS, compile="fastest"), tmp_path / "t.json", []
-
-    def measure(settings: TrainingSettings) -> float:
-        seen.append(settings.compile)
-        return compiled if settings.compile == "on" else 0.1
-
-    results = [within_budget(settings, path, "sand GNS", measure) for _ in range(2)]
-    assert seen == ["off", "on"] and results[0] == results[1]
-    assert (results[0].compile, results[0].num_steps) == (way, num_steps)
-    assert json.loads(path.read_text()) == {"sand GNS": 0.1, "sand GNS compiled": compiled}
-
-
-def test_a_model_that_does_not_compile_runs_without(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    settings, seen = replace(SETTINGS, compile="fastest"), []
-
-    def measure(settings: TrainingSettings) -> float:
-        seen.append(settings.compile)
-        if settings.compile == "on":
-            raise RuntimeError("no")
-        return 0.1
-
-    results = [within_budget(settings, tmp_path / "t.json", "sand GNS", measure) for _ in range(2)]
-    assert [(r.compile, r.num_steps) for r in results] == [("off", 300)] * 2
-    assert seen == ["off", "on"]
-    assert "compile: fastest does without torch.compile (RuntimeError)" in caplog.text
-
-
-def test_without_a_compiler_nothing_is_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(budget, "has_cpp_compiler", lambda: False)
-    result = within_budget(replace(SETTINGS, compile="fastest"), tmp_path / "t.json", "sand", lambda s: 0.1 if s.compile == "off" else 0.0)
-    assert result.compile == "off"
-
-
-def test_the_fastest_way_to_compile_needs_a_budget() -> None:
-    with pytest.raises(ValueError, match="compile=fastest: needs budget_minutes"):
-        replace(SETTINGS, compile="fastest", budget_minutes=None)
-
-
 def test_trainings_pause_while_a_step_is_measured(tmp_path: Path) -> None:
     path, events = tmp_path / "step_times.json", []
     measuring, may_end = threading.Event(), threading.Event()
