@@ -32,6 +32,7 @@ from gpe_pl.training.parallel import SummedGradients
 
 log = logging.getLogger(__name__)
 
+
 @dataclass(frozen=True)
 class TrainingSettings:
     """Everything about the optimisation; see ``TrainingModule``, ``TrajectoryDataModule``, ``data.noise`` and ``data.sampling`` for the meaning of each value.
