@@ -83,6 +83,7 @@ def fit(cfg: DictConfig) -> float:
             times,
             key,
             lambda settings: mean_step_time(new_module(settings).to(device), data().train_set, batch_size, settings),
+            device,
         )
     settings["training"] = training.as_dict()
     trained = {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training")} | unusual

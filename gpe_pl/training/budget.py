@@ -23,6 +23,7 @@ from gpe_pl.atomic import replace_text
 from gpe_pl.data.dataset import Samples, WindowDataset, collated
 from gpe_pl.data.sampling import NUM_LANES, BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
+from gpe_pl.machine import gemm_rate
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
 from gpe_pl.training.run import TrainingSettings
 
@@ -31,6 +32,12 @@ log = logging.getLogger(__name__)
 WARM_UP_STEPS = NUM_LANES
 MEASURED_STEPS = 25
 ROUNDS = 5
+RATE = "FLOP/s in products"
+"""In a file of step times: what the machine did when the first of them was measured."""
+PRODUCTS = (4096, 128)
+"""Rows and channels of the products that are timed for it."""
+SAME_MACHINE = 1.4
+"""Rates further apart than this factor are of different machines, or of a busy one."""
 
 
 def digest(settings: Any) -> str:
@@ -84,7 +91,9 @@ def _on(device: torch.device, samples: Samples) -> Samples:
     return [start.to(device) for start in samples] if isinstance(samples, list) else samples.to(device)
 
 
-def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Callable[[TrainingSettings], float]) -> TrainingSettings:
+def within_budget(
+    settings: TrainingSettings, path: Path, key: str, measure: Callable[[TrainingSettings], float], device: str = "cpu"
+) -> TrainingSettings:
     """Settings with the number of steps that ``settings.budget_minutes`` allow, and as many validations as before.
 
     The time of compiling is not part of the budget.
@@ -94,6 +103,7 @@ def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Cal
         path: JSON file of step times [s], shared by the runs of a sweep, whose trainings pause meanwhile (``PauseForMeasurements``).
         key: in that file, what the step time depends on.
         measure: step time [s] under given settings; called if the file does not have it yet.
+        device: what is used of the machine. If it is faster or slower than where the file's first time was measured, a warning says so.
 
     Raises:
         BudgetError: the file is damaged.
@@ -104,6 +114,7 @@ def within_budget(settings: TrainingSettings, path: Path, key: str, measure: Cal
         times = _read(path)
         if key not in times:
             with _announced(path):
+                _check_machine(times, path, key, device)
                 times[key] = _measured(settings, measure)
             log.info("%s: %.1f ms per training step", key, 1e3 * times[key])
             replace_text(path, json.dumps(times, indent=1))
@@ -120,6 +131,18 @@ def _measured(settings: TrainingSettings, measure: Callable[[TrainingSettings], 
     plain = measure(replace(settings, compile="off"))
     num_steps = int(60 * settings.budget_minutes / plain)
     return measure(replace(settings, num_steps=num_steps, val_interval=num_steps)) if num_steps >= COMPILE_PAYS_AFTER else plain
+
+
+def _check_machine(times: dict[str, float], path: Path, key: str, device: str) -> None:
+    """Warn if times so far are of another machine; equal budgets on both are not equal work. In an empty file, write down what this one does."""
+    rate = gemm_rate(*PRODUCTS, device)
+    before = times.get(RATE, rate) if times else times.setdefault(RATE, rate)
+    if not 1 / SAME_MACHINE < rate / before < SAME_MACHINE:
+        log.warning(
+            "%s: its step times were measured where products ran at %.0f GFLOP/s, and here it is %.0f; %s gets a number of steps that does not compare "
+            "with the others'. To compare, delete the file and measure all here, on an idle machine",
+            *(path, 1e-9 * before, 1e-9 * rate, key),
+        )
 
 
 class PauseForMeasurements(L.Callback):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -91,6 +92,30 @@ def test_a_measurement_that_was_killed_holds_nobody_up(tmp_path: Path) -> None:
     (tmp_path / "step_times.measuring").touch()
     PauseForMeasurements(path).on_train_batch_start()
     assert not (tmp_path / "step_times.measuring").exists()
+
+
+@pytest.mark.parametrize(("rate", "is_another"), [(1e11, False), (1.3e11, False), (1.5e11, True), (0.5e11, True)])
+def test_times_of_another_machine_are_not_mixed_without_a_word(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, rate: float, is_another: bool
+) -> None:
+    path = tmp_path / "step_times.json"
+    monkeypatch.setattr(budget, "gemm_rate", lambda *_: 1e11)
+    within_budget(SETTINGS, path, "sand GPE", lambda _: 0.1)
+    monkeypatch.setattr(budget, "gemm_rate", lambda *_: rate)
+    within_budget(SETTINGS, path, "sand GPE", lambda _: 0.1)
+    assert "products" not in caplog.text
+    within_budget(SETTINGS, path, "sand GNS", lambda _: 0.1)
+    said = f"step_times.json: its step times were measured where products ran at 100 GFLOP/s, and here it is {rate / 1e9:.0f}; sand GNS"
+    assert (said in caplog.text) == is_another
+    assert json.loads(path.read_text()) == {budget.RATE: 1e11, "sand GPE": 0.1, "sand GNS": 0.1}
+
+
+def test_a_file_without_a_rate_stays_without(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "step_times.json"
+    path.write_text('{"sand GPE": 0.1}')
+    within_budget(SETTINGS, path, "sand GNS", lambda _: 0.1)
+    assert json.loads(path.read_text()) == {"sand GPE": 0.1, "sand GNS": 0.1}
+    assert "products" not in caplog.text
 
 
 @pytest.mark.parametrize("content", ["", "[1]", '{"a": "fast"}', "\x00"])
