@@ -85,6 +85,8 @@ def test_the_folder_is_named_after_model_and_data(tmp_path: Path) -> None:
     cfg = compose("evaluate", checkpoint, f"paths.runs={tmp_path}/runs", "data=snow")
     assert cfg.name == "evaluation_sweep_seed=0_snow_test"
     assert compose("evaluate", "checkpoint=sand").name == "evaluation_sand_sand_test"
+    canyons = [compose("evaluate", "checkpoint=fluid", "data=fluid", f"scene={scene}").name for scene in ("canyon", "recorded_canyon")]
+    assert canyons == ["evaluation_fluid_fluid_canyon_test", "evaluation_fluid_fluid_canyon_recorded_test"]  # one may follow the other
 
 
 def test_data_that_do_not_fit_are_refused_before_any_is_generated(checkpoint: Path, tmp_path: Path) -> None:
