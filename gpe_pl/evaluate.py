@@ -90,7 +90,9 @@ def _showcase(cfg: DictConfig, simulator: LearnedSimulator) -> Callable[[Path], 
     from gpe_pl import showcase
     from gpe_pl.progress import progress_bar
 
-    settings = construct(showcase.ShowcaseSettings, {k: v for k, v in cfg.data.showcase.items() if k not in {"scene", "suffix"}}, "data.showcase")
+    settings = construct(
+        showcase.ShowcaseSettings, {k: v for k, v in cfg.data.showcase.items() if k not in {"scene", "suffix"}}, "data.showcase"
+    )
     scene = construct_target(cfg.data.showcase.scene, "data.showcase.scene", "gpe_pl.solvers.")
     try:
         state, metadata = showcase.start(simulator, scene, settings)

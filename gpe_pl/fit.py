@@ -26,7 +26,7 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
-    from gpe_pl.run_folder import RunError, claim
+    from gpe_pl.run_folder import RunError, claim, without_tables
     from gpe_pl.simulate import ensure_data, evaluated_config
     from gpe_pl.training.budget import PauseForMeasurements, digest, mean_step_time, within_budget
     from gpe_pl.training.module import TrainingModule
@@ -67,8 +67,8 @@ def fit(cfg: DictConfig) -> float:
         names = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "stress_weight", "compile")
         return TrainingModule(simulator, **{n: getattr(training, n) for n in names})
 
-    settings: Any = OmegaConf.to_container(cfg, resolve=True)
-    settings["data"].pop("comparison", None)  # what is taken of it is in graph and training
+    resolved: Any = OmegaConf.to_container(cfg, resolve=True)
+    settings = without_tables(resolved)
     unusual = {"batching": settings["batching"]} if batch_size.max_nodes is not None else {}  # as runs had it before there was a choice
     callbacks: list[L.Callback] = []
     if training.budget_minutes is not None:

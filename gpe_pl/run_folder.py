@@ -42,13 +42,19 @@ def release(run_dir: Path) -> None:
         run_dir.rmdir()
 
 
+def without_tables(values: dict[str, Any]) -> dict[str, Any]:
+    """A configuration without what data and sizes offer to comparisons, of which graph, model and training say what was taken; the budget stays."""
+    parts = {name: part for name in ("data", "size") if isinstance(part := values.get(name), dict) and "comparison" in part}
+    kept = {name: {key: value for key, value in part.items() if key != "comparison"} for name, part in parts.items()}
+    budget = parts.get("size", {}).get("comparison", {}).get("budget_minutes")
+    return values | kept | ({} if budget is None else {"size": kept["size"] | {"comparison": {"budget_minutes": budget}}})
+
+
 def config_in(path: Path) -> dict[str, Any]:
     """The configuration that a run has left in a file; raises ``RunError`` if that is damaged."""
     try:
         values = dict(json.loads(path.read_text()))
-        if isinstance(values.get("data"), dict):
-            values["data"].pop("comparison", None)  # which older runs wrote down, though it says nothing that graph and training do not
-        return values
+        return without_tables(values)  # which older runs wrote down
     except (ValueError, TypeError):
         raise RunError(f"{path} is damaged; delete the folder {path.parent} or choose another name=…") from None
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from lightning.pytorch.utilities import rank_zero_only
 
-from gpe_pl.run_folder import RunError, claim
+from gpe_pl.run_folder import RunError, claim, without_tables
 from gpe_pl.training.run import TrainerSettings, adopt, set_up
 
 CONFIG: dict[str, Any] = {"seed": 0, "model": {"depth": 3}, "training": {"batch_size": 2}}
@@ -41,10 +41,15 @@ def test_the_same_configuration_is_the_same_run(tmp_path: Path, config: dict[str
     assert taken is not None and taken.read_bytes() == b"weights"
 
 
-def test_what_a_data_set_offers_to_comparisons_is_no_part_of_a_run(tmp_path: Path) -> None:
+def test_what_data_and_sizes_offer_to_comparisons_is_no_part_of_a_run(tmp_path: Path) -> None:
     """Older runs wrote it down; new settings there must not make other runs of them."""
-    now = {**CONFIG, "data": {"name": "sand"}}
-    folder = finished(tmp_path / "there", {**now, "data": {"name": "sand", "comparison": {"noise_std": 1.0}}})
+    offered = {
+        "data": {"name": "sand", "comparison": {"noise_std": 1.0}},
+        "size": {"name": "tiny", "comparison": {"budget_minutes": 1.0, "seeds": "0,1"}},
+    }
+    now = without_tables({**CONFIG, **offered})
+    assert now == {**CONFIG, "data": {"name": "sand"}, "size": {"name": "tiny", "comparison": {"budget_minutes": 1.0}}}
+    folder = finished(tmp_path / "there", {**CONFIG, **offered})
     claim(folder, {**now, "evaluation": {"splits": ["test"]}})
     assert adopt(tmp_path / "there", now, tmp_path / "now") is not None
 
