@@ -86,12 +86,14 @@ def construct(target: Callable[..., T], settings: Mapping[str, Any], path: str, 
     return bind(target, settings, path, *given)(**given)
 
 
-def construct_target(settings: Mapping[str, Any], path: str, package: str) -> Any:
+def construct_target(settings: Any, path: str, package: str) -> Any:
     """``construct`` of the class that ``_target_`` names; it must lie below ``package``.
 
     Raises:
         ConfigError: no such class there, or settings that do not fit it.
     """
+    if not isinstance(settings, Mapping):
+        raise ConfigError(f"{path}={settings!r}: must be a table with a _target_, a class of {package.rstrip('.')}")
     values = dict(settings)
     target = str(values.pop("_target_", None))
     module, _, name = target.rpartition(".")

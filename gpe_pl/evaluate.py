@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from hashlib import sha256
 from itertools import product
 from pathlib import Path
@@ -90,16 +91,18 @@ def _showcase(cfg: DictConfig, simulator: LearnedSimulator) -> Callable[[Path], 
     from gpe_pl import showcase
     from gpe_pl.progress import progress_bar
 
+    if not isinstance(cfg.data.showcase, Mapping):
+        raise ConfigError(f"data.showcase={cfg.data.showcase!r}: must be a table with a scene, or null")
     settings = construct(
         showcase.ShowcaseSettings, {k: v for k, v in cfg.data.showcase.items() if k not in {"scene", "suffix"}}, "data.showcase"
     )
-    scene = construct_target(cfg.data.showcase.scene, "data.showcase.scene", "gpe_pl.solvers.")
+    scene = construct_target(cfg.data.showcase.get("scene"), "data.showcase.scene", "gpe_pl.solvers.")
     try:
         state, metadata = showcase.start(simulator, scene, settings)
     except ValueError as error:
         if isinstance(error, GpeError):
             raise
-        raise ConfigError(f"data.showcase.scene: {error}") from None
+        raise ConfigError(f"data.showcase: {error}") from None
 
     def show(folder: Path) -> None:
         with progress_bar("showcase") as on_progress:

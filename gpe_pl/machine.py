@@ -98,6 +98,20 @@ def gemm_rate(rows: int, channels: int, device: str) -> float:
     return max(rates)
 
 
+def reduces_precision(device: str) -> bool:
+    """Whether single-precision products become less exact where they may: not every processor has units for that, nor every GPU."""
+    left, right = torch.linspace(0.1, 0.9, 2 * 256**2, device=device).view(2, 256, 256)
+    before = torch.get_float32_matmul_precision()
+    products = []
+    try:
+        for precision in ("highest", "medium"):
+            torch.set_float32_matmul_precision(precision)
+            products.append(left @ right)
+    finally:
+        torch.set_float32_matmul_precision(before)
+    return bool((products[1] - products[0]).norm() > 1e-5 * products[0].norm())  # rounding to bfloat16 changes 1e-3
+
+
 def copy_rate(device: str, num_bytes: int = 2**28) -> float:
     """Bytes/s read and written in copying an array that no cache holds."""
     source = torch.zeros(num_bytes // 4, device=device)

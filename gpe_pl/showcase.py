@@ -23,7 +23,7 @@ from gpe_pl.containment import TOLERANCE, Contained
 from gpe_pl.geometry import signed_distance
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.machine import environment, peak_resident
-from gpe_pl.rollout import Guard, Simulator, Start, frames
+from gpe_pl.rollout import Guard, Simulator, Start, frames, impossible_material
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.trajectory import Metadata, State, Termination, Trajectory
 
@@ -66,10 +66,17 @@ def start(simulator: LearnedSimulator, scene: Scene, settings: ShowcaseSettings)
 
     Raises:
         SceneError: the scene does not fit the simulator.
-        ValueError: there is no such scene.
+        ValueError: there is no such scene, or no such material in it.
     """
     metadata = replace(describe(scene, simulator.builder.metadata.frame_dt, seed=settings.seed), dataset="showcase")
-    return simulator.standing(scene.sample(settings.values, settings.seed), metadata), metadata
+    unknown = settings.values.keys() - set(metadata.materials)
+    if unknown:
+        raise ValueError(f"values.{min(unknown)}: no material of this scene, which has {', '.join(metadata.materials)}")
+    state = simulator.standing(scene.sample(settings.values, settings.seed), metadata)
+    impossible = impossible_material(state, metadata)
+    if impossible is not None:
+        raise ValueError(f"values: {impossible.message}")
+    return state, metadata
 
 
 def run(
@@ -116,8 +123,9 @@ def run(
     if outside:
         records.append(Record("num_uncontained_steps", float(len(outside)), "1"))
         records.append(Record("share_outside_uncontained", float(np.mean(outside)), "1"))
-    written = {"environment": environment(), "records": [vars(r) for r in records], "stopped": stop}
-    replace_text(folder / "showcase.json", json.dumps(written, indent=1))
+    finite = [vars(r) | {"value": r.value if math.isfinite(r.value) else None} for r in records]  # of no step there is no mean
+    written = {"environment": environment(), "records": finite, "stopped": stop}
+    replace_text(folder / "showcase.json", json.dumps(written, indent=1, allow_nan=False))
     replace_text(folder / "showcase.md", table(records, stop))
     film.write(folder / "showcase")
     return records

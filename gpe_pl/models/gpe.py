@@ -92,14 +92,22 @@ class PairForce(nn.Module):
         self.act = nn.PReLU()
         self.lin_out = nn.Linear(hidden_channels, spec.dim, bias=self.bipartite)
 
-    def forward(self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, odd: Tensor, even: Tensor) -> Float[Tensor, "edge dim"]:
-        """Force on the target of every edge; the source feels the opposite."""
+    def forward(
+        self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, odd: Tensor, even: Tensor, chunk: int | None = None
+    ) -> Float[Tensor, "edge dim"]:
+        """Force on the target of every edge, computed for ``chunk`` edges at a time; the source feels the opposite."""
+        a, b = self.lin_target(h_target), self.lin_source(h_source)
+        size = max(edge_index.shape[1], 1) if chunk is None else chunk
+        parts = zip(edge_index.split(size, dim=1), odd.split(size), even.split(size), strict=True)
+        return torch.cat([self._force(a, b, *part) for part in parts])
+
+    def _force(self, a: Tensor, b: Tensor, edge_index: Tensor, odd: Tensor, even: Tensor) -> Tensor:
         j, i = edge_index
         s, w = self.lin_even(even), self.lin_odd(odd)
-        forward = self.act(self.lin_target(h_target)[i] + self.lin_source(h_source)[j] + s + w)
+        forward = self.act(a[i] + b[j] + s + w)
         if self.bipartite:
             return self.lin_out(forward)
-        reverse = self.act(self.lin_target(h_source)[j] + self.lin_source(h_target)[i] + s - w)
+        reverse = self.act(a[j] + b[i] + s - w)  # both ends are of one type, so their rows are the same
         return self.lin_out(forward - reverse)
 
 
@@ -393,7 +401,7 @@ class GPE(nn.Module):
         stress = {m: self.stress_decoder[m](h[m]) for m in mass if self._decodes_stress(m)}
         if self.decoder == "node":
             return {m: self.node_decoder[m](h[m]) for m in mass}, stress
-        return self._pair_accelerations(h, mass, edges), stress
+        return self._pair_accelerations(h, mass, edges, chunk), stress
 
     def _phases(self, types: list[str], edges: Edges) -> list[tuple[list[EdgeType], dict[str, Tensor | None]]]:
         """What happens one after the other within a step: relations that compute messages, and node types that receive them, or only these rows."""
@@ -431,13 +439,13 @@ class GPE(nn.Module):
             features = torch.cat([features, torch.cat([-odd, even], dim=1)])
         return features if encoder is None else encoder(features)
 
-    def _pair_accelerations(self, h: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges) -> dict[str, Tensor]:
+    def _pair_accelerations(self, h: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges, chunk: int | None) -> dict[str, Tensor]:
         force = {m: h[m].new_zeros(h[m].shape[0], self.spec.dim) for m in mass}
         for relation, (edge_index, odd, even) in edges.items():
             if self.key(relation) not in self.pair_decoder:
                 continue
             source, _, target = relation
-            f = self.pair_decoder[self.key(relation)](h[source], h[target], edge_index, odd, even)
+            f = self.pair_decoder[self.key(relation)](h[source], h[target], edge_index, odd, even, chunk)
             force[target] = force[target].index_add(0, edge_index[1], f)
             if source in force:
                 force[source] = force[source].index_add(0, edge_index[0], -f)

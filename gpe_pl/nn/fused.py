@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 
@@ -44,3 +44,21 @@ def blocks(num_rows: int) -> Iterator[tuple[int, int]]:
     """First row and number of rows of every block."""
     for first in range(0, num_rows, BLOCK):
         yield first, min(BLOCK, num_rows - first)
+
+
+def plain_gradients(
+    plain: Callable[..., Sequence[Tensor | None]], inputs: Sequence[Tensor | None], grads: Sequence[Tensor | None]
+) -> list[Tensor | None]:
+    """Gradients of what passes compute, by PyTorch's operations: for a backward pass that is itself to be differentiated (``create_graph=True``).
+
+    Args:
+        plain: the same results of the same inputs.
+        inputs: as they were saved, so that second derivatives find their way back.
+        grads: of the results.
+    """
+    own = [t.view_as(t) if t is not None and t.requires_grad else t for t in inputs]  # one input may have come from another
+    wanted = [t for t in own if t is not None and t.requires_grad]
+    pairs = [(y, g) for y, g in zip(plain(*own), grads, strict=True) if y is not None and g is not None]
+    outputs, arriving = zip(*pairs, strict=True)
+    found = iter(torch.autograd.grad(outputs, wanted, arriving, create_graph=True, allow_unused=True))
+    return [next(found) if t is not None and t.requires_grad else None for t in own]

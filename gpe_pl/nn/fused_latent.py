@@ -12,6 +12,7 @@ computes the activations again.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, no_type_check
 
 import numpy as np
@@ -19,8 +20,9 @@ import torch
 from jaxtyping import Float, Int64
 from numba import njit
 from torch import Tensor
+from torch.nn import functional
 
-from gpe_pl.nn.fused import FASTMATH, block_size, blocks
+from gpe_pl.nn.fused import FASTMATH, block_size, blocks, plain_gradients
 
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
@@ -82,35 +84,40 @@ def _gather_grad(grad_target, grad_source, source, target, first, count, g):
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _gather_message_grad(grad_target, grad_source, grad_new, source, target, first, count, g, total):
-    """Gradients of the messages, which also reach the new states, and their sum in ``total``."""
+    """Gradients of the messages, which also reach the new states, and their sum in ``total``: of a block, then of blocks, to round no worse than PyTorch's."""
+    block_sum = np.zeros_like(g[0])
     for k in range(count):
         i, j = target[first + k], source[first + k]
         for c in range(g.shape[1]):
             y = grad_target[i, c] - grad_source[j, c] + grad_new[first + k, c]
             g[k, c] = y
-            total[c] += y
+            block_sum[c] += y
+    total += block_sum
 
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _backward(a, b, w, slope, source, target, first, count, g, grad_a, grad_b, below):
     """Turns g, the gradient of x, into that of z."""
+    block_sum = np.zeros_like(g[0])
     for k in range(count):
         i, j = target[first + k], source[first + k]
         for c in range(w.shape[1]):
             z = a[i, c] + b[j, c] + w[k, c]
             negative = z <= 0
-            below[c] += g[k, c] * z if negative else 0
+            block_sum[c] += g[k, c] * z if negative else 0
             y = slope * g[k, c] if negative else g[k, c]
             g[k, c] = y
             grad_a[i, c] += y
             grad_b[j, c] += y
+    below += block_sum
 
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _backward_odd(a, b, w, u, slope, source, target, first, count, g, even, grad_a, grad_b, below):
     """Turns g, the gradient of x, into that of W e; ``even`` becomes that of V s."""
+    block_sum = np.zeros_like(g[0])
     for k in range(count):
         i, j = target[first + k], source[first + k]
         for c in range(w.shape[1]):
@@ -118,13 +125,14 @@ def _backward_odd(a, b, w, u, slope, source, target, first, count, g, even, grad
             z = a[j, c] + b[i, c] + u[k, c] - w[k, c]
             p = slope * g[k, c] if y <= 0 else g[k, c]
             q = slope * g[k, c] if z <= 0 else g[k, c]
-            below[c] += g[k, c] * ((y if y <= 0 else 0) - (z if z <= 0 else 0))
+            block_sum[c] += g[k, c] * ((y if y <= 0 else 0) - (z if z <= 0 else 0))
             g[k, c] = p + q
             even[k, c] = p - q
             grad_a[i, c] += p
             grad_b[j, c] += p
             grad_a[j, c] -= q
             grad_b[i, c] -= q
+    below += block_sum
 
 
 class _Layer:
@@ -178,29 +186,50 @@ def _forward(
     return at_target, at_source, new
 
 
+def _plain(
+    a: Tensor, b: Tensor, e: Tensor, s: Tensor | None, weight: Tensor, even_weight: Tensor, slope: Tensor, out_weight: Tensor, out_bias: Tensor,
+    edge_index: Tensor, is_joint: bool,
+) -> tuple[Tensor, Tensor | None, Tensor | None]:  # fmt: skip
+    j, i = edge_index
+    w = functional.linear(e, weight)
+    if s is None:
+        x = functional.prelu(a[i] + b[j] + w, slope)
+    else:
+        u = functional.linear(s, even_weight)
+        x = functional.prelu(a[i] + b[j] + u + w, slope) - functional.prelu(a[j] + b[i] + u - w, slope)
+    m = functional.linear(x, out_weight, out_bias) if out_weight.numel() else x
+    new = e + m if out_weight.numel() else None
+    at_target = torch.zeros_like(a).index_add(0, i, m)
+    if is_joint:
+        return at_target.index_add(0, j, m, alpha=-1), None, new
+    return at_target, torch.zeros_like(b).index_add(0, j, m, alpha=-1), new
+
+
 class _FusedLatent(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, is_joint: bool, a: Tensor, b: Tensor, e: Tensor, s: Tensor | None, *others: Tensor) -> Any:
         weight, even_weight, slope, out_weight, out_bias, edge_index = others
-        ctx.updates = out_weight.numel() > 0
+        ctx.updates, ctx.is_joint = out_weight.numel() > 0, is_joint
         ctx.save_for_backward(a, b, e, s, *others)
         layer = _Layer(a, b, e, s, weight, even_weight, slope, edge_index)
         at_target, at_source, new = _forward(layer, (out_weight.detach(), out_bias.detach()) if ctx.updates else None, is_joint, False)
         return at_target, at_source, layer.e[:0] if new is None else new
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_target: Tensor, grad_source: Tensor | None, grad_new: Tensor) -> Any:  # type: ignore[override]
         a, b, e, s, weight, even_weight, slope, out_weight, out_bias, edge_index = ctx.saved_tensors
+        if torch.is_grad_enabled():
+            plain = partial(_plain, edge_index=edge_index, is_joint=ctx.is_joint)
+            return None, *plain_gradients(plain, ctx.saved_tensors[:-1], [grad_target, grad_source, grad_new]), None
         layer = _Layer(a, b, e, s, weight, even_weight, slope, edge_index)
         ends = layer.source, layer.target
         arriving = [(grad_target if g is None else g).contiguous().numpy() for g in (grad_target, grad_source)]
-        grad_a, grad_b, grad_weight, grad_even_weight, grad_out_weight, grad_out_bias = (
-            torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (a, b, weight, even_weight, out_weight, out_bias)
+        grad_a, grad_b, grad_weight, grad_even_weight, grad_out_weight = (
+            torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (a, b, weight, even_weight, out_weight)
         )
+        grad_out_bias, below = out_bias.new_zeros(len(out_bias), dtype=torch.float64), a.new_zeros(a.shape[1], dtype=torch.float64)
         grad_e, grad_new = torch.empty_like(layer.e), grad_new.contiguous()
         grad_s = torch.empty_like(s, memory_format=torch.contiguous_format) if s is not None and ctx.needs_input_grad[4] else None
-        below = a.new_zeros(a.shape[1])
         sums = grad_a.numpy(), grad_b.numpy(), below.numpy()
         g, grad_m, even = torch.empty_like(layer.x), torch.empty_like(layer.x), torch.empty_like(layer.x)
         of_x, of_m, of_even, of_new, of_bias = (t.numpy() for t in (g, grad_m, even, grad_new, grad_out_bias))
@@ -235,9 +264,9 @@ class _FusedLatent(torch.autograd.Function):
             grad_s,
             grad_weight,
             grad_even_weight,
-            below.sum().reshape(1),
+            below.sum().reshape(1).to(slope),
             grad_out_weight,
-            grad_out_bias,
+            grad_out_bias.to(out_bias),
             None,
         )
 
@@ -255,7 +284,7 @@ def fused_latent(
     is_joint: bool = False,
     overwrites: bool = False,
 ) -> tuple[Float[Tensor, "target hidden"], Float[Tensor, "source hidden"] | None, Float[Tensor, "edge state"] | None]:
-    """T, S and e' of the module's text, on the CPU in single or double precision; differentiable once in all but ``edge_index``.
+    """T, S and e' of the module's text, on the CPU in single or double precision; differentiable in all but ``edge_index``.
 
     ``edge_index`` must hold rows that exist: nothing is checked.
 

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from typing import Any, no_type_check
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from numba import njit
 from torch import Tensor
+from torch.nn import functional
 
-from gpe_pl.nn.fused import FASTMATH, block_size, blocks
+from gpe_pl.nn.fused import FASTMATH, block_size, blocks, plain_gradients
 
 
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
@@ -53,14 +55,17 @@ def _finish(y, bias, residual, first, count):
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _backward(z, slope, first, count, g, grad_bias, below):
-    """Turns g, the gradient of φ(z), into that of z."""
+    """Turns g, the gradient of φ(z), into that of z; sums over rows are of a block, then of blocks, so that they round no worse than PyTorch's."""
+    bias_sum, below_sum = np.zeros_like(z[0]), np.zeros_like(z[0])
     for k in range(count):
         for c in range(z.shape[1]):
             negative = z[first + k, c] <= 0
-            below[c] += g[k, c] * z[first + k, c] if negative else 0
+            below_sum[c] += g[k, c] * z[first + k, c] if negative else 0
             y = slope * g[k, c] if negative else g[k, c]
             g[k, c] = y
-            grad_bias[c] += y
+            bias_sum[c] += y
+    grad_bias += bias_sum
+    below += below_sum
 
 
 def _forward(x: Tensor, weights: tuple[Tensor, ...], residual: Tensor | None, keeps: bool) -> tuple[Tensor, Tensor]:
@@ -81,23 +86,29 @@ def _forward(x: Tensor, weights: tuple[Tensor, ...], residual: Tensor | None, ke
     return y, z
 
 
+def _plain(x: Tensor, weight: Tensor, bias: Tensor, slope: Tensor, out_weight: Tensor, out_bias: Tensor) -> tuple[Tensor]:
+    return (functional.linear(functional.prelu(functional.linear(x, weight, bias), slope), out_weight, out_bias),)
+
+
 class _FusedMLP(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, residual: Tensor | None, *weights: Tensor) -> Tensor:
         rows = x.detach().contiguous()
         y, z = _forward(rows, weights, residual, keeps=True)
-        ctx.save_for_backward(rows, z, *weights)
+        ctx.save_for_backward(x, rows, z, *weights)
         return y
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Any:  # type: ignore[override]
-        x, z, weight, bias, slope, out_weight, _ = ctx.saved_tensors
+        own, x, z, *weights = ctx.saved_tensors
+        if torch.is_grad_enabled():
+            grad_own, *others = plain_gradients(_plain, [own, *weights], [grad])
+            return grad_own, grad if ctx.needs_input_grad[1] else None, *others
+        weight, bias, slope, out_weight, _ = weights
         grad = grad.contiguous()
-        grad_weight, grad_bias, grad_out_weight = (
-            torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (weight, bias, out_weight)
-        )
-        grad_x, below = torch.empty_like(x) if ctx.needs_input_grad[0] else None, torch.zeros_like(bias)
+        grad_weight, grad_out_weight = (torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (weight, out_weight))
+        grad_x = torch.empty_like(x) if ctx.needs_input_grad[0] else None
+        grad_bias, below = torch.zeros(2, len(bias), dtype=torch.float64)
         h, g = x.new_empty(2, block_size(len(x)), z.shape[1])
         of_z, of_h, of_g, p = z.numpy(), h.numpy(), g.numpy(), slope.detach().numpy()[0]
         for first, count in blocks(len(x)):
@@ -110,7 +121,8 @@ class _FusedMLP(torch.autograd.Function):
             if grad_x is not None:
                 torch.mm(g[:count], weight.detach(), out=grad_x[rows])
         grad_residual = grad if ctx.needs_input_grad[1] else None
-        return grad_x, grad_residual, grad_weight, grad_bias, below.sum().reshape(1), grad_out_weight, grad.sum(dim=0)
+        grad_slope = below.sum().reshape(1)
+        return grad_x, grad_residual, grad_weight, grad_bias.to(bias), grad_slope.to(slope), grad_out_weight, grad.sum(dim=0)
 
 
 def fused_mlp(
@@ -122,7 +134,7 @@ def fused_mlp(
     out_bias: Float[Tensor, " out"],
     residual: Float[Tensor, "row out"] | None = None,
 ) -> Float[Tensor, "row out"]:
-    """Y of the module's text, on the CPU in single or double precision; differentiable once."""
+    """Y of the module's text, on the CPU in single or double precision; differentiable."""
     weights = weight, bias, slope, out_weight, out_bias
     if not torch.is_grad_enabled():
         return _forward(x.detach().contiguous(), weights, residual, keeps=False)[0]

@@ -51,10 +51,10 @@ class Settings:
     num_graphs: Annotated[int, Field(ge=1)] = 4
     num_nodes: Annotated[int, Field(ge=10)] = 2500
     num_edges: Annotated[int, Field(ge=10)] = 24000
-    num_message_passing_steps: Annotated[int, Field(ge=1)] = 12
-    hidden_channels: Annotated[int, Field(ge=1)] = 128
+    num_message_passing_steps: Annotated[int, Field(ge=1, le=64)] = 12
+    hidden_channels: Annotated[int, Field(ge=1, le=4096)] = 128
     num_steps: Annotated[int, Field(ge=1)] = 20
-    num_threads: Annotated[int, Field(ge=1)] = 1
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
     accelerator: Literal["cpu", "gpu"] = "cpu"
 
 

@@ -70,7 +70,7 @@ class Settings:
         accelerator: where models run; the solvers run on the CPU.
     """
 
-    cases: dict[str, Case]
+    cases: Annotated[dict[str, Case], Field(min_length=1)]
     runs: list[str]
     factors: list[Annotated[float, Field(gt=1)]] = field(default_factory=lambda: [1.5, 2.0, 3.0])
     step_factors: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
@@ -78,7 +78,7 @@ class Settings:
     split: Split = "test_unseen"
     num_trajectories: Annotated[int, Field(ge=1)] = 5
     horizons: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [20, 50, 100])
-    num_threads: Annotated[int, Field(ge=1)] = 1
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
     accelerator: Literal["cpu", "gpu"] = "cpu"
 
     @property

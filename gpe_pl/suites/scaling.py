@@ -47,13 +47,20 @@ class Settings:
     num_nodes: Annotated[list[Annotated[int, Field(ge=10)]], Field(min_length=1)] = field(default_factory=lambda: [1000, 10_000, 100_000])
     dimensions: Annotated[list[Literal[2, 3]], Field(min_length=1)] = field(default_factory=lambda: [2, 3])
     fitted: tuple[int, int] = (10_000, 200_000)
-    num_message_passing_steps: Annotated[int, Field(ge=1)] = 12
-    hidden_channels: Annotated[int, Field(ge=1)] = 128
+    num_message_passing_steps: Annotated[int, Field(ge=1, le=64)] = 12
+    hidden_channels: Annotated[int, Field(ge=1, le=4096)] = 128
     edge_state: EdgeState = "latent"
     budget: Annotated[float, Field(ge=0)] = 5.0
-    num_threads: Annotated[int, Field(ge=1)] = 1
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
     accelerator: Literal["cpu", "gpu"] = "cpu"
     seed: Annotated[int, Field(ge=0)] = 0
+
+    def __post_init__(self) -> None:
+        for name, values in (("num_nodes", self.num_nodes), ("dimensions", self.dimensions)):
+            if len(set(values)) < len(values):
+                raise ValueError(f"{name}: {list(values)} has the same twice")
+        if not 0 < self.fitted[0] < self.fitted[1]:
+            raise ValueError(f"fitted: {list(self.fitted)} must go from a smaller to a larger number of nodes")
 
     @property
     def device(self) -> str:
@@ -161,7 +168,7 @@ def _fastest(function: Callable[[], Any], budget: float) -> float:
 
 def _fit(rows: list[tuple[int, float, float]], fitted: tuple[int, int], dim: int) -> list[dict[str, Any]]:
     """The exponent p of time ∝ Nᵖ by least squares of the logarithms, and the time per edge and layer at the larger end over that at the smaller."""
-    inside = [row for row in rows if fitted[0] <= row[0] <= fitted[1]]
+    inside = sorted(row for row in rows if fitted[0] <= row[0] <= fitted[1])
     if len(inside) < 2:
         return []
     size, seconds = np.log([row[0] for row in inside]), np.log([row[1] for row in inside])

@@ -45,15 +45,15 @@ class Settings:
 
     num_nodes: Annotated[int, Field(ge=10)] = 2500
     num_edges: Annotated[int, Field(ge=10)] = 24000
-    num_message_passing_steps: Annotated[int, Field(ge=1)] = 12
-    hidden_channels: Annotated[int, Field(ge=1)] = 128
+    num_message_passing_steps: Annotated[int, Field(ge=1, le=64)] = 12
+    hidden_channels: Annotated[int, Field(ge=1, le=4096)] = 128
     edge_states: Annotated[list[EdgeState], Field(min_length=1)] = field(default_factory=lambda: ["latent", "geometry"])
     num_boundary: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [5000, 50000])
     num_falling: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)] = field(default_factory=lambda: [2500, 10000])
     num_settled: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [1, 4])
     holds: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
     num_rounds: Annotated[int, Field(ge=1)] = 11
-    num_threads: Annotated[int, Field(ge=1)] = 1
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
     accelerator: Literal["cpu", "gpu"] = "cpu"
     seed: Annotated[int, Field(ge=0)] = 0
 
@@ -189,7 +189,9 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
     for level, skips in (("on", Skips()), ("off", Skips(absent_types=False))):
         calls = absent_material_calls(settings, skips)
         records.append({"metric": "absent_material_calls", "case": level, "value": calls, "unit": "1"})
-    return records, _table(settings, lines, records)
+    graph = builder(scene)
+    num_edges = sum(graph[r].edge_index.shape[1] for r in builder.spec.relations)
+    return records, _table(settings, num_edges, lines, records)
 
 
 def _hold_time_ratio(settings: Settings, edge_state: EdgeState, builder: GraphBuilder, scene: State, hold: int) -> float:
@@ -210,14 +212,14 @@ def _hold_time_ratio(settings: Settings, edge_state: EdgeState, builder: GraphBu
     return paired_ratio(times, "held", "exact")
 
 
-def _table(settings: Settings, lines: list[str], records: list[dict[str, Any]]) -> str:
+def _table(settings: Settings, num_edges: int, lines: list[str], records: list[dict[str, Any]]) -> str:
     calls = {(r["metric"], r["case"]): r["value"] for r in records if r["metric"].endswith("_calls")}
     shares = [f"{r['case']} {100 * r['value']:.0f} %" for r in records if r["metric"] == "hold_time_ratio"]
     held = f" Frames for which one prediction is held, another approximate level, take of the time: {', '.join(shares)}." if shares else ""
     header = ["edge state", "added", "without it [ms]", "level on [ms]", "longer by", "level off [ms]", "longer by"]
     return "\n".join(
         [
-            f"A step of {settings.num_nodes} nodes with {settings.num_edges} edges, GPE {settings.num_message_passing_steps} × {settings.hidden_channels}, "
+            f"A step of {settings.num_nodes} nodes with {num_edges} edges, GPE {settings.num_message_passing_steps} × {settings.hidden_channels}, "
             f"{settings.num_threads} thread(s), and of the same with what does not matter added; medians, and medians of paired ratios.",
             "",
             table_row(header),

@@ -47,7 +47,7 @@ class Settings:
         num_workers: processes that simulate at the same time, one core each.
     """
 
-    cases: dict[str, Case]
+    cases: Annotated[dict[str, Case], Field(min_length=1)]
     num_trajectories: Annotated[int, Field(ge=1)] = 4
     num_frames: Annotated[int, Field(ge=2)] = 200
     num_workers: Annotated[int, Field(ge=1)] = 2

@@ -71,7 +71,7 @@ class Settings:
     num_rest_steps: Annotated[int, Field(ge=1)] = 1000
     tests: list[Annotated[int, Field(ge=1, le=30)]] = field(default_factory=list)
     num_workers: Annotated[int, Field(ge=1)] = 2
-    num_threads: Annotated[int, Field(ge=1)] = 1
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
 
 
 def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:

@@ -99,7 +99,7 @@ class TrainerSettings:
     accelerator: Literal["cpu", "gpu", "auto"] = "cpu"
     devices: Annotated[int, Field(ge=1)] = 1
     num_nodes: Annotated[int, Field(ge=1)] = 1
-    num_threads: Annotated[int, Field(ge=1)] | None = None
+    num_threads: Annotated[int, Field(ge=1, le=1024)] | None = None
     num_workers: Annotated[int, Field(ge=0)] = 0
     matmul_precision: Literal["highest", "high", "medium"] = "highest"
     progress: bool = True

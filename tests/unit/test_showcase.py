@@ -71,6 +71,8 @@ def test_without_containment_what_enters_a_wall_is_counted(tmp_path: Path) -> No
 def test_a_rollout_that_explodes_says_so(tmp_path: Path) -> None:
     records = run(simulator(float("inf")), CANYON, SETTINGS, tmp_path)
     assert values(records)["num_steps"] == 0
+    written = json.loads((tmp_path / "showcase.json").read_text(), parse_constant=pytest.fail)  # no NaN, which JSON does not know
+    assert {r["metric"]: r["value"] for r in written["records"]}["seconds_per_step"] is None
     stopped = json.loads((tmp_path / "showcase.json").read_text())["stopped"]
     assert "not finite" in stopped and f"Stopped: {stopped}" in (tmp_path / "showcase.md").read_text()
 
@@ -95,6 +97,19 @@ def test_a_scene_of_another_spacing_is_refused(tmp_path: Path) -> None:
     coarse = FluidScene("canyon", CANYON.bounds, 3 * scenes.SPACING, 20)
     with pytest.raises(SceneError, match=r"the scene has .* spacing=0\.075 m"):
         run(simulator(), coarse, SETTINGS, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"fluid": -1.0}, "values: node 0: kinematic_viscosity of fluid is -1 "),
+        ({"fluid": 1e9}, r"values: node 0: kinematic_viscosity of fluid is 1e\+09 "),
+        ({"fluid": 10.0, "snow": 3.0}, "values.snow: no material of this scene, which has fluid"),
+    ],
+)
+def test_a_material_that_cannot_be_is_refused_before_anything_runs(values: dict[str, float], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        start(simulator(), CANYON, ShowcaseSettings(values=values))
 
 
 def test_what_approximate_levels_leave_out_is_counted(tmp_path: Path) -> None:

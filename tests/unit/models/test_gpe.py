@@ -13,6 +13,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.models.gpe import GPE, MaterialEmbedding, StressError
 from gpe_pl.schema import is_symmetric
+from gpe_pl.skips import Skips
 from tests import scenes
 
 DOUBLE = torch.float64
@@ -153,6 +154,17 @@ def test_pair_forces_of_an_isolated_body_sum_to_zero(interaction: str, seed: int
     force = model(data).acceleration["sand"] * data["sand"].mass[:, None]
     assert force.norm(dim=1).sum() > 1e-3
     assert force.sum(dim=0).norm() / force.norm(dim=1).sum() < 1e-14
+
+
+def test_pair_forces_are_computed_for_some_edges_at_a_time() -> None:
+    model = GPE(scenes.builder().spec, decoder="pair", num_message_passing_steps=1, hidden_channels=8).double()
+    model.skips, seen = Skips(edges_at_once=7), list[int]()
+    for force in model.pair_decoder.values():
+        force.lin_out.register_forward_pre_hook(lambda _, inputs: seen.append(len(inputs[0])))  # type: ignore[operator, union-attr]
+    data = isolated_body()
+    with torch.inference_mode():
+        model(data)
+    assert max(seen) == 7 and sum(seen) == data["sand", "radius", "sand"].edge_index.shape[1]
 
 
 def test_node_decoder_does_not_conserve_momentum() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -42,3 +44,21 @@ def test_steps_of_a_scene_are_timed(monkeypatch: pytest.MonkeyPatch) -> None:
     found = {r["metric"]: r["value"] for r in records}
     assert found["step_time"] == found["graph_time"] + found["forward_time"] and found["graph_time"] > 0
     assert "scaling_exponent" not in found
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"num_nodes": [20, 20]}, "num_nodes: .* the same twice"),
+        ({"dimensions": [2, 2]}, "dimensions: .* the same twice"),
+        ({"fitted": (200, 100)}, "from a smaller to a larger"),
+    ],
+)
+def test_sizes_that_nothing_can_be_fitted_to_are_refused(values: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        Settings(**values)
+
+
+def test_the_order_of_sizes_does_not_matter() -> None:
+    rows = [(10_000, 1.0, 1.0), (200_000, 20.0, 2.0)]
+    assert scaling._fit(rows, (10_000, 200_000), 2) == scaling._fit(rows[::-1], (10_000, 200_000), 2)

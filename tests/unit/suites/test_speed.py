@@ -10,6 +10,7 @@ import torch
 
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.lattice import lattice_graph
+from gpe_pl.machine import reduces_precision
 from gpe_pl.nn.fused import works_on
 from gpe_pl.suites.speed import REFERENCE, Case, Settings, cases, flop, run, training_step
 
@@ -60,9 +61,10 @@ def test_every_case_has_its_records_and_its_row(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(
         "gpe_pl.suites.speed.apart", lambda factories: nullcontext({name: factory() for name, factory in factories.items()})
     )
+    monkeypatch.setattr("gpe_pl.suites.speed.reduces_precision", lambda _: True)
     records, table = run(SMALL)
     found = {(r["metric"], r["case"]): r["value"] for r in records}
-    for name, case in cases(compiled=False).items():
+    for name, case in cases(compiled=False, reduced=True).items():
         wanted = {"forward_time", "training_time", "forward_speedup", "forward_speedup_vs_gns", "training_speedup"}
         if case.precision != "highest":
             wanted |= {"forward_difference"}
@@ -74,6 +76,20 @@ def test_every_case_has_its_records_and_its_row(monkeypatch: pytest.MonkeyPatch)
     assert found["forward_speedup", REFERENCE] == 1 and found["forward_speedup_vs_gns", "GNS"] == 1
     assert found["neighbor_time", "cpu"] > 0
     assert found["flop", "negated, geometry"] < found["flop", "negated"] < found["flop", REFERENCE]
+
+
+def test_products_that_do_not_become_less_exact_are_not_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not any(case.precision != "highest" for case in cases(compiled=True, reduced=False).values())
+    monkeypatch.setattr(torch.Tensor, "__matmul__", lambda a, b: torch.mm(a, b))
+    assert not reduces_precision("cpu")
+
+    def rounded(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+        exact = torch.get_float32_matmul_precision() == "highest"
+        return torch.mm(a, b) if exact else torch.mm(a.bfloat16().float(), b.bfloat16().float())
+
+    monkeypatch.setattr(torch.Tensor, "__matmul__", rounded)
+    assert reduces_precision("cpu")
+    assert torch.get_float32_matmul_precision() == "highest"
 
 
 def test_precision_holds_within_a_pass_alone() -> None:
@@ -91,7 +107,7 @@ def test_fused_passes_are_left_out_where_a_case_has_none() -> None:
 
 
 def test_time_is_saved_against_the_same_implementation() -> None:
-    found = {name: case.saves_against for name, case in cases(compiled=True).items()}
+    found = {name: case.saves_against for name, case in cases(compiled=True, reduced=True).items()}
     assert found["negated, plain"] == "directed, plain" and found["odd, factored"] == "directed, factored"
     assert {name for name, against in found.items() if against is None} >= {
         "negated",
@@ -100,14 +116,14 @@ def test_time_is_saved_against_the_same_implementation() -> None:
         "negated, medium",
         "GNS",
     }
-    assert not cases(compiled=True)["directed, factored"].is_fused
+    assert not cases(compiled=True, reduced=True)["directed, factored"].is_fused
 
 
 def test_without_a_compiler_nothing_is_compiled(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     class Chosen(Exception):
         pass
 
-    def see(compiled: bool) -> None:
+    def see(compiled: bool, reduced: bool) -> None:
         raise Chosen(compiled)
 
     monkeypatch.setattr("gpe_pl.suites.speed.cases", see)

@@ -119,6 +119,23 @@ def test_a_loss_that_is_not_finite_names_step_trajectories_and_frames(value: flo
         m.training_step(data, 0)
 
 
+def test_a_batch_of_nodes_without_neighbours_teaches_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With forces between pairs they fall freely, whatever the weights are."""
+    build = scenes.builder(MATERIALS, history=1)
+    simulator = LearnedSimulator(GPE(build.spec, decoder="pair", num_message_passing_steps=1, hidden_channels=8), build)
+    m = TrainingModule(simulator, 10)
+    monkeypatch.setattr(m, "log", lambda *_, **__: None)
+    alone = batch()
+    for relation in alone.edge_types:
+        for name in ("edge_index", "edge_attr", "odd", "even"):
+            if name in alone[relation]:
+                alone[relation][name] = alone[relation][name][..., :0] if name == "edge_index" else alone[relation][name][:0]
+    loss = m.training_step(alone, 0)
+    assert loss is not None and loss > 0
+    loss.backward()
+    assert all(p.grad is not None and not p.grad.any() for p in simulator.parameters())
+
+
 def test_many_bad_batches_end_a_run() -> None:
     m, data = module(), batch()
     data["sand"].target[3, 1] = torch.nan
