@@ -27,7 +27,6 @@ from gpe_pl.errors import GpeError
 from gpe_pl.generation import DatasetSpec, generate_trajectory, initial_state
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import bootstrap_interval, energy_distance
-from gpe_pl.models.gpe import GPE
 from gpe_pl.report import Run, table_row
 from gpe_pl.rollout import SimulationError, Simulator
 from gpe_pl.schema import Split
@@ -63,7 +62,7 @@ class Settings:
         runs: folders of finished runs; the models among them that were trained on a case's data set take part.
         factors: how many times coarser than the data the solver is also run.
         step_factors: how many times longer its steps may also be, at the spacing of the data.
-        holds: frames for which a prediction is held, in further rungs of GPE (``Skips.hold``).
+        holds: frames for which a prediction is held, in further rungs of every model (``Skips.hold``).
         split, num_trajectories: scenes.
         horizons: frames over which errors are averaged; the full length is always added.
         num_threads: of PyTorch; the solvers use one.
@@ -136,12 +135,12 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
 
 
 def _models(runs: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[str, tuple[LearnedSimulator, float]]:
-    """Trained simulators, GPE also with predictions held for some frames, and the seconds of their training, by label."""
+    """Trained simulators, also with predictions held for some frames, and the seconds of their training, by label."""
     found = {}
     for label, (simulator, run) in trained_on(spec, runs).items():
         seconds = training_seconds(run)
         found[label] = simulator.to(settings.device), seconds
-        for hold in settings.holds if isinstance(simulator.model, GPE) else ():
+        for hold in settings.holds:
             holding = copy.copy(simulator)
             holding.skips = replace(simulator.skips, hold=hold)
             found[f"{label}{HELD} × {hold}"] = holding, seconds

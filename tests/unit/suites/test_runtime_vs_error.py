@@ -14,6 +14,7 @@ from gpe_pl.generation import generate_trajectory, initial_state, trajectory_met
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.report import Run
 from gpe_pl.simulate import dataset_spec
@@ -153,15 +154,16 @@ def test_solvers_on_a_grid_have_longer_steps_up_to_a_cell() -> None:
     assert _with_longer_steps(dataset_spec(compose("simulate", "data=fem", "size=tiny")), 4) is None
 
 
-def test_gpe_also_holds_its_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_model_also_holds_its_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator = untrained()
-    monkeypatch.setattr(module, "trained_on", lambda *_: {"GPE": (simulator, None)})
+    simulator.model = GNS(simulator.builder.spec, num_message_passing_steps=1, hidden_channels=8)
+    monkeypatch.setattr(module, "trained_on", lambda *_: {"GNS": (simulator, None)})
     monkeypatch.setattr(module, "training_seconds", lambda _: 120.0)
     models = _models([], dataset_spec(compose("simulate", *OVERRIDES)), Settings({}, [], holds=[2, 4]))
     assert {label: (s.skips.hold, seconds) for label, (s, seconds) in models.items()} == {
-        "GPE": (1, 120.0),
-        "GPE, held predictions × 2": (2, 120.0),
-        "GPE, held predictions × 4": (4, 120.0),
+        "GNS": (1, 120.0),
+        "GNS, held predictions × 2": (2, 120.0),
+        "GNS, held predictions × 4": (4, 120.0),
     }
     assert all(s.model is simulator.model for s, _ in models.values())
 
