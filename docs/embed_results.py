@@ -34,10 +34,12 @@ def collect(run: Path, name: str) -> None:
     """Copy what is worth citing of a run into ``docs/results/{name}``."""
     target = DOCS / "results" / name
     target.mkdir(parents=True, exist_ok=True)
+    is_table1 = (run / "table1.csv").exists()
     for pattern in FILES:
         for path in sorted(run.glob(pattern)):
-            shutil.copy(path, target / path.name)
-    if (run / "table1.csv").exists():  # takes many hours: whoever has these files goes on from them
+            if not (is_table1 and path.stem == "table"):  # of all its runs at once, which says nothing
+                shutil.copy(path, target / path.name)
+    if is_table1:  # takes many hours: whoever has these files goes on from them
         for metrics in sorted(run.glob("*/**/metrics.csv")):
             if (metrics.parent / "config.json").exists():
                 kept = target / "runs" / metrics.parent.relative_to(run)

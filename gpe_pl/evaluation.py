@@ -155,9 +155,6 @@ def _predict(
     history = simulator.builder.config.history
     truths = [trajectory.frames(history) for trajectory in trajectories]
     starts = [_start(simulator, *pair) for pair in zip(trajectories, truths, strict=True)]
-    for line in sorted({line for start in starts for line in simulator.untrained_parameters(start.state)}):
-        held = "; taken for the nearest trained value" if simulator.holds_parameters else ""
-        log.warning("outside the training data: %s%s", line, held)
     totals = [{"num_corrected": 0.0, "num_asleep": 0.0, "lost_impulse": 0.0} for _ in starts]
 
     def count(scene: int, _: int, state: State) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import importlib
 import inspect
+import logging
 import zipfile
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, replace
@@ -34,6 +35,8 @@ from gpe_pl.schema import BOUNDARY, MATERIALS, EdgeType, FeatureSpec, node_code,
 from gpe_pl.signatures import checked
 from gpe_pl.skips import Skips
 from gpe_pl.trajectory import Metadata, State, Stress, Trajectory
+
+log = logging.getLogger(__name__)
 
 CHECKPOINT_FORMAT = 3
 
@@ -147,6 +150,7 @@ class LearnedSimulator(nn.Module):
         super().__init__()
         self.model, self.builder = model, builder
         self._static_friction = 0.0
+        self._warned: set[str] = set()
         self.standardizer = GraphStandardizer(builder.spec)
         self.register_buffer("acceleration_std", torch.ones((), dtype=torch.float64))
         self.register_buffer("stress_std", torch.ones((), dtype=torch.float64))
@@ -227,7 +231,8 @@ class LearnedSimulator(nn.Module):
         return self.model(self.standardizer(data, self.skips.absent_types, limits))
 
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
-        """The state at a frame with the velocity history that the graph needs, on this model's device.
+        """The state at a frame with the velocity history that the graph needs, on this model's device. Material parameters that training did not have are
+        named in a warning, once each.
 
         Raises:
             IndexError: too few frames before ``frame``.
@@ -284,6 +289,11 @@ class LearnedSimulator(nn.Module):
                 if not torch.isfinite(column).all():
                     node = int(rows[torch.nonzero(~torch.isfinite(column))[0]])
                     raise SceneError(f"node {node} ({material}): {spec.name} [{spec.unit}] is not finite")
+        for line in self.untrained_parameters(state):
+            if line not in self._warned:
+                held = "; taken for the nearest trained value" if self.holds_parameters else ""
+                log.warning("outside the training data: %s%s", line, held)
+                self._warned.add(line)
         return state
 
     @torch.inference_mode()

@@ -475,7 +475,7 @@ def test_a_scene_of_other_scales_or_materials_is_refused(change: dict[str, Any])
         simulator.initial_state(replace(fitting, metadata=replace(build.metadata, **change)), 1)
 
 
-def test_material_parameters_outside_the_training_data_are_named() -> None:
+def test_material_parameters_outside_the_training_data_are_named(caplog: pytest.LogCaptureFixture) -> None:
     build = scenes.builder(("sand", "snow"), history=1)
     simulator = learned(build)
     state = scenes.state(40, ("sand", "snow")).to_torch()
@@ -493,6 +493,9 @@ def test_material_parameters_outside_the_training_data_are_named() -> None:
     again = LearnedSimulator.from_description(simulator.description())
     again.load_state_dict(simulator.state_dict())
     assert again.untrained_parameters(replace(state, material_params=params)) == [line]
+    for _ in range(2):  # a rollout in Python has no other way to learn of it; once is enough
+        again.standing(replace(state, material_params=params), build.metadata)
+    assert [r.getMessage() for r in caplog.records] == [f"outside the training data: {line}; taken for the nearest trained value"]
 
 
 def test_material_parameters_outside_the_training_data_are_taken_for_the_nearest_trained_value() -> None:
