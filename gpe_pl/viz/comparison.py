@@ -142,5 +142,5 @@ def cost_error_figure(panels: Mapping[str, CostAndError], x_label: str, y_label:
         axes.spines[["top", "right"]].set_visible(False)
     all_axes[0].set_ylabel(y_label, fontsize=8)
     handles, labels = all_axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, fontsize=7, frameon=False, ncols=4, loc="outside upper center")
+    figure.legend(handles, labels, fontsize=7, frameon=False, ncols=4, columnspacing=1.0, handlelength=1.6, loc="outside upper center")
     return figure
