@@ -13,11 +13,26 @@ from tests.runs import compose, first_choices, tiny
 
 EXPERIMENTS = sorted(p.stem for p in (CONF / "experiment").glob("*.yaml"))
 QUICK = {"smoke"}
-"""This runs with the fast tests, all others with the slow ones."""
+"""This runs with the fast tests."""
+SLOW = {
+    "ablation_momentum",
+    "ablation_multiscale",
+    "canyon",
+    "ladder",
+    "mixed_materials",
+    "table1",
+    "table1_equal_steps",
+    "unseen_materials",
+}
+"""These with the slow ones, all others with the long ones."""
+
+
+def _mark(experiment: str) -> pytest.MarkDecorator:
+    return pytest.mark.slow if experiment in SLOW else pytest.mark.long
 
 
 def test_there_are_experiments() -> None:
-    assert set(EXPERIMENTS) > QUICK
+    assert set(EXPERIMENTS) > SLOW | QUICK
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
@@ -25,7 +40,7 @@ def test_an_experiment_states_its_own_name(experiment: str) -> None:
     assert compose("fit", f"experiment={experiment}").name == experiment
 
 
-@pytest.mark.parametrize("experiment", [e if e in QUICK else pytest.param(e, marks=pytest.mark.slow) for e in EXPERIMENTS])
+@pytest.mark.parametrize("experiment", [e if e in QUICK else pytest.param(e, marks=_mark(e)) for e in EXPERIMENTS])
 def test_an_experiment_trains_and_evaluates(experiment: str, tiny_data: Path, tmp_path: Path) -> None:
     cfg = tiny(tiny_data, tmp_path, f"experiment={experiment}", *first_choices(experiment))
     value = fit(cfg)

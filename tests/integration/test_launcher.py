@@ -55,7 +55,12 @@ def test_a_wrong_configuration_is_said_once(tiny_data: Path, tmp_path: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("launcher", "settings"), [("processes", []), ("slurm", ["hydra.launcher.cluster=local"]), ("ray", ["hydra.launcher.num_cpus=1"])]
+    ("launcher", "settings"),
+    [
+        ("processes", []),
+        pytest.param("slurm", ["hydra.launcher.cluster=local"], marks=pytest.mark.long),
+        pytest.param("ray", ["hydra.launcher.num_cpus=1"], marks=pytest.mark.long),
+    ],
 )
 def test_parts_of_a_data_set_are_generated_by_any_launcher(tiny_data: Path, tmp_path: Path, launcher: str, settings: list[str]) -> None:
     if launcher != "processes":
@@ -105,7 +110,7 @@ def test_optuna_searches_with_any_launcher(tiny_data: Path, tmp_path: Path) -> N
     assert again.returncode == 0 and "runs," not in again.stdout  # nothing is left to try
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_command_with_two_devices_starts_two_processes(tiny_data: Path, tmp_path: Path) -> None:
     steps = ["training.num_steps=4", "training.val_interval=2", "training.warmup_steps=1"]
     command = [sys.executable, "-m", "gpe_pl.fit", *DATA, *RUN, *steps, f"paths.data={tiny_data}", f"paths.runs={tmp_path}"]

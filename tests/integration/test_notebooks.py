@@ -20,9 +20,12 @@ ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 MOMENTUM = ROOT / "notebooks" / "momentum_ablation.ipynb"
 MAX_CELLS = 12
-STOPPED = re.compile(
-    r"(val|test|test_unseen) \d+ stopped: \w+, frame \d+: "
-)  # what an evaluation says of a rollout that its watchdog ended
+
+pytestmark = pytest.mark.xdist_group("notebooks")  # one worker, which makes the results and executes each notebook once
+
+TRUE_OF_MINIATURES = re.compile(  # after four steps of training a rollout may well go wrong; two training scenes have few of the parameters that are asked for
+    r"(val|test|test_unseen) \d+ stopped: \w+, frame \d+: |outside the training data: friction_angle of sand is "
+)
 
 # Everything as small as it goes: every split and both kinds of unseen parameters, few particles, frames and steps.
 DATA = (
@@ -106,8 +109,7 @@ def _outputs(notebook: Any) -> list[Any]:
 def test_notebook_runs_without_a_warning(path: Path, executed: Callable[[Path], Any]) -> None:
     before = path.read_bytes()
     errors = "".join(output.text for output in _outputs(executed(path)) if output.get("name") == "stderr")
-    # after four steps of training a rollout may well go wrong, and the evaluation then says so
-    assert [line for line in errors.splitlines() if not STOPPED.match(line)] == []
+    assert [line for line in errors.splitlines() if not TRUE_OF_MINIATURES.match(line)] == []
     assert path.read_bytes() == before
 
 

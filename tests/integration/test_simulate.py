@@ -37,12 +37,12 @@ def checked(folder: Path, num_trajectories: int) -> None:
     ("arguments", "name"),
     [
         (["data=sand", "dimension=3"], "sand_3d"),
-        (["data=snow", "dimension=3"], "snow_3d"),
-        (["data=elastomer", "dimension=3"], "elastomer_3d"),
+        pytest.param(["data=snow", "dimension=3"], "snow_3d", marks=pytest.mark.long),
+        pytest.param(["data=elastomer", "dimension=3"], "elastomer_3d", marks=pytest.mark.long),
         (["data=mixed"], "mixed"),
         (["data=mixed", "dimension=3"], "mixed_3d"),
         (["data=fluid", "dimension=2"], "fluid_2d"),
-        (["data=fluid", "scene=dam_break"], "fluid_dam_break"),
+        pytest.param(["data=fluid", "scene=dam_break"], "fluid_dam_break", marks=pytest.mark.long),
         (["data=fluid", "scene=dam_break", "dimension=2"], "fluid_dam_break_2d"),
         (["data=fluid", "scene=canyon"], "fluid_canyon"),
         (["data=fem", "dimension=3"], "fem_3d"),
@@ -65,7 +65,7 @@ def test_every_size_composes(data: str, size: str) -> None:
     assert len(spec.scene.bounds) == (3 if data == "fluid" else 2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sweep_over_parts_and_data_sets(tmp_path: Path) -> None:
     done = simulate(tmp_path, "-m", "data=sand,fem", "num_parts=2", "part=0,1")
     assert done.returncode == 0, done.stderr
@@ -73,7 +73,7 @@ def test_a_sweep_over_parts_and_data_sets(tmp_path: Path) -> None:
         checked(tmp_path / name / "tiny", 8)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sweep_on_ray(tmp_path: Path) -> None:
     pytest.importorskip("ray")
     done = simulate(tmp_path, "-m", "data=sand,fem", "hydra/launcher=ray")

@@ -168,7 +168,7 @@ def test_killed_run_resumes(folder, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("data", ["sand", "snow", "elastomer", "fluid", "fem"])
+@pytest.mark.parametrize("data", ["sand", *(pytest.param(d, marks=pytest.mark.long) for d in ("snow", "elastomer", "fluid", "fem"))])
 def test_killed_at_random_moments(tmp_path, data):
     """Four times SIGKILL (twenty over the five data sets) of the command with two workers, then to the end: every shard is sound and all bytes are those of
     an uninterrupted run.

@@ -217,7 +217,7 @@ def test_a_program_serves_any_numbers_of_nodes_and_edges(tmp_path: Path) -> None
     assert set(description["inputs"]) == set(scene_of(learned, state.to_torch()))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_program_of_a_periodic_domain(tmp_path: Path) -> None:
     learned = simulator(
         materials=("sand", "solid"), config={"mesh": True, "islands": True}, periodic=(True, True), island_momentum="angular"
@@ -232,11 +232,11 @@ def test_a_program_of_a_periodic_domain(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", SMALL)
-@pytest.mark.parametrize("kind", ["particles", "mesh"])
+@pytest.mark.parametrize(
+    ("model", "kind"),
+    [*((m, "particles") for m in SMALL), (GPE, "mesh"), *(pytest.param(m, "mesh", marks=pytest.mark.long) for m in (GNS, DPINet))],
+)
 def test_every_model_becomes_a_program(model: Any, kind: str, tmp_path: Path) -> None:
-    if kind == "mesh" and model is ContinuousConvNet:
-        pytest.skip("continuous convolutions know no meshes")
     config = {"mesh": True, "num_levels": 2, "islands": model is GPE} if kind == "mesh" else {}
     settings: dict[str, Any] = {"stress": True, "island_momentum": "angular"} if config and model is GPE else {}
     materials, dim = (("sand", "solid"), 3) if config else (("sand",), 2)

@@ -24,7 +24,7 @@ def test_processes_without_a_graph_are_refused() -> None:
         run(Settings(num_processes=[1, 5]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_steps_of_one_and_of_two_processes_are_timed() -> None:
     settings = Settings(num_graphs=3, num_nodes=40, num_edges=200, num_message_passing_steps=1, hidden_channels=8, num_steps=2)
     for number in (1, 2):
