@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -104,6 +104,17 @@ def _one_thread() -> None:
     import torch
 
     torch.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _step_times_of_few_steps() -> Iterator[None]:
+    """What a test trains within a budget of time shows that the steps are measured and kept; it has no use for their precise time."""
+    from gpe_pl.training import budget
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        for name in ("WARM_UP_STEPS", "MEASURED_STEPS", "ROUNDS"):
+            monkeypatch.setattr(budget, name, 1)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -17,14 +17,13 @@ QUICK = {"smoke"}
 SLOW = {
     "ablation_momentum",
     "ablation_multiscale",
-    "canyon",
     "ladder",
     "mixed_materials",
     "table1",
     "table1_equal_steps",
     "unseen_materials",
 }
-"""These with the slow ones, all others with the long ones."""
+"""These with the slow ones, all others with the long ones; the canyon is also trained and evaluated for its notebook."""
 
 
 def _mark(experiment: str) -> pytest.MarkDecorator:

@@ -38,7 +38,12 @@ RUN = (
     *("training.num_val_rollouts=1", "training.val_rollout_steps=5"),
     *("evaluation.horizons=[5,20]", "evaluation.num_pictures=0", "trainer.progress=false"),
 )
-CANYON = ("data.sizes.tiny.num_frames=12", "data.sizes.tiny.d3.num_particles=60", "evaluation.splits=[test]")
+CANYON = (
+    "data.sizes.tiny.num_frames=12",
+    "data.sizes.tiny.d3.num_particles=60",
+    "training.budget_minutes=null",
+    "evaluation.splits=[test]",
+)
 BENCHMARK = ("suite.factors=[2.0]", "suite.num_trajectories=1", "suite.horizons=[5,20]")
 
 # Notebooks that read any run take those of the ablation, and train for as many steps as it.
