@@ -118,8 +118,10 @@ class MomentumConv(MessagePassing):
             }
         if edges_at_once is not None and edges_at_once < edge_index.shape[1]:
             return self._in_parts(edge_index, e, w, terms, size, is_joint, update_edges, edges_at_once, overwrites)
-        terms["e"] = e if w is None else functional.linear(e, w)
-        at_target, at_source, messages = self.propagate(edge_index, size=size, is_joint=is_joint, with_messages=update_edges, **terms)
+        we = e if w is None else functional.linear(e, w)
+        at_target, at_source, messages = self.propagate(  # PyG reads these names, once, for all layers
+            edge_index, size=size, a=terms["a"], b=terms["b"], e=we, s=terms["s"], is_joint=is_joint, with_messages=update_edges
+        )
         return at_target, at_source, e + messages if update_edges else None
 
     def _is_fused(self, h_source: Tensor, h_target: Tensor, e: Tensor) -> bool:

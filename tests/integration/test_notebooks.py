@@ -15,13 +15,12 @@ from typing import Any
 
 import nbformat
 import pytest
+from filelock import FileLock
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 MOMENTUM = ROOT / "notebooks" / "momentum_ablation.ipynb"
 MAX_CELLS = 12
-
-pytestmark = pytest.mark.xdist_group("notebooks")  # one worker, which makes the results and executes each notebook once
 
 TRUE_OF_MINIATURES = re.compile(  # after four steps of training a rollout may well go wrong; two training scenes have few of the parameters that are asked for
     r"(val|test|test_unseen) \d+ stopped: \w+, frame \d+: |outside the training data: friction_angle of sand is "
@@ -51,16 +50,25 @@ SETTINGS = {"GPE_NAME": "ablation_momentum", "GPE_STEPS": "4"}
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with ``data`` and ``runs`` of what the notebooks read: miniatures of two experiments and of a benchmark, made once for all."""
-    folder = tmp_path_factory.mktemp("results")
+def results(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
+    """A folder with ``data`` and ``runs`` of what the notebooks read, made once for all workers: the other ones wait."""
+    own = tmp_path_factory.getbasetemp()
+    folder = (own if worker_id == "master" else own.parent) / "notebooks"
+    with FileLock(folder.with_suffix(".lock")):
+        if not (folder / "made").exists():
+            _make_results(folder)
+            (folder / "made").touch()
+    return folder
+
+
+def _make_results(folder: Path) -> None:
+    """Miniatures of two experiments and of a benchmark."""
     in_one_process = "hydra/launcher=basic"  # eight processes would import PyTorch for seconds to train for one
     _command(folder, "fit", "experiment=ablation_momentum", in_one_process, *DATA, *RUN)
     case = "suite.cases.sand.overrides=" + json.dumps(["data=sand", "size=tiny", *DATA])
     runs = f"suite.runs=[{folder / 'runs' / 'ablation_momentum'}]"
     _command(folder, "benchmark", "suite=runtime_vs_error", runs, case, "~suite.cases.fluid", "~suite.cases.fem", *BENCHMARK)
     _command(folder, "fit", "experiment=canyon", *DATA[:-1], *CANYON, *RUN)
-    return folder
 
 
 def _command(folder: Path, name: str, *overrides: str) -> None:
