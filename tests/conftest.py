@@ -106,8 +106,8 @@ def _one_thread() -> None:
     torch.set_num_threads(1)
 
 
-@pytest.fixture(autouse=True, scope="session")
-def _step_times_of_few_steps() -> Iterator[None]:
+@pytest.fixture(scope="session")
+def step_times_of_few_steps() -> Iterator[None]:
     """What a test trains within a budget of time shows that the steps are measured and kept; it has no use for their precise time."""
     from gpe_pl.training import budget
 
@@ -118,8 +118,8 @@ def _step_times_of_few_steps() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def tiny_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A generated data set for training runs of seconds (``tests.runs``); shared, so never written to."""
+def tiny_data(tmp_path_factory: pytest.TempPathFactory, step_times_of_few_steps: None) -> Path:
+    """A generated data set for training runs of seconds (``tests.runs``), within budgets too; shared, so never written to."""
     from tests.runs import generate_tiny
 
     return generate_tiny(tmp_path_factory.mktemp("data"))

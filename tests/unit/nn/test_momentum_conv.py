@@ -32,6 +32,11 @@ def test_is_a_message_passing_layer() -> None:
     assert isinstance(make("odd"), MessagePassing)
 
 
+def test_names_of_its_calls_are_read_once_for_all_layers() -> None:
+    """PyG falls back silently, to parsing the layer's source again for every layer made, when a call passes ``**names``."""
+    assert type(make("odd")).propagate.__module__ != MessagePassing.__module__
+
+
 @pytest.mark.parametrize("implementation", ["factored", "plain"])
 @pytest.mark.parametrize("interaction", KINDS)
 def test_sums_equal_a_loop_over_edges(interaction: str, implementation: str) -> None:
