@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from hashlib import sha256
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -60,14 +59,12 @@ def _identity(cfg: DictConfig) -> dict[str, Any]:
     """What the numbers of an evaluation depend on, and what they are about."""
     from omegaconf import OmegaConf
 
-    from gpe_pl.pretrained import checkpoint_path
+    from gpe_pl.pretrained import fingerprint
 
     values: Any = OmegaConf.to_container(cfg, resolve=True)
-    path = checkpoint_path(cfg.checkpoint)
-    digest = sha256(path.read_bytes()).hexdigest()[:12]
     without = {"evaluation": ("splits", "data", "num_pictures", "export"), "data": ("comparison",)}  # more pictures may be asked for later
     parts = {part: {k: v for k, v in values[part].items() if k not in without.get(part, ())} for part in ("data", "evaluation", "rollout")}
-    return {"checkpoint": f"{path.name} (sha256 {digest})", "split": cfg.split, **parts}  # wherever it lies now
+    return {"checkpoint": fingerprint(cfg.checkpoint), "split": cfg.split, **parts}
 
 
 def _own_data(simulator: LearnedSimulator) -> str:

@@ -26,8 +26,9 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
+    from gpe_pl.pretrained import fingerprint
     from gpe_pl.run_folder import RunError, claim, without_tables
-    from gpe_pl.simulate import ensure_data, evaluated_config
+    from gpe_pl.simulate import ensure_data, evaluated_config, scene_metadata
     from gpe_pl.training.budget import PauseForMeasurements, digest, mean_step_time, within_budget
     from gpe_pl.training.module import TrainingModule
     from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, set_up, train
@@ -37,6 +38,8 @@ def fit(cfg: DictConfig) -> float:
         raise ConfigError(f"seed={cfg.seed!r}: must be an integer of at least 0")
     if not (cfg.reuse is None or isinstance(cfg.reuse, str)):
         raise ConfigError(f"reuse={cfg.reuse!r}: must be null or the name of other runs")
+    if not (cfg.start_from is None or isinstance(cfg.start_from, str)):
+        raise ConfigError(f"start_from={cfg.start_from!r}: must be null, the folder of a run, a checkpoint or a shipped model")
     training = construct(TrainingSettings, cfg.training, "training")
     trainer = construct(TrainerSettings, cfg.trainer, "trainer")
     evaluation = construct(EvaluationSettings, {k: v for k, v in cfg.evaluation.items() if k != "data"}, "evaluation")
@@ -45,6 +48,10 @@ def fit(cfg: DictConfig) -> float:
     new_model = bind(model_class(cfg.model._target_), {k: v for k, v in cfg.model.items() if k != "_target_"}, "model", "spec")
     noise = Noise(training.noise, training.noise_std, training.noise_correction)
     batch_size = construct(BatchSize, cfg.batching, "batching", num_graphs=training.batch_size)
+
+    start = None if cfg.start_from is None else LearnedSimulator.from_checkpoint(cfg.start_from)
+    if start is not None:
+        start.check_scene(scene_metadata(cfg, "train"))
 
     run_dir = output_dir(cfg)
     Path(cfg.paths.data).mkdir(parents=True, exist_ok=True)
@@ -64,6 +71,8 @@ def fit(cfg: DictConfig) -> float:
         L.seed_everything(cfg.seed, verbose=False)
         simulator = LearnedSimulator(new_model(spec=data().builder.spec), data().builder)
         simulator.fit_statistics(data().statistics_sample())
+        if start is not None:
+            simulator.start_from(start)
         names = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "stress_weight", "compile")
         return TrainingModule(simulator, **{n: getattr(training, n) for n in names})
 
@@ -87,6 +96,7 @@ def fit(cfg: DictConfig) -> float:
         )
     settings["training"] = training.as_dict()
     trained = {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training")} | unusual
+    trained |= {} if cfg.start_from is None else {"start_from": fingerprint(cfg.start_from)}
     config = trained | {"evaluation": settings["evaluation"]}
     if evaluation.static_friction and not graph.islands:
         raise ConfigError(f"evaluation.static_friction={evaluation.static_friction:g}: needs graph.islands=true, which model=gpe_tuned has")

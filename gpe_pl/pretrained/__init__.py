@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hashlib import sha256
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
@@ -21,6 +22,12 @@ def checkpoint_path(checkpoint: Path | str) -> Path:
         return FOLDER / f"{checkpoint}{SUFFIX}"
     path = Path(checkpoint)
     return path / BEST if path.is_dir() else path
+
+
+def fingerprint(checkpoint: Path | str) -> str:
+    """What a configuration knows a checkpoint by, wherever it lies: its file's name and the beginning of its checksum."""
+    path = checkpoint_path(checkpoint)
+    return f"{path.name} (sha256 {sha256(path.read_bytes()).hexdigest()[:12]})"
 
 
 def model_name(checkpoint: Path | str | None, runs: Path | str) -> str:

@@ -524,3 +524,74 @@ def test_material_parameters_outside_the_training_data_are_taken_for_the_nearest
     free = simulator.step(state).pos
     simulator.holds_parameters = True
     assert torch.equal(simulator.step(state).pos, free)  # nothing in this scene lies beyond
+
+
+# --- training that begins with another simulator's weights --------------------------------------------------------------------------------
+
+
+def fitted(seed: int, history: int = 2, **settings: Any) -> LearnedSimulator:
+    """A simulator with statistics and parameter ranges of its own."""
+    build = scenes.builder(("sand", "snow"), history=history)
+    simulator = learned(build, seed, **settings)
+    graph = build(scenes.state(40, ("sand", "snow"), history=history, seed=seed).to_torch())
+    for material in ("sand", "snow"):
+        graph[material].target = torch.full((graph[material].num_nodes, 2), 1.0 + seed)
+    simulator.fit_statistics([graph])
+    return simulator
+
+
+def test_a_simulator_starts_from_another_ones_weights_and_statistics() -> None:
+    trained, new = fitted(0), fitted(1)
+    low, high = ({m: r[k].clone() for m, r in s.trained_ranges()} for s, k in ((new, 0), (new, 1)))
+    state = scenes.state(40, ("sand", "snow"), history=2, seed=2).to_torch()
+    graph = trained.builder(state)
+    trained.holds_parameters = new.holds_parameters = False
+    new.start_from(trained)
+    for name, value in trained(graph).acceleration.items():
+        assert torch.equal(new(graph).acceleration[name], value)
+    assert torch.equal(new.acceleration_std, trained.acceleration_std)
+    for (material, both), (_, before) in zip(new.trained_ranges(), trained.trained_ranges(), strict=True):
+        assert torch.equal(both, torch.stack([torch.minimum(before[0], low[material]), torch.maximum(before[1], high[material])]))
+    assert not all(torch.equal(a, b) for (_, a), (_, b) in zip(new.trained_ranges(), trained.trained_ranges(), strict=True))
+    next(new.model.parameters()).data.zero_()
+    assert torch.any(next(trained.model.parameters()) != 0)  # nothing is shared
+
+
+@pytest.mark.parametrize(
+    ("other", "message"),
+    [
+        ({"hidden_channels": 4}, "model.hidden_channels: 4 there, 8 now"),
+        ({"interaction": "directed"}, "model.interaction: 'directed' there, 'odd' now"),
+        ({"history": 1}, "graph.history: 1 there, 2 now"),
+    ],
+)
+def test_another_model_is_no_start(other: dict[str, Any], message: str) -> None:
+    new = fitted(1, interaction="odd")
+    before = {k: v.clone() for k, v in new.state_dict().items()}
+    with pytest.raises(CheckpointError, match=message):
+        new.start_from(fitted(0, **{"interaction": "odd", **other}))
+    assert all(torch.equal(v, before[k]) for k, v in new.state_dict().items())
+
+
+def test_a_model_of_other_scales_is_no_start() -> None:
+    new, trained = fitted(1), fitted(0)
+    trained.builder = GraphBuilder(trained.builder.config, replace(trained.builder.metadata, connectivity_radius=0.1))
+    with pytest.raises(SceneError, match=r"radius of 0\.1 m, which is 0\.12 m here; choose graph\.connectivity_spacings=2"):
+        new.start_from(trained)
+    new.builder = GraphBuilder(replace(new.builder.config, connectivity_spacings=2.0), new.builder.metadata)  # does as it says
+    new.start_from(trained)
+    trained.builder = GraphBuilder(trained.builder.config, replace(trained.builder.metadata, frame_dt=0.1))
+    with pytest.raises(SceneError, match=r"trained with frame_dt=0\.1 s"):
+        new.start_from(trained)
+
+
+def test_levels_that_share_weights_start_on_meshes_of_any_size() -> None:
+    def of_domain(size: float, level_weights: str) -> LearnedSimulator:
+        metadata = replace(scenes.metadata(("elastomer",)), bounds=((0.0, size), (0.0, size)))
+        return learned(GraphBuilder(GraphConfig(history=1, mesh=True), metadata), level_weights=level_weights, schedule="sweep")
+
+    small, large = of_domain(0.4, "shared"), of_domain(3.0, "shared")
+    assert small.builder.spec.num_levels < large.builder.spec.num_levels
+    large.start_from(small)
+    with pytest.raises(CheckpointError, match="has other graphs"):
+        of_domain(3.0, "separate").start_from(of_domain(0.4, "separate"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 import shutil
 import signal
@@ -19,6 +20,7 @@ from omegaconf import DictConfig
 
 from gpe_pl.data import sampling
 from gpe_pl.data.datamodule import TrajectoryDataModule
+from gpe_pl.errors import GpeError
 from gpe_pl.evaluation import read_rows
 from gpe_pl.fit import fit
 from gpe_pl.learned_simulator import LearnedSimulator
@@ -352,6 +354,39 @@ def test_a_trained_model_is_evaluated_again_without_training(tiny_data: Path, tm
         for name in ("first", "again")
     )
     assert now == pytest.approx(before, rel=1e-9)
+
+
+def test_training_starts_from_another_runs_model(tiny_data: Path, tmp_path: Path) -> None:
+    first = tiny(tiny_data, tmp_path, "name=first")
+    fit(first)
+    start = f"start_from={tmp_path / 'first'}"
+    still = ("training.learning_rate=1e-30", "training.final_learning_rate=1e-30")
+    again = tiny(tiny_data, tmp_path, "name=again", start, "seed=1", *still)
+    fit(again)
+    own, before = (LearnedSimulator.from_checkpoint(tmp_path / name).state_dict() for name in ("again", "first"))
+    for name, value in before.items():
+        torch.testing.assert_close(own[name], value, rtol=1e-6, atol=1e-12)
+    digest = json.loads((tmp_path / "again" / "config.json").read_text())["start_from"]
+    assert digest.startswith("best.ckpt (sha256 ")
+    with pytest.raises(RunError, match=f"start_from: '{re.escape(digest)}' there, None now"):
+        fit(tiny(tiny_data, tmp_path, "name=again", "seed=1", *still))
+    shutil.move(tmp_path / "first", tmp_path / "moved")
+    fit(tiny(tiny_data, tmp_path, "name=again", f"start_from={tmp_path / 'moved'}", "seed=1", *still))  # the same model, wherever it lies
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("start_from=nowhere", "nowhere: no such checkpoint; give the folder of a run"),
+        ("start_from=3", "start_from=3: must be null, the folder of a run"),
+        ("start_from=snow", "the model was trained with .* on snow"),
+        ("start_from=sand", "trained with .* spacing=0.015625 m .*; the scene has .* spacing=0.0208333 m"),
+    ],
+)
+def test_a_start_that_does_not_fit_is_refused(tiny_data: Path, tmp_path: Path, override: str, message: str) -> None:
+    with pytest.raises(GpeError, match=message):
+        fit(tiny(tiny_data, tmp_path, override))
+    assert not list(tmp_path.rglob("*.ckpt"))
 
 
 def test_a_trained_checkpoint_holds_the_averaged_weights(tiny_data: Path, tmp_path: Path) -> None:
