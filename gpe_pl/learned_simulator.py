@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import importlib
 import inspect
+import json
 import logging
 import zipfile
 from collections.abc import Iterable, Iterator
@@ -31,7 +32,6 @@ from gpe_pl.nn.blocks import Standardize
 from gpe_pl.nn.static_friction import is_held, supported
 from gpe_pl.pretrained import checkpoint_path, names
 from gpe_pl.rollout import SimulationError
-from gpe_pl.run_folder import differences
 from gpe_pl.schema import BOUNDARY, MATERIALS, EdgeType, FeatureSpec, node_code, role
 from gpe_pl.signatures import checked
 from gpe_pl.skips import Skips
@@ -212,33 +212,33 @@ class LearnedSimulator(nn.Module):
         """Take over what another simulator has learned, with the statistics that its weights are made for; trained ranges of parameters then cover both.
 
         Raises:
-            SceneError: the other one was trained on another frame interval, spacing, dimension, radius or materials.
-            CheckpointError: it is another model, or makes other graphs; names what differs.
+            SceneError: the other one was trained on another frame interval, spacing, dimension or materials.
+            CheckpointError: it is another model, or makes other graphs; names the settings to choose.
         """
         trained.check_scene(self.builder.metadata)
-        radius, own = trained.builder.scales.radius, self.builder.scales.radius
-        if abs(radius / own - 1) > 1e-6:
-            choice = f"graph.connectivity_spacings={radius / self.builder.metadata.spacing:g}"
-            raise SceneError(f"the model to start from was trained with a radius of {radius:g} m, which is {own:g} m here; choose {choice}")
-        different = differences(trained._kind(), self._kind())
+        there, now = trained._choices(), self._choices()
+        different = [f"{key}={value}" for key, value in there.items() if now.get(key) != value]
         if different:
-            raise CheckpointError(
-                f"the model to start from is another one or has other graphs ({'; '.join(different[:3])}); choose the same"
-            )
+            raise CheckpointError(f"the model to start from is another one or has other graphs; choose {' '.join(different)}")
         ranges = [values.clone() for _, values in self.trained_ranges()]
         try:
             self.load_state_dict(trained.state_dict())
         except RuntimeError as error:  # one set of weights per level of a mesh, and meshes of other sizes
-            raise CheckpointError(f"the model to start from is another one or has other graphs ({_reason(error)})") from None
+            raise CheckpointError(f"the model to start from has meshes of other sizes ({_reason(error)})") from None
         for (_, values), here in zip(self.trained_ranges(), ranges, strict=True):
             values[0].copy_(torch.minimum(values[0], here[0]))
             values[1].copy_(torch.maximum(values[1], here[1]))
 
-    def _kind(self) -> dict[str, Any]:
-        """What weights are made for, besides the scales of a data set."""
+    def _choices(self) -> dict[str, str]:
+        """Overrides that make such a model and such graphs; the radius in spacings, whether the graph's or the data set's."""
         own = self.description()
-        graph = {key: value for key, value in own["graph"].items() if key != "connectivity_spacings"}
-        return {"model": own["settings"] | {"_target_": own["model"]}, "graph": graph}
+        spacings = {"connectivity_spacings": float(f"{self.builder.scales.radius / self.builder.scales.spacing:.6g}")}
+        parts = {"model": {"_target_": own["model"], **own["settings"]}, "graph": own["graph"] | spacings}
+        return {
+            f"{part}.{key}": value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+            for part, values in parts.items()
+            for key, value in values.items()
+        }
 
     def trained_ranges(self) -> Iterator[tuple[str, Tensor]]:
         """Lowest and highest value [2, param] of each material's parameters in training."""

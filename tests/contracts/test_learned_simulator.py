@@ -560,9 +560,9 @@ def test_a_simulator_starts_from_another_ones_weights_and_statistics() -> None:
 @pytest.mark.parametrize(
     ("other", "message"),
     [
-        ({"hidden_channels": 4}, "model.hidden_channels: 4 there, 8 now"),
-        ({"interaction": "directed"}, "model.interaction: 'directed' there, 'odd' now"),
-        ({"history": 1}, "graph.history: 1 there, 2 now"),
+        ({"hidden_channels": 4}, "choose model.hidden_channels=4$"),
+        ({"interaction": "directed"}, "choose model.interaction=directed$"),
+        ({"history": 1}, "choose graph.history=1$"),
     ],
 )
 def test_another_model_is_no_start(other: dict[str, Any], message: str) -> None:
@@ -576,7 +576,7 @@ def test_another_model_is_no_start(other: dict[str, Any], message: str) -> None:
 def test_a_model_of_other_scales_is_no_start() -> None:
     new, trained = fitted(1), fitted(0)
     trained.builder = GraphBuilder(trained.builder.config, replace(trained.builder.metadata, connectivity_radius=0.1))
-    with pytest.raises(SceneError, match=r"radius of 0\.1 m, which is 0\.12 m here; choose graph\.connectivity_spacings=2"):
+    with pytest.raises(CheckpointError, match=r"choose graph\.connectivity_spacings=2\.0$"):
         new.start_from(trained)
     new.builder = GraphBuilder(replace(new.builder.config, connectivity_spacings=2.0), new.builder.metadata)  # does as it says
     new.start_from(trained)
@@ -593,5 +593,5 @@ def test_levels_that_share_weights_start_on_meshes_of_any_size() -> None:
     small, large = of_domain(0.4, "shared"), of_domain(3.0, "shared")
     assert small.builder.spec.num_levels < large.builder.spec.num_levels
     large.start_from(small)
-    with pytest.raises(CheckpointError, match="has other graphs"):
+    with pytest.raises(CheckpointError, match="has meshes of other sizes"):
         of_domain(3.0, "separate").start_from(of_domain(0.4, "separate"))
