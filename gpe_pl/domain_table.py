@@ -11,6 +11,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -107,8 +108,9 @@ def _cell(runs: list[Run], domain: str) -> Cell | None:
     return Cell(bootstrap_interval(errors, statistic=_median_of_means), errors, float(np.mean(trivial[0][:shared])))
 
 
-def _median_of_means(table: np.ndarray) -> float:
-    return float(np.median(table.mean(axis=1)))
+def _median_of_means(table: np.ndarray, axis: tuple[int, int]) -> Any:
+    """Over seeds, of means over trajectories."""
+    return np.median(table.mean(axis=axis[1], keepdims=True), axis=axis)
 
 
 def _write_csv(path: Path, runs: Sequence[Run]) -> None:

@@ -357,9 +357,13 @@ class RolloutMSE(Metric):
         return {f"rollout_mse@{h}": mean[k] for k, h in enumerate(self.horizons) if self.count[k] > 0}
 
 
+BOTH = (-2, -1)
+"""Axes of a table [seed, trajectory]."""
+
+
 def bootstrap_interval(
     values: Sequence[Sequence[int | float] | np.ndarray] | np.ndarray,
-    statistic: Callable[[Any], Any] = np.median,
+    statistic: Callable[..., Any] = np.median,
     confidence: float = 0.95,
     num_resamples: int = 2000,
     seed: int = 0,
@@ -372,7 +376,7 @@ def bootstrap_interval(
 
     Args:
         values: one row per training seed, one column per test trajectory; ``inf`` marks a failure.
-        statistic: maps a table [seed, trajectory] to a number, such as ``np.median`` or ``np.mean``.
+        statistic: of a table [seed, trajectory], or of several at once; takes the two axes as ``axis``, as ``np.median`` and ``np.mean`` do.
         confidence: probability that the interval should cover.
         num_resamples: bootstrap resamples.
         seed: of the resampling.
@@ -391,14 +395,14 @@ def bootstrap_interval(
         raise ValueError(f"confidence lies between 0 and 1, got {confidence}")
     rng = np.random.default_rng(seed)
     num_seeds, num_trajectories = table.shape
-    resampled = [statistic(table[np.ix_(_drawn(num_seeds, rng), _drawn(num_trajectories, rng))]) for _ in range(num_resamples)]
-    return _interval(float(statistic(table)), resampled, confidence)
+    rows, columns = _drawn(num_resamples, rng, num_seeds, num_trajectories)
+    return _interval(float(statistic(table, axis=BOTH)), statistic(_resampled(table, rows, columns), axis=BOTH), confidence)
 
 
 def bootstrap_ratio(
     values: np.ndarray,
     reference: np.ndarray,
-    statistic: Callable[[Any], Any] = np.median,
+    statistic: Callable[..., Any] = np.median,
     confidence: float = 0.95,
     num_resamples: int = 2000,
     seed: int = 0,
@@ -411,24 +415,28 @@ def bootstrap_ratio(
     """
     shared = min(values.shape[1], reference.shape[1])
     values, reference = values[:, :shared], reference[:, :shared]
-    rng = np.random.default_rng(seed)
+    rows, others, columns = _drawn(num_resamples, np.random.default_rng(seed), len(values), len(reference), shared)
 
-    def ratio(a: np.ndarray, b: np.ndarray) -> float:
-        own, other = float(statistic(a)), float(statistic(b))
-        return 1.0 if own == other else own / other if other else np.inf
+    def ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        own, other = (np.asarray(statistic(table, axis=BOTH)) for table in (a, b))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(own == other, 1.0, np.where(other == 0, np.inf, own / other))
 
-    resampled = []
-    for _ in range(num_resamples):
-        columns = _drawn(shared, rng)
-        resampled.append(ratio(*(table[np.ix_(_drawn(len(table), rng), columns)] for table in (values, reference))))
-    return _interval(ratio(values, reference), resampled, confidence)
+    resampled = ratio(_resampled(values, rows, columns), _resampled(reference, others, columns))
+    return _interval(float(ratio(values, reference)), resampled, confidence)
 
 
-def _drawn(count: int, rng: np.random.Generator) -> np.ndarray:
-    return rng.integers(count, size=count)
+def _drawn(num_resamples: int, rng: np.random.Generator, *counts: int) -> list[np.ndarray]:
+    """For each count, as many indices below it, drawn with replacement, per resample [resample, index]."""
+    return [rng.integers(count, size=(num_resamples, count)) for count in counts]
 
 
-def _interval(estimate: float, resampled: list[float], confidence: float) -> Interval:
+def _resampled(table: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Tables [resample, seed, trajectory]."""
+    return table[rows[:, :, None], columns[:, None, :]]
+
+
+def _interval(estimate: float, resampled: np.ndarray, confidence: float) -> Interval:
     # Order statistics, because interpolation between infinities is not a number.
     tail = (1 - confidence) / 2
     low, high = np.quantile(resampled, [tail, 1 - tail], method="inverted_cdf")
