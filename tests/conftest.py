@@ -9,12 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from beartype import BeartypeConf
-from beartype.claw import beartype_package
 from hypothesis import settings
-
-# Before anything of the package is imported. What has dimensions in its annotations is checked by jaxtyping (see pyproject.toml), several times as slowly.
-beartype_package("gpe_pl", conf=BeartypeConf(claw_is_pep526=False))
 
 from gpe_pl.geometry import Box, domain_walls
 from gpe_pl.schema import node_code
