@@ -36,6 +36,7 @@ def commands() -> dict[str, tuple[str, list[str]]]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "overrides"), commands().values(), ids=commands())
 def test_commands_compose(name: str, overrides: list[str]) -> None:
     GlobalHydra.instance().clear()

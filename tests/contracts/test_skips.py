@@ -107,6 +107,7 @@ def test_no_level_changes_what_a_model_says(interaction: Any, edge_state: Any, d
     assert predicted[0]["sand"].abs().max() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", LEVELS)
 @pytest.mark.parametrize("implementation", ["factored", pytest.param("plain", marks=pytest.mark.slow)])
 def test_no_level_changes_a_rollout(level: str, implementation: Any) -> None:
@@ -120,6 +121,7 @@ def test_no_level_changes_a_rollout(level: str, implementation: Any) -> None:
     assert (off.pos - start.pos).abs().max() > 1e-3 * scenes.SPACING
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("schedule", ["simultaneous", "sweep"])
 @pytest.mark.parametrize("level_weights", ["shared", "separate"])
 def test_no_level_changes_the_motion_of_meshes_and_loose_nodes(schedule: Any, level_weights: Any) -> None:

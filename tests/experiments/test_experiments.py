@@ -34,6 +34,7 @@ def test_there_are_experiments() -> None:
     assert set(EXPERIMENTS) > SLOW | QUICK
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_an_experiment_states_its_own_name(experiment: str) -> None:
     assert compose("fit", f"experiment={experiment}").name == experiment

@@ -61,6 +61,7 @@ def files(folder: Path) -> dict[str, bytes]:
     return {str(p): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
+@pytest.mark.slow
 def test_a_periodic_data_set_is_imported_trained_on_and_evaluated(
     tmp_path: Path, lagrangebench: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -104,6 +105,7 @@ def test_a_periodic_data_set_is_imported_trained_on_and_evaluated(
     assert files(folder) == before
 
 
+@pytest.mark.slow
 def test_trajectories_of_any_length(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Of those too short for the history nothing is used; the others differ in length."""
     lengths = {"train": (14, 3, 28), "val": (3, 14), "test": (20, 3, 14)}

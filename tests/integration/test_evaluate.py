@@ -38,6 +38,7 @@ def key(row: Row) -> tuple[str, int, str, str]:
     return row.model, row.trajectory, row.metric, row.horizon
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["gpe", *(pytest.param(m, marks=pytest.mark.slow) for m in ("gns", "dpinet", "cconv"))])
 def test_a_run_that_was_moved_gives_the_same_numbers(
     model: str, tiny_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

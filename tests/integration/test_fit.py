@@ -263,6 +263,7 @@ def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(
     assert not (tmp_path / "fit" / "metrics.csv").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("push_share", [pytest.param(0.0, marks=pytest.mark.slow), 0.6])
 def test_one_corrupted_batch_does_not_end_a_run(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, push_share: float
@@ -306,6 +307,7 @@ def test_a_position_that_is_not_finite_stops_the_run_and_is_named(tiny_data: Pat
         fit(tiny(tiny_data, tmp_path, "training.num_steps=40", "training.val_interval=40"))
 
 
+@pytest.mark.slow
 def test_metrics_hold_the_model_and_the_baselines(tiny_data: Path, tmp_path: Path) -> None:
     fit(tiny(tiny_data, tmp_path, "evaluation.num_pictures=1"))
     rows = list(read_rows(tmp_path / "fit" / "metrics.csv"))
@@ -356,6 +358,7 @@ def test_a_trained_model_is_evaluated_again_without_training(tiny_data: Path, tm
     assert now == pytest.approx(before, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_training_starts_from_another_runs_model(tiny_data: Path, tmp_path: Path) -> None:
     first = tiny(tiny_data, tmp_path, "name=first")
     fit(first)
@@ -389,6 +392,7 @@ def test_a_start_that_does_not_fit_is_refused(tiny_data: Path, tmp_path: Path, o
     assert not list(tmp_path.rglob("*.ckpt"))
 
 
+@pytest.mark.slow
 def test_a_trained_checkpoint_holds_the_averaged_weights(tiny_data: Path, tmp_path: Path) -> None:
     cfg = tiny(tiny_data, tmp_path, *STEPS)
     fit(cfg)

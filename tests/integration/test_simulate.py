@@ -55,6 +55,7 @@ def test_every_variant(tmp_path: Path, arguments: list[str], name: str) -> None:
     checked(tmp_path / name / "tiny", 8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", ["tiny", "small", "paper"])
 @pytest.mark.parametrize("data", ["sand", "snow", "elastomer", "mixed", "fluid", "fem"])
 def test_every_size_composes(data: str, size: str) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from gpe_pl import domain_table
 from gpe_pl.domain_table import compares_models, judged_group, report_domains
 from gpe_pl.evaluation import LEARNED, Row, write_rows
 
@@ -38,6 +39,13 @@ def write_run(folder: Path, domain: str, model: str, seed: int, errors: list[flo
         rows.append(Row(name, "test_unseen", 9, "extrapolated", 50.0, "rollout_mse", "full", 5e-3))
         rows.append(Row(name, "test", 0, "seen", 20.0, "rollout_mse", "full", 1e-3))
     write_rows(folder / "metrics.csv", rows)
+
+
+@pytest.fixture(autouse=True)
+def _without_figures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They take a second, and one test looks at them."""
+    if "figures" not in request.node.name:
+        monkeypatch.setattr(domain_table, "_figures", lambda *_: None)
 
 
 @pytest.fixture

@@ -94,6 +94,7 @@ def test_a_mesh_stays_whole_at_the_seam_and_its_displacement_goes_on(tmp_path: P
             np.testing.assert_allclose(grid.point_data["displacement"][:, :2], moved, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dim", [2, 3])
 def test_vtk_itself_reads_it(tmp_path: Path, dim: int) -> None:
     """ParaView reads by the same classes."""

@@ -169,6 +169,7 @@ def moved(frame: int, to: float) -> Callable[[Trajectory], Trajectory]:
     return change
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -288,6 +288,7 @@ def test_hostile_files_give_violations(shard: Path, edit: Callable[[h5py.File], 
         assert str(shard) in output
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_random_damage_never_raises(shard: Path, tmp_path: Path, seed: int) -> None:
     """What the validator passes, the reader reads; in a child process, so that a crash of HDF5 fails the test."""

@@ -53,6 +53,7 @@ def test_absent_materials_call_nothing_of_theirs() -> None:
     assert on == 0 and off > 0
 
 
+@pytest.mark.slow
 def test_the_table_has_a_row_per_growth() -> None:
     records, table = run(TINY)
     assert {r["metric"] for r in records} >= {

@@ -177,6 +177,7 @@ def test_a_crash_is_a_failure_with_its_reason(spec: DatasetSpec, scenes: list[Tr
     assert record["gating"] is True
 
 
+@pytest.mark.slow
 def test_a_run_writes_records_table_and_figures(spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path) -> None:
     own = subject(spec, scenes, **SHIPPED).simulator
     own.save(tmp_path / "own.ckpt")
@@ -204,6 +205,7 @@ def test_what_gates_is_the_shipped_configuration(spec: DatasetSpec, scenes: list
     assert model_label(subject(spec, scenes, **SHIPPED).simulator) == "GPE 2 × 8 geometry angular"
 
 
+@pytest.mark.slow
 def test_runs_of_one_model_are_told_apart_by_their_training(spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path) -> None:
     def made(name: str, model: Subject, **training: Any) -> Run:
         model.simulator.save(tmp_path / name / "checkpoints" / "best.ckpt")

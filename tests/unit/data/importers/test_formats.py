@@ -379,6 +379,7 @@ def test_dmcf_in_parts(tmp_path: Path) -> None:
     assert not any("velocities say" in w for w in report.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbered", [True, False])
 def test_parts_are_joined_by_number(tmp_path: Path, numbered: bool) -> None:
     """16 of them: as text, 10 comes before 2."""
