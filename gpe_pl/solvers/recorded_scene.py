@@ -38,6 +38,8 @@ WATER = 1000.0
 """Density of the recorded liquid [kg/m³], from which its spacing follows."""
 HEADROOM = 0.25
 """Height of the domain above the highest wall, of that of the walls."""
+FASTEST = 10.0
+"""Largest speed of a recorded particle, of that of a free fall through the domain's height; a still scene may have any below."""
 UPSTREAM = 1 / 3
 """Part of the domain at low x in which a flood starts."""
 
@@ -196,6 +198,7 @@ class RecordedScene:
 
         Raises:
             ValueError: the flood does not fit.
+            RecordingError: the walls make no ground, or recorded particles lie in it or are beyond all measure fast.
         """
         recording, bounds = self.recording, self.bounds
         sides = domain_walls(bounds, self.friction)[:4]
@@ -208,6 +211,8 @@ class RecordedScene:
         if self.num_particles is not None:
             pos = self._flood(self.num_particles, shapes, bounds, seed)
             vel = np.zeros_like(pos)
+        else:
+            self._check(pos, vel, shapes, bounds[2][1])
         count = len(pos)
         return State(
             pos=pos,
@@ -218,6 +223,24 @@ class RecordedScene:
             boundary=Boundary.sample(shapes, self.spacing, 3),
             gravity=np.array(self.gravity, dtype=np.float64),
         )
+
+    def _check(self, pos: np.ndarray, vel: np.ndarray, shapes: tuple[Shape, ...], height: float) -> None:
+        """Raise ``RecordingError`` for particles that no liquid has, which would make a solver or a model explode later, without a reason."""
+        depth = -signed_distance(shapes, pos)
+        # without gravity, any speed
+        speed, falling = np.linalg.norm(vel, axis=1), math.sqrt(2 * float(np.linalg.norm(self.gravity)) * height)
+        for values, limit, text in (
+            (
+                depth,
+                self.spacing,
+                "lies {:.3g} m deep in the ground or outside the walls; it must be within a particle spacing of {:.3g} m",
+            ),
+            (speed, FASTEST * falling or math.inf, "moves at {:.3g} m/s; more than {:.3g} m/s no fall through this scene explains"),
+        ):
+            wrong = np.flatnonzero(~(values <= limit))
+            if len(wrong):
+                more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+                raise RecordingError(f"{self.file}: after scaling, particle {wrong[0]}{more} {text.format(values[wrong[0]], limit)}")
 
     def _flood(self, count: int, shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ...], seed: int) -> np.ndarray:
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -128,6 +129,25 @@ def test_a_flood_fills_the_lowest_free_places_upstream(file: str) -> None:
 def test_a_file_that_is_no_such_recording_is_refused(tmp_path: Path, content: Any, message: str) -> None:
     with pytest.raises(RecordingError, match=message):
         read_recording(write(tmp_path / "scene.msgpack.zst", content))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"pos": [-0.8, -0.3, 0.1]}, r"particle 2 lies 0\.\d+ m deep in the ground or outside the walls"),
+        ({"pos": [-3.0, 0.9, 0.1]}, r"particle 2 lies 2 m deep in the ground or outside the walls"),
+        ({"vel": [0.0, -1e30, 0.0]}, r"particle 2 moves at 1e\+30 m/s"),
+    ],
+)
+def test_particles_that_no_liquid_has_are_named(tmp_path: Path, change: dict[str, list[float]], message: str) -> None:
+    (name, value), wrong = next(iter(change.items())), {}
+    stored = frame()[name]
+    wrong[name] = np.frombuffer(stored[b"data"], np.float32).reshape(8, 3).copy()
+    wrong[name][2] = value
+    scene = RecordedScene(write(tmp_path / "wrong.msgpack.zst", [frame(**wrong)]), 0.2)
+    with pytest.raises(RecordingError, match=message):
+        scene.sample({}, 0)
+    assert replace(scene, num_particles=4).sample({}, 0).num_nodes == 4  # a flood takes the ground alone
 
 
 def test_a_damaged_or_missing_file_is_named(tmp_path: Path, file: str) -> None:
