@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 
+NAMED = 5
+"""Of failures, at the end."""
+
+
 def without_folder(value: Any, runs: str) -> Any:
     """Settings as they can be shown to others, whose results lie elsewhere: ``paths.runs`` in place of that folder."""
     if isinstance(value, dict):
@@ -25,7 +29,9 @@ def without_folder(value: Any, runs: str) -> Any:
 
 
 def benchmark(cfg: DictConfig) -> None:
-    """Run one suite and write ``results.json``, ``table.md`` and its figures."""
+    """Run one suite and write ``results.json``, ``table.md`` and its figures; a suite of criteria ends with exit status 1 if one that counts is not met."""
+    import sys
+
     import torch
     from omegaconf import OmegaConf
 
@@ -50,6 +56,9 @@ def benchmark(cfg: DictConfig) -> None:
     for name, text in (("results.json", json.dumps(results, indent=1)), ("table.md", table + "\n")):
         replace_text(folder / name, text)
     print(table)
+    failures: list[str] = getattr(suite, "failures", lambda _: [])(records)
+    if failures:
+        sys.exit(f"error: {len(failures)} failed: {'; '.join(failures[:NAMED])}{'; …' if len(failures) > NAMED else ''}")
 
 
 main = entry_point("benchmark")(benchmark)

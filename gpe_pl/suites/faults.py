@@ -95,6 +95,11 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
     return records, report(records)
 
 
+def failures(records: list[dict[str, Any]]) -> list[str]:
+    """What was not survived, or accepted, executed or kept silent about."""
+    return [f"{r['kind']}, {r['fault']}: {r['status']}" for r in records if r["status"] in BAD]
+
+
 def _note(records: list[dict[str, Any]], kind: str, name: str, verdict: Verdict) -> None:
     detail = TEMPORARY.sub("", verdict.detail)
     records.append({"kind": kind, "fault": name, "status": verdict.status, "detail": detail})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 import torch
 from torch_geometric.data import HeteroData
 
+from gpe_pl.benchmark import benchmark
 from gpe_pl.generation import DatasetSpec, generate_trajectory
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
@@ -23,10 +25,12 @@ from gpe_pl.simulate import dataset
 from gpe_pl.stability import conservation, geometry, horizon, inputs, invariances, precision
 from gpe_pl.stability.horizon import energy, growth_rate, separation, valid_steps
 from gpe_pl.stability.subject import Outcome, StressTest, Subject
+from gpe_pl.suites import stability
 from gpe_pl.suites.stability import GROUPS, NothingToTestError, Settings, figures, is_gating, run
 from gpe_pl.suites.stability import test as run_tests
 from gpe_pl.suites.trained import Case, model_label, trained_on
 from gpe_pl.trajectory import State, Trajectory
+from tests.runs import compose
 
 NUM_FRAMES = 16
 SHIPPED = {"edge_state": "geometry", "island_momentum": "angular"}
@@ -196,6 +200,23 @@ def test_a_run_writes_records_table_and_figures(spec: DatasetSpec, scenes: list[
     assert set(figures(records)) == {"long_horizon_sand", "perturbation_sand"}
     with pytest.raises(NothingToTestError, match="no model that was trained on one of snow tiny; train with"):
         run(settings, {"snow": other})
+
+
+@pytest.mark.parametrize(
+    ("gating", "status", "named"),
+    [(True, "failed", ["sand, GPE: 3 x"]), (False, "failed", []), (True, "passed", []), (True, "not_applicable", [])],
+)
+def test_failures_of_gating_models_fail_the_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gating: bool, status: str, named: list[str]
+) -> None:
+    record = {"domain": "sand", "model": "GPE", "test": "3 x", "status": status, "gating": gating}
+    assert stability.failures([record]) == named
+    monkeypatch.setattr(stability, "run", lambda *_: ([record], "the table"))
+    monkeypatch.setattr(stability, "figures", lambda _: {})
+    command = compose("benchmark", "suite=stability", f"paths.runs={tmp_path}")
+    with pytest.raises(SystemExit, match="error: 1 failed: sand, GPE: 3 x") if named else contextlib.nullcontext():
+        benchmark(command)
+    assert (tmp_path / "benchmark" / "stability" / "table.md").read_text() == "the table\n"  # in any case
 
 
 def test_what_gates_is_the_shipped_configuration(spec: DatasetSpec, scenes: list[Trajectory]) -> None:
