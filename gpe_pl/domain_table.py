@@ -19,6 +19,7 @@ from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.evaluation import LEARNED
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio
 from gpe_pl.report import Run, distinct_runs, finished_runs, groups_of, table_row, values_by_seed
+from gpe_pl.schema import MATERIALS
 
 log = logging.getLogger(__name__)
 
@@ -216,4 +217,10 @@ def _figures(
                     points.setdefault(row.parameter, []).append(row.value)
     seen = {d: sorted({r.parameter for run in by_cell[d, m] for r in run.rows if r.parameter_group == "seen"}) for d, m in by_cell}
     if curves:
-        parameter_figure({d: curves[d] for d in domains}, seen, "rollout MSE [m²]").savefig(folder / PARAMETER_FIGURE, dpi=150)
+        labels = {d: _axis_label(run) for (d, _), runs in by_cell.items() for run in runs}
+        parameter_figure({d: curves[d] for d in domains}, seen, "rollout MSE [m²]", labels).savefig(folder / PARAMETER_FIGURE, dpi=150)
+
+
+def _axis_label(run: Run) -> str:
+    varied = [m for m in MATERIALS if any(key.startswith(f"data.parameters.{m}.") for key in run.config)]
+    return ", ".join(f"{MATERIALS[m].name.replace('_', ' ')}\n[{MATERIALS[m].unit}]" for m in varied)

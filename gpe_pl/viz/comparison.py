@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -48,7 +49,10 @@ def comparison_figure(intervals: Mapping[str, Mapping[str, Interval]], reference
 
 
 def parameter_figure(
-    curves: Mapping[str, Mapping[str, Mapping[float, Sequence[float]]]], seen: Mapping[str, Sequence[float]], label: str
+    curves: Mapping[str, Mapping[str, Mapping[float, Sequence[float]]]],
+    seen: Mapping[str, Sequence[float]],
+    label: str,
+    parameters: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
     """One panel per domain: median error over trajectories and seeds against the material parameter; ticks at the bottom mark trained values.
 
@@ -56,15 +60,16 @@ def parameter_figure(
         curves: errors by domain, model and parameter value.
         seen: trained values by domain.
         label: of the vertical axis.
+        parameters: labels of the horizontal axes by domain.
     """
-    figure = new_figure(TEXT_WIDTH, 2.2)
+    figure = new_figure(TEXT_WIDTH, 2.4)
     figure.set_layout_engine("constrained")
     panels = figure.subplots(1, len(curves), squeeze=False)[0]
     models = list(dict.fromkeys(m for domain in curves.values() for m in domain))
     for axes, (domain, by_model) in zip(panels, curves.items(), strict=True):
         values = [p for points in by_model.values() for p in points]
         axes.set_yscale("log")
-        if values and min(values) > 0 and max(values) > 30 * min(values):
+        if values and min(values) > 0 and max(values) > 10 * min(values):
             axes.set_xscale("log")
         for k, model in enumerate(models):
             points = sorted((p, float(np.median(v))) for p, v in by_model.get(model, {}).items())
@@ -87,10 +92,13 @@ def parameter_figure(
             markersize=6,
         )
         axes.set_title(domain, fontsize=8)
-        axes.tick_params(which="both", labelsize=6)
+        axes.set_xlabel(parameters.get(domain, ""), fontsize=6)
+        axes.tick_params(which="major", labelsize=6)
+        axes.tick_params(which="minor", labelleft=False, labelbottom=False)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel(label, fontsize=8)
-    panels[-1].legend(fontsize=6, frameon=False)
+    lines, names = panels[0].get_legend_handles_labels()
+    figure.legend(lines, names, loc="outside lower center", ncols=len(models), fontsize=6, frameon=False)
     return figure
 
 
