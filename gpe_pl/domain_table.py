@@ -131,13 +131,15 @@ def _write_csv(path: Path, runs: Sequence[Run]) -> None:
 
 
 def _markdown(domains: list[str], models: list[str], cells: dict[tuple[str, str], Cell], by_cell: dict[tuple[str, str], list[Run]]) -> str:
-    header = ["domain", *models, "ballistic", f"{OWN} / best baseline", "paper"]
+    other_scenes = any(key.startswith("evaluation.data.scene") for runs in by_cell.values() for run in runs for key in run.config)
+    papers = {} if other_scenes else {domain: [_paper_ratio(domain)] for domain in domains}
+    header = ["domain", *models, "ballistic", f"{OWN} / best baseline", *(["paper"] if papers else [])]
     lines = [table_row(header), "|" + "---|" * len(header)]
     for domain in domains:
         own = {m: cells[domain, m] for m in models if (domain, m) in cells}
         ballistic = next((c.ballistic for c in own.values()), float("nan"))
         texts = [_text(own.get(m)) for m in models]
-        lines.append(table_row([domain, *texts, f"{1e3 * ballistic:.3g}", _ratio(own), _paper_ratio(domain)]))
+        lines.append(table_row([domain, *texts, f"{1e3 * ballistic:.3g}", _ratio(own), *papers.get(domain, [])]))
     budget = ["", "Training, one row per model: steps and seeds.", "", table_row(["domain", *models]), "|" + "---|" * (len(models) + 1)]
     for domain in domains:
         steps = [
@@ -151,8 +153,8 @@ def _markdown(domains: list[str], models: list[str], cells: dict[tuple[str, str]
         "Rollout MSE ×1e-3 [m²] over all frames on material parameters not seen in training (between the trained ones; FEM also outside): mean over "
         "trajectories, median over seeds, 95 % bootstrap interval over both; a rollout that had to be stopped has failed, and the mean with it. A model "
         "that is not twice as good as ballistic flight is *not learned* and wins nothing. Ratio: over the best baseline that has learned, with its "
-        "interval, on the same trajectories; bold where that excludes 1. Last column: the paper's ratio, from its table 1; its units are not ours."
-    )
+        "interval, on the same trajectories; bold where that excludes 1."
+    ) + (" Last column: the paper's ratio, from its table 1; its units are not ours." if papers else "")
     return "\n".join([*lines, "", note, *_medians(domains, models, cells), *budget, ""])
 
 

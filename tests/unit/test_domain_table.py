@@ -105,6 +105,18 @@ def test_the_csv_has_every_number_once(sweep: Path) -> None:
     assert found["sand", "ballistic", "", "test_unseen/interpolated"] == pytest.approx(30e-3)
 
 
+def test_on_other_scenes_the_papers_ratios_are_left_out(sweep: Path) -> None:
+    report_domains(sweep)
+    assert "paper" in cells((sweep / "table1.md").read_text(), "sand")
+    for path in sweep.rglob("config.json"):
+        config = json.loads(path.read_text())
+        path.write_text(json.dumps(config | {"evaluation": {"data": {"name": "larger", "scene": {"num_particles": 9}}}}))
+    report_domains(sweep)
+    text = (sweep / "table1.md").read_text()
+    assert "paper" not in text
+    assert cells(text, "sand")["GPE / best baseline"] == "0.50 [0.25, 2.00]"
+
+
 def test_figures_are_drawn(sweep: Path) -> None:
     report_domains(sweep)
     assert all((sweep / name).stat().st_size > 1000 for name in ("table1.png", "error_by_parameter.png"))
