@@ -39,7 +39,7 @@ WATER = 1000.0
 HEADROOM = 0.25
 """Height of the domain above the highest wall, of that of the walls."""
 FASTEST = 10.0
-"""Largest speed of a recorded particle, of that of a free fall through the domain's height; a still scene may have any below."""
+"""Largest speed of a recorded particle, in that of a free fall through the domain's height; without gravity there is none."""
 UPSTREAM = 1 / 3
 """Part of the domain at low x in which a flood starts."""
 
@@ -227,14 +227,9 @@ class RecordedScene:
     def _check(self, pos: np.ndarray, vel: np.ndarray, shapes: tuple[Shape, ...], height: float) -> None:
         """Raise ``RecordingError`` for particles that no liquid has, which would make a solver or a model explode later, without a reason."""
         depth = -signed_distance(shapes, pos)
-        # without gravity, any speed
         speed, falling = np.linalg.norm(vel, axis=1), math.sqrt(2 * float(np.linalg.norm(self.gravity)) * height)
         for values, limit, text in (
-            (
-                depth,
-                self.spacing,
-                "lies {:.3g} m deep in the ground or outside the walls; it must be within a particle spacing of {:.3g} m",
-            ),
+            (depth, self.spacing, "lies {:.3g} m deep in the ground or outside the walls; more than the particles' spacing of {:.3g} m"),
             (speed, FASTEST * falling or math.inf, "moves at {:.3g} m/s; more than {:.3g} m/s no fall through this scene explains"),
         ):
             wrong = np.flatnonzero(~(values <= limit))

@@ -188,12 +188,12 @@ def _models(spec: DatasetSpec, settings: Settings) -> Iterator[tuple[str, Learne
             yield path.parent.parent.name if path.parent.name == "checkpoints" else path.stem, simulator
 
 
-# --- the table ------------------------------------------------------------------------------------------------------------------------------
-
-
 def failures(records: Sequence[dict[str, Any]]) -> list[str]:
     """What gating models failed, which is what the suite fails by."""
     return [f"{r['domain']}, {r['model']}: {r['test']}" for r in records if r["gating"] and r["status"] == "failed"]
+
+
+# --- the table ------------------------------------------------------------------------------------------------------------------------------
 
 
 MARKS = {"passed": "passed", "failed": "**failed**", "not_applicable": "–"}
