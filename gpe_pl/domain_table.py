@@ -11,13 +11,12 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.evaluation import LEARNED
-from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio
+from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio, median_of_means
 from gpe_pl.report import Run, distinct_runs, finished_runs, groups_of, table_row, values_by_seed
 from gpe_pl.schema import MATERIALS
 
@@ -106,12 +105,7 @@ def _cell(runs: list[Run], domain: str) -> Cell | None:
         return None
     shared = min(map(len, values))  # runs may have evaluated different numbers of trajectories
     errors = np.array([v[:shared] for v in values])
-    return Cell(bootstrap_interval(errors, statistic=_median_of_means), errors, float(np.mean(trivial[0][:shared])))
-
-
-def _median_of_means(table: np.ndarray, axis: tuple[int, int]) -> Any:
-    """Over seeds, of means over trajectories."""
-    return np.median(table.mean(axis=axis[1], keepdims=True), axis=axis)
+    return Cell(bootstrap_interval(errors, statistic=median_of_means), errors, float(np.mean(trivial[0][:shared])))
 
 
 def _write_csv(path: Path, runs: Sequence[Run]) -> None:
@@ -190,7 +184,7 @@ def _ratio(cells: dict[str, Cell]) -> str:
     if not baselines:
         return "no baseline learned" if own.is_learned else "no model learned"
     best = min(baselines, key=lambda c: c.interval.estimate)
-    i = bootstrap_ratio(own.errors, best.errors, statistic=_median_of_means)
+    i = bootstrap_ratio(own.errors, best.errors, statistic=median_of_means)
     estimate = f"**{i.estimate:.2f}**" if i.low > 1 or i.high < 1 else f"{i.estimate:.2f}"
     return f"{estimate} [{i.low:.2f}, {i.high:.2f}]" + ("" if own.is_learned else ", not learned")
 

@@ -361,6 +361,11 @@ BOTH = (-2, -1)
 """Axes of a table [seed, trajectory]."""
 
 
+def median_of_means(table: np.ndarray, axis: tuple[int, int]) -> Any:
+    """Over seeds, of means over trajectories: a ``statistic`` of ``bootstrap_interval``."""
+    return np.median(table.mean(axis=axis[1], keepdims=True), axis=axis)
+
+
 def bootstrap_interval(
     values: Sequence[Sequence[int | float] | np.ndarray] | np.ndarray,
     statistic: Callable[..., Any] = np.median,

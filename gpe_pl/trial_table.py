@@ -14,6 +14,7 @@ import numpy as np
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.domain_table import domain_of, model_of
 from gpe_pl.evaluation import LEARNED
+from gpe_pl.metrics import bootstrap_interval, median_of_means
 from gpe_pl.report import Run, axes_of, finished_runs, table_row, validation_curve, values_by_seed
 
 TRIALS_CSV, TRIALS_MD = "trials.csv", "trials.md"
@@ -48,8 +49,9 @@ def report_trials(folder: Path) -> None:
             losses = [loss[-1] for _, loss in (validation_curve(r.folder) for r in runs) if len(loss)]
             lines.append(table_row([domain, model, *v, str(len(runs)), f"{np.mean(losses):.3f}" if losses else "–", *cells]))
     note = (
-        "Rollout MSE ×1e-3 [m²] over all frames: mean over the trajectories of a split, median over seeds; a rollout that had to be stopped has failed, "
-        "and the mean with it. Bold: best of a domain and model. One-step nMSE: of the validation split, relative to free fall."
+        "Rollout MSE ×1e-3 [m²] over all frames: mean over the trajectories of a split, median over seeds, 95 % bootstrap interval over both (of one seed "
+        "it says nothing about training by other seeds); a rollout that had to be stopped has failed, and the mean with it. Bold: best of a domain and model. "
+        "One-step nMSE: of the validation split, relative to free fall."
     )
     replace_text(folder / TRIALS_MD, "\n".join([*lines, "", note, ""]))
 
@@ -72,10 +74,15 @@ def _error(runs: list[Run], split: str) -> float:
 
 
 def _cell(runs: list[Run], split: str, error: float, *, is_best: bool) -> str:
-    values = np.array([v for run in values_by_seed(runs, LEARNED, split, "rollout_mse", "full") for v in run])
+    errors = values_by_seed(runs, LEARNED, split, "rollout_mse", "full")
+    values = np.concatenate([np.zeros(0), *errors])
     failed = int((~np.isfinite(values)).sum())
-    text = f"{1e3 * error:.3g}" if np.isfinite(error) else f"{failed} of {len(values)} failed"
-    return f"**{text}**" if is_best else text
+    if not np.isfinite(error):
+        return f"{failed} of {len(values)} failed"
+    shared = min(map(len, errors))  # runs may have evaluated different numbers of trajectories
+    i = bootstrap_interval(np.array([e[:shared] for e in errors]), statistic=median_of_means)
+    text = f"{1e3 * error:.3g}"
+    return f"{f'**{text}**' if is_best else text} [{1e3 * i.low:.3g}, {1e3 * i.high:.3g}]"
 
 
 def _write_csv(path: Path, groups: dict[tuple[str, str], list[Run]], settings: list[str], columns: list[str], splits: list[str]) -> None:

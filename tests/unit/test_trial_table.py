@@ -42,9 +42,9 @@ def test_the_best_setting_of_each_model_is_bold(trials: Path) -> None:
     assert rows[0] == ["domain", "model", "noise_std", "seeds", "one-step nMSE", "val"]
     assert rows[2:] == [
         ["sand", "GNS", "0.3", "1", "–", "1 of 2 failed"],
-        ["sand", "GNS", "1.0", "1", "–", "**7**"],
-        ["sand", "GPE", "0.3", "2", "–", "3.5"],
-        ["sand", "GPE", "1.0", "1", "–", "**2**"],
+        ["sand", "GNS", "1.0", "1", "–", "**7** [7, 7]"],
+        ["sand", "GPE", "0.3", "2", "–", "3.5 [1, 6]"],
+        ["sand", "GPE", "1.0", "1", "–", "**2** [2, 2]"],
     ]
 
 
