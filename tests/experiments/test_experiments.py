@@ -61,6 +61,17 @@ def test_the_ablation_sweeps_every_interaction_over_seeds() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("choosing", "judging"), [("tuning_elastic", "table1"), ("tuning", "table1_equal_steps")])
+def test_scenes_to_choose_by_are_neither_trained_on_nor_judged_on(choosing: str, judging: str) -> None:
+    chosen, judged = (compose("fit", f"experiment={e}", "size=small", "data=elastomer") for e in (choosing, judging))
+    sets = [chosen.data, chosen.evaluation.data, judged.evaluation.data]
+    assert len({s.name for s in sets}) == len({s.seed for s in sets}) == 3
+    assert (chosen.data.name, chosen.data.seed) == (judged.data.name, judged.data.seed)
+    assert chosen.evaluation.splits == ["val"]
+    assert chosen.evaluation.data.num_val > chosen.data.num_val
+
+
+@pytest.mark.slow
 def test_a_learned_stress_is_drawn_and_compared(tiny_data: Path, tmp_path: Path) -> None:
     cfg = tiny(tiny_data, tmp_path, "experiment=fem_stress", "evaluation.splits=[test]", "evaluation.num_pictures=1")
     fit(cfg)
