@@ -17,7 +17,7 @@ import numpy as np
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.evaluation import LEARNED
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio, median_of_means
-from gpe_pl.report import Run, distinct_runs, finished_runs, groups_of, table_row, values_by_seed
+from gpe_pl.report import Run, distinct_runs, finished_runs, groups_of, shared_table, table_row, values_by_seed
 from gpe_pl.schema import MATERIALS
 
 log = logging.getLogger(__name__)
@@ -103,9 +103,8 @@ def _cell(runs: list[Run], domain: str) -> Cell | None:
     trivial = values_by_seed(runs, "ballistic", group, "rollout_mse", "full")
     if not values or not trivial:
         return None
-    shared = min(map(len, values))  # runs may have evaluated different numbers of trajectories
-    errors = np.array([v[:shared] for v in values])
-    return Cell(bootstrap_interval(errors, statistic=median_of_means), errors, float(np.mean(trivial[0][:shared])))
+    errors = shared_table(values)
+    return Cell(bootstrap_interval(errors, statistic=median_of_means), errors, float(np.mean(trivial[0][: errors.shape[1]])))
 
 
 def _write_csv(path: Path, runs: Sequence[Run]) -> None:

@@ -191,12 +191,17 @@ def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon
     return [t for t in table if t]
 
 
+def shared_table(values: list[list[float]]) -> np.ndarray:
+    """Values by seed as a table [seed, trajectory] of the trajectories that all runs have evaluated: runs may have evaluated different numbers of them."""
+    shared = min(map(len, values), default=0)
+    return np.array([v[:shared] for v in values]).reshape(len(values), shared)
+
+
 def _interval(values: list[list[float]], scale: float = 1.0) -> str:
     """Mean with its bootstrap interval; where rollouts failed, which makes the mean infinite, their number and the median."""
     if not values:
         return "–"
-    shared = min(len(v) for v in values)  # runs may have evaluated different numbers of trajectories
-    table = np.array([v[:shared] for v in values]) * scale
+    table = shared_table(values) * scale
     failed = int(np.sum(~np.isfinite(table)))
     if failed:
         return f"{failed} of {table.size} failed, median {np.median(table):.3g}"

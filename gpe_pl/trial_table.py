@@ -14,8 +14,8 @@ import numpy as np
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.domain_table import domain_of, model_of
 from gpe_pl.evaluation import LEARNED
-from gpe_pl.metrics import bootstrap_interval, median_of_means
-from gpe_pl.report import Run, axes_of, finished_runs, table_row, validation_curve, values_by_seed
+from gpe_pl.metrics import BOTH, bootstrap_interval, median_of_means
+from gpe_pl.report import Run, axes_of, finished_runs, shared_table, table_row, validation_curve, values_by_seed
 
 TRIALS_CSV, TRIALS_MD = "trials.csv", "trials.md"
 CONSEQUENCES = ("training.num_steps", "training.val_interval", "seed")
@@ -69,18 +69,15 @@ def _settings(runs: list[Run]) -> list[str]:
 
 
 def _error(runs: list[Run], split: str) -> float:
-    means = [np.mean(values) for values in values_by_seed(runs, LEARNED, split, "rollout_mse", "full")]
-    return float(np.median(means)) if means else float("inf")
+    errors = shared_table(values_by_seed(runs, LEARNED, split, "rollout_mse", "full"))
+    return float(median_of_means(errors, BOTH)) if errors.size else float("inf")
 
 
 def _cell(runs: list[Run], split: str, error: float, *, is_best: bool) -> str:
-    errors = values_by_seed(runs, LEARNED, split, "rollout_mse", "full")
-    values = np.concatenate([np.zeros(0), *errors])
-    failed = int((~np.isfinite(values)).sum())
+    errors = shared_table(values_by_seed(runs, LEARNED, split, "rollout_mse", "full"))
     if not np.isfinite(error):
-        return f"{failed} of {len(values)} failed"
-    shared = min(map(len, errors))  # runs may have evaluated different numbers of trajectories
-    i = bootstrap_interval(np.array([e[:shared] for e in errors]), statistic=median_of_means)
+        return f"{int((~np.isfinite(errors)).sum())} of {errors.size} failed"
+    i = bootstrap_interval(errors, statistic=median_of_means)
     text = f"{1e3 * error:.3g}"
     return f"{f'**{text}**' if is_best else text} [{1e3 * i.low:.3g}, {1e3 * i.high:.3g}]"
 
