@@ -74,6 +74,7 @@ class PortableStep(nn.Module):
         super().__init__()
         metadata = simulator.builder.metadata
         self.simulator, self.spec, self.scales = simulator, simulator.builder.spec, simulator.builder.scales
+        self.meshes = _meshes(self.spec)
         self.frame_dt, self.periodicity, self.features = metadata.frame_dt, metadata.periodicity, simulator.builder.config.features
 
     def forward(self, scene: Scene) -> tuple[Scene, Scene]:
@@ -112,6 +113,9 @@ class PortableStep(nn.Module):
         if self.spec.islands:
             data.island_is_free = scene["island_is_free"]
             data.num_islands = torch.full((1,), scene["island_is_free"].shape[0])
+            for m in self.meshes:
+                data[m].body = scene[f"body.{m}"]
+            data.num_bodies = torch.full((1,), sum(scene[f"body.{m}"].shape[0] for m in self.meshes))  # at most
         pos, vel, normal, friction, restitution = (scene[f"boundary.{name}"] for name in BOUNDARY_FIELDS)
         boundary = Boundary(pos, vel, normal, friction, restitution)
         data[BOUNDARY].x = boundary_features(boundary, self.scales).float()
@@ -144,7 +148,7 @@ class PortableStep(nn.Module):
         if not relations:
             return
         dim, values, mass = self.spec.dim, dict[str, Tensor](), dict[str, Tensor]()
-        for m in dict.fromkeys(target for _, name, target in relations if name == CELL):
+        for m in self.meshes:
             values[m] = torch.cat([scene[f"pos.{m}"], scene[f"rest_pos.{m}"], scene[f"velocity_history.{m}"].flatten(1)], dim=1)
             mass[m] = scene[f"mass.{m}"][:, None]
         width = next(iter(values.values())).shape[1]
@@ -172,12 +176,17 @@ class PortableStep(nn.Module):
             store.odd, store.even = odd.float(), even.float()
 
 
+def _meshes(spec: FeatureSpec) -> tuple[str, ...]:
+    """Materials that are connected along their cells."""
+    return tuple(target for _, name, target in spec.relations if name == CELL)
+
+
 def describe(simulator: LearnedSimulator) -> dict[str, Input]:
     """The tensors that a program of this simulator takes, by name."""
     builder, spec, dim = simulator.builder, simulator.builder.spec, simulator.builder.spec.dim
     history = builder.config.history
     inputs = {"gravity": Input((dim,), "float64", "m/s^2", "external acceleration")}
-    meshes = {r[2] for r in spec.relations if r[1] == CELL}
+    meshes = _meshes(spec)
     is_periodic = bool(builder.metadata.periodicity)
     positions = "positions; not folded into the domain, so that the nodes of a mesh stay together" if is_periodic else "positions"
     for m in spec.materials:
@@ -195,6 +204,9 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
         if spec.islands:
             doc = "number of the group of nodes that the edges between materials connect"
             inputs[f"island.{m}"] = Input((m,), "int64", "1", doc)
+        if spec.islands and m in meshes:
+            doc = "number of the body that cells connect, below the number of nodes of meshes; a node of no cell is one by itself"
+            inputs[f"body.{m}"] = Input((m,), "int64", "1", doc)
         if spec.islands and is_periodic:
             doc = "position relative to the mean of its group, as the edges lead there; 0 in a group that reaches around the domain"
             inputs[f"arm.{m}"] = Input((m, dim), "float64", "m", doc)
@@ -238,6 +250,8 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
         }
         if spec.islands:
             values |= {"island": graph[m].island, "arm": graph[m].pos.double()}
+        if spec.islands and m in _meshes(spec):
+            values["body"] = graph[m].body
         scene |= {f"{name}.{m}": value for name, value in values.items()}
     if spec.islands:
         scene["island_is_free"] = graph.island_is_free
@@ -310,7 +324,8 @@ def _example(inputs: dict[str, Input]) -> tuple[Scene, dict[str, int]]:
         elif name == "island_is_free":
             scene[name] = integers(2, *shape) > 0
         elif about.dtype == "int64":
-            scene[name] = integers(sizes["island"], *shape)
+            group, _, material = name.partition(".")
+            scene[name] = integers(sizes[material if group == "body" else group], *shape)
         else:
             scene[name] = 1 + torch.rand(shape, dtype=torch.float64, generator=random)
     return scene, sizes

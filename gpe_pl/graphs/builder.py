@@ -55,7 +55,7 @@ class GraphBuilder:
 
     With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph ``island_is_free`` [island] and ``num_islands`` [1].
     ``pos`` counts from the mean of the node's island, and in periodic domains keeps it together; an island that goes around the period has no lever arms, and
-    ``pos`` is zero there.
+    ``pos`` is zero there. Nodes of meshes then have ``body``, what their cells connect, and the graph ``num_bodies`` [1]; a node of no cell is one by itself.
 
     Attributes:
         config: what the graphs are like.
@@ -127,6 +127,7 @@ class GraphBuilder:
             self._add_empty_mesh(data, state)
         if self.config.islands:
             self._add_islands(data, state, rows)
+            self._add_bodies(data, rows, mesh)
         return data
 
     @cached_property
@@ -216,6 +217,18 @@ class GraphBuilder:
             data[material].island = label[r]
         data.island_is_free = torch.from_numpy(islands.is_free).to(state.pos.device)
         data.num_islands = torch.tensor([len(islands.is_free)], device=state.pos.device)
+
+    def _add_bodies(self, data: HeteroData, rows: dict[str, Tensor], mesh: MultiscaleGraph | None) -> None:
+        """Groups of mesh nodes that cells connect."""
+        if not self._meshes:
+            return
+        device = rows[self._meshes[0]].device
+        nodes = torch.cat([rows[m] for m in self._meshes]).cpu().numpy()
+        labels, body = np.unique(nodes if mesh is None else mesh.body[nodes], return_inverse=True)
+        parts = torch.from_numpy(body).to(device).split([len(rows[m]) for m in self._meshes])
+        for material, part in zip(self._meshes, parts, strict=True):
+            data[material].body = part
+        data.num_bodies = torch.tensor([len(labels)], device=device)
 
     def _rounded(self, values: Tensor) -> Tensor:
         """Values in the network's precision."""

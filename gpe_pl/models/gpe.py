@@ -5,14 +5,15 @@ Encoder, processor and decoder over typed nodes and relations, one parameter set
     h_i   = f_v0(x_i, Θ(material parameters))            e_ij = f_e0(edge features)
     m_ij  = f_e(h_i, h_j, e_ij),  m_ji = −m_ij           (nn.momentum_conv)
     h_i  += f_v(Σ_j m_ij)                                e_ij += m_ij
-    a_i   = f_d(h_i)                                     or a sum of antisymmetric pair forces over the true mass
+    a_i   = f_d(h_i)                                     or a sum of antisymmetric pair forces over the true mass, or both (``contact``)
 
 Virtual nodes above meshes take part as nodes of their own types and carry hidden messages only. ``simultaneous``, as in Algorithm 1, lets a message climb one
 level per step; ``sweep`` climbs all levels, passes messages within each, and comes down again, so that every step couples the whole body.
 """
 
+from collections.abc import Iterable
 from functools import partial
-from typing import Annotated, Literal, cast
+from typing import Annotated, Literal, NamedTuple, cast
 
 import torch
 from jaxtyping import Float
@@ -24,12 +25,12 @@ from gpe_pl.errors import GpeError
 from gpe_pl.models.base import Prediction
 from gpe_pl.nn.blocks import MLP
 from gpe_pl.nn.connected import Edges, order_of_edges, renumbered, reordered, touched
-from gpe_pl.nn.island_momentum import IslandMomentum, conserve
+from gpe_pl.nn.island_momentum import IslandMomentum, conserve, rigid_part
 from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction, MomentumConv, orient
 from gpe_pl.schema import CELL, DOWN, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
 from gpe_pl.skips import Skips
 
-Decoder = Literal["node", "pair"]
+Decoder = Literal["node", "pair", "contact"]
 LevelWeights = Literal["shared", "separate"]
 Schedule = Literal["simultaneous", "sweep"]
 MaterialEmbeddingKind = Literal["affine", "mlp"]
@@ -41,7 +42,21 @@ class StressError(GpeError, ValueError):
 
 
 class IslandError(GpeError, ValueError):
-    """Momentum of islands is to be kept in graphs that do not know their islands."""
+    """Islands or bodies are to move as a whole in graphs that do not know them."""
+
+
+class Decoded(NamedTuple):
+    """What the network says, per material.
+
+    Attributes:
+        acceleration: without gravity [node, dim].
+        stress: where it is decoded [node, component].
+        contact: what contacts alone would accelerate nodes of bodies by [node, dim], with the ``contact`` decoder.
+    """
+
+    acceleration: dict[str, Tensor]
+    stress: dict[str, Tensor]
+    contact: dict[str, Tensor]
 
 
 class MaterialEmbedding(nn.Module):
@@ -97,8 +112,9 @@ class PairForce(nn.Module):
     ) -> Float[Tensor, "edge dim"]:
         """Force on the target of every edge, computed for ``chunk`` edges at a time; the source feels the opposite."""
         a, b = self.lin_target(h_target), self.lin_source(h_source)
-        size = max(edge_index.shape[1], 1) if chunk is None else chunk
-        parts = zip(edge_index.split(size, dim=1), odd.split(size), even.split(size), strict=True)
+        if chunk is None:
+            return self._force(a, b, edge_index, odd, even)
+        parts = zip(edge_index.split(chunk, dim=1), odd.split(chunk), even.split(chunk), strict=True)
         return torch.cat([self._force(a, b, *part) for part in parts])
 
     def _force(self, a: Tensor, b: Tensor, edge_index: Tensor, odd: Tensor, even: Tensor) -> Tensor:
@@ -130,13 +146,23 @@ def _merge_levels(x: dict[str, Tensor], edges: Edges) -> tuple[dict[str, Tensor]
     return {t: torch.cat(parts) for t, parts in nodes.items()}, joined
 
 
+def _grouped(data: HeteroData, materials: Iterable[str], name: str, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mass, position and group (``island`` or ``body``) of the nodes of these materials; graphs of a batch number their groups from 0."""
+    stores = [data[m] for m in materials]
+    start = torch.cumsum(count, dim=0) - count
+    group = torch.cat([s[name] + start[s.batch] if "batch" in s else s[name] for s in stores])
+    return torch.cat([s.mass for s in stores]), torch.cat([s.pos for s in stores]), group
+
+
 class GPE(nn.Module):
     """The paper's model and its variants.
 
     Args:
         spec: channels of the graphs.
         interaction: how a message and its reverse relate; see ``nn.momentum_conv``.
-        decoder: ``node`` decodes an acceleration per node (paper); ``pair`` an antisymmetric force per edge, divided by the node's mass.
+        decoder: ``node`` decodes an acceleration per node (paper); ``pair`` an antisymmetric force per edge, divided by the node's mass; ``contact`` decodes
+            both in meshes: a body moves and turns as a whole by the forces of its ``radius`` edges alone, which are where it touches something, and each
+            node adds only what deforms it. What is no mesh has an acceleration per node.
         edge_state: ``latent`` updates a hidden state per edge (Algorithm 1); ``geometry`` feeds the raw edge features to every layer.
         material_embedding: ``affine`` (the paper's interpolation rule) or ``mlp``.
         num_message_passing_steps: processor layers; 12 in the paper.
@@ -151,7 +177,7 @@ class GPE(nn.Module):
 
     Raises:
         StressError: ``stress`` without a material that has one.
-        IslandError: ``island_momentum`` with graphs that do not know their islands.
+        IslandError: ``island_momentum``, or meshes with the ``contact`` decoder, with graphs that do not know islands and bodies.
     """
 
     skips = Skips()
@@ -189,6 +215,9 @@ class GPE(nn.Module):
         }
         if island_momentum != "ignored" and not spec.islands:
             raise IslandError(f"model.island_momentum={island_momentum} needs graph.islands=true")
+        self.bodies = tuple(r[0] for r in spec.relations if r[1] == CELL) if decoder == "contact" else ()
+        if self.bodies and not spec.islands:
+            raise IslandError("model.decoder=contact needs graph.islands=true")
         if stress and not spec.stress_channels:
             raise StressError(
                 f"model.stress=true, but no stress is stored of {', '.join(spec.materials)}; choose model.stress=false or data=fem"
@@ -227,17 +256,21 @@ class GPE(nn.Module):
             self.convs.append(convs)
             keys = dict.fromkeys(self.type_key(t) for t in spec.node_types if t in types)
             self.updates.append(nn.ModuleDict({k: mlp(hidden, hidden, hidden, norm) for k in keys}))
-        if decoder == "node":
+        if decoder != "pair":
             self.node_decoder = nn.ModuleDict({m: mlp(hidden, hidden, spec.dim) for m in spec.materials})
-        else:
+        if decoder == "pair" or self.bodies:
             forces = [r for r in spec.relations if r[1] in (RADIUS, CELL)]
+            if self.bodies:
+                forces = [r for r in forces if r[1] == RADIUS and {r[0], r[2]} & {*self.bodies}]
             self.pair_decoder = nn.ModuleDict({self.key(r): PairForce(spec, r, hidden) for r in forces})
         if stress:
             self.stress_decoder = nn.ModuleDict({m: mlp(hidden, hidden, c) for m, c in spec.stress_channels.items()})
 
     @property
     def num_hops(self) -> int:
-        return self.num_message_passing_steps + (self.decoder == "pair")  # a pair force reads the state of the other end
+        return self.num_message_passing_steps + (
+            self.decoder == "pair" or bool(self.bodies)
+        )  # a pair force reads the state of the other end
 
     @property
     def is_fused(self) -> bool:
@@ -282,24 +315,29 @@ class GPE(nn.Module):
         if grid(1) in x and self.level_weights == "shared" and self.schedule == "simultaneous":
             x, edges = _merge_levels(x, edges)
         apart = self.skips.isolated_nodes and not self.training
-        acceleration, stress = (self._compute_apart if apart else self._compute_in_order)(x, params, mass, edges)
+        acceleration, stress, contact = (self._compute_apart if apart else self._compute_in_order)(x, params, mass, edges)
+        if contact:
+            acceleration = self._moved_by_contacts(data, acceleration, contact)
         if acceleration and self.settings["island_momentum"] != "ignored":
             acceleration = self._conserve(data, acceleration)
         return Prediction(acceleration, stress)
 
+    @staticmethod
+    def _moved_by_contacts(data: HeteroData, acceleration: dict[str, Tensor], contact: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Accelerations whose rigid part in each body is that of its contacts."""
+        mass, pos, body = _grouped(data, contact, "body", data.num_bodies)
+        change = torch.cat([contact[m] - acceleration[m] for m in contact])
+        count = body.shape[0] if torch.compiler.is_exporting() else int(data.num_bodies.sum())  # as many at most
+        parts = rigid_part(change, mass, pos, body, count).split([a.shape[0] for a in contact.values()])
+        return acceleration | {m: acceleration[m] + part for m, part in zip(contact, parts, strict=True)}
+
     def _conserve(self, data: HeteroData, acceleration: dict[str, Tensor]) -> dict[str, Tensor]:
-        stores = [data[m] for m in acceleration]
-        count = data.num_islands
-        start = torch.cumsum(count, dim=0) - count  # graphs of a batch number their islands from 0
-        island = torch.cat([s.island + start[s.batch] if "batch" in s else s.island for s in stores])
-        mass, pos = torch.cat([s.mass for s in stores]), torch.cat([s.pos for s in stores])
+        mass, pos, island = _grouped(data, acceleration, "island", data.num_islands)
         angular = self.settings["island_momentum"] == "angular"
         kept = conserve(torch.cat([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
         return dict(zip(acceleration, kept.split([a.shape[0] for a in acceleration.values()]), strict=True))
 
-    def _compute_in_order(
-        self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def _compute_in_order(self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges) -> Decoded:
         """``compute``, in large scenes of nodes that stand in the order of their edges: what belongs together is found in the cache."""
         limit = None if self.training else self.skips.sorted_from
         if limit is None or sum(values.shape[0] for values in x.values()) < limit:
@@ -315,9 +353,7 @@ class GPE(nn.Module):
                 result[t] = torch.empty_like(result[t]).index_copy(0, order[t], result[t])
         return results
 
-    def _compute_apart(
-        self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    def _compute_apart(self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges) -> Decoded:
         """``compute``, but nodes without an edge pass no messages: what they would receive is nothing."""
         has_edge = touched({t: values.shape[0] for t, values in x.items()}, edges)
         if has_edge.keys() >= x.keys() and all(bool(mask.all()) for mask in has_edge.values()):
@@ -326,32 +362,31 @@ class GPE(nn.Module):
         def connected(values: dict[str, Tensor]) -> dict[str, Tensor]:
             return {t: v[has_edge[t]] for t, v in values.items() if t in has_edge}
 
-        inner: tuple[dict[str, Tensor], dict[str, Tensor]] = ({}, {})
+        inner, whole = Decoded({}, {}, {}), Decoded({}, {}, {})
         if edges:
             inner = self._compute_in_order(connected(x), connected(params), connected(mass), renumbered(edges, has_edge))
-        acceleration: dict[str, Tensor] = {}
-        stress: dict[str, Tensor] = {}
         for m in mass:
             alone = ~has_edge[m] if m in has_edge else torch.ones(x[m].shape[0], dtype=torch.bool, device=x[m].device)
             single = self._isolated(m, x[m][alone], params[m][alone] if m in params else None)
-            for whole, part, others in zip((acceleration, stress), single, inner, strict=True):
+            for together, part, others in zip(whole, single, inner, strict=True):
                 if part is not None:
-                    whole[m] = part.new_empty(alone.shape[0], part.shape[1])
-                    whole[m][alone] = part
+                    together[m] = part.new_empty(alone.shape[0], part.shape[1])
+                    together[m][alone] = part
                     if m in others:
-                        whole[m][~alone] = others[m]
-        return acceleration, stress
+                        together[m][~alone] = others[m]
+        return whole
 
-    def _isolated(self, material: str, x: Tensor, params: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Accelerations, and stresses where they are decoded, of nodes without an edge: every step adds the same to all of them, an update by no message."""
+    def _isolated(self, material: str, x: Tensor, params: Tensor | None) -> tuple[Tensor, Tensor | None, Tensor | None]:
+        """What ``Decoded`` has of a material, for nodes without an edge: every step adds the same to all of them, an update by no message."""
         falls_freely, with_stress = self.decoder == "pair", self._decodes_stress(material)
-        acceleration = x.new_zeros(x.shape[0], self.spec.dim)
+        nothing = x.new_zeros(x.shape[0], self.spec.dim)
         if falls_freely and not with_stress:
-            return acceleration, None
+            return nothing, None, None
         h, key = self._encode_node(material, x, params), self.type_key(material)
         for updates in self.updates:
             h = h + cast(nn.ModuleDict, updates)[key](h.new_zeros(1, h.shape[1]))
-        return acceleration if falls_freely else self.node_decoder[material](h), self.stress_decoder[material](h) if with_stress else None
+        acceleration = nothing if falls_freely else self.node_decoder[material](h)
+        return acceleration, self.stress_decoder[material](h) if with_stress else None, nothing if material in self.bodies else None
 
     def _decodes_stress(self, material: str) -> bool:
         return bool(self.settings["stress"]) and material in self.spec.stress_channels and (self.training or not self.skips.stress)
@@ -362,8 +397,8 @@ class GPE(nn.Module):
         params: dict[str, Tensor],
         mass: dict[str, Tensor],
         edges: Edges,
-    ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """``forward`` on plain tensors: the part that ``torch.compile`` sees. Accelerations and stresses per material."""
+    ) -> Decoded:
+        """``forward`` on plain tensors: the part that ``torch.compile`` sees."""
         if self.interaction == "negated":
             edges = {r: (*orient(index, odd), even) if is_symmetric(r) else (index, odd, even) for r, (index, odd, even) in edges.items()}
         is_inference = not torch.is_grad_enabled()
@@ -399,9 +434,10 @@ class GPE(nn.Module):
                     h[node_type] = update(incoming, state) if rows is None else state.index_add(0, rows, update(incoming[rows]))
 
         stress = {m: self.stress_decoder[m](h[m]) for m in mass if self._decodes_stress(m)}
-        if self.decoder == "node":
-            return {m: self.node_decoder[m](h[m]) for m in mass}, stress
-        return self._pair_accelerations(h, mass, edges, chunk), stress
+        if self.decoder == "pair":
+            return Decoded(self._pair_accelerations(h, mass, edges, chunk), stress, {})
+        contact = self._pair_accelerations(h, {m: mass[m] for m in self.bodies if m in mass}, edges, chunk) if self.bodies else {}
+        return Decoded({m: self.node_decoder[m](h[m]) for m in mass}, stress, contact)
 
     def _phases(self, types: list[str], edges: Edges) -> list[tuple[list[EdgeType], dict[str, Tensor | None]]]:
         """What happens one after the other within a step: relations that compute messages, and node types that receive them, or only these rows."""
@@ -440,13 +476,15 @@ class GPE(nn.Module):
         return features if encoder is None else encoder(features)
 
     def _pair_accelerations(self, h: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges, chunk: int | None) -> dict[str, Tensor]:
+        """What pair forces accelerate the materials in ``mass`` by."""
         force = {m: h[m].new_zeros(h[m].shape[0], self.spec.dim) for m in mass}
         for relation, (edge_index, odd, even) in edges.items():
             if self.key(relation) not in self.pair_decoder:
                 continue
             source, _, target = relation
             f = self.pair_decoder[self.key(relation)](h[source], h[target], edge_index, odd, even, chunk)
-            force[target] = force[target].index_add(0, edge_index[1], f)
+            if target in force:
+                force[target] = force[target].index_add(0, edge_index[1], f)
             if source in force:
                 force[source] = force[source].index_add(0, edge_index[0], -f)
         return {m: force[m] / mass[m][:, None] for m in mass}

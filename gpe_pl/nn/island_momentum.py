@@ -1,11 +1,12 @@
-"""Exact momentum of islands in free flight: what no edge ties to anything outside keeps its linear and angular momentum, whatever a network says.
+"""The momentum of what moves together: of islands in free flight, which keep it exactly whatever a network says, and of bodies, which forces move as a whole.
 
-With a the accelerations without gravity of an island's nodes, m their masses and r their positions relative to the island's centre of mass::
+What no edge ties to anything outside keeps its linear and angular momentum. With a the accelerations without gravity of an island's nodes, m their masses
+and r their positions relative to the island's centre of mass::
 
     a ← a − Σ m a / Σ m                                  linear: the centre of mass falls freely
     a ← a − α × r,   J α = Σ m r × a                     angular: J is the inertia tensor
 
-which is the smallest change in the mass-weighted sense that makes Σ m a and Σ m r × a vanish.
+which is the smallest change in the mass-weighted sense that makes Σ m a and Σ m r × a vanish. What it takes away is the ``rigid_part``.
 """
 
 from __future__ import annotations
@@ -38,6 +39,18 @@ def conserve(
         return acceleration
     kept = _kept(acceleration, mass, pos, island, rows, is_free.shape[0], angular)
     return acceleration.index_copy(0, rows, kept)
+
+
+def rigid_part(
+    acceleration: Float[Tensor, "node dim"],
+    mass: Float[Tensor, " node"],
+    pos: Float[Tensor, "node dim"],
+    body: Int64[Tensor, " node"],
+    count: int,
+) -> Float[Tensor, "node dim"]:
+    """The part of accelerations in which each of ``count`` bodies moves as if it were rigid: all of its momentum and angular momentum, and no more."""
+    rows = torch.arange(body.shape[0], device=body.device)
+    return acceleration - _kept(acceleration, mass, pos, body, rows, count, angular=True)
 
 
 def _kept(acceleration: Tensor, mass: Tensor, pos: Tensor, island: Tensor, rows: Tensor, count: int, angular: bool) -> Tensor:
