@@ -55,7 +55,7 @@ class GraphBuilder:
 
     With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph ``island_is_free`` [island] and ``num_islands`` [1].
     ``pos`` counts from the mean of the node's island, and in periodic domains keeps it together; an island that goes around the period has no lever arms, and
-    ``pos`` is zero there. Nodes of meshes then have ``body``, what their cells connect, and the graph ``num_bodies`` [1]; a node of no cell is one by itself.
+    ``pos`` is zero there. Nodes of meshes then have ``body``, what their cells connect, and the graph ``num_bodies`` [1]; loose nodes, of no cell, have -1.
 
     Attributes:
         config: what the graphs are like.
@@ -224,11 +224,16 @@ class GraphBuilder:
             return
         device = rows[self._meshes[0]].device
         nodes = torch.cat([rows[m] for m in self._meshes]).cpu().numpy()
-        labels, body = np.unique(nodes if mesh is None else mesh.body[nodes], return_inverse=True)
+        body, num_bodies = np.full(len(nodes), -1), 0
+        if mesh is not None:
+            label = mesh.body[nodes]
+            in_cells = np.bincount(label)[label] > 1
+            names, body[in_cells] = np.unique(label[in_cells], return_inverse=True)
+            num_bodies = len(names)
         parts = torch.from_numpy(body).to(device).split([len(rows[m]) for m in self._meshes])
         for material, part in zip(self._meshes, parts, strict=True):
             data[material].body = part
-        data.num_bodies = torch.tensor([len(labels)], device=device)
+        data.num_bodies = torch.tensor([num_bodies], device=device)
 
     def _rounded(self, values: Tensor) -> Tensor:
         """Values in the network's precision."""

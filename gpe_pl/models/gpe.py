@@ -162,7 +162,7 @@ class GPE(nn.Module):
         interaction: how a message and its reverse relate; see ``nn.momentum_conv``.
         decoder: ``node`` decodes an acceleration per node (paper); ``pair`` an antisymmetric force per edge, divided by the node's mass; ``contact`` decodes
             both in meshes: a body moves and turns as a whole by the forces of its ``radius`` edges alone, which are where it touches something, and each
-            node adds only what deforms it. What is no mesh has an acceleration per node.
+            node adds only what deforms it. What is no mesh has an acceleration per node, and so have nodes of no cell: they would escape every error.
         edge_state: ``latent`` updates a hidden state per edge (Algorithm 1); ``geometry`` feeds the raw edge features to every layer.
         material_embedding: ``affine`` (the paper's interpolation rule) or ``mlp``.
         num_message_passing_steps: processor layers; 12 in the paper.
@@ -324,11 +324,13 @@ class GPE(nn.Module):
 
     @staticmethod
     def _moved_by_contacts(data: HeteroData, acceleration: dict[str, Tensor], contact: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Accelerations whose rigid part in each body is that of its contacts."""
+        """Accelerations whose rigid part in each body is that of its contacts; loose nodes are no bodies."""
         mass, pos, body = _grouped(data, contact, "body", data.num_bodies)
+        in_body = torch.cat([data[m].body for m in contact]) >= 0
+        count = body.shape[0] if torch.compiler.is_exporting() else int(data.num_bodies.sum())  # of as many at most
         change = torch.cat([contact[m] - acceleration[m] for m in contact])
-        count = body.shape[0] if torch.compiler.is_exporting() else int(data.num_bodies.sum())  # as many at most
-        parts = rigid_part(change, mass, pos, body, count).split([a.shape[0] for a in contact.values()])
+        change = rigid_part(change, mass, pos, torch.where(in_body, body, count), count + 1)
+        parts = torch.where(in_body[:, None], change, 0.0).split([a.shape[0] for a in contact.values()])
         return acceleration | {m: acceleration[m] + part for m, part in zip(contact, parts, strict=True)}
 
     def _conserve(self, data: HeteroData, acceleration: dict[str, Tensor]) -> dict[str, Tensor]:
