@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gpe_pl.nn.island_momentum import conserve
+from gpe_pl.nn.island_momentum import conserve, rigid_part
 
 SIZES = (40, 1, 2, 25, 3)
 FREE = torch.tensor([True, True, True, False, True])
@@ -83,3 +83,30 @@ def test_gradients_are_finite_and_orthogonal_to_momentum(dim: int) -> None:
     assert torch.isfinite(a.grad).all()
     rows = torch.nonzero(island == 0).flatten()
     assert (a.grad[rows]).sum(0).abs().max() < 1e-10  # adding the same to all nodes changes nothing
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_the_rigid_part_of_each_body_is_the_nearest_rigid_motion(dim: int) -> None:
+    a, mass, pos, body = scene(dim)
+    part = rigid_part(a, mass, pos, body, len(SIZES))
+    for k in range(len(SIZES)):
+        rows = torch.nonzero(body == k).flatten()
+        motions = rigid_motions(pos[rows])
+        weight = mass[rows].sqrt().repeat_interleave(dim)[:, None]
+        fit = torch.linalg.lstsq(weight * motions, weight * a[rows].reshape(-1, 1), driver="gelsd").solution
+        torch.testing.assert_close(part[rows].reshape(-1, 1), motions @ fit)
+    torch.testing.assert_close(rigid_part(part, mass, pos, body, len(SIZES)), part)
+
+
+def rigid_motions(pos: Tensor) -> Tensor:
+    """Shifts along and turns about every axis [node · dim, motion]."""
+    n, dim = pos.shape
+    r = pos - pos.mean(dim=0)
+    shifts = torch.eye(dim, dtype=r.dtype).repeat(n, 1)
+    turns = []
+    for i in range(dim):
+        for j in range(i):
+            turn = torch.zeros_like(r)
+            turn[:, i], turn[:, j] = r[:, j], -r[:, i]
+            turns.append(turn.reshape(-1, 1))
+    return torch.cat([shifts, *turns], dim=1)
