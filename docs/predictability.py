@@ -1,7 +1,8 @@
 """How far two solutions of a solver come apart whose starts differ a little: no model can be expected to do better from a start known no better.
 
 ``python docs/predictability.py FILE data=elastomer size=small`` writes the mean squared difference [m²] over nodes, axes and the first frames, as in
-``rollout_mse``, for scenes with unseen material parameters as comparisons are judged on: all nodes moved by the same small way, or all started with a slightly other velocity.
+``rollout_mse``, for scenes with unseen material parameters as comparisons are judged on: all nodes moved by the same small way, or all
+started with a slightly other velocity.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def main(file: Path, overrides: list[str]) -> None:
         direction /= np.linalg.norm(direction)
         truth = positions(spec, state, index)
         starts = [("shift [m]", d, replace(state, pos=state.pos + d * direction), d * direction) for d in SHIFTS]
-        starts += [("velocity [m/s]", d, replace(state, vel=state.vel + d * direction), 0.0) for d in VELOCITIES]
+        starts += [("velocity [m/s]", d, replace(state, vel=state.vel + d * direction), 0.0 * direction) for d in VELOCITIES]
         for what, size, start, moved in starts:
             squares = ((positions(spec, start, index) - moved - truth) ** 2).mean(axis=(1, 2))[1:]
             errors = [float(squares[:h].mean()) for h in HORIZONS] + [float(squares.mean())]
