@@ -28,7 +28,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl import integrators
 from gpe_pl.atomic import replacing
-from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.builder import GraphBuilder, from_centre
 from gpe_pl.graphs.features import boundary_features, edge_features, history_of, material_features, mesh_features, virtual_features
 from gpe_pl.graphs.islands import unwrapped
 from gpe_pl.learned_simulator import LearnedSimulator
@@ -107,10 +107,9 @@ class PortableStep(nn.Module):
             store = data[material]
             store.x = material_features(scene[f"velocity_history.{material}"], scene["gravity"], self.scales).float()
             store.material_params, store.mass = scene[f"material_params.{material}"].float(), scene[f"mass.{material}"].float()
-            if self.spec.islands:
-                arms = scene[f"{'arm' if self.periodicity else 'pos'}.{material}"]
-                store.pos, store.island = arms.float(), scene[f"island.{material}"]
         if self.spec.islands:
+            for material, arm in self._arms(scene).items():
+                data[material].pos, data[material].island = arm.float(), scene[f"island.{material}"]
             data.island_is_free = scene["island_is_free"]
             data.num_islands = torch.full((1,), scene["island_is_free"].shape[0])
             for m in self.meshes:
@@ -122,6 +121,14 @@ class PortableStep(nn.Module):
         self._add_radius_edges(data, scene, boundary)
         self._add_mesh(data, scene)
         return data
+
+    def _arms(self, scene: Scene) -> Scene:
+        """Positions relative to the mean of the island, by material."""
+        if self.periodicity:
+            return {m: scene[f"arm.{m}"] for m in self.spec.materials}
+        pos, island = (torch.cat([scene[f"{name}.{m}"] for m in self.spec.materials]) for name in ("pos", "island"))
+        arms = from_centre(pos, island, scene["island_is_free"].shape[0])
+        return dict(zip(self.spec.materials, arms.split([scene[f"pos.{m}"].shape[0] for m in self.spec.materials]), strict=True))
 
     def _edges(self, scene: Scene, relation: EdgeType) -> Tensor:
         return scene[f"edges.{'.'.join(relation)}"]

@@ -211,7 +211,7 @@ class GraphBuilder:
         islands = find_islands(state.num_nodes, edges, touches.cpu().numpy())
         label = torch.from_numpy(islands.label).to(state.pos.device)
         pos = self._kept_together(state, edges) if state.periodicity else state.pos
-        arms = self._rounded(_from_centre(pos, label, len(islands.is_free)))  # single precision has no room for where the island is
+        arms = self._rounded(from_centre(pos, label, len(islands.is_free)))  # single precision has no room for where the island is
         for material, r in rows.items():
             data[material].pos = arms[r]
             data[material].island = label[r]
@@ -335,9 +335,9 @@ def _array(x: Tensor) -> np.ndarray:
     return np.ascontiguousarray(x.detach().cpu().numpy())
 
 
-def _from_centre(pos: Tensor, island: Tensor, num_islands: int) -> Tensor:
+def from_centre(pos: Tensor, island: Tensor, num_islands: int) -> Tensor:
     """Positions counted from the mean of their island."""
-    count = torch.bincount(island, minlength=num_islands)[:, None]
+    count = pos.new_zeros(num_islands, 1).index_add_(0, island, torch.ones_like(pos[:, :1]))
     centre = pos.new_zeros(num_islands, pos.shape[1]).index_add_(0, island, pos) / count
     return pos - centre[island]
 

@@ -12,11 +12,10 @@ import pytest
 import torch
 from torch_geometric.data import Batch, HeteroData
 
-from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder, GraphError
 from gpe_pl.graphs.multiscale import MeshError, MultiscaleGraph, _cached, build, cell_edges, levels_of, multiscale_graph
 from gpe_pl.learned_simulator import GraphStandardizer
-from gpe_pl.models.gpe import GPE, IslandError
+from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import BOUNDARY, grid, is_symmetric, node_code
 from gpe_pl.trajectory import State
 from tests import scenes
@@ -558,90 +557,6 @@ def test_pair_forces_of_a_free_body_sum_to_zero() -> None:
         force = model_of(build, decoder="pair", interaction=interaction)(data).acceleration["elastomer"] * data["elastomer"].mass[:, None]
         assert force.norm(dim=1).sum() > 1e-3
         assert force.sum(dim=0).norm() / force.norm(dim=1).sum() < 1e-14
-
-
-@pytest.mark.parametrize("kind", ["lattice", "tetrahedra"])
-def test_contacts_alone_move_and_turn_a_body(kind: str) -> None:
-    """Newton's and Euler's laws of each body under the forces of its contacts; what nodes add has no momentum."""
-    build = builder(BOTH, dim_of(kind))
-    s = scenes.mesh_state(kind, BOTH, num_bodies=2, gap=0.5)
-    assert s.cells is not None
-    cells = s.cells[~(s.cells == s.cells[0, 0]).any(axis=1)]  # which leaves a node, and more, without a cell
-    data = double(build, replace(s, cells=cells))
-    model = model_of(build, decoder="contact")
-    predicted, decoded = prediction_and_parts(model, data)
-    mass, pos, body = data["elastomer"].mass, data["elastomer"].pos, data["elastomer"].body
-    force = decoded.contact["elastomer"] * mass[:, None]
-    loose = np.setdiff1d(np.flatnonzero(s.node_type == node_code("elastomer")), cells)
-    assert len(loose)
-    assert (body == -1).nonzero().flatten().tolist() == [np.flatnonzero(data["elastomer"].node_id == n)[0] for n in loose]
-    assert body.max() + 1 == data.num_bodies
-    assert force.norm(dim=1).sum() > 1e-3
-    for b in range(int(data.num_bodies)):
-        m, r = mass[body == b][:, None], pos[body == b]
-        r = r - (m * r).sum(dim=0) / m.sum()
-        change, scale = m * predicted["elastomer"][body == b] - force[body == b], force.norm(dim=1).sum()
-        assert change.sum(dim=0).norm() < 1e-12 * scale
-        assert turning(r, change).norm() < 1e-12 * scale
-    torch.testing.assert_close(predicted["elastomer"][body < 0], decoded.acceleration["elastomer"][body < 0], rtol=0, atol=0)
-    torch.testing.assert_close(predicted["sand"], decoded.acceleration["sand"], rtol=0, atol=0)
-
-
-def prediction_and_parts(model: GPE, data: HeteroData) -> tuple[dict[str, torch.Tensor], Any]:
-    """The accelerations that a model predicts, and what it made them of."""
-    parts: list[Any] = []
-    compute = model.compute
-
-    def recorded(*args: Any) -> Any:
-        parts.append(compute(*args))
-        return parts[-1]
-
-    model.compute = recorded  # type: ignore[assignment, method-assign]
-    try:
-        return model(data).acceleration, parts[0]
-    finally:
-        del model.compute
-
-
-def turning(arm: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
-    """Torque, of as many components as axes to turn about."""
-    arm, force = (torch.nn.functional.pad(x, (0, 3 - x.shape[1])) for x in (arm, force))
-    return torch.linalg.cross(arm, force).sum(dim=0)
-
-
-def test_without_contact_a_body_falls_freely_and_deforms() -> None:
-    build = builder()
-    data = double(build, scenes.mesh_state(walls=False, gap=9.0))
-    acceleration = model_of(build, decoder="contact")(data).acceleration["elastomer"]
-    mass = data["elastomer"].mass[:, None]
-    assert acceleration.norm(dim=1).sum() > 1e-3
-    assert (data["elastomer"].body >= 0).all()
-    for b in range(int(data.num_bodies)):
-        chosen = data["elastomer"].body == b
-        assert (mass * acceleration)[chosen].sum(dim=0).norm() <= 1e-13 * (mass * acceleration).norm(dim=1).sum()
-
-
-def test_the_bodies_of_a_batch_are_told_apart() -> None:
-    build = builder(BOTH)
-    model = model_of(build, decoder="contact")
-    graphs = [double(build, scenes.mesh_state(kind, BOTH, num_bodies=n, gap=0.5)) for kind, n in (("lattice", 2), ("triangles", 1))]
-    together = model(batched(graphs)).acceleration["elastomer"]
-    torch.testing.assert_close(together, torch.cat([model(g).acceleration["elastomer"] for g in graphs]), rtol=1e-12, atol=1e-14)
-
-
-def test_contacts_move_nothing_but_bodies() -> None:
-    spec = builder(BOTH, mesh=False).spec
-    torch.manual_seed(0)
-    contact = GPE(spec, decoder="contact", num_message_passing_steps=1, hidden_channels=8)
-    torch.manual_seed(0)
-    node = GPE(spec, num_message_passing_steps=1, hidden_channels=8)
-    assert contact.state_dict().keys() == node.state_dict().keys()
-    assert contact.num_hops == node.num_hops
-
-
-def test_bodies_without_their_graphs_labels_are_refused() -> None:
-    with pytest.raises(IslandError, match=r"decoder=contact needs graph\.islands=true"):
-        GPE(builder(islands=False).spec, decoder="contact")
 
 
 def test_every_parameter_is_used(settings: dict[str, Any]) -> None:

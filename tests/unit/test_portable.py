@@ -89,8 +89,7 @@ def test_meshes(model: Any, kind: Any) -> None:
     materials, dim = ("sand", "solid", "elastomer"), 3 if kind == "tetrahedra" else 2
     settings: dict[str, Any] = {"stress": True, "level_weights": "separate", "decoder": "contact"} if model is GPE else {}
     learned = simulator(model, materials, dim, {"mesh": True, "num_levels": 3, "islands": model is GPE}, **settings)
-    state = scenes.mesh_state(kind, materials, num_bodies=3).to_torch()
-    assert_same_step(PortableStep(learned), learned, state, atol=1e-8)  # lever arms from elsewhere, in single precision
+    assert_same_step(PortableStep(learned), learned, scenes.mesh_state(kind, materials, num_bodies=3).to_torch())
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -236,17 +235,24 @@ def test_a_program_of_a_periodic_domain(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "kind"),
-    [*((m, "particles") for m in SMALL), (GPE, "mesh"), *(pytest.param(m, "mesh", marks=pytest.mark.long) for m in (GNS, DPINet))],
+    [
+        *((m, "particles") for m in SMALL),
+        (GPE, "mesh"),
+        (GPE, "bodies"),
+        *(pytest.param(m, "mesh", marks=pytest.mark.long) for m in (GNS, DPINet)),
+    ],
 )
 def test_every_model_becomes_a_program(model: Any, kind: str, tmp_path: Path) -> None:
-    config = {"mesh": True, "num_levels": 2, "islands": model is GPE} if kind == "mesh" else {}
-    settings: dict[str, Any] = {"stress": True, "island_momentum": "angular", "decoder": "contact"} if config and model is GPE else {}
+    config = {"mesh": True, "num_levels": 2, "islands": model is GPE} if kind != "particles" else {}
+    settings: dict[str, Any] = {"stress": True, "island_momentum": "angular"} if config and model is GPE else {}
+    if kind == "bodies":
+        settings["decoder"] = "contact"
     materials, dim = (("sand", "solid"), 3) if config else (("sand",), 2)
     learned = simulator(model, materials, dim, config, **settings)
     program = torch.export.load(exported(learned, tmp_path / "model.pt2")).module()
     for seed in (0, 1):
         state = scenes.mesh_state("tetrahedra", materials, seed=seed) if config else scenes.state(seed=seed, num_nodes=30 + seed)
-        assert_same_step(program, learned, state.to_torch(), atol=1e-8 if config else 1e-9)
+        assert_same_step(program, learned, state.to_torch(), atol=1e-8 if kind == "bodies" else 1e-9)  # forces over small masses are large
 
 
 def test_the_configuration_of_graphs_is_that_of_the_simulator() -> None:
