@@ -15,14 +15,16 @@ from pathlib import Path
 import numpy as np
 
 from gpe_pl.atomic import replace_text, replacing
+from gpe_pl.errors import GpeError
 from gpe_pl.evaluation import LEARNED
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio, median_of_means
-from gpe_pl.report import Run, distinct_runs, finished_runs, groups_of, shared_table, table_row, values_by_seed
+from gpe_pl.report import Run, axes_of, distinct_runs, finished_runs, groups_of, shared_table, shared_trajectories, table_row, values_by_seed
 from gpe_pl.schema import MATERIALS
 
 log = logging.getLogger(__name__)
 
 TABLE_CSV, TABLE_MD, FIGURE, PARAMETER_FIGURE = "table1.csv", "table1.md", "table1.png", "error_by_parameter.png"
+TABLES = (TABLE_CSV, TABLE_MD, FIGURE, PARAMETER_FIGURE)
 OWN = "GPE"
 NOT_LEARNED = 2.0
 """A model that is not this many times better than ballistic flight has learned nothing worth comparing."""
@@ -36,8 +38,15 @@ PAPER = {
 }
 """Yang et al. 2022, table 1: average MSE ×1e-3 in the paper's own units, which are not ours; only ratios compare."""
 
-JUDGED_GROUP = {"fem": "test_unseen"}
-"""Unseen values that lie between trained ones; FEM is also judged outside, as in the paper (trained on 1–4 MPa, tested on 0.5–10 MPa)."""
+INTERPOLATED, UNSEEN = "test_unseen/interpolated", "test_unseen"
+"""Judged are unseen values that lie between trained ones; of solids also those outside, as in the paper (trained on 1–4 MPa, tested on 0.5–10 MPa)."""
+
+SAME_IN_A_ROW = ("data.", "evaluation.data.", "evaluation.containment", "evaluation.hold_parameters", "evaluation.static_friction")
+"""Configuration keys, by how they begin, that all models of a domain need alike to be compared."""
+
+
+class TableError(GpeError, ValueError):
+    """Runs that do not belong into one table; names them, and what to do."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +69,9 @@ class Cell:
         return self.interval.estimate * NOT_LEARNED <= self.ballistic
 
 
-def judged_group(domain: str) -> str:
-    """The trajectories that a domain is judged on, as a split or part of one."""
-    return JUDGED_GROUP.get(domain, "test_unseen/interpolated")
+def judged_group(run: Run) -> str:
+    """The trajectories that a run is judged on, as a split or part of one."""
+    return UNSEEN if any(key.startswith("data.parameters.solid.") for key in run.config) else INTERPOLATED
 
 
 def compares_models(folder: Path) -> bool:
@@ -71,7 +80,11 @@ def compares_models(folder: Path) -> bool:
 
 
 def report_domains(folder: Path) -> None:
-    """Write table and figures of all finished runs below a folder."""
+    """Write table and figures of all finished runs below a folder.
+
+    Raises:
+        TableError: runs of one model and domain differ in more than their seeds, or those of a domain were judged on different scenes.
+    """
     runs = distinct_runs(finished_runs(folder))
     if not runs:
         log.warning("%s: no finished run", folder)
@@ -79,10 +92,13 @@ def report_domains(folder: Path) -> None:
     by_cell: dict[tuple[str, str], list[Run]] = defaultdict(list)
     for run in runs:
         by_cell[domain_of(run), model_of(run)].append(run)
-    _write_csv(folder / TABLE_CSV, runs)
     domains = sorted({d for d, _ in by_cell}, key=lambda d: ([*PAPER, d].index(d), d))
     models = sorted({m for _, m in by_cell}, key=lambda m: (m == OWN, m))
-    cells = {key: cell for key, members in by_cell.items() if (cell := _cell(members, key[0])) is not None}
+    _check(folder, domains, by_cell)
+    _write_csv(folder / TABLE_CSV, runs)
+    cells = {}
+    for domain in domains:
+        cells |= {(domain, model): cell for model, cell in _row({m: by_cell[d, m] for d, m in by_cell if d == domain}, domain).items()}
     replace_text(folder / TABLE_MD, _markdown(domains, models, cells, by_cell))
     _figures(folder, domains, models, cells, by_cell)
 
@@ -97,14 +113,44 @@ def model_of(run: Run) -> str:
     return str(run.config["model._target_"]).rpartition(".")[2]
 
 
-def _cell(runs: list[Run], domain: str) -> Cell | None:
-    group = judged_group(domain)
-    values = values_by_seed(runs, LEARNED, group, "rollout_mse", "full")
-    trivial = values_by_seed(runs, "ballistic", group, "rollout_mse", "full")
-    if not values or not trivial:
-        return None
-    errors = shared_table(values)
-    return Cell(bootstrap_interval(errors, statistic=median_of_means), errors, float(np.mean(trivial[0][: errors.shape[1]])))
+def _check(folder: Path, domains: list[str], by_cell: dict[tuple[str, str], list[Run]]) -> None:
+    """Refuse to average, or to compare, what was not done in the same way."""
+    for (domain, model), runs in by_cell.items():
+        keys = [key for key in axes_of(runs) if key != "seed"]
+        if keys:
+            raise TableError(
+                f"{folder}: runs of {model} on {domain} differ in {', '.join(keys[:3])}, not in the seed alone; give what is no part of the table a name=… of its own"
+            )
+    for domain in domains:
+        runs = [run for (d, _), members in by_cell.items() if d == domain for run in members]
+        keys = [key for key in axes_of(runs) if key.startswith(SAME_IN_A_ROW)]
+        if keys:
+            raise TableError(
+                f"{folder}: models on {domain} were trained or judged on different data ({', '.join(keys[:3])}) and do not compare; "
+                "give these runs a name=… of their own"
+            )
+
+
+def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, Cell]:
+    """The cells of a domain, on the trajectories that all its runs have evaluated."""
+    found = {}
+    for model, runs in by_model.items():
+        group = judged_group(runs[0])
+        values = [values_by_seed(runs, name, group, "rollout_mse", "full") for name in (LEARNED, "ballistic")]
+        if all(values):
+            found[model] = values
+    trajectories = shared_trajectories(*(table for values in found.values() for table in values))
+    if not trajectories:
+        return {}
+    num_evaluated = max(len(seed) for own, _ in found.values() for seed in own)
+    if len(trajectories) < num_evaluated:
+        log.warning("%s: judged on the %d of %d trajectories that all runs have evaluated", domain, len(trajectories), num_evaluated)
+    row = {}
+    for model, (own, trivial) in found.items():
+        errors = shared_table(own, trajectories)
+        ballistic = float(shared_table(trivial[:1], trajectories).mean())
+        row[model] = Cell(bootstrap_interval(errors, statistic=median_of_means), errors, ballistic)
+    return row
 
 
 def _write_csv(path: Path, runs: Sequence[Run]) -> None:
@@ -143,7 +189,7 @@ def _markdown(domains: list[str], models: list[str], cells: dict[tuple[str, str]
         ]
         budget.append(table_row([domain, *steps]))
     note = (
-        "Rollout MSE ×1e-3 [m²] over all frames on material parameters not seen in training (between the trained ones; FEM also outside): mean over "
+        "Rollout MSE ×1e-3 [m²] over all frames on material parameters not seen in training (between the trained ones; of solids also outside, where all models get the nearest trained value): mean over "
         "trajectories, median over seeds, 95 % bootstrap interval over both; a rollout that had to be stopped has failed, and the mean with it. A model "
         "that is not twice as good as ballistic flight is *not learned* and wins nothing. Ratio: over the best baseline that has learned, with its "
         "interval, on the same trajectories; bold where that excludes 1."
@@ -170,7 +216,8 @@ def _text(cell: Cell | None) -> str:
     numbers = f"{1e3 * i.estimate:.3g} [{1e3 * i.low:.3g}, {1e3 * i.high:.3g}]"
     failed = int((~np.isfinite(cell.errors)).sum())
     if failed:
-        numbers = f"{failed} of {cell.errors.size} failed, median {1e3 * cell.median:.3g}"
+        known = numbers if np.isfinite(i.estimate) else f"median {1e3 * cell.median:.3g}"
+        numbers = f"{known}, {failed} of {cell.errors.size} failed"
     return numbers if cell.is_learned else f"*not learned* ({numbers})"
 
 

@@ -415,12 +415,15 @@ def bootstrap_ratio(
     """Percentile interval of the ratio of a statistic of two models on the same trajectories, which are resampled for both alike; as ``bootstrap_interval``.
 
     Args:
-        values, reference: of either model, one row per training seed, one column per test trajectory; where one has more columns, these are left out.
-            Both may be infinite, which makes a ratio of 1.
+        values, reference: of either model, one row per training seed, one column per test trajectory, the same for both. Both may be infinite, which makes
+            a ratio of 1.
+
+    Raises:
+        ValueError: the tables have different numbers of trajectories.
     """
-    shared = min(values.shape[1], reference.shape[1])
-    values, reference = values[:, :shared], reference[:, :shared]
-    rows, others, columns = _drawn(num_resamples, np.random.default_rng(seed), len(values), len(reference), shared)
+    if values.shape[1] != reference.shape[1]:
+        raise ValueError(f"both models need the same test trajectories, got {values.shape[1]} and {reference.shape[1]}")
+    rows, others, columns = _drawn(num_resamples, np.random.default_rng(seed), len(values), len(reference), values.shape[1])
 
     def ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         own, other = (np.asarray(statistic(table, axis=BOTH)) for table in (a, b))

@@ -182,22 +182,32 @@ def validation_curve(run_dir: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(steps), np.array([points[s] for s in steps])
 
 
-def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon: str) -> list[list[float]]:
-    """One list of per-trajectory values per run."""
+Values = list[dict[int, float]]
+"""Of one metric: for each seed that has any, a value by number of the trajectory."""
+
+
+def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon: str) -> Values:
+    """What runs have of a metric, in order of trajectories."""
     table = []
     for run in runs:
         rows = [r for r in run.rows if r.model == model and r.metric == metric and r.horizon == horizon and split in groups_of(r)]
-        table.append([r.value for r in sorted(rows, key=lambda r: r.trajectory)])
+        table.append({r.trajectory: r.value for r in sorted(rows, key=lambda r: r.trajectory)})
     return [t for t in table if t]
 
 
-def shared_table(values: list[list[float]]) -> np.ndarray:
-    """Values by seed as a table [seed, trajectory] of the trajectories that all runs have evaluated: runs may have evaluated different numbers of them."""
-    shared = min(map(len, values), default=0)
-    return np.array([v[:shared] for v in values]).reshape(len(values), shared)
+def shared_trajectories(*values: Values) -> list[int]:
+    """Numbers of the trajectories that all seeds, of several models if given, have evaluated."""
+    seeds = [set(seed) for table in values for seed in table]
+    return sorted(set.intersection(*seeds)) if seeds else []
 
 
-def _interval(values: list[list[float]], scale: float = 1.0) -> str:
+def shared_table(values: Values, trajectories: list[int] | None = None) -> np.ndarray:
+    """Values as a table [seed, trajectory], of the given trajectories or of those that all seeds have."""
+    chosen = shared_trajectories(values) if trajectories is None else trajectories
+    return np.array([[seed[k] for k in chosen] for seed in values]).reshape(len(values), len(chosen))
+
+
+def _interval(values: Values, scale: float = 1.0) -> str:
     """Mean with its bootstrap interval; where rollouts failed, which makes the mean infinite, their number and the median."""
     if not values:
         return "–"
@@ -318,9 +328,9 @@ def table_row(cells: list[str]) -> str:
     return "| " + " | ".join(cells) + " |"
 
 
-def _mean(values: list[list[float]]) -> float:
-    return float(np.mean([v for row in values for v in row])) if values else float("nan")
+def _mean(values: Values) -> float:
+    return float(np.mean([v for seed in values for v in seed.values()])) if values else float("nan")
 
 
-def _percent(values: list[list[float]]) -> str:
+def _percent(values: Values) -> str:
     return f"{100 * _mean(values):.3f} %" if values else "–"

@@ -6,20 +6,26 @@ The number compared is the rollout MSE over all frames, mean over the trajectori
 from __future__ import annotations
 
 import csv
+import logging
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gpe_pl.atomic import replace_text, replacing
-from gpe_pl.domain_table import domain_of, model_of
+from gpe_pl.domain_table import TABLE_MD, TABLES, domain_of, model_of
 from gpe_pl.evaluation import LEARNED
 from gpe_pl.metrics import BOTH, bootstrap_interval, median_of_means
 from gpe_pl.report import Run, axes_of, finished_runs, shared_table, table_row, validation_curve, values_by_seed
 
+log = logging.getLogger(__name__)
+
 TRIALS_CSV, TRIALS_MD = "trials.csv", "trials.md"
-CONSEQUENCES = ("training.num_steps", "training.val_interval", "seed")
-"""What differs between trials without having been tried: it follows from a budget of time, or is chance."""
+CONSEQUENCES = ("training.val_interval", "seed")
+"""What differs between trials without having been tried: it follows from the number of steps, or is chance."""
+NUM_STEPS = "training.num_steps"
+"""Follows from a budget of time and the other settings; where these are equal, it was tried."""
 
 
 def compares_settings(folder: Path) -> bool:
@@ -29,7 +35,10 @@ def compares_settings(folder: Path) -> bool:
 
 
 def report_trials(folder: Path) -> None:
-    """Write ``trials.csv``, a line per run and split, and ``trials.md``, a line per setting with the best of each domain and model in bold."""
+    """Write ``trials.csv``, a line per run and split, and ``trials.md``, a line per setting with the best of each domain and model in bold.
+
+    A table of models in domains that is there goes: it would not be of all runs.
+    """
     runs = finished_runs(folder)
     groups = _by_model(runs)
     settings = sorted({key for members in groups.values() for key in _settings(members)})
@@ -54,6 +63,14 @@ def report_trials(folder: Path) -> None:
         "One-step nMSE: of the validation split, relative to free fall."
     )
     replace_text(folder / TRIALS_MD, "\n".join([*lines, "", note, ""]))
+    if (folder / TABLE_MD).exists():
+        for name in TABLES:
+            (folder / name).unlink(missing_ok=True)
+        log.warning(
+            "%s: compares settings now (%s), and its table of models is gone; move the runs that are no part of it to another name=… to have it back",
+            folder,
+            ", ".join(settings),
+        )
 
 
 def _by_model(runs: list[Run]) -> dict[tuple[str, str], list[Run]]:
@@ -65,7 +82,11 @@ def _by_model(runs: list[Run]) -> dict[tuple[str, str], list[Run]]:
 
 def _settings(runs: list[Run]) -> list[str]:
     """Configuration keys that were tried."""
-    return [key for key in axes_of(runs) if key not in CONSEQUENCES]
+    keys = [key for key in axes_of(runs) if key not in (*CONSEQUENCES, NUM_STEPS)]
+    steps: dict[tuple[str, ...], set[Any]] = defaultdict(set)
+    for run in runs:
+        steps[tuple(str(run.config.get(key)) for key in keys)].add(run.config[NUM_STEPS])
+    return [*keys, NUM_STEPS] if any(len(found) > 1 for found in steps.values()) else keys
 
 
 def _error(runs: list[Run], split: str) -> float:
@@ -97,4 +118,5 @@ def _write_csv(path: Path, groups: dict[tuple[str, str], list[Run]], settings: l
                             run.config["training.num_steps"],
                             run.config["seed"],
                         ]
-                        writer.writerow([*about, split, len(values), int((~np.isfinite(values)).sum()), float(np.mean(values))])
+                        errors = np.array([*values.values()])
+                        writer.writerow([*about, split, errors.size, int((~np.isfinite(errors)).sum()), float(errors.mean())])

@@ -325,9 +325,14 @@ def test_a_ratio_knows_that_both_models_met_the_same_trajectories():
 
 
 def test_a_ratio_of_failures_is_never_nan():
-    failed, fine = np.array([[math.inf, 1.0]]), np.array([[2.0, 2.0, 5.0]])
+    failed, fine = np.array([[math.inf, 1.0]]), np.array([[2.0, 2.0]])
     interval = bootstrap_ratio(failed, fine, np.mean)
     assert (interval.estimate, interval.low, interval.high) == (math.inf, 0.5, math.inf)
     assert bootstrap_ratio(fine, failed, np.mean).estimate == 0
     assert bootstrap_ratio(failed, failed, np.mean).estimate == 1
-    assert bootstrap_ratio(fine, np.zeros((1, 3)), np.mean).estimate == math.inf
+    assert bootstrap_ratio(fine, np.zeros((1, 2)), np.mean).estimate == math.inf
+
+
+def test_a_ratio_needs_the_same_trajectories():
+    with pytest.raises(ValueError, match="same test trajectories, got 2 and 3"):
+        bootstrap_ratio(np.ones((1, 2)), np.ones((1, 3)))

@@ -21,7 +21,7 @@ ERRORS = {  # of two seeds, by domain, model and noise
 
 def write_run(folder: Path, domain: str, model: str, noise: float, seed: int, errors: list[float]) -> None:
     folder.mkdir(parents=True)
-    training = {"noise_std": noise, "num_steps": 1000 + seed + int(noise), "val_interval": 10 + int(noise)}
+    training = {"noise_std": noise, "num_steps": 1000 + int(noise), "val_interval": 10 + int(noise)}
     config = {"seed": seed, "data": {"name": domain}, "model": {"_target_": f"gpe_pl.models.x.{model}"}, "training": training}
     (folder / "config.json").write_text(json.dumps(config))
     rows = [Row(LEARNED, "val", k, "seen", 20.0, "rollout_mse", "full", value) for k, value in enumerate(errors)]
@@ -70,3 +70,26 @@ def test_one_model_with_several_settings_is_an_ablation(tmp_path: Path) -> None:
     assert not compares_settings(tmp_path)
     write_run(tmp_path / "GNS", "sand", "GNS", 0.3, 0, [1e-3])
     assert compares_settings(tmp_path)
+
+
+def test_another_budget_alone_is_a_setting(tmp_path: Path) -> None:
+    for model in ("GPE", "GNS"):
+        write_run(tmp_path / model, "sand", model, 0.3, 0, [1e-3])
+    longer = tmp_path / "longer"
+    write_run(longer, "sand", "GPE", 0.3, 0, [1e-3])
+    config = json.loads((longer / "config.json").read_text())
+    config["training"]["num_steps"] = 9000
+    (longer / "config.json").write_text(json.dumps(config))
+    assert compares_settings(tmp_path)
+    report_trials(tmp_path)
+    assert "| sand | GPE | 9000 |" in (tmp_path / "trials.md").read_text()
+
+
+def test_a_table_of_models_does_not_outlive_a_comparison_of_settings(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for model in ("GPE", "GNS"):
+        write_run(tmp_path / model, "sand", model, 0.3, 0, [1e-3])
+    (tmp_path / "table1.md").write_text("of the two")
+    write_run(tmp_path / "trial", "sand", "GPE", 1.0, 0, [1e-3])
+    report_trials(tmp_path)
+    assert not (tmp_path / "table1.md").exists()
+    assert "compares settings now (training.noise_std)" in caplog.text
