@@ -18,7 +18,17 @@ from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation import LEARNED
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio, median_of_means
-from gpe_pl.report import Run, axes_of, distinct_runs, finished_runs, groups_of, shared_table, shared_trajectories, table_row, values_by_seed
+from gpe_pl.report import (
+    Run,
+    axes_of,
+    distinct_runs,
+    finished_runs,
+    groups_of,
+    shared_table,
+    shared_trajectories,
+    table_row,
+    values_by_seed,
+)
 from gpe_pl.schema import MATERIALS
 
 log = logging.getLogger(__name__)
@@ -119,7 +129,8 @@ def _check(folder: Path, domains: list[str], by_cell: dict[tuple[str, str], list
         keys = [key for key in axes_of(runs) if key != "seed"]
         if keys:
             raise TableError(
-                f"{folder}: runs of {model} on {domain} differ in {', '.join(keys[:3])}, not in the seed alone; give what is no part of the table a name=… of its own"
+                f"{folder}: runs of {model} on {domain} differ in {', '.join(keys[:3])}, not in the seed alone; "
+                "give what is no part of the table a name=… of its own"
             )
     for domain in domains:
         runs = [run for (d, _), members in by_cell.items() if d == domain for run in members]
@@ -189,10 +200,10 @@ def _markdown(domains: list[str], models: list[str], cells: dict[tuple[str, str]
         ]
         budget.append(table_row([domain, *steps]))
     note = (
-        "Rollout MSE ×1e-3 [m²] over all frames on material parameters not seen in training (between the trained ones; of solids also outside, where all models get the nearest trained value): mean over "
-        "trajectories, median over seeds, 95 % bootstrap interval over both; a rollout that had to be stopped has failed, and the mean with it. A model "
-        "that is not twice as good as ballistic flight is *not learned* and wins nothing. Ratio: over the best baseline that has learned, with its "
-        "interval, on the same trajectories; bold where that excludes 1."
+        "Rollout MSE ×1e-3 [m²] over all frames on material parameters not seen in training (between the trained ones; of solids also outside, where all "
+        "models get the nearest trained value): mean over trajectories, median over seeds, 95 % bootstrap interval over both; a rollout that had to be "
+        "stopped has failed, and the mean with it. A model that is not twice as good as ballistic flight is *not learned* and wins nothing. Ratio: over the "
+        "best baseline that has learned, with its interval, on the same trajectories; bold where that excludes 1."
     ) + (" Last column: the paper's ratio, from its table 1; its units are not ours." if papers else "")
     return "\n".join([*lines, "", note, *_medians(domains, models, cells), *budget, ""])
 

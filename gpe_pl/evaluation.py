@@ -46,6 +46,10 @@ SCENES_AT_ONCE = 16
 """Scenes, or windows, that one pass of the model takes together."""
 
 
+class StartError(GpeError, ValueError):
+    """Rollouts were asked to start before a model has seen enough frames."""
+
+
 @dataclass(frozen=True)
 class EvaluationSettings:
     """What is evaluated.
@@ -55,6 +59,7 @@ class EvaluationSettings:
         horizons: in frames; the full length is always added.
         num_trajectories: per split, from its start; None takes all.
         containment: put particles that cross a wall back on its surface.
+        start_frame: that rollouts start at, so that models with different histories are judged on the same frames; None takes the first with enough history.
         num_uncontained: trajectories per split that are also rolled out without containment, to see what it corrects; None takes all.
         hold_parameters: takes material parameters outside the trained range for the nearest trained value.
         static_friction: share of gravity within a frame below which what lies on a wall stays where it is; None takes the model's own.
@@ -65,12 +70,23 @@ class EvaluationSettings:
     splits: Annotated[list[Split], Field(min_length=1)] = field(default_factory=lambda: ["test", "test_unseen"])
     horizons: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [5, 20, 50, 100])
     num_trajectories: Annotated[int, Field(ge=1)] | None = None
+    start_frame: Annotated[int, Field(ge=1)] | None = None
     containment: bool = True
     num_uncontained: Annotated[int, Field(ge=0)] | None = None
     hold_parameters: bool = True
     static_friction: Annotated[float, Field(ge=0, lt=1)] | None = None
     num_pictures: Annotated[int, Field(ge=0)] = 2
     export: list[Export] = field(default_factory=list)
+
+    def first_frame(self, history: int) -> int:
+        """The frame that rollouts of a model with so much history start at.
+
+        Raises:
+            StartError: ``start_frame`` leaves too little history.
+        """
+        if self.start_frame is not None and self.start_frame < history:
+            raise StartError(f"evaluation.start_frame={self.start_frame}: graph.history={history} needs as many frames before it")
+        return history if self.start_frame is None else self.start_frame
 
 
 class ExportError(GpeError):
@@ -95,8 +111,8 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     """Roll out every trajectory of the splits; writes ``metrics.csv``, ``error_curve_*.png``, ``rollout_*.png``, ``rollout_*.gif``
     and ``rollout_*.html`` (a viewer) of some, and their ``stress_*.png`` where the model decodes a stress.
 
-    All rollouts start at the first frame with enough history and run to the end of the ground truth; ``simulator`` is left with
-    ``settings.hold_parameters`` and ``settings.static_friction``. Share outside with containment off is reported as
+    All rollouts start at ``settings.start_frame`` and run to the end of the ground truth; ``simulator`` is left with ``settings.hold_parameters`` and
+    ``settings.static_friction``. Share outside with containment off is reported as
     ``share_outside_uncontained``, where it was asked for, the share of corrected particle-steps as ``share_corrected``; neither where a boundary is known by
     its nodes only.
 
@@ -105,8 +121,10 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     [kg m/s] the momentum that falling asleep took away.
 
     Raises:
+        StartError: ``settings.start_frame`` leaves too little history.
         ExportError: a format in ``settings.export`` needs a package that is not installed.
     """
+    start_frame = settings.first_frame(simulator.builder.config.history)
     if "mp4" in settings.export and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ExportError(
             "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
@@ -119,18 +137,18 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     for split in settings.splits:
         curves: dict[str, list[np.ndarray]] = {}
         rows += [Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split))]
-        trajectories = islice(long_enough(root, split, simulator.builder.config.history), settings.num_trajectories)
+        trajectories = islice(long_enough(root, split, start_frame), settings.num_trajectories)
         number, truth = 0, None
         while batch := list(islice(trajectories, SCENES_AT_ONCE)):
             left = len(batch) if settings.num_uncontained is None else max(0, settings.num_uncontained - number)
-            for trajectory, (predictions, extra) in zip(batch, _predict(simulator, batch, settings.containment, left, label), strict=True):
-                truth = trajectory.frames(simulator.builder.config.history)
-                values = np.asarray(trajectory.material_params, dtype=np.float64)
-                parameter = float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
+            for trajectory, (predictions, extra) in zip(
+                batch, _predict(simulator, batch, start_frame, settings.containment, left, label), strict=True
+            ):
+                truth = trajectory.frames(start_frame)
                 stop = predictions[label].termination
                 if stop is not None:
                     log.warning("%s %d stopped: %s, %s", split, number, stop.reason, stop.message)
-                about = (split, number, truth.metadata.parameter_group, parameter)
+                about = (split, number, truth.metadata.parameter_group, _parameter(trajectory))
                 for model, prediction in predictions.items():
                     curves.setdefault(model, []).append(per_frame_mse(prediction, truth))
                     for record in rollout_metrics(prediction, truth, [*settings.horizons, "full"]):
@@ -149,12 +167,11 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
 
 
 def _predict(
-    simulator: LearnedSimulator, trajectories: list[Trajectory], containment: bool, num_uncontained: int, label: str
+    simulator: LearnedSimulator, trajectories: list[Trajectory], start_frame: int, containment: bool, num_uncontained: int, label: str
 ) -> Iterator[tuple[dict[str, Trajectory], dict[str, float]]]:
     """Predictions of all models, and further numbers of the learned one, for each trajectory."""
-    history = simulator.builder.config.history
-    truths = [trajectory.frames(history) for trajectory in trajectories]
-    starts = [_start(simulator, *pair) for pair in zip(trajectories, truths, strict=True)]
+    truths = [trajectory.frames(start_frame) for trajectory in trajectories]
+    starts = [_start(simulator, start_frame, *pair) for pair in zip(trajectories, truths, strict=True)]
     totals = [{"num_corrected": 0.0, "num_asleep": 0.0, "lost_impulse": 0.0} for _ in starts]
 
     def count(scene: int, _: int, state: State) -> None:
@@ -174,7 +191,7 @@ def _predict(
         prediction = predicted[scene]
         predictions = {label: prediction} if exact is None else {label: prediction, EXACT: exact[scene]}
         for name, baseline in (("ballistic", Ballistic(dt)), ("constant_velocity", ConstantVelocity(dt))):
-            predictions[name] = rollout(baseline, trajectory.state(history, history), steps, truth.metadata)
+            predictions[name] = rollout(baseline, trajectory.state(start_frame, start_frame), steps, truth.metadata)
         num_steps = truth.num_nodes * max(1, prediction.num_frames - 1)
         extra = {"num_good_frames": float(prediction.num_frames - 1)}
         if truth.boundary.shapes:  # nodes alone have no inside
@@ -189,13 +206,20 @@ def _predict(
         yield predictions, extra
 
 
-def _start(simulator: LearnedSimulator, trajectory: Trajectory, truth: Trajectory) -> Start:
-    """The first frame with enough history, and limits far beyond what the ground truth does."""
+def _parameter(trajectory: Trajectory) -> float:
+    """The material parameter of a scene, or NaN where it has several or none."""
+    values = np.unique(np.asarray(trajectory.material_params, dtype=np.float64))
+    values = values[np.isfinite(values)]
+    return float(values[0]) if len(values) == 1 else float("nan")
+
+
+def _start(simulator: LearnedSimulator, start_frame: int, trajectory: Trajectory, truth: Trajectory) -> Start:
+    """Where a rollout begins, and limits far beyond what the ground truth does."""
     bounds = truth.metadata.bounds
     size = max(high - low for low, high in bounds)
     speed = float(np.linalg.norm(trajectory.vel, axis=-1).max(initial=0.0))
     guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, size), bounds=bounds, margin=size, spacing=truth.metadata.spacing)
-    return Start(simulator.initial_state(trajectory, simulator.builder.config.history), truth.num_frames - 1, truth.metadata, guard)
+    return Start(simulator.initial_state(trajectory, start_frame), truth.num_frames - 1, truth.metadata, guard)
 
 
 def _share_outside(prediction: Trajectory, first: int, last: int, tolerance: float) -> float:

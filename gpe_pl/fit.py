@@ -44,6 +44,7 @@ def fit(cfg: DictConfig) -> float:
     trainer = construct(TrainerSettings, cfg.trainer, "trainer")
     evaluation = construct(EvaluationSettings, {k: v for k, v in cfg.evaluation.items() if k != "data"}, "evaluation")
     graph = construct(GraphConfig, cfg.graph, "graph")
+    first_frame = evaluation.first_frame(graph.history)
     logger = construct(LoggerSettings, cfg.logger, "logger")
     new_model = bind(model_class(cfg.model._target_), {k: v for k, v in cfg.model.items() if k != "_target_"}, "model", "spec")
     noise = Noise(training.noise, training.noise_std, training.noise_correction)
@@ -104,7 +105,7 @@ def fit(cfg: DictConfig) -> float:
     if not (run_dir / "metrics.csv").exists():
         best = None if cfg.reuse is None else adopt(Path(cfg.paths.runs) / cfg.reuse, trained, run_dir)
         for split in evaluation.splits:  # what cannot be evaluated is said before the training, not after it
-            window_counts(open_split(evaluated, split, cache_bytes=0), graph.history)
+            window_counts(open_split(evaluated, split, cache_bytes=0), first_frame)
         loggers = logger.loggers(run_dir, cfg.name, config)
         best = best or train(new_module(training), data(), training, trainer, loggers, run_dir, callbacks)
         rows = evaluate(LearnedSimulator.from_checkpoint(best, device), evaluated, evaluation, run_dir)

@@ -293,10 +293,11 @@ def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]],
     header = [*names, "split", *(f"@{h}" for h in horizons)]
     lines = [table_row(header), "|" + "---|" * len(header)]
     for split in splits:
-        trivial = {
-            h: min((_mean(values_by_seed([first], b, split, "rollout_mse", h)) for b in baselines), default=float("nan")) for h in horizons
-        }
         for key, runs in variants.items():
+            trivial = {
+                h: min((_mean(values_by_seed(runs[:1], b, split, "rollout_mse", h)) for b in baselines), default=float("nan"))
+                for h in horizons
+            }
             cells = []
             for h in horizons:
                 values = values_by_seed(runs, LEARNED, split, "rollout_mse", h)

@@ -91,7 +91,7 @@ def long_enough(root: Path | str, split: str, history: int) -> Iterator[Trajecto
     for number, trajectory in enumerate(iter_trajectories(root, split)):
         fault = damage(trajectory)
         if fault is None and trajectory.num_frames < history + 2:
-            fault = f"its {trajectory.num_frames} frames are fewer than the {history + 2} that graph.history={history} needs"
+            fault = f"its {trajectory.num_frames} frames are fewer than the {history + 2} that a start at frame {history} needs"
         if fault is None:
             yield trajectory
         else:
@@ -254,7 +254,8 @@ def window_counts(trajectories: Sequence[StoredTrajectory], history: int) -> lis
     if not any(counts):
         longest = max((t.num_frames for t in trajectories), default=0)
         where = f"{trajectories[0].path.parent}: " if trajectories else ""
-        raise StoreError(f"{where}no trajectory has the {history + 2} frames that graph.history={history} needs; the longest has {longest}")
+        needed = f"{history + 2} frames that a start at frame {history} needs (graph.history, evaluation.start_frame)"
+        raise StoreError(f"{where}no trajectory has the {needed}; the longest has {longest}")
     return counts
 
 

@@ -130,7 +130,7 @@ def test_what_cannot_be_evaluated_is_said_before_the_training(tmp_path: Path) ->
     short = Trajectory.from_numpy(crowd(9)[:3], 0.01, "sand", {"sand": 30.0})
     long = [Trajectory.from_numpy(crowd(k), 0.01, "sand", {"sand": 30.0}) for k in range(2)]
     save_dataset(tmp_path / "data", "short", train=long[:1], val=long[1:], test=[short])
-    with pytest.raises(StoreError, match=r"short/imported/test: no trajectory has the 4 frames that graph.history=2 needs"):
+    with pytest.raises(StoreError, match=r"short/imported/test: no trajectory has the 4 frames that a start at frame 2 needs"):
         trained(tmp_path, "short", "evaluation.splits=[test]")
     assert not list((tmp_path / "runs").rglob("*.ckpt"))
 

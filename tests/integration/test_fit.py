@@ -21,7 +21,7 @@ from omegaconf import DictConfig
 from gpe_pl.data import sampling
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.errors import GpeError
-from gpe_pl.evaluation import read_rows
+from gpe_pl.evaluation import StartError, read_rows
 from gpe_pl.fit import fit
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.progress import Progress
@@ -325,6 +325,22 @@ def test_metrics_hold_the_model_and_the_baselines(tiny_data: Path, tmp_path: Pat
     ballistic = {(r.split, r.trajectory): r.value for r in rows if (r.model, r.metric, r.horizon) == ("ballistic", "rollout_mse", "full")}
     assert len(ballistic) == 3
     assert len(set(ballistic.values())) == 3
+
+
+@pytest.mark.slow
+def test_models_with_other_histories_are_judged_on_the_same_frames(tiny_data: Path, tmp_path: Path) -> None:
+    judged = []
+    for history in (1, 3):
+        fit(
+            tiny(
+                tiny_data, tmp_path, f"graph.history={history}", "evaluation.start_frame=3", "evaluation.splits=[test]", f"name=h{history}"
+            )
+        )
+        judged.append([r for r in read_rows(tmp_path / f"h{history}" / "metrics.csv") if r.model == "ballistic"])
+    assert judged[0] == judged[1] and judged[0]
+    with pytest.raises(StartError, match="start_frame=1: graph.history=3 needs"):
+        fit(tiny(tiny_data, tmp_path, "graph.history=3", "evaluation.start_frame=1", "name=early"))
+    assert not (tmp_path / "early").exists()
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gpe_pl.evaluation import MetricsError, Row, _share_outside, read_rows, write_rows
+from gpe_pl.evaluation import EvaluationSettings, MetricsError, Row, StartError, _parameter, _share_outside, read_rows, write_rows
 from gpe_pl.trajectory import Termination, Trajectory
 
 
@@ -52,3 +52,18 @@ def test_changed_rows_are_refused(tmp_path: Path, change: Callable[[bytes], byte
         list(read_rows(path))
     (tmp_path / "metrics.csv.sha256").unlink()
     assert len(list(read_rows(path))) < 3  # as in runs of earlier versions
+
+
+def test_rollouts_start_where_asked_or_as_early_as_they_can() -> None:
+    assert EvaluationSettings().first_frame(3) == 3
+    assert EvaluationSettings(start_frame=5).first_frame(3) == 5
+    with pytest.raises(StartError, match="start_frame=2: graph.history=3 needs"):
+        EvaluationSettings(start_frame=2).first_frame(3)
+
+
+def test_a_scene_of_several_materials_has_no_one_parameter(inside: Trajectory) -> None:
+    values = np.full((inside.num_nodes, 2), np.nan)
+    values[:, 0] = 30.0
+    assert _parameter(replace(inside, material_params=values)) == 30.0
+    values[0] = np.nan, 1e5
+    assert np.isnan(_parameter(replace(inside, material_params=values)))

@@ -130,7 +130,7 @@ def test_trajectories_that_are_too_short_are_skipped(tmp_path: Path, new_traject
     write_shard(tmp_path / "train" / "shard-00000.h5", [new_trajectory(k, num_frames=n) for k, n in enumerate(lengths)])
     data = dataset(tmp_path, history=3)
     assert [data.locate(k) for k in range(len(data))] == [(1, 3), (1, 4), (3, 3)]
-    with pytest.raises(StoreError, match=r"no trajectory has the 7 frames that graph.history=5 needs; the longest has 6"):
+    with pytest.raises(StoreError, match=r"no trajectory has the 7 frames that a start at frame 5 needs .*; the longest has 6"):
         dataset(tmp_path, history=5)
 
 
