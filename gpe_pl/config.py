@@ -198,6 +198,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
         def main() -> Any:
             if not CONF.is_dir():
                 _fail(ConfigError(f"{CONF} not found: install gpe_pl from a clone with `pip install -e .`"))
+            sys.argv[1:] = [quoted(argument) for argument in sys.argv[1:]]
             os.environ["HYDRA_FULL_ERROR"] = "1"  # let exceptions reach us instead of Hydra's own report
             try:
                 return hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
@@ -218,6 +219,13 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
         return main
 
     return decorate
+
+
+def quoted(argument: str) -> str:
+    """An override whose value is a path that exists and holds ``=``, as folders of sweeps do, in the quotes that Hydra wants around it."""
+    key, _, value = argument.partition("=")
+    is_path = "=" in value and value[0] not in "\"'[{" and Path(value).exists()
+    return f'{key}="{value}"' if is_path else argument
 
 
 def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
@@ -252,7 +260,8 @@ def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
     if match is None:
         override = getattr(error, "override", None)  # of a syntax error
         text = re.sub(r" ?Config search path:.*| ?Set the environment variable.*| See https://.*", "", text)
-        return f"{override}: {text}" if override and override not in text else text
+        text = f"{override}: {text}" if override and override not in text else text
+        return f"{text}; a value that holds = needs quotes: 'KEY=\"VALUE\"'" if override and override.count("=") > 1 else text
     key = match.group(1).partition("@")[0].lstrip("+~")
     parent, _, leaf = key.rpartition(".")
     if key.startswith("hydra."):

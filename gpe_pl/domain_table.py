@@ -19,21 +19,22 @@ from gpe_pl.errors import GpeError
 from gpe_pl.evaluation import LEARNED
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio, median_of_means
 from gpe_pl.report import (
+    PARAMETER_FIGURE,
     Run,
     axes_of,
     distinct_runs,
     finished_runs,
     groups_of,
+    parameter_curves,
     shared_table,
     shared_trajectories,
     table_row,
     values_by_seed,
 )
-from gpe_pl.schema import MATERIALS
 
 log = logging.getLogger(__name__)
 
-TABLE_CSV, TABLE_MD, FIGURE, PARAMETER_FIGURE = "table1.csv", "table1.md", "table1.png", "error_by_parameter.png"
+TABLE_CSV, TABLE_MD, FIGURE = "table1.csv", "table1.md", "table1.png"
 TABLES = (TABLE_CSV, TABLE_MD, FIGURE, PARAMETER_FIGURE)
 OWN = "GPE"
 NOT_LEARNED = 2.0
@@ -255,25 +256,11 @@ def _paper_ratio(domain: str) -> str:
 def _figures(
     folder: Path, domains: list[str], models: list[str], cells: dict[tuple[str, str], Cell], by_cell: dict[tuple[str, str], list[Run]]
 ) -> None:
-    from gpe_pl.viz.comparison import comparison_figure, parameter_figure
+    from gpe_pl.viz.comparison import comparison_figure
 
     shown = {d: {m: cells[d, m].interval for m in models if (d, m) in cells} for d in domains}
     references = {d: next(c.ballistic for (domain, _), c in cells.items() if domain == d) for d in domains if shown[d]}
     if any(shown.values()):
         comparison_figure({d: s for d, s in shown.items() if s}, references, "rollout MSE [m²]").savefig(folder / FIGURE, dpi=150)
-    curves: dict[str, dict[str, dict[float, list[float]]]] = {}
-    for (domain, model), runs in by_cell.items():
-        points = curves.setdefault(domain, {}).setdefault(model, {})
-        for run in runs:
-            for row in run.rows:
-                if (row.model, row.metric, row.horizon) == (LEARNED, "rollout_mse", "full") and np.isfinite(row.parameter):
-                    points.setdefault(row.parameter, []).append(row.value)
-    seen = {d: sorted({r.parameter for run in by_cell[d, m] for r in run.rows if r.parameter_group == "seen"}) for d, m in by_cell}
-    if curves:
-        labels = {d: _axis_label(run) for (d, _), runs in by_cell.items() for run in runs}
-        parameter_figure({d: curves[d] for d in domains}, seen, "rollout MSE [m²]", labels).savefig(folder / PARAMETER_FIGURE, dpi=150)
-
-
-def _axis_label(run: Run) -> str:
-    varied = [m for m in MATERIALS if any(key.startswith(f"data.parameters.{m}.") for key in run.config)]
-    return ", ".join(f"{MATERIALS[m].name.replace('_', ' ')}\n[{MATERIALS[m].unit}]" for m in varied)
+    by_domain = {d: {m: by_cell[d, m] for m in models if (d, m) in by_cell} for d in domains}
+    parameter_curves(by_domain).savefig(folder / PARAMETER_FIGURE, dpi=150)

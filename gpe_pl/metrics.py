@@ -24,7 +24,7 @@ from torchmetrics import Metric
 
 from gpe_pl import integrators
 from gpe_pl.rollout import share_outside
-from gpe_pl.trajectory import Metadata, Trajectory
+from gpe_pl.trajectory import Metadata, Trajectory, von_mises
 
 Horizon = int | Literal["full"]
 
@@ -35,6 +35,7 @@ UNITS: dict[str, str] = {
     "displacement_error": "1",
     "velocity_error": "1",
     "von_mises_error": "1",
+    "stress_error": "1",
     "energy_distance": "m",
     "momentum_error": "m/s",
     "angular_momentum_error": "m^2/s",
@@ -179,12 +180,24 @@ def _relative_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps
         "velocity_error": _relative(steps - true_steps, true_steps),
     }
     if prediction.stress is not None and ground_truth.stress is not None:
-        stress, true_stress = (t.stress.node_von_mises[1:].astype(np.float64) for t in (prediction, ground_truth))  # type: ignore[union-attr]
-        wrong = stress[:num_steps] - true_stress[:num_steps]
-        errors["von_mises_error"] = _relative(
-            wrong / np.sqrt(wrong.size), true_stress / np.sqrt(true_stress.size)
-        )  # before an impact there is none
+        own_stress, true_stress = (np.asarray(t.stress.node, dtype=np.float64)[1:] for t in (prediction, ground_truth))  # type: ignore[union-attr]
+        errors["von_mises_error"] = _stress_error(von_mises(own_stress), von_mises(true_stress), num_steps)
+        errors["stress_error"] = _stress_error(_whole(own_stress), _whole(true_stress), num_steps)
     return errors
+
+
+def _stress_error(stress: np.ndarray, reference: np.ndarray, num_steps: int) -> float:
+    """Root mean square error over the first frames, over the root mean square of the reference over all its frames: before an impact there is none."""
+    wrong = stress[:num_steps] - reference[:num_steps]
+    return _relative(wrong / np.sqrt(wrong.size), reference / np.sqrt(reference.size))
+
+
+def _whole(stress: np.ndarray) -> np.ndarray:
+    """Stresses [..., component] weighted so that the sum of squares is that of the tensor, which holds every shear twice."""
+    shears = (1,) if stress.shape[-1] == 4 else (1, 2, 4)
+    weight = np.ones(stress.shape[-1])
+    weight[[*shears]] = np.sqrt(2)
+    return stress * weight
 
 
 def _relative(error: np.ndarray, reference: np.ndarray) -> float:
@@ -245,6 +258,7 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     velocity_error         1      ‖v − v̂‖ / ‖v̂‖ likewise
     von_mises_error        1      root mean square error of the von Mises stress at mesh nodes over frames 1 … h, over the root mean square of the ground
                                   truth's over all its frames; only where both trajectories have a stress
+    stress_error           1      the same of the Cauchy stress tensor
     energy_distance        m      between the clouds of frame h, per material, averaged by mass
     momentum_error         m/s    length of the difference in momentum per mass, mean over frames. Gravity and walls act on the
                                   ground truth too, so only what the prediction adds or loses remains
@@ -268,7 +282,7 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     periodic = any(ground_truth.metadata.periodic)
     undefined = {"energy_distance", "angular_momentum_error"} if periodic else set()
     if prediction.stress is None or ground_truth.stress is None:
-        undefined.add("von_mises_error")
+        undefined |= {"von_mises_error", "stress_error"}
     if not ground_truth.boundary.shapes:
         undefined.add("share_outside")
     names = [name for name in UNITS if name not in undefined]

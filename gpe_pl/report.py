@@ -9,7 +9,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -20,11 +20,18 @@ from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import bootstrap_interval
 from gpe_pl.nn.fused import unfused
 from gpe_pl.run_folder import config_in
+from gpe_pl.schema import MATERIALS
 from gpe_pl.timing import paired_ratio, paired_times
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 
 TRIVIAL = ("ballistic", "constant_velocity")
+UNSEEN_GROUPS = ("interpolated", "extrapolated")
+PARAMETER_FIGURE = "error_by_parameter.png"
+STRESS_METRICS = ("von_mises_error", "stress_error")
 TABLE_HORIZONS = 4
 """The longest horizons, shown in the Markdown table; ``table.csv`` has all."""
 
@@ -100,7 +107,7 @@ def report(folder: Path) -> None:
 
 
 def _report(folder: Path, runs: list[Run]) -> None:
-    """Write ``table.csv``, ``table.md`` and ``validation_loss.png``."""
+    """Write ``table.csv``, ``table.md``, ``validation_loss.png`` and, of unseen material parameters, ``error_by_parameter.png``."""
     if not runs:
         return
     axes = [a for a in axes_of(runs) if a != "seed"]
@@ -116,6 +123,33 @@ def _report(folder: Path, runs: list[Run]) -> None:
         from gpe_pl.viz.figures import validation_loss_figure
 
         validation_loss_figure(curves).savefig(folder / "validation_loss.png", dpi=150)
+    if any(row.parameter_group in UNSEEN_GROUPS for row in runs[0].rows):
+        parameter_curves({str(runs[0].config["data.name"]): {", ".join(v) or LEARNED: members for v, members in variants.items()}}).savefig(
+            folder / PARAMETER_FIGURE, dpi=150
+        )
+
+
+def parameter_curves(by_domain: dict[str, dict[str, list[Run]]]) -> Figure:
+    """Rollout MSE over all frames against the material parameter, of runs by domain and label."""
+    from gpe_pl.viz.comparison import parameter_figure
+
+    curves: dict[str, dict[str, dict[float, list[float]]]] = {}
+    for domain, members in by_domain.items():
+        for label, runs in members.items():
+            points = curves.setdefault(domain, {}).setdefault(label, {})
+            for row in (row for run in runs for row in run.rows):
+                if (row.model, row.metric, row.horizon) == (LEARNED, "rollout_mse", "full") and np.isfinite(row.parameter):
+                    points.setdefault(row.parameter, []).append(row.value)
+    runs = {domain: [run for members in by_label.values() for run in members] for domain, by_label in by_domain.items()}
+    seen = {
+        d: sorted({row.parameter for run in members for row in run.rows if row.parameter_group == "seen"}) for d, members in runs.items()
+    }
+    return parameter_figure(curves, seen, "rollout MSE [m²]", {d: _axis_label(members[0]) for d, members in runs.items()})
+
+
+def _axis_label(run: Run) -> str:
+    varied = [m for m in MATERIALS if any(key.startswith(f"data.parameters.{m}.") for key in run.config)]
+    return ", ".join(f"{MATERIALS[m].name.replace('_', ' ')}\n[{MATERIALS[m].unit}]" for m in varied)
 
 
 def conclusion(folder: Path) -> str:
@@ -147,7 +181,7 @@ def _column(axis: str) -> str:
 
 def groups_of(row: Row) -> list[str]:
     """Splits that a row counts for; unseen parameters also apart by where they lie."""
-    return [row.split, f"{row.split}/{row.parameter_group}"] if row.parameter_group in ("interpolated", "extrapolated") else [row.split]
+    return [row.split, f"{row.split}/{row.parameter_group}"] if row.parameter_group in UNSEEN_GROUPS else [row.split]
 
 
 def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
@@ -246,7 +280,9 @@ def forward_time_ratios(variants: dict[tuple[str, ...], list[Run]], num_rounds: 
 def _markdown(axes: list[str], variants: dict[tuple[str, ...], list[Run]], ratios: dict[tuple[str, ...], float]) -> str:
     names = [_column(a) for a in axes] or ["model"]
     first = next(iter(variants.values()))[0]
-    return "\n".join([*_training_table(names, variants, ratios), "", *_rollout_table(names, variants, first), ""])
+    return "\n".join(
+        [*_training_table(names, variants, ratios), "", *_rollout_table(names, variants, first), *_stress_table(names, variants), ""]
+    )
 
 
 def _training_table(names: list[str], variants: dict[tuple[str, ...], list[Run]], ratios: dict[tuple[str, ...], float]) -> list[str]:
@@ -285,10 +321,8 @@ def _training_table(names: list[str], variants: dict[tuple[str, ...], list[Run]]
 
 
 def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]], first: Run) -> list[str]:
-    splits = sorted({r.split for r in first.rows})  # table.csv also has the parts of test_unseen
-    horizons = sorted({r.horizon for r in first.rows if r.metric == "rollout_mse"}, key=lambda h: (h == "full", h.zfill(6)))[
-        -TABLE_HORIZONS:
-    ]
+    splits = sorted({split for r in first.rows for split in groups_of(r)})
+    horizons = _horizons(first)
     baselines = sorted({r.model for r in first.rows} - {LEARNED})
     header = [*names, "split", *(f"@{h}" for h in horizons)]
     lines = [table_row(header), "|" + "---|" * len(header)]
@@ -311,10 +345,32 @@ def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]],
         "seeds or trajectories are few), and how many times lower than the best trivial baseline (bold where it is lower)."
     )
     if "test_unseen" in splits:
-        note += (
-            " `test_unseen` holds material parameters that training did not have, between the trained ones and outside their range; "
-            "`table.csv` has these two apart."
-        )
+        note += " `test_unseen` holds material parameters that training did not have, between the trained ones and outside their range."
+    return [*lines, "", note]
+
+
+def _horizons(run: Run) -> list[str]:
+    found = {r.horizon for r in run.rows if r.metric == "rollout_mse"}
+    return sorted(found, key=lambda h: (h == "full", h.zfill(6)))[-TABLE_HORIZONS:]
+
+
+def _stress_table(names: list[str], variants: dict[tuple[str, ...], list[Run]]) -> list[str]:
+    """Errors of displacement, velocity and stress beside each other, of models that decode a stress."""
+    stressed = {key: runs for key, runs in variants.items() if any(r.metric in STRESS_METRICS for r in runs[0].rows)}
+    if not stressed:
+        return []
+    horizons = _horizons(next(iter(stressed.values()))[0])
+    header = [*names, "split", "relative error", *(f"@{h}" for h in horizons)]
+    lines = ["", table_row(header), "|" + "---|" * len(header)]
+    for key, runs in stressed.items():
+        for split in sorted({r.split for r in runs[0].rows}):
+            for metric in ("displacement_error", "velocity_error", *STRESS_METRICS):
+                cells = [_interval(values_by_seed(runs, LEARNED, split, metric, h)) for h in horizons]
+                lines.append(table_row([*(key or (LEARNED,)), split, metric.removesuffix("_error").replace("_", " "), *cells]))
+    note = (
+        "L2 errors relative to the ground truth's displacement and velocity up to the horizon, and to its stress over all frames; von Mises stress, and stress "
+        "as a tensor, at mesh nodes. Mean over trajectories and seeds with its interval, as above."
+    )
     return [*lines, "", note]
 
 

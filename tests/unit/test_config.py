@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from pydantic import Field
 
 from gpe_pl.benchmark import benchmark, without_folder
-from gpe_pl.config import CONF, ConfigError, Report, bind, construct, entry_point, explain, output_dir
+from gpe_pl.config import CONF, ConfigError, Report, bind, construct, entry_point, explain, output_dir, quoted
 from gpe_pl.errors import GpeError
 from gpe_pl.fit import fit
 from gpe_pl.learned_simulator import UnknownModelError
@@ -363,3 +363,12 @@ def test_a_table_by_model_has_a_default() -> None:
     table = ["data=mixed", "+comparison=equal_steps", "data.comparison.noise_std.default=0.5", "++data.comparison.noise_std.GNS=2.0"]
     assert compose("fit", *table).training.noise_std == 0.5
     assert compose("fit", *table, "model=gns").training.noise_std == 2.0
+
+
+def test_a_path_with_an_equals_sign_is_taken_as_typed(tmp_path: Path) -> None:
+    run = tmp_path / "data=sand" / "seed=0"
+    run.mkdir(parents=True)
+    assert compose("evaluate", quoted(f"checkpoint={run}")).checkpoint == str(run)
+    for argument in (f"checkpoint={tmp_path}", "checkpoint=", "model.decoder=node", f'checkpoint="{run}"', "--help", "a=b=c"):
+        assert quoted(argument) == argument
+    assert "a value that holds = needs quotes: 'KEY=\"VALUE\"'" in complaint("evaluate", f"checkpoint={run}0")

@@ -65,7 +65,7 @@ def test_rollout_mse_is_the_mean_over_frames_one_to_horizon(ground_truth):
     records = rollout_metrics(shifted(ground_truth, 0.1 * np.arange(11)), ground_truth, (2, "full"))
     assert value(records, "rollout_mse", 2) == pytest.approx((0.01 + 0.04) / 2 / 2)
     assert value(records, "rollout_mse", "full") == pytest.approx(0.01 * 385 / 10 / 2)
-    assert {r.metric for r in records} == set(UNITS) - {"von_mises_error", "share_outside"}
+    assert {r.metric for r in records} == set(UNITS) - {"von_mises_error", "stress_error", "share_outside"}
 
 
 def test_a_perfect_rollout_is_zero_everywhere(ground_truth):
@@ -96,6 +96,23 @@ def test_von_mises_error_is_reported_where_both_have_a_stress():
     wrong = replace(truth, stress=Stress(1.5 * uniaxial, uniaxial[:, :1]))
     assert value(rollout_metrics(wrong, truth, (2,)), "von_mises_error", 2) == pytest.approx(0.5)
     assert "von_mises_error" not in {r.metric for r in rollout_metrics(replace(wrong, stress=None), truth, (2,))}
+
+
+def test_stress_error_is_that_of_the_whole_tensor():
+    truth = trajectory(np.zeros((3, 2, 2)))
+    hydrostatic = np.zeros((3, 2, 4), np.float32)
+    hydrostatic[..., [0, 2, 3]] = 2.0  # norm √12, von Mises stress 0
+    sheared = hydrostatic + np.array([0, 1, 0, 0], np.float32)  # off by √2
+    truth, wrong = (replace(truth, stress=Stress(s, s[:, :1])) for s in (hydrostatic, sheared))
+    records = rollout_metrics(wrong, truth, (2,))
+    assert value(records, "stress_error", 2) == pytest.approx(np.sqrt(2 / 12))
+    assert value(records, "von_mises_error", 2) == np.inf
+    axial = np.zeros((3, 2, 6), np.float32)
+    axial[..., [0, 3, 5]] = 1.0
+    spatial = trajectory(np.zeros((3, 2, 3)))
+    shears = axial + np.array([0, 1, 1, 0, 1, 0], np.float32)
+    truth, wrong = (replace(spatial, stress=Stress(s, s[:, :1])) for s in (axial, shears))
+    assert value(rollout_metrics(wrong, truth, (2,)), "stress_error", 2) == pytest.approx(np.sqrt(6 / 3))
 
 
 def test_stress_is_judged_by_what_the_impact_will_bring():
@@ -147,7 +164,13 @@ def test_periodic_axes_take_the_short_way():
     wrapped = np.where(pos >= 10, pos - 20, pos)
     truth, prediction = trajectory(pos, periodic=(True, False)), trajectory(wrapped, periodic=(True, False))
     records = rollout_metrics(prediction, truth, (2,))
-    assert {r.metric for r in records} == set(UNITS) - {"energy_distance", "angular_momentum_error", "von_mises_error", "share_outside"}
+    assert {r.metric for r in records} == set(UNITS) - {
+        "energy_distance",
+        "angular_momentum_error",
+        "von_mises_error",
+        "stress_error",
+        "share_outside",
+    }
     assert all(r.value == pytest.approx(0, abs=1e-12) for r in records)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from gpe_pl import report
-from gpe_pl.evaluation import LEARNED, Row, write_rows
+from gpe_pl.evaluation import LEARNED, Row, read_rows, write_rows
 from gpe_pl.run_folder import RunError
 
 ERRORS = {  # of two test scenes; free flight has 2e-3 and 6e-3
@@ -51,9 +51,13 @@ def cells(folder: Path, interaction: str) -> list[list[str]]:
 
 def test_errors_are_means_and_factors_over_the_best_trivial_baseline(runs: Path) -> None:
     report.report_sweep(runs)
-    (training, rollout) = cells(runs, "negated")
+    training, rollout, *_ = cells(runs, "negated")
     assert training[1:3] == ["2", "0.3000 (0.2000 – 0.4000)"]
     assert rollout[1:] == ["test_unseen", "2 **2.0×**"]
+    assert [row[1:] for row in cells(runs, "negated")[2:]] == [
+        ["test_unseen/extrapolated", "2.5 **2.4×**"],
+        ["test_unseen/interpolated", "1.5 **1.3×**"],
+    ]
     assert cells(runs, "odd")[1][2] == "8 0.5×"
     assert cells(runs, "odd_even")[1][2] == "4e+09 < 0.01×"
     assert cells(runs, "ballistic")[0][2] == "4"
@@ -85,3 +89,19 @@ def test_a_damaged_configuration_is_named(runs: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(RunError, match=r"negated/0/config.json is damaged; delete the folder"):
         report.report_sweep(runs)
+
+
+def test_a_parameter_that_training_did_not_have_makes_a_figure(runs: Path) -> None:
+    report.report_sweep(runs)
+    assert (runs / "error_by_parameter.png").stat().st_size > 1000
+
+
+def test_stress_is_reported_beside_displacement_and_velocity(runs: Path) -> None:
+    path = runs / "negated" / "0" / "metrics.csv"
+    values = {"displacement_error": 0.25, "velocity_error": 0.5, "von_mises_error": 0.75, "stress_error": 1.25}
+    rows = [Row(LEARNED, "test_unseen", 0, "interpolated", 20.0, metric, "full", value) for metric, value in values.items()]
+    write_rows(path, [*read_rows(path), *rows])
+    report.report_sweep(runs)
+    found = {row[2]: row[3] for row in cells(runs, "negated") if len(row) == 4}
+    assert found == {"displacement": "0.25", "velocity": "0.5", "von mises": "0.75", "stress": "1.25"}
+    assert not [row for row in cells(runs, "odd") if len(row) == 4]
