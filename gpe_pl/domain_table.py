@@ -107,7 +107,7 @@ def report_domains(folder: Path) -> None:
     models = sorted({m for _, m in by_cell}, key=lambda m: (m == OWN, m))
     _check(folder, domains, by_cell)
     _write_csv(folder / TABLE_CSV, runs)
-    cells = {}
+    cells: dict[tuple[str, str], Cell] = {}
     for domain in domains:
         cells |= {(domain, model): cell for model, cell in _row({m: by_cell[d, m] for d, m in by_cell if d == domain}, domain).items()}
     replace_text(folder / TABLE_MD, _markdown(domains, models, cells, by_cell))
