@@ -147,7 +147,10 @@ class DatasetSpec:
             if scene[key] != solver[key]:
                 raise ValueError(f"scene.{key} = {scene[key]} and solver.{key} = {solver[key]} must be equal")
         if set(self.parameters) != set(self.scene.materials):
-            raise ValueError(f"parameters are for {', '.join(self.parameters)}, the scene has {', '.join(self.scene.materials)}")
+            raise ValueError(
+                f"parameters are for {', '.join(self.parameters)}, the scene has {', '.join(self.scene.materials)}; "
+                "leave out others with ~data.parameters.MATERIAL"
+            )
         for material, values in self.parameters.items():
             parameter = MATERIALS[material]
             for key, group in asdict(cast(Any, values)).items():

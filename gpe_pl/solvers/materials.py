@@ -1,7 +1,7 @@
 """Materials of the material point method: their constants, and the map from the stored material parameter to what a constitutive law takes.
 
 Every law is isotropic hyperelasticity, some with a return mapping; the laws themselves are in ``mpm.laws_2d`` and ``mpm.laws_3d``. A law reads one row of
-constants per particle; ``LAMBDA`` … ``MAX_HARDENING`` name the columns.
+constants per particle; ``LAMBDA`` … ``MAX_HARDENING`` name the columns. Viscosity is added to what any law says.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from gpe_pl.schema import MATERIALS
 SAND, SNOW, ELASTOMER = 0, 1, 2
 """Codes under which ``respond`` calls the laws."""
 
-LAMBDA, MU, COEFFICIENT, SMALLEST, LARGEST, MAX_HARDENING = range(6)
-"""Columns of a particle's constants: Lamé parameters at rest [Pa], slope of the cone in strains (sand) or ξ (snow), and three of snow's constants."""
+LAMBDA, MU, COEFFICIENT, SMALLEST, LARGEST, MAX_HARDENING, VISCOSITY = range(7)
+"""Columns of a particle's constants: Lamé parameters at rest [Pa], slope of the cone in strains (sand) or ξ (snow), three of snow's constants, and the
+kinematic viscosity [m²/s]."""
+NUM_CONSTANTS = 7
 
 Positive = Annotated[float, Field(gt=0)]
 PoissonRatio = Annotated[float, Field(ge=0, lt=0.5)]
@@ -51,7 +53,7 @@ def drucker_prager_coefficient(friction_angle: np.ndarray, dim: int) -> np.ndarr
 
 def _constants(count: int, **columns: float | np.ndarray) -> np.ndarray:
     """Rows [node, constant] from the columns that a law reads."""
-    rows = np.zeros((count, 6))
+    rows = np.zeros((count, NUM_CONSTANTS))
     for name, value in columns.items():
         rows[:, globals()[name]] = value
     return rows
@@ -146,6 +148,30 @@ class Elastomer:
     def smallest_stiffness(self) -> float:
         """λ + 2μ at rest [Pa] of the softest elastomer that the schema allows."""
         return _pressure_wave_modulus(MATERIALS["elastomer"].low, self.poisson_ratio)
+
+
+@dataclass(frozen=True, config={"extra": "forbid"})
+class Fluid:
+    """Liquid, for scenes in which it meets other materials: weakly compressible and viscous, and without tension, as sand that has no friction. Material
+    parameter: kinematic viscosity [m²/s]. Liquids alone are computed as incompressible by ``flip``.
+
+    Attributes:
+        bulk_modulus: [Pa]; a numerical choice: a column of height H is compressed by ρ g H over it at its foot.
+        density: mass per volume at rest [kg/m³].
+    """
+
+    bulk_modulus: Positive = 5e5
+    density: Positive = 1000.0
+    law: ClassVar[int] = SAND
+
+    def constants(self, kinematic_viscosity: np.ndarray, dim: int) -> np.ndarray:
+        """What the law reads [node, constant]."""
+        return _constants(len(kinematic_viscosity), LAMBDA=self.bulk_modulus, VISCOSITY=kinematic_viscosity)
+
+    @property
+    def smallest_stiffness(self) -> float:
+        """[Pa] at rest."""
+        return self.bulk_modulus
 
 
 def _pressure_wave_modulus(youngs_modulus: float, poisson_ratio: float) -> float:

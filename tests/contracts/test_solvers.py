@@ -71,8 +71,8 @@ def fem(dim: int) -> tuple[FEM, State]:
 
 SOLVERS: dict[str, Callable[[], tuple[Simulator, State]]] = {
     "mpm-sand": lambda: mpm(2, "sand"),
-    "mpm-mixed": lambda: mpm(2, "sand", "snow", "elastomer"),
-    "mpm-3d": lambda: mpm(3, "sand", "snow", "elastomer"),
+    "mpm-mixed": lambda: mpm(2, "sand", "snow", "elastomer", "fluid"),
+    "mpm-3d": lambda: mpm(3, "sand", "snow", "elastomer", "fluid"),
     "flip": lambda: flip(2),
     "flip-3d": lambda: flip(3),
     "fem": lambda: fem(2),

@@ -57,6 +57,14 @@ def test_an_experiment_trains_and_evaluates(experiment: str, tiny_data: Path, tm
     assert 0 < value < 10
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["gpe_tuned", "dpinet"])
+def test_snow_on_liquid_trains_and_rolls_out(model: str, tiny_data: Path, tmp_path: Path) -> None:
+    fit(tiny(tiny_data, tmp_path, "experiment=mixed_materials", "data=snow_on_liquid", f"model={model}", "evaluation.splits=[test_unseen]"))
+    values = [r.value for r in read_rows(tmp_path / "mixed_materials" / "metrics.csv") if (r.model, r.metric) == ("learned", "rollout_mse")]
+    assert values and all(0 < value < 10 for value in values)
+
+
 def test_the_ablation_sweeps_every_interaction_over_seeds() -> None:
     hydra = compose("fit", "experiment=ablation_momentum", hydra_config=True).hydra
     assert hydra.mode.name == "MULTIRUN"

@@ -41,6 +41,8 @@ def checked(folder: Path, num_trajectories: int) -> None:
         pytest.param(["data=elastomer", "dimension=3"], "elastomer_3d", marks=pytest.mark.long),
         (["data=mixed"], "mixed"),
         (["data=mixed", "dimension=3"], "mixed_3d"),
+        (["data=snow_on_liquid"], "snow_on_liquid"),
+        pytest.param(["data=snow_on_liquid", "dimension=3"], "snow_on_liquid_3d", marks=pytest.mark.long),
         (["data=fluid", "dimension=2"], "fluid_2d"),
         pytest.param(["data=fluid", "scene=dam_break"], "fluid_dam_break", marks=pytest.mark.long),
         (["data=fluid", "scene=dam_break", "dimension=2"], "fluid_dam_break_2d"),
@@ -57,7 +59,7 @@ def test_every_variant(tmp_path: Path, arguments: list[str], name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", ["tiny", "small", "paper"])
-@pytest.mark.parametrize("data", ["sand", "snow", "elastomer", "mixed", "fluid", "fem"])
+@pytest.mark.parametrize("data", ["sand", "snow", "elastomer", "mixed", "snow_on_liquid", "fluid", "fem"])
 def test_every_size_composes(data: str, size: str) -> None:
     from gpe_pl.simulate import dataset_spec
 

@@ -9,7 +9,7 @@ import pytest
 
 from gpe_pl.geometry import Bowl, Shape, Sphere, domain_walls, signed_distance
 from gpe_pl.schema import STICKY, node_code
-from gpe_pl.solvers.materials import Elastomer, Sand, Snow, lame_parameters
+from gpe_pl.solvers.materials import Elastomer, Fluid, Sand, Snow, lame_parameters
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.trajectory import Boundary
 from tests.particles import VALUE, block, run, together
@@ -17,7 +17,7 @@ from tests.particles import VALUE, block, run, together
 pytestmark = pytest.mark.slow
 
 GRAVITY = 9.81
-MATERIALS = ("sand", "snow", "elastomer")
+MATERIALS = ("sand", "snow", "elastomer", "fluid")
 DIMS = (2, 3)
 
 
@@ -39,7 +39,7 @@ def collision(dim, materials):
     return solver, together(materials, left, right)
 
 
-PAIRS = [("sand",), ("snow",), ("elastomer",), ("sand", "elastomer"), ("sand", "snow")]
+PAIRS = [("sand",), ("snow",), ("elastomer",), ("fluid",), ("sand", "elastomer"), ("sand", "snow"), ("snow", "fluid")]
 
 
 @pytest.mark.parametrize("dim", DIMS)
@@ -101,6 +101,8 @@ def elastic_energy(material, value, state):
     """Elastic energy [J]; snow's hardening included."""
     stretch = np.linalg.svd(state.internal.deformation, compute_uv=False)
     volume = state.mass / material.density
+    if isinstance(material, Fluid):
+        return float(np.sum(volume * material.bulk_modulus / 2 * np.log(stretch).sum(axis=1) ** 2))
     lam, mu = lame_parameters(value if isinstance(material, Elastomer) else material.youngs_modulus, material.poisson_ratio)
     strain = np.log(stretch)
     if isinstance(material, Sand):
@@ -116,7 +118,7 @@ def elastic_energy(material, value, state):
 
 def energies(solver, state, num_steps):
     """Kinetic, gravitational and elastic energy after each frame, the initial state first [J]."""
-    material, value = getattr(solver, solver.materials[0]), float(state.material_params[0, 0])
+    material, value = solver.constants_of(solver.materials[0]), float(state.material_params[0, 0])
     values = []
     for _ in range(num_steps + 1):
         elastic = 0.0 if state.internal is None else elastic_energy(material, value, state)
@@ -192,13 +194,14 @@ def test_snow_stretches_stay_in_their_limits(dim, physics):
     physics("smallest J_P - 1", float(state.internal.plastic.min()), -0.05, formula="compaction", source="it was compacted", kind="at_most")
 
 
-def test_hydrostatic_column(physics):
+@pytest.mark.parametrize("material", ["sand", "fluid"])
+def test_hydrostatic_column(material, physics):
     """A wide layer between slip walls; the mean over time, because elastic waves hardly decay."""
     height, spacing = 0.25, 1 / 64
     boundary = Boundary.sample(domain_walls(unit(2), 0.0), spacing, 2)
-    state = block((0.0, 0.0), (1.0, height), spacing, boundary=boundary, gravity=GRAVITY * down(2))
-    solver = MPM(bounds=unit(2), grid_spacing=2 * spacing)
-    lam, mu = lame_parameters(solver.sand.youngs_modulus, solver.sand.poisson_ratio)
+    state = block((0.0, 0.0), (1.0, height), spacing, material, boundary=boundary, gravity=GRAVITY * down(2))
+    solver = MPM(bounds=unit(2), grid_spacing=2 * spacing, materials=(material,))
+    lam, mu = lame_parameters(solver.sand.youngs_modulus, solver.sand.poisson_ratio) if material == "sand" else (Fluid().bulk_modulus, 0.0)
     stresses = []
     for _ in range(400):
         state = solver.step(state)
@@ -209,9 +212,49 @@ def test_hydrostatic_column(physics):
     tau_yy = np.mean(stresses[40:], axis=0)
     inner = (state.pos[:, 1] > 2 * spacing) & (state.pos[:, 1] < height - 2 * spacing)
     slope, floor = np.polyfit(state.pos[inner, 1], tau_yy[inner], 1)
-    weight, source = solver.sand.density * GRAVITY, "equilibrium"
+    weight, source = solver.constants_of(material).density * GRAVITY, "equilibrium"
     physics("vertical stress at the floor", floor, -weight * height, 0.05, formula="-ρ g H", source=source, unit="Pa")
     physics("its gradient", slope, weight, 0.1, formula="ρ g", source=source, unit="Pa/m")
+
+
+# --- liquid --------------------------------------------------------------------------------------------------------------------------------
+
+
+def vortex_decay(viscosity, cells, dim=2):
+    """Decay rate [1/s] of a Taylor-Green vortex between slip walls, extruded in 3D, after sound has crossed the box a few times: it first has to tell all
+    of the liquid what the walls, a cell thick, do to it.
+    """
+    dx, k = 1 / cells, math.pi
+    bounds = ((0.0, 1.0), (0.0, 1.0), (0.0, 4 * dx))[:dim]
+    boundary = Boundary.sample(domain_walls(bounds, 0.0), dx / 2, dim)
+    state = block((0.0,) * dim, tuple(high for _, high in bounds), dx / 2, "fluid", value=viscosity, jitter=0.0, boundary=boundary)
+
+    def mode(pos):
+        x, y = pos[:, 0], pos[:, 1]
+        flow = np.zeros_like(pos)
+        flow[:, 0], flow[:, 1] = np.sin(k * x) * np.cos(k * y), -np.cos(k * x) * np.sin(k * y)
+        return flow
+
+    solver = MPM(bounds=bounds, grid_spacing=dx, materials=("fluid",), max_substeps=10**4)
+    state, amplitude = replace(state, vel=0.2 * mode(state.pos)), []
+    for _ in range(30):
+        state = solver.step(state)
+        flow = mode(state.pos)
+        amplitude.append(np.sum(state.vel * flow) / np.sum(flow**2))
+    return -np.polyfit(solver.frame_dt * np.arange(15), np.log(amplitude[15:]), 1)[0]
+
+
+VORTEX = {"formula": "2 ν π²", "source": "Taylor and Green 1937, exact solution of Navier-Stokes", "unit": "1/s"}
+
+
+@pytest.mark.parametrize(("viscosity", "cells", "dim"), [(0.1, 32, 2), (0.5, 32, 2), (0.5, 32, 3)])
+def test_a_vortex_decays_by_the_viscosity(viscosity, cells, dim, physics):
+    physics(f"decay rate, {dim}D, ν = {viscosity}", vortex_decay(viscosity, cells, dim), 2 * viscosity * math.pi**2, 0.05, **VORTEX)
+
+
+def test_the_grids_own_viscosity_falls_with_its_spacing(physics):
+    own = [vortex_decay(0.01, cells) / (2 * math.pi**2) - 0.01 for cells in (16, 32)]
+    physics("viscosity of the transfers, 32 cells over 16", own[1] / own[0], 0.5, formula="≤ 1/2", source="convergence", kind="at_most")
 
 
 # --- elastomer -----------------------------------------------------------------------------------------------------------------------------
@@ -431,11 +474,11 @@ def test_nothing_leaves_a_bowl(physics):
 
 
 def test_largest_speed_of_a_mixed_impact(physics):
-    """Sand, snow and elastomer thrown at a ball and each other at 10 m/s in 3D; nothing gets faster than that, but for the fall."""
+    """Sand, snow, elastomer and liquid thrown at a ball and each other at 10 m/s in 3D; nothing gets faster than that, but for the fall."""
     cell = 1 / 16
     boundary = Boundary.sample((*domain_walls(unit(3), 0.3), Sphere((0.5, 0.5, 0.2), 0.15, 0.3)), cell / 2, 3)
     fall = {"velocity": 10 * down(3), "gravity": GRAVITY * down(3), "boundary": boundary}
-    blocks = [block((0.1 + 0.27 * k, 0.35, 0.45), (0.25, 0.25, 0.25), cell / 2, m, **fall) for k, m in enumerate(MATERIALS)]
+    blocks = [block((0.07 + 0.22 * k, 0.35, 0.45), (0.1875, 0.25, 0.25), cell / 2, m, **fall) for k, m in enumerate(MATERIALS)]
     state, fastest = together(MATERIALS, *blocks), 0.0
     solver = MPM(bounds=unit(3), grid_spacing=cell, materials=MATERIALS)
     for _ in range(60):

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from gpe_pl.schema import STICKY
+from gpe_pl.solvers.materials import VISCOSITY
 from gpe_pl.solvers.mpm import transfer_2d, transfer_3d
 from gpe_pl.solvers.mpm.collider import keep_out
 
@@ -54,6 +55,10 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
         gravity_squared += gravity[axis] * gravity[axis]
     # a particle at rest may fall by no more than a quarter of cfl cells, so with its speed it moves at most 1.25 cfl cells
     fall_rate = 2.0 * math.sqrt(math.sqrt(gravity_squared) / (cfl * spacing))
+    # what a viscosity makes of the rate of deformation of a particle's surroundings must not change its sign (see ``transfer_2d.deform``)
+    diffusion_rate = 0.0
+    for p in range(particles.pos.shape[0]):
+        diffusion_rate = max(diffusion_rate, 8.0 * inv * inv * particles.constants[p, VISCOSITY])
     grid, active = np.zeros((collider.distance.shape[0], dim + 1)), np.zeros((3, 2), dtype=np.int64)
     flat, stress = grid.reshape(-1), np.empty((particles.pos.shape[0], 3 * dim - 3))
     remaining, substeps = frame_dt, 0
@@ -62,7 +67,9 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
         status, node, speed = _survey(particles.pos, particles.vel, bounds, origin, counts, spacing, active)
         if status != OK or remaining <= 0.0:
             return status, node, substeps, last_substep
-        needed = max(remaining * (math.sqrt(squared) + speed) / (cfl * spacing), remaining * fall_rate) * (1.0 - 1e-12)
+        needed = max(remaining * (math.sqrt(squared) + speed) / (cfl * spacing), remaining * fall_rate, remaining * diffusion_rate) * (
+            1.0 - 1e-12
+        )
         if not needed <= max_substeps - substeps:  # before it is rounded: an integer may not hold it
             return TOO_MANY_SUBSTEPS, node, substeps, last_substep
         count = max(1, math.ceil(needed))

@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass as validated_dataclass
 from gpe_pl.geometry import check_whole_cells
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, NODE_TYPES, node_code, param_names
-from gpe_pl.solvers.materials import Elastomer, Sand, Snow
+from gpe_pl.solvers.materials import NUM_CONSTANTS, Elastomer, Fluid, Sand, Snow
 from gpe_pl.solvers.mpm.collider import Collider, collider
 from gpe_pl.solvers.mpm.frame import ESCAPE, NOT_FINITE, OK, Particles, advance
 from gpe_pl.trajectory import Boundary, State
@@ -21,7 +21,7 @@ from gpe_pl.trajectory import Boundary, State
 PADDING = 3
 """Cells between the domain and the edge of the grid: room for the kernel of a particle on a wall, or one cell behind it."""
 
-KNOWN = ("sand", "snow", "elastomer")
+KNOWN = ("sand", "snow", "elastomer", "fluid")
 """Materials that have a law; also the names of the solver's settings that hold their constants."""
 
 
@@ -52,15 +52,15 @@ class MPM:
     """Material point solver; a ``Simulator``.
 
     Each step advances one frame by substeps that satisfy ``h (c + |v|_max) <= cfl Δ``, with c the fastest elastic wave in any particle as it is deformed and
-    hardened now, and ``h² |g| <= cfl Δ / 4``. They are chosen from the current state alone, so a restart repeats a run-through bit by bit. Obstacles must
-    be at least one grid cell thick.
+    hardened now, ``h² |g| <= cfl Δ / 4`` and ``8 h ν <= Δ²``. They are chosen from the current state alone, so a restart repeats a run-through bit by bit.
+    Obstacles must be at least one grid cell thick.
 
     Attributes:
         bounds: ``(low, high)`` per axis of the domain [m]; whole multiples of the grid spacing apart.
         grid_spacing: Δ [m].
         frame_dt: time between frames [s].
         materials: every material of the data set, which fixes the columns of ``State.material_params``.
-        sand, snow, elastomer: constants of each material. Particles carry mass, so the density tells their volume.
+        sand, snow, elastomer, fluid: constants of each material, of liquid the usual ones if None. Particles carry mass, so the density tells their volume.
         cfl: fraction of a cell that a wave or a particle may cross in one substep.
         max_substeps: per frame; more means that the state has exploded.
     """
@@ -72,6 +72,7 @@ class MPM:
     sand: Sand = field(default_factory=Sand)
     snow: Snow = field(default_factory=Snow)
     elastomer: Elastomer = field(default_factory=Elastomer)
+    fluid: Fluid | None = None
     cfl: Annotated[float, Field(gt=0, le=1)] = 0.5
     max_substeps: Annotated[int, Field(ge=1)] = 1000
 
@@ -88,8 +89,12 @@ class MPM:
     @property
     def solver_dt(self) -> float:
         """Largest substep in s: that of particles at rest of the material with the slowest waves."""
-        slowest = min(m.smallest_stiffness / m.density for m in (getattr(self, name) for name in self.materials))
+        slowest = min(m.smallest_stiffness / m.density for m in (self.constants_of(name) for name in self.materials))
         return min(self.frame_dt, self.cfl * self.grid_spacing / math.sqrt(slowest))
+
+    def constants_of(self, material: str) -> Sand | Snow | Elastomer | Fluid:
+        """Of a material by its name."""
+        return getattr(self, material) or Fluid()
 
     def compile_kernels(self) -> None:
         """Compile what this solver's dimension needs and fill Numba's cache on disk, so that worker processes started afterwards only load it."""
@@ -165,11 +170,11 @@ class MPM:
         if not np.all(np.isfinite(state.gravity)):
             raise SimulationError(f"gravity {state.gravity} is not finite", reason="nan")
         self._require(np.asarray(state.mass) > 0, "mass is not positive")
-        law, specific_volume, constants = np.empty(num_nodes, dtype=np.int64), np.empty(num_nodes), np.empty((num_nodes, 6))
+        law, specific_volume, constants = np.empty(num_nodes, dtype=np.int64), np.empty(num_nodes), np.empty((num_nodes, NUM_CONSTANTS))
         known = np.zeros(num_nodes, dtype=bool)
         for name in self.materials:
             chosen = np.asarray(state.node_type) == node_code(name)
-            material, parameter = getattr(self, name), MATERIALS[name]
+            material, parameter = self.constants_of(name), MATERIALS[name]
             values = np.asarray(state.material_params, dtype=np.float64)[:, names.index(parameter.name)]
             in_range = (values >= parameter.low) & (values <= parameter.high)
             self._require(in_range | ~chosen, f"{parameter.name} is outside [{parameter.low:g}, {parameter.high:g}] {parameter.unit}")

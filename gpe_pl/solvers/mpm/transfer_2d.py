@@ -15,6 +15,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from gpe_pl.solvers.materials import VISCOSITY
 from gpe_pl.solvers.mpm import laws_2d
 
 
@@ -40,7 +41,10 @@ def squared_wave_speed(particles):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def deform(particles, stress, h):
-    """Deform the particles by ``h C`` and write their Kirchhoff stress [node, 3] in Pa; returns the new ``squared_wave_speed``."""
+    """Deform the particles by ``h C`` and write their Kirchhoff stress [node, 3] in Pa; returns the new ``squared_wave_speed``.
+
+    Viscosity ν adds ``2 ρ ν dev C``, symmetrised and in plane strain. The transfer that follows takes ``8 h ν / Δ²`` of it away, whatever the positions.
+    """
     deformation, affine, plastic, specific_volume = particles.deformation, particles.affine, particles.plastic, particles.specific_volume
     law, constants, squared = particles.law, particles.constants, 0.0
     for p in range(plastic.shape[0]):
@@ -58,6 +62,11 @@ def deform(particles, stress, h):
         )
         deformation[p, 0, 0], deformation[p, 0, 1], deformation[p, 1, 0], deformation[p, 1, 1] = f00, f01, f10, f11
         squared = max(squared, stiffness * specific_volume[p])
+        if constants[p, VISCOSITY] > 0.0:
+            viscosity, mean = constants[p, VISCOSITY] / specific_volume[p], (c00 + c11) / 3.0
+            stress[p, 0] += 2.0 * viscosity * (c00 - mean)
+            stress[p, 1] += viscosity * (c01 + c10)
+            stress[p, 2] += 2.0 * viscosity * (c11 - mean)
     return squared
 
 

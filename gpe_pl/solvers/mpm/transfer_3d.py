@@ -7,6 +7,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from gpe_pl.solvers.materials import VISCOSITY
 from gpe_pl.solvers.mpm import laws_3d
 from gpe_pl.solvers.mpm.transfer_2d import weights
 
@@ -64,6 +65,14 @@ def deform(particles, stress, h):
         _store(deformation, p, f)
         stress[p, 0], stress[p, 1], stress[p, 2], stress[p, 3], stress[p, 4], stress[p, 5] = t
         squared = max(squared, stiffness * specific_volume[p])
+        if constants[p, VISCOSITY] > 0.0:
+            viscosity, mean = constants[p, VISCOSITY] / specific_volume[p], (c[0] + c[4] + c[8]) / 3.0
+            stress[p, 0] += 2.0 * viscosity * (c[0] - mean)
+            stress[p, 1] += viscosity * (c[1] + c[3])
+            stress[p, 2] += viscosity * (c[2] + c[6])
+            stress[p, 3] += 2.0 * viscosity * (c[4] - mean)
+            stress[p, 4] += viscosity * (c[5] + c[7])
+            stress[p, 5] += 2.0 * viscosity * (c[8] - mean)
     return squared
 
 
