@@ -17,20 +17,10 @@ import numpy as np
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation import LEARNED
+from gpe_pl.finished_runs import Run, axes_of, distinct_runs, finished_runs, groups_of, shared_table, shared_trajectories, values_by_seed
+from gpe_pl.markdown import table_row
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio, median_of_means
-from gpe_pl.report import (
-    PARAMETER_FIGURE,
-    Run,
-    axes_of,
-    distinct_runs,
-    finished_runs,
-    groups_of,
-    parameter_curves,
-    shared_table,
-    shared_trajectories,
-    table_row,
-    values_by_seed,
-)
+from gpe_pl.parameter_curves import PARAMETER_FIGURE, parameter_curves
 
 log = logging.getLogger(__name__)
 

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import csv
-import json
 import logging
 from collections import defaultdict
-from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,84 +13,34 @@ import torch
 
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.evaluation import LEARNED, Row, read_rows
+from gpe_pl.finished_runs import (
+    UNSEEN_GROUPS,
+    Run,
+    Values,
+    axes_of,
+    distinct_runs,
+    finished_runs,
+    groups_of,
+    shared_table,
+    validation_curve,
+    values_by_seed,
+)
 from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.markdown import table_row
 from gpe_pl.metrics import bootstrap_interval
 from gpe_pl.nn.fused import unfused
-from gpe_pl.run_folder import config_in
-from gpe_pl.schema import MATERIALS
+from gpe_pl.parameter_curves import PARAMETER_FIGURE, parameter_curves
 from gpe_pl.timing import paired_ratio, paired_times
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    pass
 
 log = logging.getLogger(__name__)
 
 TRIVIAL = ("ballistic", "constant_velocity")
-UNSEEN_GROUPS = ("interpolated", "extrapolated")
-PARAMETER_FIGURE = "error_by_parameter.png"
 STRESS_METRICS = ("von_mises_error", "stress_error")
 TABLE_HORIZONS = 4
 """The longest horizons, shown in the Markdown table; ``table.csv`` has all."""
-
-
-@dataclass(frozen=True)
-class Run:
-    """A finished run: its folder, its flattened configuration and its rows."""
-
-    folder: Path
-    config: dict[str, Any]
-    rows: list[Row]
-
-
-UNSAID: dict[str, Any] = {"training.sampling": "uniform", "training.push_share": 0.0, "training.push_correction": 1.0}
-"""What the ``config.json`` of a run leaves out where it is not used, as runs did before there was a choice."""
-
-
-TRAINED = {"data.name", "model._target_", "training.num_steps"}
-"""What the configuration of every training run says."""
-
-
-def finished_runs(folder: Path) -> list[Run]:
-    """All finished training runs below a folder, in order of their paths; evaluations beside them are none."""
-    runs = []
-    for path in sorted(folder.rglob("metrics.csv")):
-        config = path.parent / "config.json"
-        if config.exists():
-            values = UNSAID | dict(_flatten(config_in(config)))
-            if values.keys() >= TRAINED:
-                runs.append(Run(path.parent, values, list(read_rows(path))))
-            else:
-                log.warning(
-                    "%s is not of a training run (%s) and is left out of the report",
-                    path.parent,
-                    ", ".join(sorted(TRAINED - values.keys())),
-                )
-    return runs
-
-
-def distinct_runs(runs: list[Run]) -> list[Run]:
-    """Runs of the same configuration count once."""
-    first: dict[str, Run] = {}
-    for run in runs:
-        kept = first.setdefault(json.dumps(run.config, sort_keys=True), run)
-        if kept is not run:
-            log.warning("%s repeats %s and is left out of the report", run.folder, kept.folder)
-    return list(first.values())
-
-
-def _flatten(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
-    if isinstance(value, dict):
-        for key, item in value.items():
-            yield from _flatten(item, f"{path}.{key}" if path else str(key))
-    else:
-        yield path, value if not isinstance(value, list) else json.dumps(value)
-
-
-def axes_of(runs: list[Run]) -> list[str]:
-    """Configuration keys whose values differ between runs, ``seed`` last."""
-    keys = sorted({k for r in runs for k in r.config})
-    different = [k for k in keys if len({json.dumps(r.config.get(k)) for r in runs}) > 1]
-    return sorted(different, key=lambda k: (k == "seed", k))
 
 
 def report_sweep(folder: Path) -> None:
@@ -129,27 +76,6 @@ def _report(folder: Path, runs: list[Run]) -> None:
         )
 
 
-def parameter_curves(by_domain: dict[str, dict[str, list[Run]]]) -> Figure:
-    """Rollout MSE over all frames against the material parameter, of runs by domain and label."""
-    from gpe_pl.viz.comparison import parameter_figure
-
-    curves: dict[str, dict[str, dict[float, list[float]]]] = {}
-    for domain, by_label in by_domain.items():
-        for label, members in by_label.items():
-            points = curves.setdefault(domain, {}).setdefault(label, {})
-            for row in (row for run in members for row in run.rows):
-                if (row.model, row.metric, row.horizon) == (LEARNED, "rollout_mse", "full") and np.isfinite(row.parameter):
-                    points.setdefault(row.parameter, []).append(row.value)
-    runs = {domain: [run for members in by_label.values() for run in members] for domain, by_label in by_domain.items()}
-    seen = {d: sorted({row.parameter for run in own for row in run.rows if row.parameter_group == "seen"}) for d, own in runs.items()}
-    return parameter_figure(curves, seen, "rollout MSE [m²]", {domain: _axis_label(own[0]) for domain, own in runs.items()})
-
-
-def _axis_label(run: Run) -> str:
-    varied = [m for m in MATERIALS if any(key.startswith(f"data.parameters.{m}.") for key in run.config)]
-    return ", ".join(f"{MATERIALS[m].name.replace('_', ' ')}\n[{MATERIALS[m].unit}]" for m in varied)
-
-
 def conclusion(folder: Path) -> str:
     """What a command ends with: the numbers of the run or evaluation in a folder, and what to look at next."""
     viewers = sorted(folder.glob("rollout_*_00.html"))
@@ -177,11 +103,6 @@ def _column(axis: str) -> str:
     return axis.rpartition(".")[2]
 
 
-def groups_of(row: Row) -> list[str]:
-    """Splits that a row counts for; unseen parameters also apart by where they lie."""
-    return [row.split, f"{row.split}/{row.parameter_group}"] if row.parameter_group in UNSEEN_GROUPS else [row.split]
-
-
 def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
     """One line per variant, seed, split, metric and horizon: the mean over trajectories."""
     lines: list[list[Any]] = []
@@ -200,43 +121,6 @@ def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
         writer = csv.writer(handle)
         writer.writerow([*(_column(a) for a in axes), "seed", "split", "metric", "horizon", "value"])
         writer.writerows(lines)
-
-
-def validation_curve(run_dir: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Steps and one-step validation loss of a run, over all its starts."""
-    points: dict[int, float] = {}
-    for path in sorted(run_dir.glob("log/version_*/metrics.csv"), key=lambda p: int(p.parent.name.partition("_")[2])):
-        with open(path, newline="") as handle:
-            for line in csv.DictReader(handle):
-                if line.get("val/one_step_nmse"):
-                    points[int(line["step"]) + 1] = float(line["val/one_step_nmse"])
-    steps = sorted(points)
-    return np.array(steps), np.array([points[s] for s in steps])
-
-
-Values = list[dict[int, float]]
-"""Of one metric: for each seed that has any, a value by number of the trajectory."""
-
-
-def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon: str) -> Values:
-    """What runs have of a metric, in order of trajectories."""
-    table = []
-    for run in runs:
-        rows = [r for r in run.rows if r.model == model and r.metric == metric and r.horizon == horizon and split in groups_of(r)]
-        table.append({r.trajectory: r.value for r in sorted(rows, key=lambda r: r.trajectory)})
-    return [t for t in table if t]
-
-
-def shared_trajectories(*values: Values) -> list[int]:
-    """Numbers of the trajectories that all seeds, of several models if given, have evaluated."""
-    seeds = [set(seed) for table in values for seed in table]
-    return sorted(set.intersection(*seeds)) if seeds else []
-
-
-def shared_table(values: Values, trajectories: list[int] | None = None) -> np.ndarray:
-    """Values as a table [seed, trajectory], of the given trajectories or of those that all seeds have."""
-    chosen = shared_trajectories(values) if trajectories is None else trajectories
-    return np.array([[seed[k] for k in chosen] for seed in values]).reshape(len(values), len(chosen))
 
 
 def _interval(values: Values, scale: float = 1.0) -> str:
@@ -376,11 +260,6 @@ def _factor(ratio: float) -> str:
     if ratio == 0:  # of a mean that failed rollouts make infinite
         return ""
     return f" **{ratio:.1f}×**" if ratio > 1 else f" {ratio:.2g}×" if ratio >= 0.01 else " < 0.01×"
-
-
-def table_row(cells: list[str]) -> str:
-    """A row of a Markdown table."""
-    return "| " + " | ".join(cells) + " |"
 
 
 def _mean(values: Values) -> float:

@@ -16,8 +16,9 @@ import numpy as np
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.domain_table import TABLE_MD, TABLES, domain_of, model_of
 from gpe_pl.evaluation import LEARNED
+from gpe_pl.finished_runs import Run, axes_of, finished_runs, shared_table, validation_curve, values_by_seed
+from gpe_pl.markdown import table_row
 from gpe_pl.metrics import BOTH, bootstrap_interval, median_of_means
-from gpe_pl.report import Run, axes_of, finished_runs, shared_table, table_row, validation_curve, values_by_seed
 
 log = logging.getLogger(__name__)
 

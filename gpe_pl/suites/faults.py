@@ -19,7 +19,7 @@ from gpe_pl.faults import checkpoints, configs, isolation, runs, scenes, stores
 from gpe_pl.faults.runs import Command
 from gpe_pl.faults.verdict import BAD, GOOD, Fault, Verdict
 from gpe_pl.generation import DatasetSpec
-from gpe_pl.report import table_row
+from gpe_pl.markdown import table_row
 from gpe_pl.suites.trained import Case
 
 log = logging.getLogger(__name__)

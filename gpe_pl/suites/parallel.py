@@ -24,8 +24,8 @@ from gpe_pl.errors import GpeError
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.lattice import lattice_scene
+from gpe_pl.markdown import table_row
 from gpe_pl.models.gpe import GPE
-from gpe_pl.report import table_row
 from gpe_pl.training.parallel import sum_gradients
 
 SAND = "sand"

@@ -24,10 +24,11 @@ from gpe_pl.approximate import approximate
 from gpe_pl.baselines import Ballistic, ConstantVelocity
 from gpe_pl.containment import Contained
 from gpe_pl.errors import GpeError
+from gpe_pl.finished_runs import Run
 from gpe_pl.generation import DatasetSpec, generate_trajectory, initial_state
 from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.markdown import table_row
 from gpe_pl.metrics import bootstrap_interval, energy_distance
-from gpe_pl.report import Run, table_row
 from gpe_pl.rollout import SimulationError, Simulator
 from gpe_pl.schema import Split
 from gpe_pl.solvers.resolution import Resolved, coarser, finer

@@ -16,9 +16,9 @@ from pydantic import Field
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.lattice import lattice_scene
 from gpe_pl.machine import peak_memory, peak_on_gpu, synchronized
+from gpe_pl.markdown import table_row
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.momentum_conv import EdgeState
-from gpe_pl.report import table_row
 from gpe_pl.skips import Skips
 from gpe_pl.timing import paired_ratio, paired_times
 

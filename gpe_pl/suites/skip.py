@@ -17,9 +17,9 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.lattice import lattice_scene
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.machine import synchronized
+from gpe_pl.markdown import table_row
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.momentum_conv import EdgeState
-from gpe_pl.report import table_row
 from gpe_pl.rollout import Simulator
 from gpe_pl.schema import param_names
 from gpe_pl.skips import Skips

@@ -24,13 +24,13 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.neighbors import radius_pairs
 from gpe_pl.lattice import lattice_graph, lattice_scene
 from gpe_pl.machine import copy_rate, gemm_rate, has_cpp_compiler, peak_memory, peak_on_gpu, reduces_precision, synchronized
+from gpe_pl.markdown import table_row
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.fused import unfused
 from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction
-from gpe_pl.report import table_row
 from gpe_pl.schema import FeatureSpec
 from gpe_pl.timing import apart, paired_ratio, paired_times
 

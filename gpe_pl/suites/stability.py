@@ -21,7 +21,7 @@ from pydantic import Field
 from gpe_pl.errors import GpeError
 from gpe_pl.generation import DatasetSpec, generate_trajectory
 from gpe_pl.learned_simulator import LearnedSimulator
-from gpe_pl.report import table_row
+from gpe_pl.markdown import table_row
 from gpe_pl.stability import conservation, geometry, horizon, inputs, invariances, precision
 from gpe_pl.stability.subject import Outcome, StressTest, Subject
 from gpe_pl.suites.trained import Case, runs_in, trained_on

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
+from gpe_pl.finished_runs import Run, axes_of, finished_runs
 from gpe_pl.generation import DatasetSpec
 from gpe_pl.learned_simulator import LearnedSimulator
-from gpe_pl.report import Run, axes_of, finished_runs
 
 DEPTHS = ("num_message_passing_steps", "num_propagation_steps", "num_convolutions")
 """What models call the number of their layers."""

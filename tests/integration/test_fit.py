@@ -22,10 +22,11 @@ from gpe_pl.data import sampling
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation import StartError, read_rows
+from gpe_pl.finished_runs import validation_curve
 from gpe_pl.fit import fit
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.progress import Progress
-from gpe_pl.report import report_sweep, validation_curve
+from gpe_pl.report import report_sweep
 from gpe_pl.run_folder import RunError, claim
 from gpe_pl.store import StoreError
 from gpe_pl.training import callbacks

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from gpe_pl import domain_table
 from gpe_pl.domain_table import TableError, compares_models, judged_group, report_domains
 from gpe_pl.evaluation import LEARNED, Row, read_rows, write_rows
-from gpe_pl.report import finished_runs
+from gpe_pl.finished_runs import finished_runs
 from tests.runs import compose
 
 ERRORS = {

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from gpe_pl.baselines import ConstantVelocity
+from gpe_pl.finished_runs import Run
 from gpe_pl.generation import generate_trajectory, initial_state, trajectory_metadata
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
-from gpe_pl.report import Run
 from gpe_pl.simulate import dataset_spec
 from gpe_pl.solvers.resolution import Resolved
 from gpe_pl.suites import runtime_vs_error as module

@@ -13,13 +13,13 @@ import torch
 from torch_geometric.data import HeteroData
 
 from gpe_pl.benchmark import benchmark
+from gpe_pl.finished_runs import Run
 from gpe_pl.generation import DatasetSpec, generate_trajectory
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
-from gpe_pl.report import Run
 from gpe_pl.simulate import dataset
 from gpe_pl.stability import conservation, geometry, horizon, inputs, invariances, precision
 from gpe_pl.stability.horizon import energy, growth_rate, separation, valid_steps

@@ -12,12 +12,12 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.data.dataset import Start, StartKey, WindowDataset, open_split
 from gpe_pl.data.sampling import PushForward
+from gpe_pl.finished_runs import UNSAID
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
-from gpe_pl.report import UNSAID
 from gpe_pl.rollout import SimulationError
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.push_forward import walked

@@ -1,0 +1,123 @@
+"""Training runs that have ended: their configuration, what they were evaluated to, and the values that several of them share."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpe_pl.evaluation import Row, read_rows
+from gpe_pl.run_folder import config_in
+
+log = logging.getLogger(__name__)
+
+UNSEEN_GROUPS = ("interpolated", "extrapolated")
+"""Where material parameters that training did not have can lie."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run: its folder, its flattened configuration and its rows."""
+
+    folder: Path
+    config: dict[str, Any]
+    rows: list[Row]
+
+
+UNSAID: dict[str, Any] = {"training.sampling": "uniform", "training.push_share": 0.0, "training.push_correction": 1.0}
+"""What the ``config.json`` of a run leaves out where it is not used, as runs did before there was a choice."""
+
+
+TRAINED = {"data.name", "model._target_", "training.num_steps"}
+"""What the configuration of every training run says."""
+
+
+def finished_runs(folder: Path) -> list[Run]:
+    """All finished training runs below a folder, in order of their paths; evaluations beside them are none."""
+    runs = []
+    for path in sorted(folder.rglob("metrics.csv")):
+        config = path.parent / "config.json"
+        if config.exists():
+            values = UNSAID | dict(_flatten(config_in(config)))
+            if values.keys() >= TRAINED:
+                runs.append(Run(path.parent, values, list(read_rows(path))))
+            else:
+                log.warning(
+                    "%s is not of a training run (%s) and is left out of the report",
+                    path.parent,
+                    ", ".join(sorted(TRAINED - values.keys())),
+                )
+    return runs
+
+
+def distinct_runs(runs: list[Run]) -> list[Run]:
+    """Runs of the same configuration count once."""
+    first: dict[str, Run] = {}
+    for run in runs:
+        kept = first.setdefault(json.dumps(run.config, sort_keys=True), run)
+        if kept is not run:
+            log.warning("%s repeats %s and is left out of the report", run.folder, kept.folder)
+    return list(first.values())
+
+
+def _flatten(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _flatten(item, f"{path}.{key}" if path else str(key))
+    else:
+        yield path, value if not isinstance(value, list) else json.dumps(value)
+
+
+def axes_of(runs: list[Run]) -> list[str]:
+    """Configuration keys whose values differ between runs, ``seed`` last."""
+    keys = sorted({k for r in runs for k in r.config})
+    different = [k for k in keys if len({json.dumps(r.config.get(k)) for r in runs}) > 1]
+    return sorted(different, key=lambda k: (k == "seed", k))
+
+
+def groups_of(row: Row) -> list[str]:
+    """Splits that a row counts for; unseen parameters also apart by where they lie."""
+    return [row.split, f"{row.split}/{row.parameter_group}"] if row.parameter_group in UNSEEN_GROUPS else [row.split]
+
+
+def validation_curve(run_dir: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Steps and one-step validation loss of a run, over all its starts."""
+    points: dict[int, float] = {}
+    for path in sorted(run_dir.glob("log/version_*/metrics.csv"), key=lambda p: int(p.parent.name.partition("_")[2])):
+        with open(path, newline="") as handle:
+            for line in csv.DictReader(handle):
+                if line.get("val/one_step_nmse"):
+                    points[int(line["step"]) + 1] = float(line["val/one_step_nmse"])
+    steps = sorted(points)
+    return np.array(steps), np.array([points[s] for s in steps])
+
+
+Values = list[dict[int, float]]
+"""Of one metric: for each seed that has any, a value by number of the trajectory."""
+
+
+def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon: str) -> Values:
+    """What runs have of a metric, in order of trajectories."""
+    table = []
+    for run in runs:
+        rows = [r for r in run.rows if r.model == model and r.metric == metric and r.horizon == horizon and split in groups_of(r)]
+        table.append({r.trajectory: r.value for r in sorted(rows, key=lambda r: r.trajectory)})
+    return [t for t in table if t]
+
+
+def shared_trajectories(*values: Values) -> list[int]:
+    """Numbers of the trajectories that all seeds, of several models if given, have evaluated."""
+    seeds = [set(seed) for table in values for seed in table]
+    return sorted(set.intersection(*seeds)) if seeds else []
+
+
+def shared_table(values: Values, trajectories: list[int] | None = None) -> np.ndarray:
+    """Values as a table [seed, trajectory], of the given trajectories or of those that all seeds have."""
+    chosen = shared_trajectories(values) if trajectories is None else trajectories
+    return np.array([[seed[k] for k in chosen] for seed in values]).reshape(len(values), len(chosen))
