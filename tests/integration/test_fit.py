@@ -212,7 +212,7 @@ def _claimed(cfg: DictConfig) -> dict[str, Any]:
 
 @pytest.mark.slow
 def test_a_folder_in_which_nothing_was_saved_is_free(tiny_data: Path, tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="graph.history=11 needs"):
+    with pytest.raises(StoreError, match="a start at frame 11 needs"):
         fit(tiny(tiny_data, tmp_path, "graph.history=11"))
     assert fit(tiny(tiny_data, tmp_path)) > 0
     (tmp_path / "fit" / "config.json").write_text("{")
