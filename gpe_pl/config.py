@@ -224,7 +224,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 def quoted(argument: str) -> str:
     """An override whose value is a path that exists and holds ``=``, as folders of sweeps do, in the quotes that Hydra wants around it."""
     key, _, value = argument.partition("=")
-    is_path = "=" in value and value[0] not in "\"'[{" and Path(value).exists()
+    is_path = "=" in value and value[0] not in "\"'[{" and os.path.exists(value)  # Path.exists fails on names that are too long
     return f'{key}="{value}"' if is_path else argument
 
 

@@ -33,6 +33,8 @@ class Run:
 UNSAID: dict[str, Any] = {"training.sampling": "uniform", "training.push_share": 0.0, "training.push_correction": 1.0}
 """What the ``config.json`` of a run leaves out where it is not used, as runs did before there was a choice."""
 
+WITHOUT_CONSEQUENCE = {"evaluation.num_pictures", "evaluation.export"}
+"""What runs may differ in without having been done otherwise."""
 
 TRAINED = {"data.name", "model._target_", "training.num_steps"}
 """What the configuration of every training run says."""
@@ -44,7 +46,7 @@ def finished_runs(folder: Path) -> list[Run]:
     for path in sorted(folder.rglob("metrics.csv")):
         config = path.parent / "config.json"
         if config.exists():
-            values = UNSAID | dict(_flatten(config_in(config)))
+            values = UNSAID | {key: value for key, value in _flatten(config_in(config)) if key not in WITHOUT_CONSEQUENCE}
             if values.keys() >= TRAINED:
                 runs.append(Run(path.parent, values, list(read_rows(path))))
             else:

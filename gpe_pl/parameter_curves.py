@@ -21,15 +21,17 @@ def parameter_curves(by_domain: dict[str, dict[str, list[Run]]]) -> Figure:
     from gpe_pl.viz.comparison import parameter_figure
 
     curves: dict[str, dict[str, dict[float, list[float]]]] = {}
+    seen: dict[str, set[float]] = {}
     for domain, by_label in by_domain.items():
         for label, members in by_label.items():
             points = curves.setdefault(domain, {}).setdefault(label, {})
             for row in (row for run in members for row in run.rows):
                 if (row.model, row.metric, row.horizon) == (LEARNED, "rollout_mse", "full") and np.isfinite(row.parameter):
                     points.setdefault(row.parameter, []).append(row.value)
-    runs = {domain: [run for members in by_label.values() for run in members] for domain, by_label in by_domain.items()}
-    seen = {d: sorted({row.parameter for run in own for row in run.rows if row.parameter_group == "seen"}) for d, own in runs.items()}
-    return parameter_figure(curves, seen, "rollout MSE [m²]", {domain: _axis_label(own[0]) for domain, own in runs.items()})
+                    if row.parameter_group == "seen":
+                        seen.setdefault(domain, set()).add(row.parameter)
+    labels = {domain: _axis_label(next(iter(by_label.values()))[0]) for domain, by_label in by_domain.items()}
+    return parameter_figure(curves, {domain: sorted(values) for domain, values in seen.items()}, "rollout MSE [m²]", labels)
 
 
 def _axis_label(run: Run) -> str:

@@ -6,7 +6,7 @@ import csv
 import logging
 from collections import defaultdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,9 +31,6 @@ from gpe_pl.metrics import bootstrap_interval
 from gpe_pl.nn.fused import unfused
 from gpe_pl.parameter_curves import PARAMETER_FIGURE, parameter_curves
 from gpe_pl.timing import paired_ratio, paired_times
-
-if TYPE_CHECKING:
-    pass
 
 log = logging.getLogger(__name__)
 
@@ -70,10 +67,9 @@ def _report(folder: Path, runs: list[Run]) -> None:
         from gpe_pl.viz.figures import validation_loss_figure
 
         validation_loss_figure(curves).savefig(folder / "validation_loss.png", dpi=150)
-    if any(row.parameter_group in UNSEEN_GROUPS for row in runs[0].rows):
-        parameter_curves({str(runs[0].config["data.name"]): {", ".join(v) or LEARNED: members for v, members in variants.items()}}).savefig(
-            folder / PARAMETER_FIGURE, dpi=150
-        )
+    if any(row.parameter_group in UNSEEN_GROUPS and np.isfinite(row.parameter) for row in runs[0].rows):
+        by_label = {", ".join(v) or LEARNED: members for v, members in variants.items()}
+        parameter_curves({str(runs[0].config["data.name"]): by_label}).savefig(folder / PARAMETER_FIGURE, dpi=150)
 
 
 def conclusion(folder: Path) -> str:

@@ -369,6 +369,14 @@ def test_a_path_with_an_equals_sign_is_taken_as_typed(tmp_path: Path) -> None:
     run = tmp_path / "data=sand" / "seed=0"
     run.mkdir(parents=True)
     assert compose("evaluate", quoted(f"checkpoint={run}")).checkpoint == str(run)
-    for argument in (f"checkpoint={tmp_path}", "checkpoint=", "model.decoder=node", f'checkpoint="{run}"', "--help", "a=b=c"):
+    for argument in (
+        f"checkpoint={tmp_path}",
+        "checkpoint=",
+        "model.decoder=node",
+        f'checkpoint="{run}"',
+        "--help",
+        "a=b=c",
+        "a=" + 200 * "b=c",
+    ):
         assert quoted(argument) == argument
     assert "a value that holds = needs quotes: 'KEY=\"VALUE\"'" in complaint("evaluate", f"checkpoint={run}0")

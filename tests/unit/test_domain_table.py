@@ -219,3 +219,11 @@ def test_a_failed_seed_is_counted_beside_the_median_of_the_others(tmp_path: Path
         write_run(tmp_path / str(seed), "sand", "GPE", seed, errors)
     report_domains(tmp_path)
     assert cells((tmp_path / "table1.md").read_text(), "sand")["GPE"] == "3 [1, inf], 1 of 6 failed"
+
+
+def test_runs_with_other_pictures_are_seeds_all_the_same(sweep: Path) -> None:
+    report_domains(sweep)
+    before = (sweep / "table1.md").read_text()
+    change(sweep / "sand" / "GPE" / "1", "evaluation", num_pictures=7)
+    report_domains(sweep)
+    assert (sweep / "table1.md").read_text() == before

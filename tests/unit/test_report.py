@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -105,3 +106,10 @@ def test_stress_is_reported_beside_displacement_and_velocity(runs: Path) -> None
     found = {row[2]: row[3] for row in cells(runs, "negated") if len(row) == 4}
     assert found == {"displacement": "0.25", "velocity": "0.5", "von mises": "0.75", "stress": "1.25"}
     assert not [row for row in cells(runs, "odd") if len(row) == 4]
+
+
+def test_scenes_without_one_parameter_make_no_figure(runs: Path) -> None:
+    for path in runs.glob("*/*/metrics.csv"):
+        write_rows(path, [replace(row, parameter=float("nan")) for row in read_rows(path)])
+    report.report_sweep(runs)
+    assert (runs / "table.md").exists() and not (runs / "error_by_parameter.png").exists()
