@@ -322,23 +322,36 @@ class Report(Callback):
     def _report(self, folder: Path, is_sweep: bool) -> None:
         """Ends the process on failure: Hydra turns an exception of a callback into a warning, and the command would seem to have succeeded."""
         try:
-            from gpe_pl.domain_table import compares_models, report_domains
-            from gpe_pl.report import conclusion, report, report_sweep
-            from gpe_pl.trial_table import compares_settings, report_trials
+            if is_sweep:
+                self._report_sweep(folder)
+            else:
+                from gpe_pl.report import conclusion, report
 
-            if not is_sweep:
                 report(folder)
                 if (folder / "metrics.csv").exists():
                     print(conclusion(folder))
-            elif compares_settings(folder):
-                report_trials(folder)
-            elif compares_models(folder):
-                report_domains(folder)
-            else:
-                report_sweep(folder)
             print(folder)
         except GpeError as error:
             _fail(error)
         except Exception:
             traceback.print_exc()
             sys.exit(1)
+
+    @staticmethod
+    def _report_sweep(folder: Path) -> None:
+        """Write and print the table that suits what the runs differ in."""
+        from gpe_pl.domain_table import TABLE_MD, compares_models, report_domains
+        from gpe_pl.report import SWEEP_MD, report_sweep
+        from gpe_pl.trial_table import TRIALS_MD, compares_settings, report_trials
+
+        if compares_settings(folder):
+            report_trials(folder)
+            table = folder / TRIALS_MD
+        elif compares_models(folder):
+            report_domains(folder)
+            table = folder / TABLE_MD
+        else:
+            report_sweep(folder)
+            table = folder / SWEEP_MD
+        if table.exists():  # not where no run has finished
+            print(table.read_text())

@@ -131,6 +131,18 @@ def _check(folder: Path, domains: list[str], by_cell: dict[tuple[str, str], list
                 f"{folder}: models on {domain} were trained or judged on different data ({', '.join(keys[:3])}) and do not compare; "
                 "give these runs a name=… of their own"
             )
+        frames = {frame for frame in map(_first_frame, runs) if frame is not None}
+        if len(frames) > 1:
+            raise TableError(
+                f"{folder}: rollouts of models on {domain} start at different frames ({', '.join(map(str, sorted(frames)))}: evaluation.start_frame, "
+                "or else graph.history) and do not compare; evaluate all with one evaluation.start_frame=…"
+            )
+
+
+def _first_frame(run: Run) -> int | None:
+    """Where rollouts of a run start, if its configuration says so."""
+    frame = run.config.get("evaluation.start_frame")
+    return run.config.get("graph.history") if frame is None else frame
 
 
 def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, Cell]:

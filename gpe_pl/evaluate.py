@@ -62,9 +62,14 @@ def _identity(cfg: DictConfig) -> dict[str, Any]:
     from gpe_pl.pretrained import fingerprint
 
     values: Any = OmegaConf.to_container(cfg, resolve=True)
-    without = {"evaluation": ("splits", "data", "num_pictures", "export"), "data": ("comparison",)}  # more pictures may be asked for later
-    parts = {part: {k: v for k, v in values[part].items() if k not in without.get(part, ())} for part in ("data", "evaluation", "rollout")}
-    return {"checkpoint": fingerprint(cfg.checkpoint), "split": cfg.split, **parts}
+    without = ("splits", "data", "num_pictures", "export")  # more pictures may be asked for later
+    evaluation = {key: value for key, value in values["evaluation"].items() if key not in without}
+    return {
+        "checkpoint": fingerprint(cfg.checkpoint),
+        "split": cfg.split,
+        "evaluation": evaluation,
+        **{k: values[k] for k in ("data", "rollout")},
+    }
 
 
 def _own_data(simulator: LearnedSimulator) -> str:

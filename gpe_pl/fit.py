@@ -71,7 +71,7 @@ def fit(cfg: DictConfig) -> float:
     def new_module(training: TrainingSettings) -> TrainingModule:
         L.seed_everything(cfg.seed, verbose=False)
         simulator = LearnedSimulator(new_model(spec=data().builder.spec), data().builder)
-        simulator.fit_statistics(data().statistics_sample())
+        simulator.fit_statistics(data().statistics_sample(), data().parameter_ranges())
         if start is not None:
             simulator.start_from(start)
         names = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "stress_weight", "compile")
@@ -83,7 +83,8 @@ def fit(cfg: DictConfig) -> float:
     callbacks: list[L.Callback] = []
     if training.budget_minutes is not None:
         parts = {k: settings[k] for k in ("graph", "model", "data")} | {"batch_size": training.batch_size, "device": device}
-        parts |= unusual
+        parts |= unusual | ({} if training.compile == "off" else {"compile": training.compile})
+        parts |= {} if trainer.matmul_precision == "highest" else {"matmul_precision": trainer.matmul_precision}
         parts |= {"push_forward": [training.push_share, training.push_steps]} if training.push_share else {}
         key = f"{cfg.data.name} {cfg.size.name} {cfg.model._target_.rpartition('.')[2]} {digest(parts)}"
         times = Path(cfg.paths.runs) / (cfg.reuse or cfg.name) / "step_times.json"

@@ -12,7 +12,7 @@ import inspect
 import json
 import logging
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
@@ -187,10 +187,14 @@ class LearnedSimulator(nn.Module):
         return int(cast(Any, self.model).num_hops)
 
     @torch.no_grad()
-    def fit_statistics(self, graphs: Iterable[HeteroData]) -> None:
+    def fit_statistics(self, graphs: Iterable[HeteroData], parameter_ranges: Mapping[str, Tensor] | None = None) -> None:
         """Set feature statistics, the range of material parameters, and the scales of acceleration and stress from training graphs with ``target``.
 
         Each scale is one scalar for all axes or components and all materials, with mean zero.
+
+        Args:
+            graphs: a sample of the training data.
+            parameter_ranges: lowest and highest value [2, param] of each material's parameters in all of them; by default in the sample.
         """
         graphs = list(graphs)
         self.standardizer.fit(graphs)
@@ -202,10 +206,12 @@ class LearnedSimulator(nn.Module):
         stress = [g[m].stress_target for g in graphs for m in self.builder.spec.stress_channels if "stress_target" in g[m]]
         if stress:
             self.stress_std.copy_(torch.cat(stress).double().square().mean().sqrt().clamp(min=1.0))
+        if parameter_ranges is None:
+            params = {m: torch.cat([g[m].material_params for g in graphs]) for m, _ in self.trained_ranges()}
+            parameter_ranges = {m: torch.stack([p.amin(dim=0), p.amax(dim=0)]) for m, p in params.items() if len(p)}
         for material, trained in self.trained_ranges():
-            params = torch.cat([g[material].material_params for g in graphs]).double()
-            if len(params):
-                trained.copy_(torch.stack([params.amin(dim=0), params.amax(dim=0)]))
+            if material in parameter_ranges:
+                trained.copy_(parameter_ranges[material])
 
     @torch.no_grad()
     def start_from(self, trained: LearnedSimulator) -> None:
@@ -220,14 +226,15 @@ class LearnedSimulator(nn.Module):
         different = [f"{key}={value}" for key, value in there.items() if now.get(key) != value]
         if different:
             raise CheckpointError(f"the model to start from is another one or has other graphs; choose {' '.join(different)}")
-        ranges = [values.clone() for _, values in self.trained_ranges()]
+        ranges = {material: values.clone() for material, values in self.trained_ranges()}
         try:
             self.load_state_dict(trained.state_dict())
         except RuntimeError as error:  # one set of weights per level of a mesh, and meshes of other sizes
             raise CheckpointError(f"the model to start from has meshes of other sizes ({_reason(error)})") from None
-        for (_, values), here in zip(self.trained_ranges(), ranges, strict=True):
-            values[0].copy_(torch.minimum(values[0], here[0]))
-            values[1].copy_(torch.maximum(values[1], here[1]))
+        for material, values in self.trained_ranges():
+            low, high = ranges[material]
+            values[0].copy_(torch.minimum(values[0], low))
+            values[1].copy_(torch.maximum(values[1], high))
 
     def _choices(self) -> dict[str, str]:
         """Overrides that make such a model and such graphs; the radius in spacings, whether the graph's or the data set's."""

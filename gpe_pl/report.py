@@ -36,6 +36,8 @@ log = logging.getLogger(__name__)
 
 TRIVIAL = ("ballistic", "constant_velocity")
 STRESS_METRICS = ("von_mises_error", "stress_error")
+SWEEP_MD = "table.md"
+
 TABLE_HORIZONS = 4
 """The longest horizons, shown in the Markdown table; ``table.csv`` has all."""
 
@@ -60,7 +62,7 @@ def _report(folder: Path, runs: list[Run]) -> None:
         variants[tuple(str(run.config.get(a)) for a in axes)].append(run)
     _write_csv(folder / "table.csv", axes, runs)
     ratios = forward_time_ratios(variants)
-    replace_text(folder / "table.md", _markdown(axes, variants, ratios))
+    replace_text(folder / SWEEP_MD, _markdown(axes, variants, ratios))
     curves = {", ".join(v) or LEARNED: [validation_curve(r.folder) for r in members] for v, members in variants.items()}
     curves = {k: [c for c in v if len(c[0])] for k, v in curves.items()}
     if all(curves.values()):

@@ -11,6 +11,8 @@ from gpe_pl.atomic import replace_text
 from gpe_pl.errors import GpeError
 
 CONFIG = "config.json"
+OFFERED = ("comparison", "larger")
+"""Tables of ``data`` and ``size`` that other keys are taken from."""
 
 
 class RunError(GpeError, RuntimeError):
@@ -23,6 +25,7 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
     Raises:
         RunError: the folder holds a run with another configuration; names the first differing key.
     """
+    config = without_tables(config)
     run_dir.mkdir(parents=True, exist_ok=True)
     path = run_dir / CONFIG
     if any(found.name != CONFIG for pattern in results for found in run_dir.glob(pattern)):
@@ -43,10 +46,17 @@ def release(run_dir: Path) -> None:
 
 
 def without_tables(values: dict[str, Any]) -> dict[str, Any]:
-    """A configuration without what data and sizes offer to comparisons, of which graph, model and training say what was taken; the budget stays."""
-    parts = {name: part for name in ("data", "size") if isinstance(part := values.get(name), dict) and "comparison" in part}
-    kept = {name: {key: value for key, value in part.items() if key != "comparison"} for name, part in parts.items()}
-    budget = parts.get("size", {}).get("comparison", {}).get("budget_minutes")
+    """A configuration without what data and sizes offer to comparisons and evaluations; graph, model, training and the evaluated scene say what was taken.
+
+    The budget of a comparison stays: it decides the number of steps.
+    """
+    kept = {
+        name: {key: value for key, value in part.items() if key not in OFFERED}
+        for name in ("data", "size")
+        if isinstance(part := values.get(name), dict)
+    }
+    size = values.get("size")
+    budget = size.get("comparison", {}).get("budget_minutes") if isinstance(size, dict) else None
     return values | kept | ({} if budget is None else {"size": kept["size"] | {"comparison": {"budget_minutes": budget}}})
 
 
@@ -55,7 +65,7 @@ def config_in(path: Path) -> dict[str, Any]:
     try:
         values = dict(json.loads(path.read_text()))
         return without_tables(values)  # which older runs wrote down
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, AttributeError):
         raise RunError(f"{path} is damaged; delete the folder {path.parent} or choose another name=…") from None
 
 

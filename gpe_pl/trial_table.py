@@ -26,7 +26,7 @@ TRIALS_CSV, TRIALS_MD = "trials.csv", "trials.md"
 CONSEQUENCES = ("training.val_interval", "seed")
 """What differs between trials without having been tried: it follows from the number of steps, or is chance."""
 NUM_STEPS = "training.num_steps"
-"""Follows from a budget of time and the other settings; where these are equal, it was tried."""
+"""Follows from a budget of time and the other settings; where these and the seed are equal, it was tried."""
 
 
 def compares_settings(folder: Path) -> bool:
@@ -86,7 +86,7 @@ def _settings(runs: list[Run]) -> list[str]:
     keys = [key for key in axes_of(runs) if key not in (*CONSEQUENCES, NUM_STEPS)]
     steps: dict[tuple[str, ...], set[Any]] = defaultdict(set)
     for run in runs:
-        steps[tuple(str(run.config.get(key)) for key in keys)].add(run.config[NUM_STEPS])
+        steps[tuple(str(run.config.get(key)) for key in (*keys, "seed"))].add(run.config[NUM_STEPS])
     return [*keys, NUM_STEPS] if any(len(found) > 1 for found in steps.values()) else keys
 
 

@@ -20,6 +20,7 @@ from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling,
 from gpe_pl.data.statistics import acceleration_std, is_intact
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.schema import MATERIALS, node_code
 from gpe_pl.store import StoreError
 from gpe_pl.trajectory import Trajectory
 
@@ -91,6 +92,18 @@ class TrajectoryDataModule(L.LightningDataModule):
         """Training graphs, noise included, evenly spread over the split; for the standardisation of features."""
         for window in _spread(len(self.train_set), num_windows):
             yield self.train_set[int(window)]
+
+    def parameter_ranges(self) -> dict[str, torch.Tensor]:
+        """Lowest and highest value [2, 1] of each material's parameter in all training trajectories; of materials that occur."""
+        found: dict[str, list[np.ndarray]] = {}
+        for stored in self.train_set.trajectories:
+            first = stored.window(0, 1)
+            for material in self.builder.spec.param_channels:
+                column = self.metadata.param_names.index(MATERIALS[material].name)
+                values = first.material_params[first.node_type == node_code(material), column]
+                if len(values):
+                    found.setdefault(material, []).append(np.array([values.min(), values.max()]))
+        return {m: torch.tensor([[np.min(pairs)], [np.max(pairs)]], dtype=torch.float32) for m, pairs in found.items()}
 
     def val_trajectories(self, count: int) -> list[Trajectory]:
         """The first ``count`` trajectories of the ``val`` split that are long enough."""

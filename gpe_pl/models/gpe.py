@@ -161,8 +161,8 @@ class GPE(nn.Module):
         spec: channels of the graphs.
         interaction: how a message and its reverse relate; see ``nn.momentum_conv``.
         decoder: ``node`` decodes an acceleration per node (paper); ``pair`` an antisymmetric force per edge, divided by the node's mass; ``contact`` decodes
-            both in meshes: a body moves and turns as a whole by the forces of its ``radius`` edges alone, which are where it touches something, and each
-            node adds only what deforms it. What is no mesh has an acceleration per node, and so have nodes of no cell: they would escape every error.
+            both in meshes: a body moves and turns as a whole by the forces of its ``radius`` edges to others alone, which are where it touches something, and
+            each node adds only what deforms it. What is no mesh has an acceleration per node, and so have nodes of no cell: they would escape every error.
         edge_state: ``latent`` updates a hidden state per edge (Algorithm 1); ``geometry`` feeds the raw edge features to every layer.
         material_embedding: ``affine`` (the paper's interpolation rule) or ``mlp``.
         num_message_passing_steps: processor layers; 12 in the paper.
@@ -315,7 +315,8 @@ class GPE(nn.Module):
         if grid(1) in x and self.level_weights == "shared" and self.schedule == "simultaneous":
             x, edges = _merge_levels(x, edges)
         apart = self.skips.isolated_nodes and not self.training
-        acceleration, stress, contact = (self._compute_apart if apart else self._compute_in_order)(x, params, mass, edges)
+        body = {m: data[m].body for m in self.bodies if m in x}
+        acceleration, stress, contact = (self._compute_apart if apart else self._compute_in_order)(x, params, mass, body, edges)
         if contact:
             acceleration = self._moved_by_contacts(data, acceleration, contact)
         if acceleration and self.settings["island_momentum"] != "ignored":
@@ -339,34 +340,38 @@ class GPE(nn.Module):
         kept = conserve(torch.cat([*acceleration.values()]), mass, pos, island, data.island_is_free, angular)
         return dict(zip(acceleration, kept.split([a.shape[0] for a in acceleration.values()]), strict=True))
 
-    def _compute_in_order(self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges) -> Decoded:
+    def _compute_in_order(
+        self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], body: dict[str, Tensor], edges: Edges
+    ) -> Decoded:
         """``compute``, in large scenes of nodes that stand in the order of their edges: what belongs together is found in the cache."""
         limit = None if self.training else self.skips.sorted_from
         if limit is None or sum(values.shape[0] for values in x.values()) < limit:
-            return self.compute(x, params, mass, edges)
+            return self.compute(x, params, mass, body, edges)
         order = order_of_edges({t: values.shape[0] for t, values in x.items()}, edges)
 
         def in_order(values: dict[str, Tensor]) -> dict[str, Tensor]:
             return {t: v[order[t]] if t in order else v for t, v in values.items()}
 
-        results = self.compute(in_order(x), in_order(params), in_order(mass), reordered(edges, order))
+        results = self.compute(in_order(x), in_order(params), in_order(mass), in_order(body), reordered(edges, order))
         for result in results:
             for t in result.keys() & order.keys():
                 result[t] = torch.empty_like(result[t]).index_copy(0, order[t], result[t])
         return results
 
-    def _compute_apart(self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges) -> Decoded:
+    def _compute_apart(
+        self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], body: dict[str, Tensor], edges: Edges
+    ) -> Decoded:
         """``compute``, but nodes without an edge pass no messages: what they would receive is nothing."""
         has_edge = touched({t: values.shape[0] for t, values in x.items()}, edges)
         if has_edge.keys() >= x.keys() and all(bool(mask.all()) for mask in has_edge.values()):
-            return self._compute_in_order(x, params, mass, edges)
+            return self._compute_in_order(x, params, mass, body, edges)
 
         def connected(values: dict[str, Tensor]) -> dict[str, Tensor]:
             return {t: v[has_edge[t]] for t, v in values.items() if t in has_edge}
 
         inner, whole = Decoded({}, {}, {}), Decoded({}, {}, {})
         if edges:
-            inner = self._compute_in_order(connected(x), connected(params), connected(mass), renumbered(edges, has_edge))
+            inner = self._compute_in_order(connected(x), connected(params), connected(mass), connected(body), renumbered(edges, has_edge))
         for m in mass:
             alone = ~has_edge[m] if m in has_edge else torch.ones(x[m].shape[0], dtype=torch.bool, device=x[m].device)
             single = self._isolated(m, x[m][alone], params[m][alone] if m in params else None)
@@ -398,6 +403,7 @@ class GPE(nn.Module):
         x: dict[str, Tensor],
         params: dict[str, Tensor],
         mass: dict[str, Tensor],
+        body: dict[str, Tensor],
         edges: Edges,
     ) -> Decoded:
         """``forward`` on plain tensors: the part that ``torch.compile`` sees."""
@@ -437,8 +443,8 @@ class GPE(nn.Module):
 
         stress = {m: self.stress_decoder[m](h[m]) for m in mass if self._decodes_stress(m)}
         if self.decoder == "pair":
-            return Decoded(self._pair_accelerations(h, mass, edges, chunk), stress, {})
-        contact = self._pair_accelerations(h, {m: mass[m] for m in self.bodies if m in mass}, edges, chunk) if self.bodies else {}
+            return Decoded(self._pair_accelerations(h, mass, body, edges, chunk), stress, {})
+        contact = self._pair_accelerations(h, {m: mass[m] for m in body}, body, edges, chunk) if body else {}
         return Decoded({m: self.node_decoder[m](h[m]) for m in mass}, stress, contact)
 
     def _phases(self, types: list[str], edges: Edges) -> list[tuple[list[EdgeType], dict[str, Tensor | None]]]:
@@ -477,14 +483,19 @@ class GPE(nn.Module):
             features = torch.cat([features, torch.cat([-odd, even], dim=1)])
         return features if encoder is None else encoder(features)
 
-    def _pair_accelerations(self, h: dict[str, Tensor], mass: dict[str, Tensor], edges: Edges, chunk: int | None) -> dict[str, Tensor]:
-        """What pair forces accelerate the materials in ``mass`` by."""
+    def _pair_accelerations(
+        self, h: dict[str, Tensor], mass: dict[str, Tensor], body: dict[str, Tensor], edges: Edges, chunk: int | None
+    ) -> dict[str, Tensor]:
+        """What pair forces accelerate the materials in ``mass`` by; without those within a ``body``, which could turn it, as they need not be central."""
         force = {m: h[m].new_zeros(h[m].shape[0], self.spec.dim) for m in mass}
         for relation, (edge_index, odd, even) in edges.items():
             if self.key(relation) not in self.pair_decoder:
                 continue
             source, _, target = relation
             f = self.pair_decoder[self.key(relation)](h[source], h[target], edge_index, odd, even, chunk)
+            if source in body and target in body:
+                (j, i), here, there = edge_index, body[target], body[source]
+                f = torch.where(((here[i] == there[j]) & (here[i] >= 0))[:, None], 0.0, f)
             if target in force:
                 force[target] = force[target].index_add(0, edge_index[1], f)
             if source in force:

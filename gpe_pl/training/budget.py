@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -32,6 +33,8 @@ log = logging.getLogger(__name__)
 WARM_UP_STEPS = NUM_LANES
 MEASURED_STEPS = 25
 ROUNDS = 5
+SHARE_TO_MEASURE = 0.5
+"""Of a budget: no further round begins once measuring has taken as long."""
 RATE = "FLOP/s in products"
 """In a file of step times: what the machine did when the first of them was measured."""
 PRODUCTS = (4096, 128)
@@ -51,19 +54,26 @@ class BudgetError(GpeError, ValueError):
 
 def mean_step_time(module: TrainingModule, data: WindowDataset, size: BatchSize, settings: TrainingSettings) -> float:
     """Seconds per optimiser step, over a run that begins without own steps of the model and may end with them."""
-    plain = step_time(module, data, size, settings.gradient_clip)
+    limit = math.inf if settings.budget_minutes is None else SHARE_TO_MEASURE * 60 * settings.budget_minutes
     if not settings.push_share:
-        return plain
-    late = step_time(module, data, size, settings.gradient_clip, PushForward(0, settings.push_steps))
+        return step_time(module, data, size, settings.gradient_clip, limit=limit)
+    plain = step_time(module, data, size, settings.gradient_clip, limit=limit / 2)
+    late = step_time(module, data, size, settings.gradient_clip, PushForward(0, settings.push_steps), limit=limit / 2)
     return (1 - settings.push_share) * plain + settings.push_share * late
 
 
 def step_time(
-    module: TrainingModule, data: WindowDataset, size: BatchSize, gradient_clip: float, push_forward: PushForward | None = None
+    module: TrainingModule,
+    data: WindowDataset,
+    size: BatchSize,
+    gradient_clip: float,
+    push_forward: PushForward | None = None,
+    limit: float = math.inf,
 ) -> float:
     """Seconds per optimiser step, the building of its graphs included: processor time, or on a GPU wall time, in the fastest of several rounds.
 
-    Other processes can only lengthen it, through shared caches and memory even where processor time is counted.
+    No round but the first begins after ``limit`` seconds of them. Other processes can only lengthen a step, through shared caches and memory even where
+    processor time is counted.
     """
     on_gpu = next(module.parameters()).is_cuda
     clock = time.perf_counter if on_gpu else time.process_time
@@ -84,7 +94,10 @@ def step_time(
 
     with module.compiled():
         steps(WARM_UP_STEPS)
-        return min(steps(MEASURED_STEPS) for _ in range(ROUNDS)) / MEASURED_STEPS
+        rounds = [steps(MEASURED_STEPS)]
+        while len(rounds) < ROUNDS and sum(rounds) < limit:
+            rounds.append(steps(MEASURED_STEPS))
+        return min(rounds) / MEASURED_STEPS
 
 
 def _on(device: torch.device, samples: Samples) -> Samples:

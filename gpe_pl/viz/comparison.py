@@ -16,6 +16,8 @@ from gpe_pl.viz.film_strip import TEXT_WIDTH, new_figure
 def comparison_figure(intervals: Mapping[str, Mapping[str, Interval]], references: Mapping[str, float], label: str) -> Figure:
     """A group per domain, a mark with its interval per model, on a logarithmic axis; a line across each group marks its reference.
 
+    An interval without an upper end reaches out of the figure, and a mark that is itself infinite stands as a triangle at its top.
+
     Args:
         intervals: by domain and model.
         references: by domain, such as the error of ballistic flight.
@@ -29,13 +31,20 @@ def comparison_figure(intervals: Mapping[str, Mapping[str, Interval]], reference
     for k, model in enumerate(models):
         shift = (k - (len(models) - 1) / 2) * 0.6 / max(1, len(models))
         found = [(d + shift, group[model]) for d, group in enumerate(intervals.values()) if model in group]
-        x, i = [p for p, _ in found], [v for _, v in found]
-        middle = np.array([v.estimate for v in i])
-        spread = np.abs(np.array([[v.estimate - v.low for v in i], [v.high - v.estimate for v in i]]))
-        finite = np.isfinite(middle) & np.isfinite(spread).all(axis=0)
+        x = np.array([p for p, _ in found])
+        middle, low, high = np.array([[v.estimate, v.low, v.high] for _, v in found]).T
+        color = PALETTE[k % len(PALETTE)]
+        finite, open_end = np.isfinite(middle), np.isfinite(middle) & ~np.isfinite(high)
+        ends = np.stack([low, np.where(open_end, middle, high)])[:, finite]
         axes.errorbar(
-            np.array(x)[finite], middle[finite], spread[:, finite], fmt="o", markersize=4, linewidth=1, capsize=2, color=PALETTE[k % len(PALETTE)], label=model
+            x[finite], middle[finite], np.abs(ends - middle[finite]), fmt="o", markersize=4, linewidth=1, capsize=2, color=color, label=model
         )  # fmt: skip
+        top = axes.get_xaxis_transform()
+        for place, value in zip(x[open_end], middle[open_end], strict=True):
+            axes.annotate(
+                "", (place, 1.0), (place, value), top, axes.transData, {"arrowstyle": "->", "color": color, "shrinkA": 0, "shrinkB": 0}
+            )
+        axes.plot(x[~finite], np.ones((~finite).sum()), "^", markersize=5, color=color, transform=top, clip_on=False)
     for d, domain in enumerate(intervals):
         axes.plot(
             [d - 0.4, d + 0.4], [references[domain]] * 2, color="0.5", linestyle=":", linewidth=1, label="ballistic" if d == 0 else None

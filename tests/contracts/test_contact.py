@@ -14,6 +14,7 @@ from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.models.gpe import GPE, IslandError
 from gpe_pl.schema import node_code
+from gpe_pl.skips import Skips
 from gpe_pl.trajectory import State
 from tests import scenes
 
@@ -92,6 +93,30 @@ def test_without_contact_a_body_falls_freely_and_deforms() -> None:
     for b in range(int(data.num_bodies)):
         chosen = data["elastomer"].body == b
         assert (mass * acceleration)[chosen].sum(dim=0).norm() <= 1e-13 * (mass * acceleration).norm(dim=1).sum()
+
+
+@pytest.mark.parametrize("skips", [Skips(), Skips(sorted_from=0)])
+def test_a_body_that_touches_itself_does_not_turn_itself(skips: Skips) -> None:
+    """Two heaps of cells that touch, far apart at rest and tied together by one long cell: forces at their contact are no forces from outside."""
+    build = builder(("elastomer",))
+    s = scenes.mesh_state("triangles", ("elastomer",), num_bodies=2, gap=0.5, walls=False)
+    store = double(build, s)["elastomer"]
+    first, second = (store.node_id[store.body == b].numpy() for b in range(2))
+    assert s.cells is not None and s.rest_pos is not None
+    s = replace(s, cells=np.concatenate([s.cells, [[*first[:2], second[0]]]]))
+    rest = np.array(s.rest_pos)
+    rest[second, 0] += 50 * scenes.SPACING
+    data = double(build, replace(s, rest_pos=rest))
+    assert data.num_bodies == 1
+    assert data["elastomer", "radius", "elastomer"].edge_index.shape[1]
+    model = contact_model(build)
+    model.skips = skips
+    acceleration = model.eval()(data).acceleration["elastomer"]
+    mass, pos = data["elastomer"].mass[:, None], data["elastomer"].pos
+    force, arm = mass * acceleration, pos - (mass * pos).sum(dim=0) / mass.sum()
+    assert force.norm(dim=1).sum() > 1e-3
+    assert force.sum(dim=0).norm() < 1e-12 * force.norm(dim=1).sum()
+    assert turning(arm, force).norm() < 1e-12 * force.norm(dim=1).sum()
 
 
 def test_the_bodies_of_a_batch_are_told_apart() -> None:

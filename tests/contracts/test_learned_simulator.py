@@ -498,6 +498,16 @@ def test_material_parameters_outside_the_training_data_are_named(caplog: pytest.
     assert [r.getMessage() for r in caplog.records] == [f"outside the training data: {line}; taken for the nearest trained value"]
 
 
+def test_the_trained_range_is_that_of_all_data_where_graphs_are_a_sample() -> None:
+    build = scenes.builder(("sand",), history=1)
+    simulator = learned(build)
+    graph = build(scenes.state(40, ("sand",)).to_torch())
+    graph["sand"].target = torch.ones(graph["sand"].num_nodes, 2)
+    simulator.fit_statistics([graph], {"sand": torch.tensor([[-5.0], [95.0]])})
+    ((material, trained),) = simulator.trained_ranges()
+    assert (material, trained.tolist()) == ("sand", [[-5.0], [95.0]])
+
+
 def test_material_parameters_outside_the_training_data_are_taken_for_the_nearest_trained_value() -> None:
     build = scenes.builder(("sand", "snow"), history=1)
     simulator = learned(build).eval()

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from itertools import product
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
@@ -55,6 +59,46 @@ def test_an_experiment_trains_and_evaluates(experiment: str, tiny_data: Path, tm
     ]
     assert value == pytest.approx(sum(full) / len(full))
     assert 0 < value < 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_value_of_a_sweep_is_a_run_of_its_own(experiment: str) -> None:
+    """An axis that changes nothing for some model would train the same thing twice and show it as two."""
+    params: dict[str, Any] = compose("fit", f"experiment={experiment}", hydra_config=True).hydra.sweeper.params or {}
+    if experiment == "search":
+        pytest.skip("its values are proposed while it runs")
+    axes = [[f"{key}={value}" for value in str(values).split(",")] for key, values in params.items() if key != "seed"]
+    configs: list[Any] = [OmegaConf.to_container(compose("fit", f"experiment={experiment}", *o)) for o in product(*axes)]
+    runs = [without_tables(config) for config in configs]
+    done = [json.dumps({key: run[key] for key in ("data", "graph", "model", "training")}, sort_keys=True) for run in runs]
+    assert len({*done}) == len(done)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", [e for e in EXPERIMENTS if compose("fit", f"experiment={e}").reuse == "table1"])
+def test_what_takes_over_from_table_1_has_a_run_to_take(experiment: str) -> None:
+    """One of its settings is trained as table 1 does."""
+    params: dict[str, Any] = compose("fit", f"experiment={experiment}", hydra_config=True).hydra.sweeper.params or {}
+    axes = [[f"{key}={value}" for value in str(values).split(",")] for key, values in params.items() if key != "seed"]
+    found = False
+    for overrides in product(*axes):
+        cfg = compose("fit", f"experiment={experiment}", *overrides)
+        domain = cfg.data.name
+        model = {"GPE": "gpe_tuned", "GNS": "gns", "DPINet": "dpinet", "ContinuousConvNet": "cconv"}[cfg.model._target_.rpartition(".")[2]]
+        there = compose("fit", "experiment=table1", f"data={domain}", f"model={model}")
+        found |= all(cfg[key] == there[key] for key in ("size", "data", "graph", "model", "training"))
+    assert found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", ["tiny", "small", "paper"])
+@pytest.mark.parametrize("domain", ["sand", "snow", "elastomer"])
+def test_the_grid_sees_every_obstacle_of_larger_scenes(domain: str, size: str) -> None:
+    """The thinnest are ramps four times as long as thick."""
+    larger = compose("fit", "experiment=larger_scenes", f"data={domain}", f"size={size}").evaluation.data
+    scene = OmegaConf.merge(compose("fit", f"data={domain}", f"size={size}").data.scene, larger.scene)
+    assert 2 * scene.obstacle_radius[0] * np.sin(np.arctan2(1, 4)) >= scene.grid_spacing
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from gpe_pl import domain_table
+from gpe_pl.config import Report
 from gpe_pl.domain_table import TableError, compares_models, judged_group, report_domains
 from gpe_pl.evaluation import LEARNED, Row, read_rows, write_rows
 from gpe_pl.finished_runs import finished_runs
@@ -195,6 +196,38 @@ def test_runs_that_differ_in_more_than_the_seed_are_no_seeds(sweep: Path, part: 
     with pytest.raises(TableError, match=f"GPE on sand differ in {part}.{key}, not in the seed alone"):
         report_domains(sweep)
     assert not (sweep / "table1.csv").exists()
+
+
+def test_seeds_trained_for_other_numbers_of_steps_are_refused_and_the_table_stays(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As after another measurement of step times: a mistake to name, not a trial of settings that would replace the table."""
+    report_sweep_of(sweep)
+    table = (sweep / "table1.md").read_text()
+    change(sweep / "sand" / "GPE" / "1", "training", num_steps=7)
+    with pytest.raises(SystemExit):
+        report_sweep_of(sweep)
+    assert "GPE on sand differ in training.num_steps" in capsys.readouterr().err
+    assert (sweep / "table1.md").read_text() == table
+    assert not (sweep / "trials.md").exists()
+
+
+def report_sweep_of(folder: Path) -> None:
+    """What a command does when its sweep has ended."""
+    Report().on_multirun_end(OmegaConf.create({"hydra": {"sweep": {"dir": str(folder)}}}))
+
+
+def test_the_table_is_printed(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report_sweep_of(sweep)
+    assert (sweep / "table1.md").read_text() in capsys.readouterr().out
+
+
+def test_rollouts_from_different_frames_do_not_compare(sweep: Path) -> None:
+    for run in finished_runs(sweep / "sand"):
+        change(run.folder, "graph", history=1 if "GPE" in run.folder.parts else 5)
+    with pytest.raises(TableError, match=r"models on sand start at different frames \(1, 5:"):
+        report_domains(sweep)
+    for run in finished_runs(sweep / "sand" / "GPE"):
+        change(run.folder, "evaluation", start_frame=5)
+    report_domains(sweep)
 
 
 def test_models_judged_on_other_scenes_do_not_compare(sweep: Path) -> None:

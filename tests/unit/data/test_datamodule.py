@@ -129,6 +129,18 @@ def test_statistics_are_those_of_noisy_inputs(root: Path) -> None:
     assert not torch.equal(sample[0]["sand"].x, next(clean.statistics_sample(4))["sand"].x)
 
 
+def test_parameter_ranges_cover_what_the_sample_of_windows_leaves_out(root: Path) -> None:
+    def other(trajectory: Trajectory) -> Trajectory:
+        return replace(trajectory, material_params=trajectory.material_params + 7.0)
+
+    module = datamodule(with_another(root, other))
+    (sample,) = module.statistics_sample(1)
+    known = sample["sand"].material_params
+    low, high = module.parameter_ranges()["sand"]
+    assert float(low) == known.min()
+    assert float(high) == pytest.approx(float(known.max()) + 7.0)
+
+
 def test_validation_trajectories_come_from_the_validation_split(root: Path) -> None:
     assert [t.metadata.split for t in datamodule(root).val_trajectories(3)] == ["val"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -141,19 +142,56 @@ def test_equal_settings_have_equal_digests() -> None:
     assert digest(a) != digest({**a, "batch_size": 3})
 
 
-def test_measuring_trains_nothing(tiny_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def measurable(tiny_data: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[TrainingModule, WindowDataset]:
+    """A module and its windows, of which few steps are measured."""
     monkeypatch.setattr(budget, "WARM_UP_STEPS", 1)
     monkeypatch.setattr(budget, "MEASURED_STEPS", 2)
     stored = open_split(tiny_data / "sand" / "tiny", "train")
     builder = GraphBuilder(GraphConfig(history=2), stored[0].window(0, 1).metadata)
     module = TrainingModule(LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder), num_steps=10)
+    return module, WindowDataset(stored, builder)
+
+
+def test_measuring_trains_nothing(measurable: tuple[TrainingModule, WindowDataset]) -> None:
+    module, data = measurable
     before = {k: v.clone() for k, v in module.state_dict().items()}
-    assert step_time(module, WindowDataset(stored, builder), BatchSize(2), gradient_clip=1.0) > 0
-    assert step_time(module, WindowDataset(stored, builder), BatchSize(2), 1.0, PushForward(0, 3)) > 0
+    assert step_time(module, data, BatchSize(2), gradient_clip=1.0) > 0
+    assert step_time(module, data, BatchSize(2), 1.0, PushForward(0, 3)) > 0
     assert all(torch.equal(v, before[k]) for k, v in module.state_dict().items())
 
-    monkeypatch.setattr(budget, "step_time", lambda *arguments: 0.1 if len(arguments) == 4 else 0.5)
-    times = [
-        budget.mean_step_time(module, WindowDataset(stored, builder), BatchSize(2), replace(SETTINGS, push_share=s)) for s in (0.0, 0.25)
-    ]
+
+@pytest.mark.parametrize(("limit", "num_steps"), [(0.0, 1 + 2), (math.inf, 1 + 5 * 2)])
+def test_no_round_begins_after_the_limit(
+    measurable: tuple[TrainingModule, WindowDataset], limit: float, num_steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One of warming up, and rounds of two."""
+    module, data = measurable
+    monkeypatch.setattr(budget, "ROUNDS", 5)
+    counted: list[int] = []
+    loss = module.loss
+
+    def counted_loss(batch: Any) -> torch.Tensor:
+        counted.append(1)
+        return loss(batch)
+
+    monkeypatch.setattr(module, "loss", counted_loss)
+    step_time(module, data, BatchSize(2), 1.0, limit=limit)
+    assert len(counted) == num_steps
+
+
+def test_own_steps_weigh_as_they_occur_and_share_the_time_to_measure(
+    measurable: tuple[TrainingModule, WindowDataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module, data = measurable
+    limits: list[float] = []
+
+    def fake(*arguments: Any, limit: float) -> float:
+        limits.append(limit)
+        return 0.1 if len(arguments) == 4 else 0.5
+
+    monkeypatch.setattr(budget, "step_time", fake)
+    settings = replace(SETTINGS, budget_minutes=0.5)
+    times = [budget.mean_step_time(module, data, BatchSize(2), replace(settings, push_share=s)) for s in (0.0, 0.25)]
     assert times == pytest.approx([0.1, 0.2])
+    assert limits == [15.0, 7.5, 7.5]

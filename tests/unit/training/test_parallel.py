@@ -157,7 +157,7 @@ def trained(root: Path, run: Path, rank: int, num_ranks: int, size: BatchSize, n
     data = TrajectoryDataModule(root, GraphConfig(history=2), Noise("velocity", 0.1), size, seed=1, sampling=kind)
     torch.manual_seed(5 + rank)  # ranks start from the weights of the first
     simulator = LearnedSimulator(GPE(data.builder.spec, num_message_passing_steps=2, hidden_channels=8), data.builder)
-    simulator.fit_statistics(data.statistics_sample())
+    simulator.fit_statistics(data.statistics_sample(), data.parameter_ranges())
     module = Recorded(simulator, SETTINGS.num_steps, warmup_steps=SETTINGS.warmup_steps, compile="off")
     settings = replace(SETTINGS, num_steps=num_steps, push_share=0.5 if late else 0.0, push_steps=3)
     run.mkdir(exist_ok=True)

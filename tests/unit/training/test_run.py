@@ -41,16 +41,17 @@ def test_the_same_configuration_is_the_same_run(tmp_path: Path, config: dict[str
     assert taken is not None and taken.read_bytes() == b"weights"
 
 
-def test_what_data_and_sizes_offer_to_comparisons_is_no_part_of_a_run(tmp_path: Path) -> None:
+def test_what_data_and_sizes_offer_is_no_part_of_a_run(tmp_path: Path) -> None:
     """Older runs wrote it down; new settings there must not make other runs of them."""
     offered = {
-        "data": {"name": "sand", "comparison": {"noise_std": 1.0}},
+        "data": {"name": "sand", "comparison": {"noise_std": 1.0}, "larger": {"scene": {"max_bodies": 6}}},
         "size": {"name": "tiny", "comparison": {"budget_minutes": 1.0, "seeds": "0,1"}},
     }
     now = without_tables({**CONFIG, **offered})
     assert now == {**CONFIG, "data": {"name": "sand"}, "size": {"name": "tiny", "comparison": {"budget_minutes": 1.0}}}
     folder = finished(tmp_path / "there", {**CONFIG, **offered})
-    claim(folder, {**now, "evaluation": {"splits": ["test"]}})
+    for config in (now, {**CONFIG, **offered}):
+        claim(folder, {**config, "evaluation": {"splits": ["test"]}})
     assert adopt(tmp_path / "there", now, tmp_path / "now") is not None
 
 
