@@ -29,7 +29,7 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.pretrained import fingerprint
     from gpe_pl.run_folder import RunError, claim, without_tables
     from gpe_pl.simulate import ensure_data, evaluated_config, scene_metadata
-    from gpe_pl.training.budget import PauseForMeasurements, digest, mean_step_time, within_budget
+    from gpe_pl.training.budget import PauseForMeasurements, mean_step_time, step_time_key, within_budget
     from gpe_pl.training.module import TrainingModule
     from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, set_up, train
     from gpe_pl.training.tracking import LoggerSettings, publish
@@ -82,11 +82,7 @@ def fit(cfg: DictConfig) -> float:
     unusual = {"batching": settings["batching"]} if batch_size.max_nodes is not None else {}  # as runs had it before there was a choice
     callbacks: list[L.Callback] = []
     if training.budget_minutes is not None:
-        parts = {k: settings[k] for k in ("graph", "model", "data")} | {"batch_size": training.batch_size, "device": device}
-        parts |= unusual | ({} if training.compile == "off" else {"compile": training.compile})
-        parts |= {} if trainer.matmul_precision == "highest" else {"matmul_precision": trainer.matmul_precision}
-        parts |= {"push_forward": [training.push_share, training.push_steps]} if training.push_share else {}
-        key = f"{cfg.data.name} {cfg.size.name} {cfg.model._target_.rpartition('.')[2]} {digest(parts)}"
+        key = step_time_key(settings, training, trainer)
         times = Path(cfg.paths.runs) / (cfg.reuse or cfg.name) / "step_times.json"
         callbacks.append(PauseForMeasurements(times))
         training = within_budget(

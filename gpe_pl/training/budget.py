@@ -26,7 +26,7 @@ from gpe_pl.data.sampling import NUM_LANES, BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
 from gpe_pl.machine import gemm_rate
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
-from gpe_pl.training.run import TrainingSettings
+from gpe_pl.training.run import TrainerSettings, TrainingSettings
 
 log = logging.getLogger(__name__)
 
@@ -43,9 +43,21 @@ SAME_MACHINE = 1.4
 """Rates further apart than this factor are of different machines, or of a busy one."""
 
 
-def digest(settings: Any) -> str:
-    """A short name for settings: equal for equal ones."""
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+def step_time_key(config: dict[str, Any], training: TrainingSettings, trainer: TrainerSettings) -> str:
+    """A name for what the time of a training step depends on.
+
+    Args:
+        config: of the run, resolved, without the tables of data and sizes (``run_folder.without_tables``), as offers to others must not change the name.
+        training, trainer: the same settings as objects.
+    """
+    parts = {k: config[k] for k in ("graph", "model", "data")} | {"batch_size": training.batch_size, "device": trainer.device}
+    # only what is not as in the first files of step times, so that those stay known
+    parts |= {} if config["batching"]["max_nodes"] is None else {"batching": config["batching"]}
+    parts |= {} if training.compile == "off" else {"compile": training.compile}
+    parts |= {} if trainer.matmul_precision == "highest" else {"matmul_precision": trainer.matmul_precision}
+    parts |= {"push_forward": [training.push_share, training.push_steps]} if training.push_share else {}
+    digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:8]
+    return f"{config['data']['name']} {config['size']['name']} {config['model']['_target_'].rpartition('.')[2]} {digest}"
 
 
 class BudgetError(GpeError, ValueError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,8 @@ from gpe_pl.config import CONF, construct
 from gpe_pl.evaluation import read_rows
 from gpe_pl.fit import fit
 from gpe_pl.run_folder import config_in, differences, without_tables
-from gpe_pl.training.run import TrainingSettings
+from gpe_pl.training.budget import step_time_key, within_budget
+from gpe_pl.training.run import TrainerSettings, TrainingSettings
 from tests.runs import compose, first_choices, tiny
 
 EXPERIMENTS = sorted(p.stem for p in (CONF / "experiment").glob("*.yaml"))
@@ -32,6 +34,7 @@ SLOW = {
     "unseen_materials",
 }
 """These with the slow ones, all others with the long ones; the canyon is also trained and evaluated for its notebook."""
+TAKING_OVER = [e for e in EXPERIMENTS if "\nreuse: table1\n" in (CONF / "experiment" / f"{e}.yaml").read_text()]
 
 
 def _mark(experiment: str) -> pytest.MarkDecorator:
@@ -76,7 +79,7 @@ def test_every_value_of_a_sweep_is_a_run_of_its_own(experiment: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("experiment", [e for e in EXPERIMENTS if compose("fit", f"experiment={e}").reuse == "table1"])
+@pytest.mark.parametrize("experiment", TAKING_OVER)
 def test_what_takes_over_from_table_1_has_a_run_to_take(experiment: str) -> None:
     """One of its settings is trained as table 1 does."""
     params: dict[str, Any] = compose("fit", f"experiment={experiment}", hydra_config=True).hydra.sweeper.params or {}
@@ -142,11 +145,13 @@ def test_a_learned_stress_is_drawn_and_compared(tiny_data: Path, tmp_path: Path)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("run", sorted(RESULTS.glob("data=*/model=*/seed=0")), ids=lambda run: "/".join(run.parts[-3:-1]))
-def test_runs_of_the_results_can_be_gone_on_with(run: Path) -> None:
-    """What is copied from them is not trained again, and the canyon and larger scenes take their models."""
+def test_runs_of_the_results_can_be_gone_on_with(run: Path, tmp_path: Path) -> None:
+    """What is copied from them is not trained again, further seeds get as many steps, and the canyon and larger scenes take their models."""
     there = config_in(run / "config.json")
     cfg = compose("fit", "experiment=table1", "size=small", *run.parts[-3:])
     now = without_tables(dict(OmegaConf.to_container(cfg, resolve=True)))  # type: ignore[arg-type,call-overload]
-    now["training"] = construct(TrainingSettings, cfg.training, "training").as_dict()
-    different = differences(there, {key: now[key] for key in there})
-    assert [d for d in different if not d.startswith(("training.num_steps", "training.val_interval", "training.budget_minutes"))] == []
+    training = construct(TrainingSettings, cfg.training, "training")
+    key = step_time_key(now, training, construct(TrainerSettings, cfg.trainer, "trainer"))
+    times = Path(shutil.copy(RESULTS.parent / "step_times.json", tmp_path))
+    now["training"] = within_budget(training, times, key, lambda _: pytest.fail(f"{key} would be measured again")).as_dict()
+    assert differences(there, {key: now[key] for key in there}) == []

@@ -11,17 +11,21 @@ from typing import Any
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
+from gpe_pl.config import construct
 from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.data.sampling import BatchSize, PushForward
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
+from gpe_pl.run_folder import without_tables
 from gpe_pl.training import budget
-from gpe_pl.training.budget import BudgetError, PauseForMeasurements, digest, step_time, within_budget
+from gpe_pl.training.budget import BudgetError, PauseForMeasurements, step_time, step_time_key, within_budget
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
-from gpe_pl.training.run import TrainingSettings
+from gpe_pl.training.run import TrainerSettings, TrainingSettings
+from tests.runs import compose
 
 SETTINGS = TrainingSettings(num_steps=1000, val_interval=250, budget_minutes=0.5)
 
@@ -136,10 +140,27 @@ def test_a_measurement_that_fails_writes_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "t.json").exists()
 
 
-def test_equal_settings_have_equal_digests() -> None:
-    a: dict[str, Any] = {"model": {"x": 1, "y": [1, 2]}, "batch_size": 2}
-    assert digest(a) == digest({"batch_size": 2, "model": {"y": [1, 2], "x": 1}})
-    assert digest(a) != digest({**a, "batch_size": 3})
+@pytest.mark.parametrize(
+    ("overrides", "is_other"),
+    [
+        (["seed=3", "name=mine", "trainer.progress=false"], False),
+        (["data.larger.scene.max_bodies=7", "data.comparison.push_correction.default=0.5"], False),
+        (["model.hidden_channels=8"], True),
+        (["training.batch_size=3"], True),
+        (["batching=by_nodes"], True),
+        (["training.compile=auto"], True),
+        (["trainer.matmul_precision=high"], True),
+        (["training.push_share=0.9"], True),
+    ],
+)
+def test_a_step_is_measured_again_where_its_time_is_another(overrides: list[str], is_other: bool) -> None:
+    def key(*more: str) -> str:
+        cfg = compose("fit", "size=tiny", "model=gpe_tuned", "training.compile=off", *more)
+        values: Any = OmegaConf.to_container(cfg, resolve=True)
+        settings = construct(TrainingSettings, cfg.training, "training"), construct(TrainerSettings, cfg.trainer, "trainer")
+        return step_time_key(without_tables(values), *settings)
+
+    assert (key(*overrides) != key()) == is_other
 
 
 @pytest.fixture
