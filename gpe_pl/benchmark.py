@@ -35,7 +35,7 @@ def benchmark(cfg: DictConfig) -> None:
     import torch
     from omegaconf import OmegaConf
 
-    from gpe_pl.machine import environment
+    from gpe_pl.machine import environment, keep_freed_memory
     from gpe_pl.simulate import dataset
 
     suites = sorted(path.stem for path in (CONF / "suite").glob("*.yaml"))
@@ -46,6 +46,7 @@ def benchmark(cfg: DictConfig) -> None:
     settings = construct(suite.Settings, {k: v for k, v in values.items() if k != "name"}, "suite")
     if getattr(settings, "accelerator", "cpu") == "gpu" and not torch.cuda.is_available():
         raise ConfigError("trainer.accelerator=gpu: PyTorch finds no GPU here; choose trainer=cpu")
+    keep_freed_memory()  # as trainings and evaluations do
     cases = getattr(settings, "cases", None)  # of a suite about data sets
     records, table = suite.run(settings) if cases is None else suite.run(settings, {k: dataset(*c.overrides) for k, c in cases.items()})
     folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name

@@ -4,6 +4,7 @@ the memory that a function needs.
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
 import platform
@@ -55,6 +56,19 @@ def commit() -> str:
     except OSError:
         return "unknown"
     return (not tracked.returncode and described.stdout.strip()) or "unknown"
+
+
+def keep_freed_memory() -> None:
+    """Let this process reuse the memory of large arrays that it has freed, rather than give it back and have the system clear it anew every time.
+
+    Where arrays of edges are larger than 32 MB, that clearing takes a third to a half of a rollout on a CPU. Does something with glibc only, whose
+    ``mallopt`` it calls; more than 2 GiB that are free at the end of the heap are still given back.
+    """
+    mmap_threshold, trim_threshold = -3, -1  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD in malloc.h
+    if platform.libc_ver()[0] == "glibc":
+        libc = ctypes.CDLL(None)
+        for option in (mmap_threshold, trim_threshold):
+            libc.mallopt(option, 2**31 - 1)
 
 
 def has_cpp_compiler() -> bool:

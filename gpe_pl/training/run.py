@@ -24,6 +24,7 @@ from gpe_pl.atomic import replacing
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import NoiseKind
 from gpe_pl.data.sampling import PushForward, Sampling
+from gpe_pl.machine import keep_freed_memory
 from gpe_pl.run_folder import CONFIG, RunError, config_in, differences
 from gpe_pl.training.callbacks import RolloutValidation, StepProgress, WarmAverage
 from gpe_pl.training.checkpoints import AtomicCheckpoints
@@ -207,7 +208,7 @@ def train(
 
 
 def set_up(settings: TrainerSettings) -> str:
-    """Threads and precision of PyTorch in this process; the device to compute on.
+    """Threads, memory and precision of PyTorch in this process; the device to compute on.
 
     Raises:
         RunError: there is no such device.
@@ -216,5 +217,6 @@ def set_up(settings: TrainerSettings) -> str:
         raise RunError(f"trainer.accelerator={settings.accelerator}: PyTorch finds no GPU here; choose trainer=cpu")
     if settings.num_threads is not None:
         torch.set_num_threads(settings.num_threads)
+    keep_freed_memory()
     torch.set_float32_matmul_precision(settings.matmul_precision)
     return settings.device
