@@ -61,7 +61,7 @@ def commit() -> str:
 def keep_freed_memory() -> None:
     """Let this process reuse the memory of large arrays that it has freed, rather than give it back and have the system clear it anew every time.
 
-    Where arrays of edges are larger than 32 MB, that clearing takes a third to a half of a rollout on a CPU. Does something with glibc only, whose
+    Where arrays of edges are larger than 32 MB, that clearing can take half of a rollout on a CPU. Does something with glibc only, whose
     ``mallopt`` it calls; more than 2 GiB that are free at the end of the heap are still given back.
     """
     mmap_threshold, trim_threshold = -3, -1  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD in malloc.h
