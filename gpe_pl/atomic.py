@@ -53,7 +53,7 @@ def _is_running(pid: str) -> bool:
 def _flush(path: Path) -> None:
     """To the disk, so that a power cut does not leave an empty file under the final name."""
     if path.is_file():
-        with open(path, "rb") as file:
+        with open(path, "rb+") as file:  # Windows flushes only what may be written
             os.fsync(file.fileno())
 
 

@@ -8,7 +8,6 @@ import ctypes
 import multiprocessing
 import os
 import platform
-import resource
 import shutil
 import subprocess
 import sys
@@ -19,10 +18,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 
-BYTES_PER_UNIT = 1 if sys.platform == "darwin" else 1024
-"""Of ``ru_maxrss``."""
 CLEAR_REFS = Path("/proc/self/clear_refs")
 
 
@@ -43,7 +41,7 @@ def environment() -> dict[str, Any]:
 def _processor() -> str:
     """Its name, as far as the system tells."""
     cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines() if cpuinfo.exists() else []
     return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor())
 
 
@@ -52,7 +50,14 @@ def commit() -> str:
     here = Path(__file__).resolve()
     try:
         tracked = subprocess.run(["git", "ls-files", "--error-unmatch", here.name], cwd=here.parent, capture_output=True, check=False)
-        described = subprocess.run(["git", "describe", "--always", "--dirty"], cwd=here.parent, capture_output=True, text=True, check=False)
+        described = subprocess.run(
+            ["git", "describe", "--always", "--dirty"],
+            cwd=here.parent,
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            check=False,
+        )
     except OSError:
         return "unknown"
     return (not tracked.returncode and described.stdout.strip()) or "unknown"
@@ -173,20 +178,26 @@ def _resident() -> int:
     """Bytes in use; forgets an earlier peak where the system can (Linux), else the peak so far, against which a smaller need cannot be seen."""
     if not CLEAR_REFS.exists():
         return peak_resident()
-    CLEAR_REFS.write_text("5")
-    return _status("VmRSS")
+    CLEAR_REFS.write_text("5", encoding="utf-8")
+    return resident_bytes()
 
 
 def peak_resident() -> int:
     """Most bytes that this process has had in memory so far."""
-    return _status("VmHWM") if CLEAR_REFS.exists() else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * BYTES_PER_UNIT
+    if CLEAR_REFS.exists():
+        return _status("VmHWM")
+    if hasattr(usage := psutil.Process().memory_info(), "peak_wset"):  # Windows
+        return int(usage.peak_wset)
+    import resource  # Windows has none
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def _status(key: str) -> int:
-    lines = Path("/proc/self/status").read_text().splitlines()
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     return 1024 * int(next(line for line in lines if line.startswith(f"{key}:")).split()[1])
 
 
 def resident_bytes() -> int:
-    """Bytes of this process in use now, or at most so far where the system does not tell."""
-    return _status("VmRSS") if CLEAR_REFS.exists() else peak_resident()
+    """Bytes of this process in use now."""
+    return int(psutil.Process().memory_info().rss)

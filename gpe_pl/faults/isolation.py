@@ -15,6 +15,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from gpe_pl.errors import GpeError
 from gpe_pl.faults.verdict import MAX_DETAIL, Fault, Verdict
 
 PRELOADED = [
@@ -31,8 +32,18 @@ PRELOADED = [
 PRELOADED += ["gpe_pl.evaluation", "gpe_pl.generation", "gpe_pl.solvers.scenes", "gpe_pl.solvers.mpm", "gpe_pl.models.gpe", "gpe_pl.report"]
 
 
+class IsolationError(GpeError):
+    """This system cannot isolate faults."""
+
+
 def forks() -> Any:
-    """A multiprocessing context whose processes start with everything imported."""
+    """A multiprocessing context whose processes start with everything imported.
+
+    Raises:
+        IsolationError: the system has no such processes (Windows).
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        raise IsolationError("suite=faults needs processes that are forked, which this system does not have; run it on Linux")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
     return context

@@ -6,7 +6,6 @@ import contextlib
 import hashlib
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -235,6 +234,8 @@ def damage_faults(command: Command, sound: Path, count: int, seed: int, limit: f
 
 def limit_file_size(size: int) -> None:
     """From now on no file of this process grows beyond a size: what a full disk does to a write, with another number of error."""
+    import resource  # Windows has none
+
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
 

@@ -137,6 +137,14 @@ def test_no_optional_dependency_at_module_level(path: Path) -> None:
     assert used <= allowed, f"{dotted(path)} imports {sorted(used - allowed)}, which pyproject.toml does not require"
 
 
+NOT_ON_WINDOWS = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
+
+
+@pytest.mark.parametrize("path", MODULES, ids=dotted)
+def test_every_module_can_be_imported_on_windows(path: Path) -> None:
+    assert NOT_ON_WINDOWS & top_level_imports(ast.parse(path.read_text(encoding="utf-8"))) == set()
+
+
 def test_ci_skips_nothing_for_a_missing_package(monkeypatch: pytest.MonkeyPatch) -> None:
     extras = PROJECT["optional-dependencies"]
     assert f"gpe_pl[{','.join(sorted(set(extras) - {'dev', 'docs', 'notebooks'}))}]" in extras["dev"]

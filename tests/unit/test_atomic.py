@@ -25,6 +25,15 @@ def test_a_file_appears_when_the_block_ends(tmp_path: Path) -> None:
     assert list(path.parent.iterdir()) == [path]
 
 
+def test_what_is_synced_is_open_for_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows refuses to sync a handle that only reads."""
+    fcntl = pytest.importorskip("fcntl")
+    modes = []
+    monkeypatch.setattr(os, "fsync", lambda handle: modes.append(fcntl.fcntl(handle, fcntl.F_GETFL) & os.O_ACCMODE))
+    replace_text(tmp_path / "a.json", "{}")
+    assert modes == [os.O_RDWR]
+
+
 def test_a_folder_appears_when_the_block_ends(tmp_path: Path) -> None:
     with replacing(tmp_path / "store") as part:
         part.mkdir()

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -54,6 +55,17 @@ def test_memory_is_what_a_function_takes() -> None:
 def test_a_function_that_fails_says_so() -> None:
     with pytest.raises(MemoryError, match="failing ended without an answer"):
         peak_memory(failing)
+
+
+def test_memory_is_known_where_there_is_no_proc_and_no_resource(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """As on Windows, where psutil tells the peak."""
+    resident = machine.resident_bytes()
+    assert 0.5 * resident < machine.peak_resident() < 100 * resident
+    monkeypatch.setattr(machine, "CLEAR_REFS", tmp_path / "none")
+    assert 0.5 * resident < machine.peak_resident() < 100 * resident  # from `resource`, in the system's own unit
+    monkeypatch.setitem(sys.modules, "resource", None)
+    monkeypatch.setattr(machine.psutil.Process, "memory_info", lambda _: SimpleNamespace(rss=1, peak_wset=7))
+    assert machine.peak_resident() == 7 and machine.resident_bytes() == 1
 
 
 PAGES_OF_NEW_ARRAYS = """

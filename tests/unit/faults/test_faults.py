@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import shutil
 import time
@@ -55,6 +56,12 @@ def test_damaged_wrong_and_hostile_checkpoints(checkpoint: Path, tmp_path: Path,
     faults = checkpoints.faults(checkpoint, 16)
     assert len(faults) > 100
     assert not bad(faults[::step], tmp_path)
+
+
+def test_a_system_that_does_not_fork_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(multiprocessing, "get_all_start_methods", lambda: ["spawn"])  # as on Windows
+    with pytest.raises(GpeError, match="suite=faults needs processes that are forked"):
+        next(verdicts([]), None)
 
 
 def test_every_bit_of_a_weight_counts(checkpoint: Path, tmp_path: Path) -> None:
