@@ -146,12 +146,10 @@ def checked_materials(
     for material in present:
         spec, rows = MATERIALS[material], codes == node_code(material)
         values = per_node(f"params[{material!r}]", params[material], (num_nodes,))
-        outside = rows & ((values < spec.low * (1 - 1e-6)) | (values > spec.high * (1 + 1e-6)))
-        if outside.any():
-            node = int(outside.argmax())
-            raise ArrayError(
-                f"params[{material!r}]: node {node} has {spec.name} = {values[node]:g}, must be between {spec.low:g} and {spec.high:g} {spec.unit}"
-            )
+        wrong = rows & ~spec.accepts(values)
+        if wrong.any():
+            node = int(wrong.argmax())
+            raise ArrayError(f"params[{material!r}]: node {node} has {spec.name} = {values[node]:g} {spec.unit}, must be {spec.rule}")
         columns[rows, param_names(present).index(spec.name)] = values[rows]
     return codes, columns, present
 

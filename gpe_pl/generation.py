@@ -38,6 +38,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.progress import Progress
 from gpe_pl.rollout import Guard, SimulationError, Simulator, rollout
 from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup
+from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.store import StoreError, read_trajectory, trajectory_names, write_shard
 from gpe_pl.trajectory import Metadata, State, Trajectory
@@ -152,13 +153,12 @@ class DatasetSpec:
                 "leave out others with ~data.parameters.MATERIAL"
             )
         for material, values in self.parameters.items():
-            parameter = MATERIALS[material]
+            parameter, limits = MATERIALS[material], LIMITS[material]
             for key, group in asdict(cast(Any, values)).items():
                 for value in group:
-                    if not parameter.low <= value <= parameter.high:
+                    if not limits.low <= value <= limits.high:
                         raise ValueError(
-                            f"parameters.{material}.{key}: {parameter.name} = {value} is outside "
-                            f"[{parameter.low:g}, {parameter.high:g}] {parameter.unit}"
+                            f"parameters.{material}.{key}: {parameter.name} = {value} {parameter.unit} is outside {limits}, the solvers' limits"
                         )
             if self.num_test_unseen and not (values.interpolated and values.extrapolated):
                 raise ValueError(f"num_test_unseen > 0 needs parameters.{material}.interpolated and .extrapolated")

@@ -327,9 +327,10 @@ class LearnedSimulator(nn.Module):
             if material in self.builder.metadata.materials:
                 rows = torch.nonzero(state.node_type == node_code(material)).flatten()
                 column = state.material_params[rows, self.builder.metadata.param_names.index(spec.name)]
-                if not torch.isfinite(column).all():
-                    node = int(rows[torch.nonzero(~torch.isfinite(column))[0]])
-                    raise SceneError(f"node {node} ({material}): {spec.name} [{spec.unit}] is not finite")
+                wrong = ~spec.accepts(column)
+                if wrong.any():
+                    node, value = int(rows[wrong][0]), float(column[wrong][0])
+                    raise SceneError(f"node {node} ({material}): {spec.name} is {value:g} {spec.unit}, must be {spec.rule}")
         for line in self.untrained_parameters(state):
             if line not in self._warned:
                 held = "; taken for the nearest trained value" if self.holds_parameters else ""

@@ -178,19 +178,17 @@ def crowding(pos: np.ndarray, width: float) -> np.ndarray:
 
 
 def impossible_material(state: State, metadata: Metadata) -> Termination | None:
-    """The first node whose material parameter is not finite or beyond what ``schema.MATERIALS`` calls possible, or None."""
+    """The first node whose material parameter is not what ``schema.MaterialParameter.rule`` says, or None. Solvers refuse what they cannot compute."""
     params, types = _numpy(state.material_params), _numpy(state.node_type)
     for material in metadata.materials:
         spec = MATERIALS[material]
         column = metadata.param_names.index(spec.name)
         rows = np.flatnonzero(types == node_code(material))
-        wrong = rows[~((params[rows, column] >= spec.low * (1 - 1e-6)) & (params[rows, column] <= spec.high * (1 + 1e-6)))]
+        wrong = rows[~spec.accepts(params[rows, column])]
         if len(wrong):
             node = int(wrong[0])
-            limits = f"possible are {spec.low:g} to {spec.high:g}"
-            return Termination(
-                "material", 0, node, f"node {node}: {spec.name} of {material} is {params[node, column]:g} {spec.unit}; {limits}"
-            )
+            value = f"{params[node, column]:g} {spec.unit}"
+            return Termination("material", 0, node, f"node {node}: {spec.name} of {material} is {value}, must be {spec.rule}")
     return None
 
 

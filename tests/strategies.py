@@ -15,6 +15,7 @@ from gpe_pl.faults.stores import flipped, overwritten, truncated
 from gpe_pl.geometry import domain_walls
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.schema import MATERIALS, STICKY, node_code, param_names
+from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.scenes import BodyScene
 from gpe_pl.trajectory import Boundary, Metadata, State, Trajectory
 from tests.scenes import SPACING, builder, metadata
@@ -55,8 +56,8 @@ def states(
     kinds = rng.integers(len(materials), size=count)
     params = np.full((count, len(names)), np.nan)
     for row, kind in enumerate(kinds):
-        spec = MATERIALS[materials[kind]]
-        params[row, names.index(spec.name)] = rng.uniform(spec.low, min(spec.high, spec.low + 40.0))
+        low, high = LIMITS[materials[kind]]
+        params[row, names.index(MATERIALS[materials[kind]].name)] = rng.uniform(low, min(high, low + 40.0))
     speed = draw(st.sampled_from([0.0, 1.0, 100.0]))
     past = speed * rng.normal(size=(count, history, dim))
     shapes = domain_walls(((0.0, 1.0),) * dim, draw(st.sampled_from([0.0, 0.5, STICKY]))) if draw(st.booleans()) else ()

@@ -139,11 +139,12 @@ def damage(trajectory: Trajectory) -> str | None:
     if len(wrong):
         return f"the mass of node {wrong[0]} is {trajectory.mass[wrong[0]]:g} kg"
     for material in metadata.materials:
-        name = MATERIALS[material].name
+        spec = MATERIALS[material]
         rows = np.flatnonzero(trajectory.node_type == node_code(material))
-        wrong = rows[~np.isfinite(trajectory.material_params[rows, metadata.param_names.index(name)])]
+        values = trajectory.material_params[rows, metadata.param_names.index(spec.name)]
+        wrong = np.flatnonzero(~spec.accepts(values))
         if len(wrong):
-            return f"the {name} of node {wrong[0]} is not finite"
+            return f"the {spec.name} of node {rows[wrong[0]]} is {values[wrong[0]]:g} {spec.unit}, must be {spec.rule}"
     return _jump(trajectory)
 
 

@@ -27,6 +27,7 @@ from pydantic import TypeAdapter, ValidationError
 from gpe_pl.geometry import Shape
 from gpe_pl.graphs.islands import Islands, free_since, islands_within
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup
+from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.store import (
     StoreError,
     digest,
@@ -307,13 +308,9 @@ def _check_nodes(m: Metadata, arrays: dict[str, np.ndarray], names: tuple[str, .
             p = by_code[code]
             if p is None:
                 continue
-            slack = 1e-6 * max(abs(p.low), abs(p.high))  # float32
-            outside = used & (codes == code) & ((value < p.low - slack) | (value > p.high + slack))
-            if where := _offenders("mass", outside):
-                yield (
-                    "material_params",
-                    f"{name}: {where}: {value[outside][0]:.6g} is outside {p.low:g} … {p.high:g} {p.unit} of {names[code]}",
-                )
+            wrong = used & (codes == code) & ~np.isnan(value) & ~p.accepts(value)
+            if where := _offenders("mass", wrong):
+                yield "material_params", f"{name}: {where}: is {value[wrong][0]:g} {p.unit} of {names[code]}, must be {p.rule}"
     if "cells" in arrays and (where := _offenders("cells", (arrays["cells"] < 0) | (arrays["cells"] >= len(codes)))):
         yield "cells", f"{where}: no such node, there are {len(codes)}"
 
@@ -386,7 +383,7 @@ def format_page() -> str:
             for key, f in FIELDS.items()
         ],
         "metadata": [f"| `{key}` | {meaning[key]} |" for key in Metadata.__dataclass_fields__],
-        "materials": [f"| `{name}` | `{p.name}` | {p.unit} | {p.low:g} … {p.high:g} | {p.scale} |" for name, p in MATERIALS.items()],
+        "materials": [f"| `{name}` | `{p.name}` | {p.unit} | {p.rule} | {LIMITS[name]} | {p.scale} |" for name, p in MATERIALS.items()],
     }
     return _PAGE.format(
         version=SCHEMA_VERSION,
@@ -443,8 +440,8 @@ Splits: {splits}. The material parameters of the first three have the trained va
 
 ## Materials and their parameters
 
-| material | column of `material_params` | unit | accepted | scale |
-|---|---|---|---|---|
+| material | column of `material_params` | unit | stored values are | the solvers accept | scale |
+|---|---|---|---|---|---|
 {materials}
 
 ## Metadata

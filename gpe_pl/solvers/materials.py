@@ -1,4 +1,4 @@
-"""Materials of the material point method: their constants, and the map from the stored material parameter to what a constitutive law takes.
+"""Materials of the solvers: limits of their parameters; constants of the material point method, and what a law takes for a stored parameter.
 
 Every law is isotropic hyperelasticity, some with a return mapping; the laws themselves are in ``mpm.laws_2d`` and ``mpm.laws_3d``. A law reads one row of
 constants per particle; ``LAMBDA`` … ``MAX_HARDENING`` name the columns. Viscosity is added to what any law says.
@@ -7,12 +7,13 @@ constants per particle; ``LAMBDA`` … ``MAX_HARDENING`` name the columns. Visco
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, TypeVar
+from typing import Annotated, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
+from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS
 
 SAND, SNOW, ELASTOMER = 0, 1, 2
@@ -22,6 +23,46 @@ LAMBDA, MU, COEFFICIENT, SMALLEST, LARGEST, MAX_HARDENING, VISCOSITY = range(7)
 """Columns of a particle's constants: Lamé parameters at rest [Pa], slope of the cone in strains (sand) or ξ (snow), three of snow's constants, and the
 kinematic viscosity [m²/s]."""
 NUM_CONSTANTS = 7
+
+
+class Limits(NamedTuple):
+    """Smallest and largest value of a material parameter that the solvers compute, in its unit."""
+
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.low:g} … {self.high:g}"
+
+
+LIMITS: dict[str, Limits] = {
+    "sand": Limits(0.0, 60.0),
+    "snow": Limits(0.0, 30.0),
+    "fluid": Limits(1e-6, 10.0),
+    "elastomer": Limits(1e3, 1e8),
+    "solid": Limits(1e3, 1e9),
+}
+"""By material. Imported data need not keep to them: ``schema.MaterialParameter.rule`` says what can be stored."""
+
+
+def check_limits(material: str, values: np.ndarray, nodes: np.ndarray) -> None:
+    """Refuse parameters that no solver computes.
+
+    Args:
+        material: of all nodes.
+        values: its parameter [node].
+        nodes: numbers of the nodes [node], for the message.
+
+    Raises:
+        SimulationError: a value is outside ``LIMITS``, or not a number.
+    """
+    parameter, limits = MATERIALS[material], LIMITS[material]
+    wrong = ~((values >= limits.low) & (values <= limits.high))
+    if wrong.any():
+        node, value = int(nodes[wrong][0]), values[wrong][0]
+        message = f"node {node}: {parameter.name} of {material} is {value:g} {parameter.unit}, outside {limits}, the limits of the solvers"
+        raise SimulationError(message, reason="input", node=node)
+
 
 Positive = Annotated[float, Field(gt=0)]
 PoissonRatio = Annotated[float, Field(ge=0, lt=0.5)]
@@ -146,8 +187,8 @@ class Elastomer:
 
     @property
     def smallest_stiffness(self) -> float:
-        """λ + 2μ at rest [Pa] of the softest elastomer that the schema allows."""
-        return _pressure_wave_modulus(MATERIALS["elastomer"].low, self.poisson_ratio)
+        """λ + 2μ at rest [Pa] of the softest elastomer within the limits."""
+        return _pressure_wave_modulus(LIMITS["elastomer"].low, self.poisson_ratio)
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})

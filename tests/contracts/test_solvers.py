@@ -12,6 +12,7 @@ import pytest
 
 from gpe_pl.geometry import Shape, Sphere, domain_walls
 from gpe_pl.rollout import SimulationError, Simulator, rollout
+from gpe_pl.schema import MATERIALS, NODE_TYPES, param_names
 from gpe_pl.solvers.fem import FEM
 from gpe_pl.solvers.flip import FLIP
 from gpe_pl.solvers.mpm import MPM
@@ -132,6 +133,20 @@ def test_internal_state_matters(case):
     if middle.internal is None:
         pytest.skip("this solver keeps nothing besides position and velocity")
     assert not np.array_equal(solver.step(replace(middle, internal=None)).pos, solver.step(middle).pos)
+
+
+def test_a_parameter_outside_the_limits_is_refused(case):
+    """Imported data may have any parameter; a solver that is given them names node, material and value."""
+    solver, state = case
+    node, params = state.num_nodes // 2, state.material_params.copy()
+    material = NODE_TYPES[int(state.node_type[node])]
+    name = MATERIALS[material].name
+    column = param_names(tuple(NODE_TYPES[code] for code in np.unique(state.node_type))).index(name)
+    params[node, column] = 1e12
+    message = rf"^node {node}: {name} of {material} is 1e\+12 .*, outside .*, the limits of the solvers$"
+    with pytest.raises(SimulationError, match=message) as caught:
+        solver.step(replace(state, material_params=params))
+    assert (caught.value.reason, caught.value.node) == ("input", node)
 
 
 def test_input_is_not_modified(case):

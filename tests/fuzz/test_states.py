@@ -17,7 +17,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout import Guard, SimulationError, crowding, rollout
-from gpe_pl.schema import MATERIALS
+from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.scenes import BodyScene
 from gpe_pl.stability.subject import in_order, permuted
 from gpe_pl.trajectory import State
@@ -119,7 +119,7 @@ def test_crowding_never_counts_too_few(seed: int, width: float, dim: int) -> Non
 
 @given(body_scenes(), seeds)
 def test_scenes_keep_their_promises(scene: BodyScene, seed: int) -> None:
-    values = {material: (MATERIALS[material].low + min(MATERIALS[material].high, 40.0)) / 2 for material in scene.materials}
+    values = {material: (LIMITS[material].low + min(LIMITS[material].high, 40.0)) / 2 for material in scene.materials}
     try:
         state = scene.sample(values, seed)
     except ValueError:  # impossible settings are said to be

@@ -67,6 +67,24 @@ def test_everything_can_be_given() -> None:
     assert t.boundary is walls
 
 
+@pytest.mark.parametrize(
+    ("material", "value"),
+    [
+        ("fluid", 8.93e-7),  # water at 25 °C
+        ("fluid", 1.14e-7),  # mercury
+        ("elastomer", 500.0),  # soft tissue
+        ("solid", 2.1e11),  # steel
+        ("sand", 65.0),
+    ],
+)
+def test_a_parameter_that_no_solver_computes_is_stored(tmp_path: Path, material: str, value: float) -> None:
+    trajectories = [trajectory(k, materials=material, params={material: value}) for k in range(3)]
+    report = save_dataset(tmp_path, "set", train=trajectories)
+    stored = next(iter_trajectories(Path(report.folder), "train"))
+    np.testing.assert_allclose(stored.material_params, value, rtol=1e-6)
+    assert not validate([report.folder]).violations
+
+
 def test_positions_are_folded_into_a_periodic_domain() -> None:
     far = motion().astype(np.float64) + np.array([5.0, 0.0])
     t = trajectory(pos=far, bounds=BOX, periodic=(True, False))
@@ -110,7 +128,10 @@ BAD[3, 5, 1] = np.nan
         ({"params": {}}, r"^params: has nothing, needs sand: friction_angle \[deg\]; any constant will do"),
         ({"params": {"sand": 30, "snow": 5}}, "^params: has sand, snow, needs sand"),
         ({"params": {"sand": np.full(20, np.nan)}}, r"^params\['sand'\]: node 0 is nan$"),
-        ({"params": {"sand": 90}}, r"^params\['sand'\]: node 0 has friction_angle = 90, must be between 0 and 60 deg$"),
+        (
+            {"materials": "fluid", "params": {"fluid": np.append(np.ones(19), 0.0)}},
+            r"^params\['fluid'\]: node 19 has kinematic_viscosity = 0 m\^2/s, must be positive and finite$",
+        ),
         ({"vel": np.zeros((10, 20, 3))}, r"^vel: has shape \[10, 20, 3\], expected \[frame 10, node 20, dim 2\]$"),
         ({"mass": np.zeros(20)}, "^mass: node 0 is 0, must be positive$"),
         ({"mass": [1, 2]}, r"^mass: has shape \[2\], expected \[node 20\]$"),

@@ -210,7 +210,7 @@ def test_fit_takes_only_models(target: str, tmp_path: Path) -> None:
         ("data.num_train=0", "data.num_train=0: input should be greater than or equal to 1"),
         (
             "data.parameters.sand.extrapolated=[100]",
-            r"data: parameters.sand.extrapolated: friction_angle = 100.0 is outside \[0, 60\] deg$",
+            r"data: parameters.sand.extrapolated: friction_angle = 100.0 deg is outside 0 … 60, the solvers' limits$",
         ),
         ("data.parameters.sand.interpolated=[20.0]", r"data.parameters.sand: unseen values \[20.0\] are among the seen ones$"),
         ("data.solver.materials=[snad]", "data.scene: materials must be different ones of sand, snow, fluid, elastomer, solid, got "),

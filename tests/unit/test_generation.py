@@ -354,7 +354,7 @@ def test_disk_estimate_is_near_the_truth(folder):
     ("change", "message"),
     [
         ({"parameters": {"sand": {"seen": ()}}}, "seen"),
-        ({"parameters": {"sand": {"seen": (20, 90)}}}, "parameters.sand.seen: friction_angle = 90.0 is outside"),
+        ({"parameters": {"sand": {"seen": (20, 90)}}}, "parameters.sand.seen: friction_angle = 90.0 deg is outside"),
         ({"parameters": {"sand": {"seen": (20, 40), "interpolated": (50,)}}}, "inside"),
         ({"parameters": {"sand": {"seen": (20, 40), "extrapolated": (30.5,)}}}, "outside the range"),
         ({"parameters": {"sand": {"seen": (20, 30, 40), "interpolated": (30,)}}}, "among the seen ones"),

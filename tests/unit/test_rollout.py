@@ -207,7 +207,7 @@ def test_a_start_that_cannot_be_trusted_is_frame_0(trajectory: Trajectory) -> No
     assert result.num_frames == 1
 
 
-@pytest.mark.parametrize("value", [75.0, -1.0, np.nan, np.inf])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_an_impossible_material_ends_the_rollout_before_it_begins(trajectory: Trajectory, value: float) -> None:
     start = replace(trajectory.state(0), material_params=trajectory.material_params.copy())
     start.material_params[7] = value

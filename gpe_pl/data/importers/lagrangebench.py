@@ -34,7 +34,7 @@ from gpe_pl.data.importers.source import (
     split_files,
     typed,
 )
-from gpe_pl.schema import MATERIALS, STICKY
+from gpe_pl.schema import STICKY
 
 PADDING = -1
 TYPES = {0: "fluid", 1: "boundary", 2: "boundary", 3: "solid"}
@@ -64,10 +64,11 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         notes.append("force.py is code and was not run")
     parameters = {}
     if "viscosity" in values:
-        spec, viscosity = MATERIALS["fluid"], number(values, "viscosity", described, low=0.0)
-        parameters["fluid"] = min(max(viscosity, spec.low), spec.high)
-        if parameters["fluid"] != viscosity:
-            notes.append(f"viscosity {viscosity:g} is outside {spec.low:g} … {spec.high:g}; {parameters['fluid']:g} {spec.unit} is stored")
+        viscosity = number(values, "viscosity", described, low=0.0)
+        if viscosity > 0:
+            parameters["fluid"] = viscosity
+        else:
+            notes.append("viscosity is 0, which cannot be stored: models take its logarithm (parameters={fluid: …})")
     if "write_every" not in values:
         notes.append("write_every is not in the source; every step of dt is taken for a frame (frame_dt=…)")
     facts = Facts(

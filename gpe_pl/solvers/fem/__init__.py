@@ -22,7 +22,7 @@ from pydantic.dataclasses import dataclass
 
 from gpe_pl.geometry import check_bounds
 from gpe_pl.rollout import SimulationError
-from gpe_pl.schema import MATERIALS, node_code
+from gpe_pl.schema import node_code
 from gpe_pl.solvers.fem.contact import Obstacles, collect, push_out_corners, push_out_nodes, resist_corners, resist_nodes
 from gpe_pl.solvers.fem.elements import (
     Mesh,
@@ -33,7 +33,7 @@ from gpe_pl.solvers.fem.elements import (
     cauchy_stress,
     elastic_energy,
 )
-from gpe_pl.solvers.materials import lame_parameters
+from gpe_pl.solvers.materials import LIMITS, check_limits, lame_parameters
 from gpe_pl.trajectory import Boundary, State
 
 OK, NOT_FINITE, ESCAPE, TOO_MANY_SUBSTEPS = 0, 1, 2, 3
@@ -141,7 +141,7 @@ class FEM:
         self.step(
             State(
                 pos, np.zeros_like(pos), np.full(count, node_code("solid"), dtype=np.uint8), np.full(count, size**dim),
-                np.full((count, 1), MATERIALS["solid"].low), Boundary.empty(dim), np.zeros(dim), rest_pos=pos, cells=np.arange(count)[None],
+                np.full((count, 1), LIMITS["solid"].low), Boundary.empty(dim), np.zeros(dim), rest_pos=pos, cells=np.arange(count)[None],
             )
         )  # fmt: skip
 
@@ -176,12 +176,8 @@ class FEM:
             raise SimulationError(f"gravity {state.gravity} is not finite", reason="nan")
         _require(np.asarray(state.mass) > 0, "mass is not positive")
         _require(np.asarray(state.node_type) == node_code("solid"), "node_type is not solid")
-        parameter = MATERIALS["solid"]
         modulus = np.asarray(state.material_params, dtype=np.float64)[:, 0]
-        _require(
-            (modulus >= parameter.low) & (modulus <= parameter.high),
-            f"{parameter.name} is outside [{parameter.low:g}, {parameter.high:g}] {parameter.unit}",
-        )
+        check_limits("solid", modulus, np.arange(num_nodes))
         if np.any(np.asarray(state.boundary.vel) != 0) or np.any(np.asarray(state.boundary.restitution) != 0):
             raise SimulationError("FEM supports only boundaries at rest and without restitution", reason="input")
         mesh = build_mesh(state.rest_pos, state.cells, state.mass)

@@ -12,10 +12,11 @@ from pydantic.dataclasses import dataclass as validated_dataclass
 
 from gpe_pl.geometry import Wall, check_whole_cells, domain_walls, outward_normal, signed_distance, thickness
 from gpe_pl.rollout import SimulationError
-from gpe_pl.schema import MATERIALS, NODE_TYPES, node_code, param_names
+from gpe_pl.schema import NODE_TYPES, node_code, param_names
 from gpe_pl.solvers.flip import islands, pressure, transfer, viscosity
 from gpe_pl.solvers.flip.grid import HALF, Grid, Solids, make_grid, make_solids
 from gpe_pl.solvers.flip.linear import conjugate_gradients, incomplete_cholesky
+from gpe_pl.solvers.materials import check_limits
 from gpe_pl.trajectory import Boundary, State
 
 MATERIAL = "fluid"
@@ -382,7 +383,6 @@ class FLIP:
     def _check(self, state: State) -> np.ndarray:
         """Kinematic viscosity per particle, or an error that names what does not fit."""
         num_nodes, dim = state.num_nodes, len(self.bounds)
-        parameter = MATERIALS[MATERIAL]
         shapes = {
             "pos": (state.pos, (num_nodes, dim)),
             "vel": (state.vel, (num_nodes, dim)),
@@ -404,8 +404,7 @@ class FLIP:
         known = np.asarray(state.node_type) == node_code(MATERIAL)
         _require(known, f"node_type is none of the solver's materials {MATERIAL} (codes of {', '.join(NODE_TYPES)})")
         values = np.array(state.material_params, dtype=np.float64)[:, 0]
-        in_range = (values >= parameter.low) & (values <= parameter.high)
-        _require(in_range, f"{parameter.name} is outside [{parameter.low:g}, {parameter.high:g}] {parameter.unit}")
+        check_limits(MATERIAL, values, np.arange(num_nodes))
         return np.ascontiguousarray(values)
 
 

@@ -13,7 +13,7 @@ from pydantic.dataclasses import dataclass as validated_dataclass
 from gpe_pl.geometry import check_whole_cells
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, NODE_TYPES, node_code, param_names
-from gpe_pl.solvers.materials import NUM_CONSTANTS, Elastomer, Fluid, Sand, Snow
+from gpe_pl.solvers.materials import LIMITS, NUM_CONSTANTS, Elastomer, Fluid, Sand, Snow, check_limits
 from gpe_pl.solvers.mpm.collider import Collider, collider
 from gpe_pl.solvers.mpm.frame import ESCAPE, NOT_FINITE, OK, Particles, advance
 from gpe_pl.trajectory import Boundary, State
@@ -99,7 +99,7 @@ class MPM:
     def compile_kernels(self) -> None:
         """Compile what this solver's dimension needs and fill Numba's cache on disk, so that worker processes started afterwards only load it."""
         material, dim = self.materials[0], len(self.bounds)
-        params = np.full((1, len(param_names(self.materials))), MATERIALS[material].low)
+        params = np.full((1, len(param_names(self.materials))), LIMITS[material].low)
         middle = np.array([[(low + high) / 2 for low, high in self.bounds]])
         code = np.array([node_code(material)], dtype=np.uint8)
         self.step(State(middle, np.zeros((1, dim)), code, np.ones(1), params, Boundary.empty(dim), np.zeros(dim)))
@@ -176,8 +176,7 @@ class MPM:
             chosen = np.asarray(state.node_type) == node_code(name)
             material, parameter = self.constants_of(name), MATERIALS[name]
             values = np.asarray(state.material_params, dtype=np.float64)[:, names.index(parameter.name)]
-            in_range = (values >= parameter.low) & (values <= parameter.high)
-            self._require(in_range | ~chosen, f"{parameter.name} is outside [{parameter.low:g}, {parameter.high:g}] {parameter.unit}")
+            check_limits(name, values[chosen], np.flatnonzero(chosen))
             law[chosen], specific_volume[chosen] = material.law, 1.0 / material.density
             constants[chosen] = material.constants(values[chosen], dim)
             known |= chosen

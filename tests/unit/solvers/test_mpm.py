@@ -8,7 +8,8 @@ import pytest
 
 from gpe_pl.geometry import Box, Polygon, Sphere, domain_walls
 from gpe_pl.rollout import SimulationError
-from gpe_pl.schema import MATERIALS, node_code
+from gpe_pl.schema import node_code
+from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.mpm import MPM, MPMInternal
 from gpe_pl.trajectory import Boundary
 from tests.particles import VALUE, block, run, together
@@ -107,7 +108,7 @@ def test_absurd_internal_state_or_boundary(dim, material, reason, change):
 
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("speed", [10.0, 100.0])
-@pytest.mark.parametrize(("material", "value"), [(m, v) for m in ALL for v in (MATERIALS[m].low, VALUE[m], MATERIALS[m].high)])
+@pytest.mark.parametrize(("material", "value"), [(m, v) for m in ALL for v in (LIMITS[m].low, VALUE[m], LIMITS[m].high)])
 def test_stable_for_every_parameter(dim, speed, material, value):
     """At 10 m/s an impact ends within the domain and no faster than it began; at 100 m/s that, or a typed error."""
     solver = MPM(bounds=bounds(dim), grid_spacing=CELL, materials=(material,), frame_dt=2e-3, max_substeps=2000)

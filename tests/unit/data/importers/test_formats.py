@@ -175,6 +175,16 @@ def test_lagrangebench(tmp_path: Path, dim: int) -> None:
     assert not report.repairs
 
 
+def test_lagrangebench_viscosity_is_stored_as_it_is(tmp_path: Path) -> None:
+    for value, stored_value in ((1e-7, 1e-7), (50.0, 50.0), (0, 1e-3)):
+        raw = tmp_path / f"{value}"
+        sources.lagrangebench_metadata(raw, viscosity=value)
+        sources.lagrangebench_h5(raw / "train.h5", [(drift(seed=k), np.zeros(20, np.int64)) for k in range(3)])
+        report, stored = imported(tmp_path / f"{value}_out", raw, "lagrangebench")
+        np.testing.assert_allclose(stored["train"][0].material_params, stored_value, rtol=1e-6)
+        assert any("viscosity is 0, which cannot be stored" in note for note in report.notes) == (value == 0)
+
+
 def test_walls_padding_and_a_lid_that_slides(tmp_path: Path) -> None:
     """A cavity: periodic along x, walls below, a lid above that moves at 3 m/s, and padding."""
     lid_x, count = np.linspace(0, 1, 10, endpoint=False), 20
