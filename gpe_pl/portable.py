@@ -212,7 +212,7 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
             doc = "number of the group of nodes that the edges between materials connect"
             inputs[f"island.{m}"] = Input((m,), "int64", "1", doc)
         if spec.islands and m in meshes:
-            doc = "number of the body that cells connect, below the number of nodes of meshes; -1 for nodes of no cell"
+            doc = "number of the body that a node moves with, below the number of nodes of meshes; -1 for all where there are no cells"
             inputs[f"body.{m}"] = Input((m,), "int64", "1", doc)
         if spec.islands and is_periodic:
             doc = "position relative to the mean of its group, as the edges lead there; 0 in a group that reaches around the domain"

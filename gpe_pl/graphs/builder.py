@@ -55,7 +55,8 @@ class GraphBuilder:
 
     With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph ``island_is_free`` [island] and ``num_islands`` [1].
     ``pos`` counts from the mean of the node's island, and in periodic domains keeps it together; an island that goes around the period has no lever arms, and
-    ``pos`` is zero there. Nodes of meshes then have ``body``, what their cells connect, and the graph ``num_bodies`` [1]; loose nodes, of no cell, have -1.
+    ``pos`` is zero there. Nodes of meshes then have ``body``, which they move with, and the graph ``num_bodies`` [1]: what cells connect, with the nodes of no
+    cell beside it. Where there are no cells at all, ``body`` is -1.
 
     Attributes:
         config: what the graphs are like.
@@ -127,7 +128,7 @@ class GraphBuilder:
             self._add_empty_mesh(data, state)
         if self.config.islands:
             self._add_islands(data, state, rows)
-            self._add_bodies(data, rows, mesh)
+            self._add_bodies(data, state, rows, mesh)
         return data
 
     @cached_property
@@ -218,17 +219,17 @@ class GraphBuilder:
         data.island_is_free = torch.from_numpy(islands.is_free).to(state.pos.device)
         data.num_islands = torch.tensor([len(islands.is_free)], device=state.pos.device)
 
-    def _add_bodies(self, data: HeteroData, rows: dict[str, Tensor], mesh: MultiscaleGraph | None) -> None:
-        """Groups of mesh nodes that cells connect."""
+    def _add_bodies(self, data: HeteroData, state: State, rows: dict[str, Tensor], mesh: MultiscaleGraph | None) -> None:
+        """Groups of mesh nodes that move together."""
         if not self._meshes:
             return
-        device = rows[self._meshes[0]].device
+        device = state.pos.device
         nodes = torch.cat([rows[m] for m in self._meshes]).cpu().numpy()
         body, num_bodies = np.full(len(nodes), -1), 0
         if mesh is not None:
-            label = mesh.body[nodes]
-            in_cells = np.bincount(label)[label] > 1
-            names, body[in_cells] = np.unique(label[in_cells], return_inverse=True)
+            names, body = np.unique(
+                mesh.moving_bodies(state.node_type.cpu().numpy().astype(np.int64), self.scales.spacing)[nodes], return_inverse=True
+            )
             num_bodies = len(names)
         parts = torch.from_numpy(body).to(device).split([len(rows[m]) for m in self._meshes])
         for material, part in zip(self._meshes, parts, strict=True):

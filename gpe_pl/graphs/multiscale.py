@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from gpe_pl.errors import GpeError
 
@@ -27,12 +28,15 @@ SNAP = 1e-3
 MESHES_HELD = 1024
 """Multi-scale graphs kept in memory; one of a thousand nodes takes about 0.2 MB."""
 
+REACH = 2.0
+"""Rest spacings within which a node of no cell is part of a body: further than the diagonal of a lattice's cell in space."""
+
 
 class MeshError(GpeError, ValueError):
     """Cells and rest positions do not make a mesh; names the cell or node."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MultiscaleGraph:
     """What stays the same about the mesh of a scene. Points are the nodes of the state, followed by the virtual nodes in the order of their levels.
 
@@ -60,6 +64,18 @@ class MultiscaleGraph:
     def num_nodes(self) -> int:
         """Nodes of the state."""
         return len(self.rest_pos)
+
+    def moving_bodies(self, kind: Int64[np.ndarray, " node"], spacing: float) -> Int64[np.ndarray, " node"]:
+        """Body that each node of the state moves with.
+
+        A node of no cell moves with the body of its kind that it lies beside at rest, within ``REACH`` spacings, directly or by other such nodes. Where
+        there is none it is a body of its own.
+
+        Args:
+            kind: node types.
+            spacing: rest spacing [m].
+        """
+        return _moving_bodies(self, kind.tobytes(), spacing)
 
     def are_in_contact(self, pairs: Int64[np.ndarray, "2 edge"], radius: float) -> Bool[np.ndarray, " edge"]:
         """Which near pairs of nodes touch rather than belong together.
@@ -107,6 +123,23 @@ def _cached(
         if isinstance(array, np.ndarray):
             array.setflags(write=False)
     return graph
+
+
+@lru_cache(maxsize=MESHES_HELD)
+def _moving_bodies(graph: MultiscaleGraph, kind: bytes, spacing: float) -> Int64[np.ndarray, " node"]:
+    body, kinds = graph.body[: graph.num_nodes].copy(), np.frombuffer(kind, np.int64)
+    is_placed = np.zeros(graph.num_nodes, dtype=bool)
+    is_placed[graph.cell_edges] = True
+    for code in np.unique(kinds):
+        loose = np.flatnonzero((kinds == code) & ~is_placed)
+        placed = np.flatnonzero((kinds == code) & is_placed)
+        while len(loose) and len(placed):  # then those beside the ones that found their body
+            distance, nearest = cKDTree(graph.rest_pos[placed]).query(graph.rest_pos[loose])
+            found = distance <= REACH * spacing
+            body[loose[found]] = body[placed[nearest[found]]]
+            loose, placed = loose[~found], loose[found]
+    body.setflags(write=False)
+    return body
 
 
 def build(rest_pos: np.ndarray, cells: np.ndarray, spacing: float, num_levels: int) -> MultiscaleGraph:

@@ -162,7 +162,8 @@ class GPE(nn.Module):
         interaction: how a message and its reverse relate; see ``nn.momentum_conv``.
         decoder: ``node`` decodes an acceleration per node (paper); ``pair`` an antisymmetric force per edge, divided by the node's mass; ``contact`` decodes
             both in meshes: a body moves and turns as a whole by the forces of its ``radius`` edges to others alone, which are where it touches something, and
-            each node adds only what deforms it. What is no mesh has an acceleration per node, and so have nodes of no cell: they would escape every error.
+            each node adds only what deforms it. Nodes of no cell are part of the body beside them. Forces between bodies have no sum. What is no mesh has
+            an acceleration per node: with it, ``island_momentum`` keeps the sum.
         edge_state: ``latent`` updates a hidden state per edge (Algorithm 1); ``geometry`` feeds the raw edge features to every layer.
         material_embedding: ``affine`` (the paper's interpolation rule) or ``mlp``.
         num_message_passing_steps: processor layers; 12 in the paper.
@@ -325,7 +326,7 @@ class GPE(nn.Module):
 
     @staticmethod
     def _moved_by_contacts(data: HeteroData, acceleration: dict[str, Tensor], contact: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Accelerations whose rigid part in each body is that of its contacts; loose nodes are no bodies."""
+        """Accelerations whose rigid part in each body is that of its contacts; graphs without cells have no bodies."""
         mass, pos, body = _grouped(data, contact, "body", data.num_bodies)
         in_body = torch.cat([data[m].body for m in contact]) >= 0
         count = body.shape[0] if torch.compiler.is_exporting() else int(data.num_bodies.sum())  # of as many at most
