@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from gpe_pl.atomic import replace_text
 from gpe_pl.config import CONF, ConfigError, construct, entry_point
+from gpe_pl.printable import one_line
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -59,7 +60,7 @@ def benchmark(cfg: DictConfig) -> None:
     print(table)
     failures: list[str] = getattr(suite, "failures", lambda _: [])(records)
     if failures:
-        sys.exit(f"error: {len(failures)} failed: {'; '.join(failures[:NAMED])}{'; …' if len(failures) > NAMED else ''}")
+        sys.exit(one_line(f"error: {len(failures)} failed: {'; '.join(failures[:NAMED])}{'; …' if len(failures) > NAMED else ''}"))
 
 
 main = entry_point("benchmark")(benchmark)

@@ -30,7 +30,9 @@ from pydantic import ValidationError
 from gpe_pl import plugins
 from gpe_pl.errors import GpeError
 from gpe_pl.launcher import RESULT, USAGE_ERROR, SweepError, end_with_sweep
+from gpe_pl.names import NameRefused, run_name, sweep_name
 from gpe_pl.pretrained import model_name
+from gpe_pl.printable import clean_logs, one_line
 from gpe_pl.signatures import checked, parameters
 
 WITHOUT_KEY = {"comparison", "experiment", "scene", "solver"}
@@ -47,6 +49,9 @@ def _for_model(values: Mapping[str, Any], target: str) -> Any:
 
 OmegaConf.register_new_resolver("for_model", _for_model, replace=True)
 OmegaConf.register_new_resolver("model_name", model_name, replace=True)  # ${model_name:checkpoint,runs}
+
+OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # ${run_name:name}: of a folder of results in conf/
+OmegaConf.register_new_resolver("sweep_name", sweep_name, replace=True)
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells have it."""
@@ -198,6 +203,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
         def main() -> Any:
             if not CONF.is_dir():
                 _fail(ConfigError(f"{CONF} not found: install gpe_pl from a clone with `pip install -e .`"))
+            clean_logs()
             sys.argv[1:] = [quoted(argument) for argument in sys.argv[1:]]
             os.environ["HYDRA_FULL_ERROR"] = "1"  # let exceptions reach us instead of Hydra's own report
             try:
@@ -247,13 +253,15 @@ def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
 
 
 def _fail(error: Exception) -> None:
-    print("error: " + " ".join(str(error).split()), file=sys.stderr)
-    sys.exit(USAGE_ERROR if RESULT in os.environ and isinstance(error, ConfigError) else 2)
+    print(f"error: {one_line(str(error))}", file=sys.stderr)
+    sys.exit(USAGE_ERROR if RESULT in os.environ and isinstance(error, (ConfigError, NameRefused)) else 2)
 
 
 def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
     """One line for a composition error, with the valid keys or choices."""
     text = " ".join(str(error).split())
+    if f"{NameRefused.__name__} raised" in text:
+        return re.sub(r"^.*? raised while resolving interpolation: | full_key: .*", "", text)
     if "'data/imported'" in text:
         return f"data=imported: {config_name} takes data that it simulates; fit and evaluate take imported ones"
     match = re.search(r"Could not override '([^']+)'", text)
@@ -289,8 +297,11 @@ def _check_top_level(cfg: DictConfig, config_name: str) -> None:
     wrong = {str(k) for k in cfg} ^ (known - WITHOUT_KEY)
     if wrong:
         raise ConfigError(f"{min(wrong)}: unknown or missing key; valid keys: {', '.join(sorted(known))}")
-    if "name" in cfg and OmegaConf.to_container(file)["name"] is not None and not (isinstance(cfg.name, str) and cfg.name.strip()):  # type: ignore[call-overload,index]
-        raise ConfigError(f"name={cfg.name!r}: must be the name of a folder for the results")
+    if "name" in cfg and OmegaConf.to_container(file)["name"] is not None:  # type: ignore[call-overload,index]
+        try:
+            run_name(cfg.name)
+        except NameRefused as error:
+            raise ConfigError(str(error)) from None
 
 
 def _first_choice(override: str) -> str:
@@ -307,7 +318,7 @@ def _groups(config_name: str) -> set[str]:
 
 def output_dir(cfg: DictConfig) -> Path:
     """Folder of the running job; without one, as in a notebook, that of a single run."""
-    return Path(HydraConfig.get().runtime.output_dir) if HydraConfig.initialized() else Path(cfg.paths.runs) / cfg.name
+    return Path(HydraConfig.get().runtime.output_dir) if HydraConfig.initialized() else Path(cfg.paths.runs) / run_name(cfg.name)
 
 
 class Report(Callback):

@@ -26,6 +26,7 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
+    from gpe_pl.names import data_name, run_name
     from gpe_pl.pretrained import fingerprint
     from gpe_pl.run_folder import RunError, claim, without_tables
     from gpe_pl.simulate import ensure_data, evaluated_config, scene_metadata
@@ -36,8 +37,9 @@ def fit(cfg: DictConfig) -> float:
 
     if type(cfg.seed) is not int or cfg.seed < 0:
         raise ConfigError(f"seed={cfg.seed!r}: must be an integer of at least 0")
-    if not (cfg.reuse is None or isinstance(cfg.reuse, str)):
-        raise ConfigError(f"reuse={cfg.reuse!r}: must be null or the name of other runs")
+    data_name(cfg.data.name, "data.name")
+    if cfg.reuse is not None:
+        run_name(cfg.reuse, "reuse")
     if not (cfg.start_from is None or isinstance(cfg.start_from, str)):
         raise ConfigError(f"start_from={cfg.start_from!r}: must be null, the folder of a run, a checkpoint or a shipped model")
     training = construct(TrainingSettings, cfg.training, "training")

@@ -35,6 +35,7 @@ from pydantic.dataclasses import dataclass
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, is_intact, shard_moments, with_checksum
 from gpe_pl.errors import GpeError
+from gpe_pl.names import DataName
 from gpe_pl.progress import Progress
 from gpe_pl.rollout import Guard, SimulationError, Simulator, rollout
 from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup
@@ -53,7 +54,6 @@ MOST = 1_000_000
 """Trajectories of a split, and frames of a trajectory: far more than anyone needs, and few enough to be listed."""
 
 Count = Annotated[int, Field(ge=0, le=MOST)]
-PathPart = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
 
 
 class GenerationError(GpeError):
@@ -129,8 +129,8 @@ class DatasetSpec:
         solver: what simulates them.
     """
 
-    name: PathPart
-    size: PathPart
+    name: DataName
+    size: DataName
     parameters: dict[str, ParameterValues]
     scene: InstanceOf[Scene]
     solver: InstanceOf[Solver]

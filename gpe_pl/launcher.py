@@ -31,6 +31,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gpe_pl.errors import GpeError
+from gpe_pl.printable import one_line
 
 LOG = "output.log"
 RESULT = "GPE_PL_RESULT"
@@ -140,15 +141,15 @@ class CommandLauncher(Launcher):
         jobs = [self._job(initial_job_idx + k, overrides) for k, overrides in enumerate(job_overrides)]
         module = sys.modules["__main__"].__spec__
         assert module is not None, "a sweep is started by python -m"
-        console = Console(highlight=False, soft_wrap=True)
-        console.print(f"{len(jobs)} runs, {self.place(jobs)}; each has its {LOG} below {self.config.hydra.sweep.dir}")
+        console = Console(highlight=False, soft_wrap=True, markup=False)
+        console.print(f"{len(jobs)} runs, {self.place(jobs)}; each has its {LOG} below {one_line(str(self.config.hydra.sweep.dir))}")
         returns: dict[int, JobReturn] = {}
         for k, outcome in self.run(jobs, module.name):
             returns[k] = outcome
             if isinstance(outcome._return_value, UsageError):
                 raise outcome._return_value
             failed = outcome.status is JobStatus.FAILED
-            console.print(f"{len(returns)}/{len(jobs)} {'failed' if failed else 'done'}: {jobs[k].name}")
+            console.print(f"{len(returns)}/{len(jobs)} {'failed' if failed else 'done'}: {one_line(jobs[k].name)}")
         errors = [f"{jobs[k].name}: {r._return_value}" for k, r in sorted(returns.items()) if r.status is JobStatus.FAILED]
         if errors:
             error = SweepError(f"{len(errors)} of {len(jobs)} runs failed; the same command runs only those again. {'; '.join(errors[:3])}")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gpe_pl.config import ConfigError, compose, construct, construct_target, entry_point
+from gpe_pl.names import data_name
 from gpe_pl.schema import SPLITS
 
 if TYPE_CHECKING:
@@ -48,9 +49,9 @@ def dataset(*overrides: str) -> DatasetSpec:
 
 def imported_data(cfg: DictConfig) -> Path:
     """Folder of an imported data set; raises ``ConfigError`` where there is none."""
-    if not isinstance(cfg.data.name, str):
+    if cfg.data.name is None:
         raise ConfigError("data.name=null: name the imported data set, as `python -m gpe_pl.convert name=…` did")
-    folder = Path(cfg.paths.data) / cfg.data.name / IMPORTED
+    folder = Path(cfg.paths.data) / data_name(cfg.data.name, "data.name") / IMPORTED
     if not (folder / "statistics.json").is_file():
         there = ", ".join(sorted(path.parent.parent.name for path in Path(cfg.paths.data).glob(f"*/{IMPORTED}/statistics.json"))) or "none"
         raise ConfigError(
@@ -91,7 +92,10 @@ def ensure_split(cfg: DictConfig, split: str) -> Path:
 
     from gpe_pl.generation import SPEC_FILE
 
-    if cfg.data.size != IMPORTED and not (Path(cfg.paths.data) / cfg.data.name / cfg.size.name / SPEC_FILE).exists():
+    if (
+        cfg.data.size != IMPORTED
+        and not (Path(cfg.paths.data) / data_name(cfg.data.name, "data.name") / cfg.size.name / SPEC_FILE).exists()
+    ):
         counts = {f"num_{s}": cfg.data[f"num_{s}"] if s == split else int(s == "train") for s in SPLITS}
         only: Any = OmegaConf.merge(cfg, {"data": {"name": f"{cfg.data.name}_{split}", **counts}})
         return ensure_data(only)

@@ -26,6 +26,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from gpe_pl.geometry import Shape
 from gpe_pl.graphs.islands import Islands, free_since, islands_within
+from gpe_pl.printable import printable
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup
 from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.store import (
@@ -65,8 +66,7 @@ class Violation:
 
     def __str__(self) -> str:
         parts = (str(self.path), self.trajectory, self.field, self.message)
-        text = ": ".join(part for part in parts if part)
-        return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)  # names in a hostile file must not steer a terminal
+        return printable(": ".join(part for part in parts if part))
 
 
 @dataclass
@@ -106,7 +106,7 @@ class Group:
 
         box = " × ".join(f"{a:.4g} … {b:.4g}" for a, b in zip(self.low, self.high, strict=True))
         lines = [
-            f"{m.dataset}/{m.split}: {len(self.frames)} trajectories of {'+'.join(m.materials)} in {m.dim}D",
+            printable(f"{m.dataset}/{m.split}: {len(self.frames)} trajectories of {'+'.join(m.materials)} in {m.dim}D"),
             f"  frames {span(self.frames)}, nodes {span(self.nodes)}, frame_dt {m.frame_dt:.6g} s, solver_dt {m.solver_dt:.6g} s",
             f"  spacing {m.spacing:.6g} m, connectivity_radius {m.connectivity_radius:.6g} m",
             f"  positions {box} m, fastest {self.max_speed:.4g} m/s",

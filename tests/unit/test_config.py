@@ -215,7 +215,7 @@ def test_fit_takes_only_models(target: str, tmp_path: Path) -> None:
         ("data.parameters.sand.interpolated=[20.0]", r"data.parameters.sand: unseen values \[20.0\] are among the seen ones$"),
         ("data.solver.materials=[snad]", "data.scene: materials must be different ones of sand, snow, fluid, elastomer, solid, got "),
         ("data.scene._target_=os.system", "data.scene._target_='os.system': must be a class of gpe_pl.solvers$"),
-        ("data.name=a/b", "data.name='a/b': string should match pattern"),
+        ("data.name=a/b", "data.name='a/b': must be a folder's name of letters"),
         ("data.solver.cfl=0", "data.solver.cfl=0: input should be greater than 0"),
         ("data.scene.gravity=[0,down]", "data.scene.gravity.1='down': input should be a valid number"),
         ("+data.solver.foo=1", "data.solver.foo: unknown key; valid keys: "),

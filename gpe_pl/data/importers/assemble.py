@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
-import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
@@ -19,10 +18,11 @@ from gpe_pl.arrays import ArrayError, nearest_distances
 from gpe_pl.atomic import replacing
 from gpe_pl.data.importers.motion import MotionSummary, better_origin, motion_of
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
-from gpe_pl.data.importers.source import NAME, Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
+from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments, with_checksum
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
+from gpe_pl.names import NameRefused, data_name
 from gpe_pl.periodicity import PeriodicityError
 from gpe_pl.progress import Progress
 from gpe_pl.schema import HISTORY, MATERIALS, SPLITS, ParameterGroup, node_code, param_names
@@ -139,9 +139,10 @@ def _member(split: str, trajectories: Sequence[Trajectory], k: int) -> Item:
 
 
 def _free_folder(root: Path, name: str) -> Path:
-    if not re.fullmatch(NAME, name):
-        raise ImportFailure(f"name={name!r}: must be a folder's name of letters, digits, '_', '-' and '.'")
-    folder = root / name / FOLDER
+    try:
+        folder = root / data_name(name) / FOLDER
+    except NameRefused as error:
+        raise ImportFailure(str(error)) from None
     if folder.exists():
         raise ImportFailure(f"{folder}: exists already, and imported data are never overwritten; delete it, or choose another name=…")
     return folder

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gpe_pl.atomic import replace_text
+from gpe_pl.printable import printable
 from gpe_pl.schema import MATERIALS
 
 REPORT_FILE = "report.json"
@@ -173,8 +174,3 @@ class Report:
 def _span(values: list[Any]) -> str:
     low, high = min(values), max(values)
     return f"{low:.6g}" if low == high else f"{low:.6g} … {high:.6g}"
-
-
-def printable(text: str) -> str:
-    """Names in a hostile file must not steer a terminal."""
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)

@@ -16,14 +16,12 @@ from pydantic import Field
 from gpe_pl.arrays import estimated_normals, numbers
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import domain_walls
+from gpe_pl.names import DataName
 from gpe_pl.periodicity import NOWHERE, Periodicity
 from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES
 from gpe_pl.trajectory import Boundary, Motion, Trajectory
 
 Format = Literal["gns", "lagrangebench", "meshgraphnets", "dpinet", "dmcf", "arrays"]
-
-NAME = "[A-Za-z0-9][A-Za-z0-9_.-]*"
-"""Names of data sets, which are folders."""
 
 SPLIT_NAMES = {"train": "train", "valid": "val", "validation": "val", "val": "val", "test": "test", "test_unseen": "test_unseen"}
 """Names of splits in public data sets, and those of the store."""
@@ -78,7 +76,7 @@ class ImportSettings:
 
     format: Format
     source: str
-    name: Annotated[str, Field(pattern=f"^{NAME}$")] | None = None
+    name: DataName | None = None
     frame_dt: Annotated[float, Field(gt=0)] | None = None
     bounds: list[tuple[float, float]] | None = None
     periodic: list[bool] | None = None

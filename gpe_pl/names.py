@@ -1,0 +1,99 @@
+"""Names that become folders: of runs, sweeps and data sets."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import AfterValidator
+
+from gpe_pl.errors import GpeError
+
+MOST_BYTES = 200
+"""Of a name that a user chooses. File systems allow 255, and locks and temporary files beside it have longer names."""
+MOST_BYTES_OF_VALUES = 255
+FORBIDDEN = frozenset('<>:"|?*\\')
+"""What Windows does not allow."""
+RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{k}" for port in ("com", "lpt") for k in range(1, 10))}
+"""Devices of Windows, with any suffix."""
+PLAIN = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_.-")
+
+
+class NameRefused(GpeError, ValueError):
+    """A name cannot be that of a folder; the message names the key and says why."""
+
+
+def run_name(name: Any, key: str = "name") -> str:
+    """The name, which is one of runs in the folder of results; ``/`` stands between a folder and a run in it, as in ``sweep/first``.
+
+    Raises:
+        NameRefused: it leads elsewhere, or some system would not take it.
+    """
+    faults = ["must be the name of a folder for the results"] if not isinstance(name, str) else map(_fault, name.split("/"))
+    for fault in filter(None, faults):
+        raise NameRefused(f"{key}={_quoted(name)}: {fault}")
+    return str(name)
+
+
+def data_name(name: Any, key: str = "name") -> str:
+    """The name, which is one of a data set: letters, digits, ``_``, ``-`` and ``.``, a letter or digit first.
+
+    Raises:
+        NameRefused: it is not.
+    """
+    try:
+        return _plain(name)
+    except ValueError as fault:
+        raise NameRefused(f"{key}={_quoted(name)}: {fault}") from None
+
+
+def _plain(name: Any) -> str:
+    if not isinstance(name, str) or not name or set(name) - PLAIN or name[0] in "_.-":
+        raise ValueError("must be a folder's name of letters, digits, '_', '-' and '.', a letter or digit first")
+    if fault := _fault(name):
+        raise ValueError(fault)
+    return name
+
+
+DataName = Annotated[str, AfterValidator(_plain)]
+
+
+def sweep_name(overrides: str) -> str:
+    """The overrides of a run of a sweep, as the path of its folder in the sweep's. Their values can be paths, with ``/`` in them.
+
+    Raises:
+        NameRefused: that path leads elsewhere, or a part of it is longer than file systems allow.
+    """
+    for part in overrides.split("/"):
+        if part == "..":
+            raise NameRefused(
+                f"{_quoted(overrides)}: the run's folder is named by its overrides, and /../ leads out of it; give a path without"
+            )
+        if not part.isprintable() or len(part.encode()) > MOST_BYTES_OF_VALUES:
+            raise NameRefused(
+                f"{_quoted(part)}: the run's folder is named by its overrides, which must be printable and have at most {MOST_BYTES_OF_VALUES} bytes each"
+            )
+    return overrides.lstrip("/")
+
+
+def _fault(part: str) -> str | None:
+    """Why a part of a path is no folder's name on every system."""
+    if not part.strip():
+        return "must be the name of a folder, not empty"
+    if part[0] == ".":
+        return "must not begin with a dot, nor lead outside the folder of the results"
+    if not part.isprintable():
+        return "holds characters that are not shown; leave them out"
+    if len(part.encode()) > MOST_BYTES:
+        return f"has {len(part.encode())} bytes; the name of a folder has at most {MOST_BYTES}"
+    if forbidden := FORBIDDEN.intersection(part):
+        return f"holds {' '.join(sorted(forbidden))}, which not every system allows in the name of a folder"
+    if part[-1] in ". " or part[0] == " ":
+        return "must not end in a dot, nor begin or end with a space"
+    if part.partition(".")[0].lower() in RESERVED:
+        return "is a device of Windows; choose another name"
+    return None
+
+
+def _quoted(name: Any, most: int = 100) -> str:
+    text = repr(name)
+    return text if len(text) <= most else f"{text[:most]}…"

@@ -1,0 +1,33 @@
+"""Text that may hold what a file or a command line says, as it is shown: names in a hostile file must not steer a terminal, nor look like another message."""
+
+from __future__ import annotations
+
+import logging
+
+LONGEST = 4000
+"""Characters of a message. Names can have tens of thousands."""
+
+
+def printable(text: str) -> str:
+    """The text with its control characters, text directions, line ends and whatever else is not shown as escapes."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def one_line(text: str, longest: int = LONGEST) -> str:
+    """A message as one line: spaces for line ends, escapes for what is not shown, and the middle left out where it is longer than ``longest``."""
+    if len(text) > longest:
+        head, tail = text[: longest * 3 // 4], text[-(longest // 4) :]
+        text = f"{head} … ({len(text) - len(head) - len(tail)} characters) … {tail}"
+    return printable(" ".join(part for line in text.splitlines() if (part := line.strip())).replace("\t", " "))
+
+
+class LogRecord(logging.LogRecord):
+    """A record whose message is one line."""
+
+    def getMessage(self) -> str:
+        return one_line(super().getMessage())
+
+
+def clean_logs() -> None:
+    """Every message that this process logs from now on is one line, whatever handler writes it."""
+    logging.setLogRecordFactory(LogRecord)

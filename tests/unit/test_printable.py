@@ -1,0 +1,56 @@
+"""What others have written is shown, and does nothing."""
+
+from __future__ import annotations
+
+import io
+import logging
+import time
+
+import pytest
+
+from gpe_pl.errors import GpeError
+from gpe_pl.markdown import table_row
+from gpe_pl.printable import LONGEST, LogRecord, clean_logs, one_line, printable
+from gpe_pl.store import StoreError
+
+HOSTILE = "sand\x1b[2K\rerror: forged\nerror: forged\u202e\u2028\x9b31m"
+
+
+def test_a_message_is_one_line_that_steers_no_terminal() -> None:
+    assert one_line(HOSTILE) == "sand\\x1b[2K error: forged error: forged\\u202e \\x9b31m"
+    assert one_line("  two  spaces\n\n  and a\ttab\n") == "two  spaces and a tab"
+    assert one_line("Δt = 3 µs, 'größe' 数") == "Δt = 3 µs, 'größe' 数"
+    assert printable("a\nb") == "a\\nb"
+
+
+def test_long_messages_lose_their_middle() -> None:
+    text = one_line("begin " + "\x1b" * 60_000 + " end", 100)
+    assert text.startswith("begin ") and text.endswith(" end") and "(59910 characters)" in text
+    assert len(one_line(str(StoreError("x" * 10**6)))) < 2 * LONGEST
+    started = time.process_time()
+    one_line(" " * 10**6 + "\n" * 10**6)
+    assert time.process_time() - started < 5  # not quadratic
+
+
+@pytest.mark.parametrize("error", [GpeError, StoreError])
+def test_errors_are_printable_wherever_they_are_shown(error: type[Exception]) -> None:
+    assert str(error(HOSTILE)).isprintable()
+    assert str(error("plain")) == "plain"
+
+
+def test_log_lines_are_printable_whatever_handler_writes_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, stream = logging.getLogRecordFactory(), io.StringIO()
+    logger, handler = logging.getLogger("gpe_pl.shown"), logging.StreamHandler(stream)
+    logger.addHandler(handler)
+    try:
+        clean_logs()
+        assert logging.getLogRecordFactory() is LogRecord
+        logger.warning("name: %s", HOSTILE)
+    finally:
+        logging.setLogRecordFactory(before)
+        logger.removeHandler(handler)
+    assert stream.getvalue() == f"name: {one_line(HOSTILE)}\n"
+
+
+def test_cells_of_tables_are_printable() -> None:
+    assert table_row(["a\nb", "\x1b[31m"]) == "| a\\nb | \\x1b[31m |"
