@@ -11,13 +11,10 @@ from gpe_pl import integrators
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import check_bounds
 from gpe_pl.periodicity import NOWHERE, Periodicity
-from gpe_pl.schema import MATERIALS, MESH_MATERIALS, NODE_TYPES, node_code, param_names
+from gpe_pl.schema import LARGEST, MATERIALS, MESH_MATERIALS, NODE_TYPES, node_code, param_names
 
 RADIUS_SPACINGS = 2.0
 """Neighbour radius in rest spacings where none is given: about 12 neighbours in the plane and 32 in space."""
-
-LARGEST = np.sqrt(np.float64(np.finfo(np.float32).max))
-"""Squares of larger numbers overflow float32, in which data are stored and trained on."""
 
 FRAMES_AT_ONCE = 256
 NEIGHBOURS = 16

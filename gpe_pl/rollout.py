@@ -15,8 +15,9 @@ from array_api_compat import array_namespace
 
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import signed_distance
-from gpe_pl.schema import MATERIALS, node_code
+from gpe_pl.schema import NODE_TYPES
 from gpe_pl.trajectory import Metadata, Motion, State, Stress, Termination, Trajectory
+from gpe_pl.values import faults, size_conflicts
 
 
 @runtime_checkable
@@ -177,18 +178,31 @@ def crowding(pos: np.ndarray, width: float) -> np.ndarray:
     return counts[box]
 
 
-def impossible_material(state: State, metadata: Metadata) -> Termination | None:
-    """The first node whose material parameter is not what ``schema.MaterialParameter.rule`` says, or None. Solvers refuse what they cannot compute."""
-    params, types = _numpy(state.material_params), _numpy(state.node_type)
-    for material in metadata.materials:
-        spec = MATERIALS[material]
-        column = metadata.param_names.index(spec.name)
-        rows = np.flatnonzero(types == node_code(material))
-        wrong = rows[~spec.accepts(params[rows, column])]
-        if len(wrong):
-            node = int(wrong[0])
-            value = f"{params[node, column]:g} {spec.unit}"
-            return Termination("material", 0, node, f"node {node}: {spec.name} of {material} is {value}, must be {spec.rule}")
+def unsound(state: State, metadata: Metadata) -> Termination | None:
+    """The first array of a state whose size or values break the rules of ``schema.FIELDS``, or None; nothing could be told from what follows it."""
+    b, has_mesh = state.boundary, state.cells is not None and state.rest_pos is not None
+    nodes = {
+        "node_type": state.node_type,
+        "mass": state.mass,
+        "material_params": state.material_params,
+        "pos": state.pos[None],
+        "vel": state.vel[None],
+        **({"rest_pos": state.rest_pos, "cells": state.cells} if has_mesh else {}),
+    }
+    conditions = {"boundary_friction": b.friction, "boundary_restitution": b.restitution}
+    walls = {"boundary_pos": b.pos[None], "boundary_vel": b.vel[None], "boundary_normal": b.normal[None], **conditions}
+    m = b.motion
+    path = {} if m is None else {"boundary_pos": m.pos, "boundary_vel": m.vel, "boundary_normal": m.normal, **conditions}
+    for part in (nodes, walls, path):
+        arrays = {key: _numpy(value) for key, value in part.items()}
+        for conflict in size_conflicts(arrays, metadata.dim, len(metadata.param_names)):
+            return Termination("input", 0, -1, conflict)
+        for fault in faults(arrays, NODE_TYPES, metadata.materials, metadata.param_names):
+            reason = {"pos": "nan", "vel": "nan", "material_params": "material"}.get(fault.field, "input")
+            return Termination(reason, 0, fault.index("node"), str(fault))
+    for name, values in (("gravity", state.gravity), ("velocity_history", state.velocity_history)):
+        if values is not None and not np.isfinite(_numpy(values)).all():
+            return Termination("nan", 0, -1, f"{name} is not finite")
     return None
 
 
@@ -216,7 +230,8 @@ class Start:
         state: becomes frame 0.
         num_steps: frames to add.
         metadata: of the scene; describes the result.
-        guard: stops the rollout at the first state that cannot be trusted; if that is the first of all, the frame of the termination is 0.
+        guard: stops the rollout at the first state that cannot be trusted; if that is the first of all, the frame of the termination is 0. A start with
+            values that break the rules of ``schema.FIELDS`` is never trusted.
     """
 
     state: State
@@ -230,7 +245,7 @@ def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int,
     live = {}
     guards = [None if start.guard is None else start.guard.of(start.state) for start in starts]
     for scene, (start, guard) in enumerate(zip(starts, guards, strict=True)):
-        impossible = None if guard is None else impossible_material(start.state, start.metadata) or guard.check(start.state, 0)
+        impossible = unsound(start.state, start.metadata) or (None if guard is None else guard.check(start.state, 0))
         if impossible is None:
             live[scene] = start.state
         else:

@@ -10,6 +10,9 @@ from typing import Any, Literal, get_args
 SCHEMA_VERSION = 2
 """Version of the HDF5 layout; a reader refuses any other."""
 
+LARGEST = math.sqrt(3.4028234663852886e38)
+"""Squares of larger numbers overflow float32, in which data are stored and trained on."""
+
 STICKY = 1.0e6
 """Coulomb friction coefficient that stands for a no-slip boundary (any value this large or larger is no-slip)."""
 
@@ -118,15 +121,29 @@ def mesh_relations(materials: tuple[str, ...], num_levels: int) -> tuple[EdgeTyp
     return (*((m, CELL, m) for m in meshes), *((grid(1), DOWN, m) for m in meshes if num_levels), *same, *down)
 
 
+Values = Literal[
+    "finite",  # magnitudes up to LARGEST
+    "positive",
+    "at least 0",
+    "0 to 1",
+    "unit vectors",
+    "node types",  # of the data set's materials
+    "parameters",  # finite where a node's material has the parameter, and positive where it enters by its logarithm
+    "nodes",  # row of a node
+]
+"""What a stored array may hold; ``gpe_pl.values`` compares."""
+
+
 @dataclass(frozen=True)
 class Field:
-    """A stored array: its dimensions, in the order of its axes, its unit and its meaning."""
+    """A stored array: its dimensions, in the order of its axes, its unit, its meaning and the values that it may hold."""
 
     dims: tuple[str, ...]
     dtype: str
     unit: str
     doc: str
     required: bool = True
+    values: Values = "finite"
 
 
 STRESS_COMPONENTS = "xx, xy, yy, zz in plane strain; xx, xy, xz, yy, yz, zz in 3D"
@@ -137,20 +154,28 @@ MOTION = "one or frame"
 FIELDS: dict[str, Field] = {
     "pos": Field(("frame", "node", "dim"), "float32", "m", "positions of the dynamic nodes"),
     "vel": Field(("frame", "node", "dim"), "float32", "m/s", "velocities of the dynamic nodes as the solver has them at that frame"),
-    "node_type": Field(("node",), "uint8", "1", "index into the attribute node_types"),
-    "mass": Field(("node",), "float32", "kg", "mass (per metre of depth in 2D)"),
-    "material_params": Field(("node", "param"), "float32", "per column", "columns as in param_names; NaN where one does not apply"),
+    "node_type": Field(("node",), "uint8", "1", "index into the attribute node_types", values="node types"),
+    "mass": Field(("node",), "float32", "kg", "mass (per metre of depth in 2D)", values="positive"),
+    "material_params": Field(
+        ("node", "param"), "float32", "per column", "columns as in param_names; NaN where one does not apply", values="parameters"
+    ),
     "boundary_pos": Field((MOTION, "boundary_node", "dim"), "float32", "m", "positions of the boundary nodes"),
     "boundary_vel": Field((MOTION, "boundary_node", "dim"), "float32", "m/s", "velocities of the boundary nodes, to the next frame"),
-    "boundary_normal": Field((MOTION, "boundary_node", "dim"), "float32", "1", "unit normals that point into free space"),
-    "boundary_friction": Field(("boundary_node",), "float32", "1", f"Coulomb coefficient; {STICKY:g} or more is no-slip"),
-    "boundary_restitution": Field(("boundary_node",), "float32", "1", "fraction of the normal velocity that a bounce returns"),
+    "boundary_normal": Field(
+        (MOTION, "boundary_node", "dim"), "float32", "1", "unit normals that point into free space", values="unit vectors"
+    ),
+    "boundary_friction": Field(
+        ("boundary_node",), "float32", "1", f"Coulomb coefficient; {STICKY:g} or more is no-slip", values="at least 0"
+    ),
+    "boundary_restitution": Field(
+        ("boundary_node",), "float32", "1", "fraction of the normal velocity that a bounce returns", values="0 to 1"
+    ),
     "rest_pos": Field(("node", "dim"), "float32", "m", "undeformed positions of mesh nodes", required=False),
-    "cells": Field(("cell", "corner"), "int32", "1", "node indices of each mesh cell", required=False),
+    "cells": Field(("cell", "corner"), "int32", "1", "node indices of each mesh cell", required=False, values="nodes"),
     "node_stress": Field(("frame", "node", "stress"), "float32", "Pa", f"Cauchy stress at nodes: {STRESS_COMPONENTS}", required=False),
     "cell_stress": Field(("frame", "cell", "stress"), "float32", "Pa", "Cauchy stress in cells, components as node_stress", required=False),
-    "node_von_mises": Field(("frame", "node"), "float32", "Pa", "von Mises stress at nodes", required=False),
-    "cell_von_mises": Field(("frame", "cell"), "float32", "Pa", "von Mises stress in cells", required=False),
+    "node_von_mises": Field(("frame", "node"), "float32", "Pa", "von Mises stress at nodes", required=False, values="at least 0"),
+    "cell_von_mises": Field(("frame", "cell"), "float32", "Pa", "von Mises stress in cells", required=False, values="at least 0"),
 }
 
 

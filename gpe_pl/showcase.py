@@ -23,7 +23,7 @@ from gpe_pl.containment import TOLERANCE, Contained
 from gpe_pl.geometry import signed_distance
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.machine import environment, peak_resident
-from gpe_pl.rollout import Guard, Simulator, Start, frames, impossible_material
+from gpe_pl.rollout import Guard, Simulator, Start, frames, unsound
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.trajectory import Metadata, State, Termination, Trajectory
 
@@ -73,7 +73,7 @@ def start(simulator: LearnedSimulator, scene: Scene, settings: ShowcaseSettings)
     if unknown:
         raise ValueError(f"values.{min(unknown)}: no material of this scene, which has {', '.join(metadata.materials)}")
     state = simulator.standing(scene.sample(settings.values, settings.seed), metadata)
-    impossible = impossible_material(state, metadata)
+    impossible = unsound(state, metadata)
     if impossible is not None:
         raise ValueError(f"values: {impossible.message}")
     return state, metadata

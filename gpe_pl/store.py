@@ -24,10 +24,23 @@ from gpe_pl.errors import GpeError
 from gpe_pl.geometry import Shape, shape_from_dict, shape_to_dict
 from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, SCHEMA_VERSION, node_code
 from gpe_pl.trajectory import Boundary, Metadata, Motion, Stress, Trajectory
+from gpe_pl.values import faults, size_conflicts
 
 
 class StoreError(GpeError, ValueError):
     """A file of the store is missing, damaged or of another schema; the message names file, trajectory and field."""
+
+
+class UnsoundError(StoreError):
+    """A stored trajectory can be read, but holds what nothing can be learned from or compared with.
+
+    Attributes:
+        fault: what is wrong, without file and trajectory.
+    """
+
+    def __init__(self, where: str, fault: str) -> None:
+        super().__init__(f"{where}: {fault}; see `python -m gpe_pl.data.validate`")
+        self.fault = fault
 
 
 def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
@@ -199,24 +212,6 @@ def read_field(group: h5py.Group, key: str, frames: slice | None = None) -> np.n
         raise StoreError(f"{where} is damaged (checksum mismatch); delete the shard and generate or import the data again") from None
 
 
-def size_conflicts(arrays: dict[str, np.ndarray], metadata: Metadata) -> list[str]:
-    """Fields whose shape contradicts the metadata or an earlier field; one sentence each."""
-    sizes = {"dim": metadata.dim, "param": len(metadata.param_names)}
-    conflicts = []
-    for key, array in arrays.items():
-        for axis, size in zip(FIELDS[key].dims, array.shape, strict=True):
-            if axis == MOTION:
-                first = len(arrays.get("boundary_pos", array))
-                if size != first or size not in (1, sizes.get("frame", size)):
-                    conflicts.append(
-                        f"field {key!r} has size {size} along {axis!r}, expected 1 or, for all three fields of a motion, the number of frames"
-                    )
-                continue
-            if sizes.setdefault(axis, size) != size:
-                conflicts.append(f"field {key!r} has size {size} along {axis!r}, expected {sizes[axis]}")
-    return conflicts
-
-
 def trajectory_names(path: Path | str) -> list[str]:
     """Group names of a shard, in order."""
     with open_shard(path) as file:
@@ -282,6 +277,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
 
     Raises:
         StoreError: file, group or field missing, wrong shape or type, or a checksum that does not match.
+        UnsoundError: metadata or values that break the rules of ``Metadata.violations`` and ``schema.FIELDS``; names field, frame and node.
     """
     if verify and frames is not None:
         raise ValueError("the digest covers all frames: pass verify or frames, not both")
@@ -297,12 +293,14 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
                 )
         if ("node_stress" in arrays) != ("cell_stress" in arrays):
             raise StoreError(f"{path}:{name}: has only one of the fields 'node_stress' and 'cell_stress'")
-        for conflict in size_conflicts(arrays, metadata):
+        for conflict in size_conflicts(arrays, metadata.dim, len(metadata.param_names)):
             raise StoreError(f"{path}:{name}: {conflict}")
         shapes, names = shapes_of(group), node_types_of(group)
-    codes = arrays["node_type"]
-    if codes.size and codes.max() >= len(names):
-        raise StoreError(f"{path}:{name}: node {codes.argmax()} has node_type {codes.max()}, but there are {len(names)} node types")
+    for key, violation in metadata.violations():
+        raise UnsoundError(f"{path}:{name}", f"{key} {violation}")
+    first_frame = 0 if frames is None else frames.start or 0
+    for fault in faults(arrays, names, metadata.materials, metadata.param_names, first_frame):
+        raise UnsoundError(f"{path}:{name}", str(fault))
     motion = Motion(arrays["boundary_pos"], arrays["boundary_vel"], arrays["boundary_normal"])
     boundary = Boundary(
         motion.pos[0],
@@ -317,7 +315,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         metadata,
         arrays["pos"],
         arrays["vel"],
-        np.array([node_code(n) for n in names], dtype=np.uint8)[codes],
+        np.array([node_code(n) for n in names], dtype=np.uint8)[arrays["node_type"]],
         arrays["mass"],
         arrays["material_params"],
         boundary,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias, overload
@@ -22,8 +23,7 @@ from gpe_pl.data.noise import Noise
 from gpe_pl.data.statistics import FRAMES_AT_ONCE
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
-from gpe_pl.schema import MATERIALS, node_code
-from gpe_pl.store import StoreError, iter_trajectories, open_group, open_shard, read_trajectory, shards
+from gpe_pl.store import StoreError, UnsoundError, open_group, open_shard, read_trajectory, shards, trajectory_names
 from gpe_pl.trajectory import State, Trajectory
 
 log = logging.getLogger(__name__)
@@ -57,7 +57,7 @@ MAX_JUMP, MIN_RATIO = 2.0, 10.0
 
 @dataclass(frozen=True)
 class StoredTrajectory:
-    """Where a trajectory lies, and the trajectory itself if the split is held in memory."""
+    """Where a trajectory lies, and the trajectory itself if the split is held in memory and nothing is wrong with it."""
 
     path: Path
     name: str
@@ -66,7 +66,7 @@ class StoredTrajectory:
     held: Trajectory | None
 
     def window(self, start: int, stop: int) -> Trajectory:
-        """Frames ``start:stop``."""
+        """Frames ``start:stop``; raises ``StoreError``, also for values that nothing can be learned from."""
         if self.held is not None:
             return self.held.frames(start, stop)
         return read_trajectory(self.path, self.name, frames=slice(start, stop))
@@ -81,21 +81,34 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
         with open_shard(path) as file:
             shapes = {name: open_group(file, name)["pos"].shape[:2] for name in sorted(file)}
         for name, (num_frames, num_nodes) in shapes.items():
-            held = _read_only(read_trajectory(path, name)) if hold else None
+            held = None
+            if hold:
+                with suppress(UnsoundError):  # which ``usable`` will meet again
+                    held = _read_only(read_trajectory(path, name))
             stored.append(StoredTrajectory(path, name, num_frames, num_nodes, held))
     return stored
 
 
 def long_enough(root: Path | str, split: str, history: int) -> Iterator[Trajectory]:
     """The undamaged trajectories of a split that have a frame with so many velocities and one to predict; warns of the others."""
-    for number, trajectory in enumerate(iter_trajectories(root, split)):
-        fault = damage(trajectory)
-        if fault is None and trajectory.num_frames < history + 2:
-            fault = f"its {trajectory.num_frames} frames are fewer than the {history + 2} that a start at frame {history} needs"
-        if fault is None:
-            yield trajectory
-        else:
-            log.warning("%s, trajectory %d: left out, %s", Path(root) / split, number, fault)
+    for path in shards(root, split):
+        for name in trajectory_names(path):
+            try:
+                trajectory = read_trajectory(path, name)
+            except UnsoundError as error:
+                _warn(path, name, error.fault)
+                continue
+            fault = damage(trajectory)
+            if fault is None and trajectory.num_frames < history + 2:
+                fault = f"its {trajectory.num_frames} frames are fewer than the {history + 2} that a start at frame {history} needs"
+            if fault is None:
+                yield trajectory
+            else:
+                _warn(path, name, fault)
+
+
+def _warn(path: Path, name: str, fault: str) -> None:
+    log.warning("%s:%s: left out, %s; see `python -m gpe_pl.data.validate`", path, name, fault)
 
 
 def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
@@ -106,11 +119,14 @@ def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
     """
     found = []
     for stored in trajectories:
-        fault = damage(stored.window(0, stored.num_frames))
+        try:
+            fault = damage(stored.window(0, stored.num_frames))
+        except UnsoundError as error:
+            fault = error.fault
         if fault is None:
             found.append(stored)
         else:
-            log.warning("%s:%s: left out, %s; see `python -m gpe_pl.data.validate`", stored.path, stored.name, fault)
+            _warn(stored.path, stored.name, fault)
     num_damaged = len(trajectories) - len(found)
     if not found or num_damaged > max(1, MAX_DAMAGED * len(trajectories)):
         where = trajectories[0].path.parent
@@ -119,12 +135,10 @@ def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
 
 
 def damage(trajectory: Trajectory) -> str | None:
-    """Why a trajectory cannot be learned from, with the frame and node, or None."""
+    """Why a trajectory whose values are sound cannot be learned from, with the frame and node, or None."""
     pos, metadata = trajectory.pos, trajectory.metadata
     if trajectory.num_nodes == 0:
         return "it has no nodes"
-    for key, fault in metadata.violations():
-        return f"{key} {fault}"
     bounds = np.array(metadata.bounds)
     width = np.ptp(bounds, axis=1)
     low, high = (
@@ -133,18 +147,7 @@ def damage(trajectory: Trajectory) -> str | None:
     near = (pos >= low) & (pos <= high)
     if not near.all():
         frame, node = np.argwhere(~near)[0, :2]
-        what = "farther outside the domain than this is wide" if np.isfinite(pos[frame, node]).all() else "not finite"
-        return f"the position of node {node} in frame {frame} is {what}"
-    wrong = np.flatnonzero(~((trajectory.mass > 0) & np.isfinite(trajectory.mass)))
-    if len(wrong):
-        return f"the mass of node {wrong[0]} is {trajectory.mass[wrong[0]]:g} kg"
-    for material in metadata.materials:
-        spec = MATERIALS[material]
-        rows = np.flatnonzero(trajectory.node_type == node_code(material))
-        values = trajectory.material_params[rows, metadata.param_names.index(spec.name)]
-        wrong = np.flatnonzero(~spec.accepts(values))
-        if len(wrong):
-            return f"the {spec.name} of node {rows[wrong[0]]} is {values[wrong[0]]:g} {spec.unit}, must be {spec.rule}"
+        return f"the position of node {node} in frame {frame} is farther outside the domain than this is wide"
     return _jump(trajectory)
 
 
@@ -278,7 +281,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         probability: of each window to be drawn, where they are not drawn alike; graphs then carry ``weight``, its inverse over that of equal chances.
 
     Raises:
-        StoreError: no trajectory is long enough, or a window holds a position that is not finite.
+        StoreError: no trajectory is long enough, or a window holds values that nothing can be learned from.
     """
 
     def __init__(
@@ -336,10 +339,6 @@ class WindowDataset(Dataset[HeteroData | Start]):
         trajectory = stored.window(frame - history, frame + 2 + ahead)
         dt = trajectory.metadata.frame_dt
         truth = trajectory.pos.astype(np.float64)
-        if not np.isfinite(truth).all():
-            bad, node = np.argwhere(~np.isfinite(truth))[0, :2]
-            where = f"{stored.path}:{stored.name}: frame {frame - history + bad}, node {node}"
-            raise StoreError(f"{where}: the position is not finite; see `python -m gpe_pl.data.validate`")
         pos = truth[: history + 2]
         if self.noise is not None:
             rng = np.random.default_rng((self.seed, sample))

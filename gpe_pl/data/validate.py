@@ -39,9 +39,9 @@ from gpe_pl.store import (
     read_field,
     read_text,
     shapes_of,
-    size_conflicts,
 )
 from gpe_pl.trajectory import Metadata
+from gpe_pl.values import faults, size_conflicts
 
 Finding = tuple[str, str]
 """Name of the field or attribute, and what is wrong with it."""
@@ -241,16 +241,21 @@ def _check_trajectory(group: h5py.Group, path: Path) -> tuple[Metadata, dict[str
             except StoreError as error:
                 findings.append(("", str(error)))
     findings += [(key, "is not a field of this schema") for key in group if key not in FIELDS]
-    conflicts = size_conflicts(arrays, metadata)
+    conflicts = size_conflicts(arrays, metadata.dim, len(metadata.param_names))
     findings += [("", conflict) for conflict in conflicts]
     sha = read_text(group, "sha256")
     if digest(arrays, {key: read_text(group, key) for key in ("metadata", "shapes", "node_types")}) != sha:
         findings.append(("sha256", "does not match the content; delete the shard and generate or import the data again"))
     complete = all(key in arrays for key, spec in FIELDS.items() if spec.required)
     if complete and not conflicts:  # the checks of meaning rely on consistent shapes
-        findings += _check_nodes(metadata, arrays, node_types_of(group))
+        names = node_types_of(group)
+        unsound = list(faults(arrays, names, [m for m in metadata.materials if m in MATERIALS], metadata.param_names))
+        findings += [(fault.field, fault.message) for fault in unsound]
+        wrong = {fault.field for fault in unsound}
+        if "node_type" not in wrong:
+            findings += _check_parameters(metadata, arrays, names)
         findings += _check_motion(metadata, arrays)
-        findings += _check_boundary(metadata, arrays, shapes_of(group))
+        findings += _check_shapes(metadata, arrays, shapes_of(group), "boundary_pos" not in wrong)
     return metadata, arrays, sha, findings
 
 
@@ -288,31 +293,12 @@ def _offenders(key: str, bad: np.ndarray) -> str | None:
     return ", ".join(axes) + (f" and {more} more" if more else "")
 
 
-def _check_nodes(m: Metadata, arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> Iterator[Finding]:
-    codes, params = arrays["node_type"], arrays["material_params"].astype(np.float64)
-    allowed = [k for k, name in enumerate(names) if name in m.materials]
-    if where := _offenders("node_type", ~np.isin(codes, allowed)):
-        yield "node_type", f"{where}: the code stands for none of the data set's materials ({', '.join(m.materials)})"
-        return
-    if where := _offenders("mass", ~(np.isfinite(arrays["mass"]) & (arrays["mass"] > 0))):
-        yield "mass", f"{where}: must be positive and finite"
+def _check_parameters(m: Metadata, arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> Iterator[Finding]:
     by_code = [MATERIALS.get(name) for name in names]
     for column, name in enumerate(m.param_names):
-        used = np.isin(codes, [k for k, p in enumerate(by_code) if p is not None and p.name == name])
-        value = params[:, column]
-        if where := _offenders("mass", used & np.isnan(value)):
-            yield "material_params", f"{name}: {where}: NaN, but the material has this parameter"
-        if where := _offenders("mass", ~used & ~np.isnan(value)):
+        used = np.isin(arrays["node_type"], [k for k, p in enumerate(by_code) if p is not None and p.name == name])
+        if where := _offenders("mass", ~used & ~np.isnan(arrays["material_params"][:, column])):
             yield "material_params", f"{name}: {where}: has a value, but the material has no such parameter (NaN expected)"
-        for code in np.unique(codes[used]):
-            p = by_code[code]
-            if p is None:
-                continue
-            wrong = used & (codes == code) & ~np.isnan(value) & ~p.accepts(value)
-            if where := _offenders("mass", wrong):
-                yield "material_params", f"{name}: {where}: is {value[wrong][0]:g} {p.unit} of {names[code]}, must be {p.rule}"
-    if "cells" in arrays and (where := _offenders("cells", (arrays["cells"] < 0) | (arrays["cells"] >= len(codes)))):
-        yield "cells", f"{where}: no such node, there are {len(codes)}"
 
 
 def _check_motion(m: Metadata, arrays: dict[str, np.ndarray]) -> Iterator[Finding]:
@@ -320,9 +306,6 @@ def _check_motion(m: Metadata, arrays: dict[str, np.ndarray]) -> Iterator[Findin
     if pos.shape[0] < 2 or pos.shape[1] < 1:
         yield "pos", f"has {pos.shape[0]} frames and {pos.shape[1]} nodes; at least 2 frames and 1 node are needed"
         return
-    for key in ("pos", "vel", "rest_pos", "node_stress", "cell_stress"):
-        if key in arrays and (where := _offenders(key, ~np.isfinite(arrays[key]))):
-            yield key, f"{where}: not finite"
     for axis, (low, high) in enumerate(m.bounds):
         slack = 1e-5 * max(abs(low), abs(high), high - low)  # float32, and the solvers' own margin
         outside = (pos[..., axis] < low - slack) | (pos[..., axis] > high + slack)
@@ -333,21 +316,9 @@ def _check_motion(m: Metadata, arrays: dict[str, np.ndarray]) -> Iterator[Findin
             )
 
 
-def _check_boundary(m: Metadata, arrays: dict[str, np.ndarray], shapes: tuple[Shape, ...]) -> Iterator[Finding]:
-    pos, normal = arrays["boundary_pos"], arrays["boundary_normal"].astype(np.float64)
-    sound = True
-    for key in ("boundary_pos", "boundary_vel", "boundary_normal", "boundary_friction", "boundary_restitution"):
-        if where := _offenders(key, ~np.isfinite(arrays[key])):
-            sound = sound and key != "boundary_pos"
-            yield key, f"{where}: not finite"
-    length = np.sqrt((normal**2).sum(-1))
-    if where := _offenders("boundary_normal", np.abs(length - 1) > 1e-4):
-        yield "boundary_normal", f"{where}: length {length[np.abs(length - 1) > 1e-4][0]:.6g}, must be 1"
-    if where := _offenders("boundary_friction", arrays["boundary_friction"] < 0):
-        yield "boundary_friction", f"{where}: negative"
-    restitution = arrays["boundary_restitution"]
-    if where := _offenders("boundary_restitution", (restitution < 0) | (restitution > 1)):
-        yield "boundary_restitution", f"{where}: must lie between 0 and 1"
+def _check_shapes(m: Metadata, arrays: dict[str, np.ndarray], shapes: tuple[Shape, ...], sound: bool) -> Iterator[Finding]:
+    """Shapes, and whether boundary nodes lie on them where their positions are ``sound``."""
+    pos = arrays["boundary_pos"]
     for k, shape in enumerate(shapes):
         if message := _bad_shape(shape, m.dim):
             sound = False
@@ -379,7 +350,7 @@ def format_page() -> str:
     meaning = _documented_attributes(Metadata)
     rows = {
         "fields": [
-            f"| `{key}` | {'×'.join(f.dims)} | {f.dtype} | {f.unit} | {f.doc}{'' if f.required else ' (optional)'} |"
+            f"| `{key}` | {'×'.join(f.dims)} | {f.dtype} | {f.unit} | {f.values} | {f.doc}{'' if f.required else ' (optional)'} |"
             for key, f in FIELDS.items()
         ],
         "metadata": [f"| `{key}` | {meaning[key]} |" for key in Metadata.__dataclass_fields__],
@@ -432,9 +403,11 @@ Splits: {splits}. The material parameters of the first three have the trained va
 
 ## Fields
 
-| name | axes | type | unit | meaning |
-|---|---|---|---|---|
+| name | axes | type | unit | values | meaning |
+|---|---|---|---|---|---|
 {fields}
+
+Values are finite and at most 1.8e19 in magnitude. The reader refuses others, and names file, trajectory, field, frame and node.
 
 `node_type` is an index into the attribute `node_types`: {codes}. Dynamic nodes only: `{boundary}` nodes have fields of their own.
 

@@ -97,7 +97,8 @@ def test_node_types_are_stored_by_name(shard: Path, trajectory: Trajectory) -> N
     """A later schema may number the node types differently; names decide."""
     with h5py.File(shard, "r+") as file:
         file["00000"].attrs["node_types"] = np.bytes_(b'["snow", "sand"]')
-    assert {NODE_TYPES[k] for k in read_trajectory(shard, "00000").node_type} == {"snow"}
+        file["00000/node_type"][:] = 1
+    assert {NODE_TYPES[k] for k in read_trajectory(shard, "00000").node_type} == {"sand"}
 
 
 def test_equal_content_gives_equal_bytes(tmp_path: Path, trajectory: Trajectory) -> None:
@@ -208,7 +209,7 @@ def test_variable_length_text_is_refused(shard: Path) -> None:
         ("shapes", b'[{"kind": "cone"}]', "unknown shape kind 'cone'"),
         ("shapes", b"3", "'shapes' is unreadable"),
         ("node_types", b'["sand", "lava"]', r"names \['lava'\]"),
-        ("node_types", b"[]", "node 0 has node_type 0, but there are 0 node types"),
+        ("node_types", b"[]", "field 'node_type': node 0 and 11 more: the code stands for none of the data set's materials"),
     ],
 )
 def test_damaged_attributes(shard: Path, key: str, value: bytes, message: str) -> None:

@@ -25,9 +25,10 @@ from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.names import NameRefused, data_name
 from gpe_pl.periodicity import PeriodicityError
 from gpe_pl.progress import Progress
-from gpe_pl.schema import HISTORY, MATERIALS, SPLITS, ParameterGroup, node_code, param_names
-from gpe_pl.store import iter_trajectories, write_shard
+from gpe_pl.schema import HISTORY, MATERIALS, NODE_TYPES, SPLITS, ParameterGroup, node_code, param_names
+from gpe_pl.store import iter_trajectories, stored_arrays, write_shard
 from gpe_pl.trajectory import Trajectory
+from gpe_pl.values import faults, size_conflicts
 
 FOLDER = "imported"
 """Folder of imported data in that of a data set, where generated data have their size."""
@@ -227,6 +228,8 @@ class _Conversion:
     def _accept(self, split: str, name: str, trajectory: Trajectory) -> None:
         """Add a trajectory to what is known; raises ``Refusal`` where it does not fit the others."""
         survey, m, where = self.survey, trajectory.metadata, f"{split}, {name}"
+        for fault in _faults(trajectory):
+            raise Refusal(fault)
         common = (m.frame_dt, m.dim, m.periodic)
         if survey.common is None:
             survey.common = common
@@ -460,6 +463,14 @@ class _Conversion:
             report.max_speed = max(report.max_speed, float(np.linalg.norm(trajectory.vel, axis=-1).max()))
         report.mean_acceleration = np.mean(means, axis=0).tolist()
         report.step_in_spacings = report.max_speed * report.frame_dt / report.spacing
+
+
+def _faults(trajectory: Trajectory) -> Iterator[str]:
+    """What the store would not read again."""
+    m, arrays = trajectory.metadata, stored_arrays(trajectory)
+    yield from (f"{key} {violation}" for key, violation in m.violations())
+    yield from size_conflicts(arrays, m.dim, len(m.param_names))
+    yield from map(str, faults(arrays, NODE_TYPES, m.materials, m.param_names))
 
 
 def _degrees(trajectory: Trajectory) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -134,15 +134,16 @@ def test_trajectories_that_are_too_short_are_skipped(tmp_path: Path, new_traject
         dataset(tmp_path, history=5)
 
 
-def test_a_position_that_is_not_finite_is_named(store: Path) -> None:
-    data = dataset(store, noise=None)
-    held = data.trajectories[1].held
-    assert held is not None
-    pos = held.pos.copy()
+@pytest.mark.parametrize("cache_bytes", [0, 2**30])
+def test_a_position_that_is_not_finite_is_named(store: Path, cache_bytes: int) -> None:
+    path = store / "train" / "shard-00000.h5"
+    sound, other = (read_trajectory(path, f"{k:05d}") for k in range(2))
+    pos = other.pos.copy()
     pos[4, 7, 1] = np.nan
-    data.trajectories[1] = replace(data.trajectories[1], held=replace(held, pos=pos))
-    assert torch.isfinite(data[3]["sand"].x).all()  # windows that do not touch it
-    with pytest.raises(StoreError, match=r"shard-00000.h5:00001: frame 4, node 7: the position is not finite"):
+    write_shard(path, [sound, replace(other, pos=pos)])
+    data = dataset(store, noise=None, cache_bytes=cache_bytes)
+    assert torch.isfinite(data[0]["sand"].x).all()
+    with pytest.raises(StoreError, match=r"shard-00000.h5:00001: field 'pos': frame 4, node 7, dim 1: not finite"):
         data[5]
 
 
