@@ -232,28 +232,3 @@ def estimated_normals(boundary_pos: np.ndarray, visited: np.ndarray, periodicity
         weak = np.linalg.norm(normal, axis=1) < 1e-3
         normal[weak] = fallback[weak]
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)
-
-
-def carried_along(pos: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Unit normals [frame, boundary_node, dim] that turn as the nodes around each node do.
-
-    The turn of a node since the first frame is the rotation that brings its neighbours of then closest to where they are now [Kabsch 1976].
-
-    Args:
-        pos: positions [frame, boundary_node, dim] in m, continuous.
-        normal: those of the first frame [boundary_node, dim].
-    """
-    from scipy.spatial import cKDTree
-
-    num_frames, num_nodes, dim = pos.shape
-    moved = pos - pos[0]
-    if num_nodes <= dim or np.abs(moved - moved[:, :1]).max() < 1e-6 * np.ptp(pos[0], axis=0).max():  # nothing turns
-        return np.broadcast_to(normal, pos.shape)
-    near = cKDTree(pos[0]).query(pos[0], k=min(1 + NEIGHBOURS, num_nodes))[1][:, 1:]
-    arms = pos[0][near] - pos[0][:, None]
-    turned = np.empty_like(pos)
-    for frame in range(num_frames):
-        u, _, vt = np.linalg.svd(np.einsum("nkd,nke->nde", arms, pos[frame][near] - pos[frame][:, None]))
-        u[:, :, -1] *= np.linalg.det(u @ vt)[:, None]  # a rotation, no reflection
-        turned[frame] = np.einsum("nde,nd->ne", u @ vt, normal)
-    return turned

@@ -15,7 +15,6 @@ from gpe_pl import integrators
 from gpe_pl.arrays import (
     RADIUS_SPACINGS,
     ArrayError,
-    carried_along,
     checked_bounds,
     checked_cells,
     checked_materials,
@@ -28,6 +27,7 @@ from gpe_pl.arrays import (
 )
 from gpe_pl.geometry import Shape, moved
 from gpe_pl.periodicity import NOWHERE, Periodicity, PeriodicityError
+from gpe_pl.rigid_parts import carried_along
 from gpe_pl.schema import BOUNDARY, MATERIALS, STICKY, node_code, param_names
 
 Array = Any
@@ -127,15 +127,12 @@ class Boundary:
         """
         pos = numbers("boundary pos", pos, {"boundary_node": None, "dim": None})
         normal = numbers("boundary normal", normal, dict(zip(("boundary_node", "dim"), pos.shape, strict=True)))
-        length = np.linalg.norm(normal.astype(np.float64), axis=1)
-        if (length == 0).any():
-            raise ArrayError(f"boundary normal: boundary_node {int(length.argmin())} has length 0; it must point into free space")
         vel = per_node("boundary vel", vel, pos.shape, "boundary_node")
         friction, restitution = (
             per_node(f"boundary {name}", value, pos.shape[:1], "boundary_node", low=0.0, high=high)
             for name, value, high in (("friction", friction, np.inf), ("restitution", restitution, 1.0))
         )
-        return cls(pos, vel, (normal / length[:, None]).astype(np.float32), friction, restitution, shapes)
+        return cls(pos, vel, _unit(normal).astype(np.float32), friction, restitution, shapes)
 
     @classmethod
     def moving(
@@ -152,7 +149,8 @@ class Boundary:
 
         Args:
             pos: positions [frame, boundary_node, dim] in m, of as many frames as the trajectory.
-            normal: directions into free space in the first frame [boundary_node, dim], of any length; they turn as the nodes around do.
+            normal: directions into free space, of any length: in the first frame [boundary_node, dim], from where they turn as the rigid parts do that the
+                motion shows (``rigid_parts``), or in every frame [frame, boundary_node, dim].
             frame_dt: seconds between frames.
             friction, restitution: as in ``from_numpy``.
             periodicity: where space repeats.
@@ -161,11 +159,15 @@ class Boundary:
             ArrayError: as ``from_numpy``.
         """
         pos = numbers("boundary pos", pos, {"frame": None, "boundary_node": None, "dim": None})
-        first = cls.from_numpy(periodicity.wrapped(pos[0].astype(np.float64)), normal, friction=friction, restitution=restitution)
+        given = np.ndim(normal) == 3
+        if given:
+            normal = numbers("boundary normal", normal, dict(zip(("frame", "boundary_node", "dim"), pos.shape, strict=True)))
+        now = normal[0] if given else normal
+        first = cls.from_numpy(periodicity.wrapped(pos[0].astype(np.float64)), now, friction=friction, restitution=restitution)
         steps = periodicity.shortest(np.diff(pos.astype(np.float64), axis=0))
         path = np.concatenate([first.pos[None], first.pos + np.cumsum(steps, axis=0)])  # continuous, also across seams
         vel = np.concatenate([steps, steps[-1:]]) / positive("frame_dt", frame_dt, "seconds")
-        normals = carried_along(path, np.asarray(first.normal, np.float64))
+        normals = _unit(normal) if given else carried_along(path, np.asarray(first.normal, np.float64), periodicity)
         inside = np.stack([periodicity.wrapped(frame) for frame in path])
         return replace(first, motion=Motion(inside, vel, normals)).at(0)
 
@@ -207,6 +209,16 @@ def search_tree(pos: Array, periodicity: Periodicity = NOWHERE) -> Any:
     if not periodicity:
         return cKDTree(points, balanced_tree=False, compact_nodes=False)
     return cKDTree(periodicity.from_corner(points), balanced_tree=False, compact_nodes=False, boxsize=periodicity.period)
+
+
+def _unit(normal: np.ndarray) -> np.ndarray:
+    """Directions [..., boundary_node, dim] of length 1."""
+    length = np.linalg.norm(normal.astype(np.float64), axis=-1, keepdims=True)
+    if (length == 0).any():
+        *frame, node, _ = np.argwhere(length == 0)[0].tolist()
+        where = f"frame {frame[0]}, " if frame else ""
+        raise ArrayError(f"boundary normal: {where}boundary_node {node} has length 0; it must point into free space", *frame)
+    return np.asarray(normal / length)
 
 
 def _numpy(x: Array) -> np.ndarray:

@@ -6,7 +6,8 @@
 
 Keys are the arguments of ``Trajectory.from_numpy``, which documents them; ``params_{material}`` stands for ``params[material]``, and ``boundary_pos``,
 ``boundary_normal``, ``boundary_vel``, ``boundary_friction`` and ``boundary_restitution`` for those of ``Boundary.from_numpy``, or of ``Boundary.moving`` if
-``boundary_pos`` is [frame, boundary_node, dim]. Without ``boundary_normal`` normals are estimated. Needed are ``pos``, ``frame_dt``, ``materials`` and
+``boundary_pos`` is [frame, boundary_node, dim], where ``boundary_normal`` may be of the first frame or of every frame. Without it normals are estimated.
+Needed are ``pos``, ``frame_dt``, ``materials`` and
 ``params_…``; the settings of the command override what the files say.
 """
 
