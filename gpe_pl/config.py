@@ -33,6 +33,7 @@ from gpe_pl.launcher import RESULT, USAGE_ERROR, SweepError, end_with_sweep
 from gpe_pl.names import NameRefused, run_name, sweep_name
 from gpe_pl.pretrained import model_name
 from gpe_pl.printable import clean_logs, one_line
+from gpe_pl.run_folder import refuse_links
 from gpe_pl.signatures import checked, parameters
 
 WITHOUT_KEY = {"comparison", "experiment", "scene", "solver"}
@@ -323,6 +324,13 @@ def output_dir(cfg: DictConfig) -> Path:
 
 class Report(Callback):
     """Aggregates what a command has run, a single run or a sweep, when it ends: tables and figures in the folder of the results."""
+
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        """Before Hydra writes into the folder."""
+        try:
+            refuse_links(Path(config.hydra.run.dir))
+        except GpeError as error:
+            _fail(error)
 
     def on_run_end(self, config: DictConfig, **_: Any) -> None:
         self._report(Path(config.hydra.run.dir), is_sweep=False)

@@ -13,9 +13,11 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
+import time
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -32,12 +34,15 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gpe_pl.errors import GpeError
 from gpe_pl.printable import one_line
+from gpe_pl.run_folder import RunError, refuse_links
 
 LOG = "output.log"
 RESULT = "GPE_PL_RESULT"
 """Environment variable: the file in which a command leaves the value that it returns."""
 USAGE_ERROR = 64
 """Exit status of a run whose configuration is wrong: the rest of the sweep is not started."""
+GRACE_SECONDS = 30.0
+"""That a run has to save its training when its sweep is gone, as Slurm and Kubernetes give."""
 REPORT = "hydra.callbacks.report"
 """Belongs to the sweep as a whole."""
 
@@ -66,6 +71,10 @@ class Job:
 
     def run(self, module: str) -> JobReturn:
         """Run ``python -m module`` for this job and wait for its end."""
+        try:
+            refuse_links(self.folder)
+        except RunError as error:
+            return self.failed(SweepError(str(error)))
         self.folder.mkdir(parents=True, exist_ok=True)
         result = self.folder / ".result"
         here = [f"hydra.run.dir={json.dumps(str(self.folder))}", "hydra.mode=RUN", *self.settings]
@@ -101,12 +110,14 @@ class Job:
 def end_with_sweep() -> None:
     """End this run when the sweep that started it is gone, however it ended: the pipe that is its standard input then closes.
 
-    Otherwise the same command, given again, would meet the run in its folder.
+    Otherwise the same command, given again, would meet the run in its folder. A training has ``GRACE_SECONDS`` to save a checkpoint.
     """
 
     def watch() -> None:
         while os.read(0, 1):
             pass
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(GRACE_SECONDS)
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
@@ -144,12 +155,18 @@ class CommandLauncher(Launcher):
         console = Console(highlight=False, soft_wrap=True, markup=False)
         console.print(f"{len(jobs)} runs, {self.place(jobs)}; each has its {LOG} below {one_line(str(self.config.hydra.sweep.dir))}")
         returns: dict[int, JobReturn] = {}
-        for k, outcome in self.run(jobs, module.name):
-            returns[k] = outcome
-            if isinstance(outcome._return_value, UsageError):
-                raise outcome._return_value
-            failed = outcome.status is JobStatus.FAILED
-            console.print(f"{len(returns)}/{len(jobs)} {'failed' if failed else 'done'}: {one_line(jobs[k].name)}")
+        try:
+            for k, outcome in self.run(jobs, module.name):
+                returns[k] = outcome
+                if isinstance(outcome._return_value, UsageError):
+                    raise outcome._return_value
+                failed = outcome.status is JobStatus.FAILED
+                console.print(f"{len(returns)}/{len(jobs)} {'failed' if failed else 'done'}: {one_line(jobs[k].name)}")
+        except KeyboardInterrupt:
+            num_done = sum(r.status is JobStatus.COMPLETED for r in returns.values())
+            raise SweepError(
+                f"interrupted with {num_done} of {len(jobs)} runs done; the same command goes on with the others, each {LOG} says from where"
+            ) from None
         errors = [f"{jobs[k].name}: {r._return_value}" for k, r in sorted(returns.items()) if r.status is JobStatus.FAILED]
         if errors:
             error = SweepError(f"{len(errors)} of {len(jobs)} runs failed; the same command runs only those again. {'; '.join(errors[:3])}")

@@ -23,9 +23,10 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
     """Take a folder for a run with this configuration; one without ``results`` (patterns) is free.
 
     Raises:
-        RunError: the folder holds a run with another configuration; names the first differing key.
+        RunError: the folder holds a run with another configuration, or a link that leads out of it; names the first differing key, or the link.
     """
     config = without_tables(config)
+    refuse_links(run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
     path = run_dir / CONFIG
     if any(found.name != CONFIG for pattern in results for found in run_dir.glob(pattern)):
@@ -36,6 +37,14 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
             )
         return
     replace_text(path, json.dumps(config, indent=1, sort_keys=True))
+
+
+def refuse_links(run_dir: Path) -> None:
+    """Raise ``RunError`` where a folder, which may be someone else's, has a link through which a run would write outside of it."""
+    inside = run_dir.resolve()
+    for path in sorted(run_dir.iterdir()) if run_dir.is_dir() else []:
+        if path.is_symlink() and not path.resolve().is_relative_to(inside):
+            raise RunError(f"{path}: a link that leads out of the run folder; remove it, or make the folder itself a link")
 
 
 def release(run_dir: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -119,7 +120,7 @@ class TrajectoryDataModule(L.LightningDataModule):
             num_workers=self.num_workers,
             persistent_workers=self.num_workers > 0,
             prefetch_factor=4 if self.num_workers else None,
-            worker_init_fn=_one_thread,
+            worker_init_fn=_set_up_worker,
         )
 
     def val_dataloader(self) -> DataLoader:
@@ -136,5 +137,6 @@ def _spread(length: int, count: int) -> np.ndarray:
     return np.unique(np.linspace(0, length - 1, min(length, count)).round().astype(int))
 
 
-def _one_thread(_: int) -> None:
+def _set_up_worker(_: int) -> None:
     torch.set_num_threads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the training needs its workers until it has saved

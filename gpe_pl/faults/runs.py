@@ -24,7 +24,17 @@ from gpe_pl.faults import isolation, stores
 from gpe_pl.faults.verdict import MAX_DETAIL, Fault, Verdict
 from gpe_pl.learned_simulator import load_checkpoint
 
-SAVED = ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers", "global_step", "simulator")
+SAVED = (
+    "state_dict",
+    "current_model_state",
+    "averaging_state",
+    "optimizer_states",
+    "lr_schedulers",
+    "global_step",
+    "simulator",
+    "excursions",
+    "skipped",
+)
 """What of a training checkpoint does not depend on where it lies."""
 
 

@@ -1,16 +1,113 @@
-"""How a run's checkpoints reach the disk: whole or not at all, and only sound ones come back."""
+"""Checkpoints of a run: when they are saved, what is remembered of them, and that they reach the disk whole or not at all."""
 
 from __future__ import annotations
 
 import io
+import math
+import time
 from pathlib import Path
 from typing import Any
 
+import lightning as L
 import torch
 from lightning.fabric.plugins.io import TorchCheckpointIO
+from lightning.pytorch.callbacks import Checkpoint
 
+from gpe_pl import ranks
 from gpe_pl.atomic import replacing
 from gpe_pl.learned_simulator import CheckpointError, load_checkpoint
+from gpe_pl.training.interruption import Interruption
+
+SCORE = "val/rollout_mse"
+"""The validation whose model has the lowest becomes the best checkpoint."""
+
+
+class Checkpoints(Checkpoint):
+    """Saves ``last.ckpt`` after every validation, every so many seconds between them, and when training is interrupted; ``best.ckpt`` after the best.
+
+    A checkpoint remembers the best score and its step, and no path: the files lie where this run's folder lies now. Ranks save and stop together.
+
+    Args:
+        folder: of the two files.
+        seconds: between validations, from one ``last.ckpt`` to the next.
+        interruption: listened to from the first step on; ends training with ``KeyboardInterrupt`` when ``last.ckpt`` is saved.
+
+    Attributes:
+        best_score, best_step: of ``best.ckpt``; None: there is none.
+        saved_step: of ``last.ckpt``; None: this training has neither loaded nor saved it.
+    """
+
+    def __init__(self, folder: Path, seconds: float = math.inf, interruption: Interruption | None = None) -> None:
+        self.best, self.last = folder / "best.ckpt", folder / "last.ckpt"
+        self.seconds, self.interruption = seconds, interruption or Interruption()
+        self.best_score: float | None = None
+        self.best_step: int | None = None
+        self.saved_step: int | None = None
+        self._saved_at = time.monotonic()
+
+    def where_saved(self) -> str | None:
+        """Path and step of ``last.ckpt``, for messages; None: there is none."""
+        if not self.last.exists():
+            return None
+        return str(self.last) if self.saved_step is None else f"{self.last}, step {self.saved_step}"
+
+    # --- when ----------------------------------------------------------------------------------------------------------------------------
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        self._saved_at = time.monotonic()
+        self.interruption.listen()
+
+    def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int) -> None:
+        interval = trainer.val_check_batch
+        assert isinstance(interval, int)
+        if trainer.global_step % interval == 0:
+            return  # the validation comes next, and saves; a run resumed from here would go on without it
+        is_due = time.monotonic() - self._saved_at >= self.seconds
+        stops, saves = self._agreed(pl_module, self.interruption.requested, is_due)
+        if stops or saves:
+            self._save_last(trainer)
+        if stops:
+            raise KeyboardInterrupt
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        score = float(trainer.callback_metrics[SCORE])
+        if self.best_score is None or score < self.best_score:
+            self.best_score, self.best_step = score if math.isfinite(score) else math.inf, trainer.global_step
+            trainer.save_checkpoint(self.best, weights_only=False)
+        self._save_last(trainer)
+        if self._agreed(pl_module, self.interruption.requested)[0]:
+            raise KeyboardInterrupt
+
+    def _save_last(self, trainer: L.Trainer) -> None:
+        trainer.save_checkpoint(self.last, weights_only=False)
+        self.saved_step, self._saved_at = trainer.global_step, time.monotonic()
+
+    @staticmethod
+    def _agreed(module: L.LightningModule, *wishes: bool) -> list[bool]:
+        """Which wishes any rank has; all ranks get the same answer."""
+        if ranks.num_ranks() == 1:
+            return list(wishes)
+        return [bool(count) for count in ranks.summed(torch.tensor(wishes, dtype=torch.int64, device=module.device)).tolist()]
+
+    # --- what is remembered ---------------------------------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"best_score": self.best_score, "best_step": self.best_step}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Take up what ``state_dict`` gave.
+
+        Raises:
+            CheckpointError: it is something else.
+        """
+        score, step = (state_dict.get(key) for key in ("best_score", "best_step"))
+        if (score, step) != (None, None) and not (type(score) is float and type(step) is int):
+            raise CheckpointError(f"{self.last}: does not hold the score and step of the best checkpoint; delete the file")
+        if self.best.exists():  # else the next validation is the best one that there is
+            self.best_score, self.best_step = score, step
+
+    def on_load_checkpoint(self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
+        self.saved_step = checkpoint["global_step"]
 
 
 class AtomicCheckpoints(TorchCheckpointIO):

@@ -19,7 +19,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl import ranks
 from gpe_pl.data.dataset import Samples
 from gpe_pl.errors import GpeError
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator
 from gpe_pl.machine import has_cpp_compiler
 from gpe_pl.metrics import OneStepNMSE
 from gpe_pl.training.push_forward import Excursions
@@ -32,6 +32,12 @@ MAX_SKIPPED, SKIP_WINDOW, MAX_IN_ROW = 10, 100, 3
 
 COMPILE_PAYS_AFTER = 10_000
 """Steps from which ``compile: auto`` repays the time that compilation takes."""
+
+RESUMED = {
+    *("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers", "loops", "callbacks", "global_step"),
+    *("skipped", "excursions"),
+}
+"""What a checkpoint holds from which a run goes on."""
 
 log = logging.getLogger(__name__)
 
@@ -214,7 +220,7 @@ class TrainingModule(L.LightningModule):
         is_in_row = len(self._skipped) >= before and self.global_step - self._skipped[-before] <= before
         if is_often or is_in_row:
             raise TrainingError(
-                f"{what}, as in {len(self._skipped)} other batches since step {self._skipped[0]}; the last good checkpoint is kept. "
+                f"{what}, as in {len(self._skipped)} other batches since step {self._skipped[0]}. "
                 "Lower training.learning_rate, or validate the data with `python -m gpe_pl.data.validate`"
             )
         self._skipped.append(self.global_step)
@@ -225,13 +231,24 @@ class TrainingModule(L.LightningModule):
         for material, value in predicted.items():
             self.val_nmse.update(value, self._normalized(batch[material].target))
 
+    def on_validation_start(self) -> None:
+        self._excursions.clear()  # they have drifted from the weights, and the checkpoints that follow stay small
+
     def on_validation_epoch_end(self) -> None:
         self.log("val/one_step_nmse", self.val_nmse.compute(), sync_dist=True)  # of all ranks already; Lightning advises it if not told
         self.val_nmse.reset()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["simulator"] = self.simulator.description()
-        self._excursions.clear()  # a resumed run has none either
+        checkpoint["skipped"] = list(self._skipped)
+        checkpoint["excursions"] = self._excursions.state_dict()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        missing = RESUMED - checkpoint.keys()
+        if missing:
+            raise CheckpointError(f"last.ckpt: has no {min(missing)}, and is none to resume from; delete the file to train from the start")
+        self._skipped.extend(checkpoint["skipped"])
+        self._excursions.load_state_dict(checkpoint["excursions"])
 
     def _normalized(self, target: Tensor) -> Tensor:
         return target / self.simulator.acceleration_std.to(target.dtype)

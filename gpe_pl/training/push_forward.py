@@ -7,17 +7,22 @@ prediction, and waits until its turn comes again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
+from gpe_pl import ranks
 from gpe_pl.data.dataset import Start
 from gpe_pl.graphs.batching import batched
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator
 from gpe_pl.rollout import SimulationError
 from gpe_pl.trajectory import State
+
+MOVED = ("pos", "vel", "velocity_history", "time")
+"""Of a state: what a step changes, apart from a moving boundary, which follows from the number of steps."""
 
 
 @dataclass
@@ -30,34 +35,68 @@ class Excursion:
     graphs: list[HeteroData]
 
 
+Stored = dict[int, dict[int, dict[str, Any]]]
+"""Of each lane, and each sample in it: what a scene has come to, other than by its start; see ``Excursions.state_dict``."""
+
+
 class Excursions:
     """All batches that a simulator is under way with, one per lane (see ``PushForward``).
 
-    What they hold is never stored. After ``clear`` they are walked again from their starts, with the weights of the day; a run that clears them whenever it
-    saves a checkpoint goes on from it as it would have anyway.
+    After ``clear`` they are walked again from their starts, with the weights of the day.
     """
 
     def __init__(self) -> None:
         self._lanes: dict[int, Excursion] = {}
+        self._loaded: Stored = {}
 
     def clear(self) -> None:
         self._lanes.clear()
+        self._loaded.clear()
+
+    def state_dict(self) -> Stored:
+        """Where all scenes of all ranks are: ``steps``, ``time`` and the tensors ``pos``, ``vel``, ``velocity_history``. All ranks have to call it."""
+        own: Stored = {lane: dict(scenes) for lane, scenes in self._loaded.items()}  # loaded, and not asked for since
+        for lane, way in self._lanes.items():
+            scenes = zip(way.samples, way.states, way.steps, strict=True)
+            own[lane] = {sample: {"steps": steps, **{name: getattr(state, name) for name in MOVED}} for sample, state, steps in scenes}
+        together: Stored = {}
+        for part in ranks.gathered(own):
+            for lane, stored in part.items():
+                together.setdefault(lane, {}).update(stored)
+        return together
+
+    def load_state_dict(self, stored: Stored) -> None:
+        """Go on from where ``state_dict`` was; with any number of ranks, each of which takes up the samples that it is given."""
+        self.clear()
+        self._loaded = {lane: dict(scenes) for lane, scenes in stored.items()}
 
     def graphs(self, simulator: LearnedSimulator, starts: Sequence[Start]) -> HeteroData:
         """Graphs of the states after each start's own steps. A scene that has come to nothing, or to the end of the truth, is at its start again."""
-        samples = [start.sample for start in starts]
-        under_way = self._lanes.get(starts[0].lane)
+        samples, lane = [start.sample for start in starts], starts[0].lane
+        under_way = self._lanes.get(lane)
         if under_way is None or under_way.samples != samples:
-            under_way = Excursion(samples, *walked(simulator, starts), [])
+            under_way = self._taken_up(lane, starts) or Excursion(samples, *walked(simulator, starts), [])
         under_way.graphs = []
         for k, start in enumerate(starts):
+            if start.state.boundary.motion is not None:  # known as far as this start goes, which may be farther than the one before
+                boundary = start.state.boundary.at(under_way.steps[k])
+                under_way.states[k] = replace(under_way.states[k], boundary=boundary)
             graph = _graph(simulator, start, under_way.states[k], under_way.steps[k])
             if graph is None:
                 under_way.states[k], under_way.steps[k] = start.state, 0
                 graph = start.graph(simulator.builder, start.state, 0)
             under_way.graphs.append(graph)
-        self._lanes[starts[0].lane] = under_way
+        self._lanes[lane] = under_way
         return batched(under_way.graphs)
+
+    def _taken_up(self, lane: int, starts: Sequence[Start]) -> Excursion | None:
+        """What a checkpoint holds of these samples; None if it is about others."""
+        stored = self._loaded.pop(lane, {})
+        if not all(start.sample in stored for start in starts):
+            return None
+        scenes = [stored[start.sample] for start in starts]
+        states = [_moved(start.state, scene) for start, scene in zip(starts, scenes, strict=True)]
+        return Excursion([start.sample for start in starts], states, [scene["steps"] for scene in scenes], [])
 
     @torch.no_grad()
     def move_on(self, simulator: LearnedSimulator, lane: int, acceleration: dict[str, Tensor]) -> None:
@@ -75,6 +114,21 @@ def _graph(simulator: LearnedSimulator, start: Start, state: State, step: int) -
         return start.graph(simulator.builder, state, step)
     except SimulationError:
         return None
+
+
+def _moved(start: State, scene: dict[str, Any]) -> State:
+    """A start with what a checkpoint says of its scene."""
+    values = {}
+    for name in MOVED:
+        there, here = scene[name], getattr(start, name)
+        if isinstance(here, Tensor):
+            if not (isinstance(there, Tensor) and there.shape == here.shape and there.dtype == here.dtype):
+                raise CheckpointError(
+                    f"last.ckpt: excursions.{name} does not fit the training data; delete the file to train from the start"
+                )
+            there = there.to(here.device)
+        values[name] = there
+    return replace(start, **values)
 
 
 @torch.no_grad()

@@ -14,7 +14,8 @@ from typing import Annotated, Any, Literal
 
 import lightning as L
 import torch
-from lightning.pytorch.callbacks import Callback, LearningRateMonitor, ModelCheckpoint
+from lightning.fabric.plugins.environments import SLURMEnvironment
+from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
@@ -27,8 +28,9 @@ from gpe_pl.data.sampling import PushForward, Sampling
 from gpe_pl.machine import keep_freed_memory
 from gpe_pl.run_folder import CONFIG, RunError, config_in, differences
 from gpe_pl.training.callbacks import RolloutValidation, StepProgress, WarmAverage
-from gpe_pl.training.checkpoints import AtomicCheckpoints
-from gpe_pl.training.module import Compile, Schedule, TrainingModule
+from gpe_pl.training.checkpoints import AtomicCheckpoints, Checkpoints
+from gpe_pl.training.interruption import Interruption
+from gpe_pl.training.module import Compile, Schedule, TrainingError, TrainingModule
 from gpe_pl.training.parallel import SummedGradients
 
 log = logging.getLogger(__name__)
@@ -94,7 +96,7 @@ class TrainerSettings:
     """Where the training runs: in one process per device, each of which takes a part of every batch (see ``training.parallel``).
 
     ``devices`` are those of one of ``num_nodes`` machines. ``matmul_precision`` is PyTorch's for products of single precision: ``high`` and ``medium`` may use
-    TensorFloat-32 or bfloat16 inside, where the processor or GPU is faster with them.
+    TensorFloat-32 or bfloat16 inside, where the processor or GPU is faster with them. Between validations a checkpoint is saved every ``checkpoint_minutes``.
     """
 
     accelerator: Literal["cpu", "gpu", "auto"] = "cpu"
@@ -103,6 +105,7 @@ class TrainerSettings:
     num_threads: Annotated[int, Field(ge=1, le=1024)] | None = None
     num_workers: Annotated[int, Field(ge=0)] = 0
     matmul_precision: Literal["highest", "high", "medium"] = "highest"
+    checkpoint_minutes: Annotated[float, Field(gt=0)] = 5.0
     progress: bool = True
 
     @property
@@ -150,19 +153,14 @@ def train(
     running.
     """
     datamodule.push_forward = training.push_forward  # known only now, as a budget of time has become a number of steps
-    folder = run_dir / "checkpoints"
-    last = folder / "last.ckpt"
-    options: dict[str, Any] = {"save_top_k": 1, "save_on_train_epoch_end": False, "enable_version_counter": False}
-    best = ModelCheckpoint(folder, filename="best", monitor="val/rollout_mse", mode="min", **options)
-    # not save_last, which writes only when the best one changes; and after it, so that it knows the best one so far
-    latest = ModelCheckpoint(folder, filename="last", **options)
+    interruption = Interruption()
+    checkpoints = Checkpoints(run_dir / "checkpoints", 60 * trainer_settings.checkpoint_minutes, interruption)
     steps = min(training.val_rollout_steps, datamodule.val_trajectories(1)[0].num_frames - datamodule.builder.config.history - 1)
     own: list[Callback] = [
         RolloutValidation(datamodule.val_trajectories(training.num_val_rollouts), steps),
         WarmAverage(training.ema_decay),
         LearningRateMonitor(),
-        best,
-        latest,
+        checkpoints,
     ]
     if trainer_settings.progress:
         own.append(StepProgress())
@@ -188,23 +186,39 @@ def train(
             log_every_n_steps=min(50, training.num_steps),
             enable_progress_bar=False,
             enable_model_summary=False,
-            plugins=[AtomicCheckpoints()],
+            default_root_dir=run_dir,
+            plugins=[AtomicCheckpoints(), *([SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else [])],
         )
     except MisconfigurationException as error:
         raise RunError(f"trainer.accelerator={trainer_settings.accelerator}, trainer.devices={trainer_settings.devices}: {error}") from None
-    if last.exists():
+    last = checkpoints.last if checkpoints.last.exists() else None
+    if last is not None:
         log.info("resuming from %s", last)
     for known in (r"`isinstance\(treespec, LeafSpec\)` is deprecated", r"Checkpoint directory .* exists and is not empty"):
         warnings.filterwarnings("ignore", known)  # the first is between Lightning and PyTorch, the second what resuming is
     try:
-        trainer.fit(module, datamodule, ckpt_path=str(last) if last.exists() else None, weights_only=True)
-    except SystemExit:  # Lightning's answer to Ctrl-C
-        raise RunError(f"interrupted; run the same command again to resume from {last}") from None
+        with interruption:
+            trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
+    except SystemExit:  # Lightning's answer to an interruption
+        if trainer.global_rank > 0:
+            raise
+        saved = checkpoints.where_saved()
+        advice = (
+            "nothing was saved yet, the same command starts again"
+            if saved is None
+            else f"run the same command again to resume from {saved}"
+        )
+        raise RunError(f"interrupted; {advice}") from None
+    except TrainingError as error:
+        saved = checkpoints.where_saved()
+        raise TrainingError(
+            f"{error}; {'no checkpoint was saved yet' if saved is None else f'the last good checkpoint is kept: {saved}'}"
+        ) from None
     if is_parallel:
         if trainer.global_rank > 0:
             sys.exit()  # what comes after training is for one process
         torch.distributed.destroy_process_group()
-    return folder / "best.ckpt"
+    return checkpoints.best
 
 
 def set_up(settings: TrainerSettings) -> str:

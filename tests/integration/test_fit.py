@@ -91,14 +91,35 @@ def assert_equal(a: Any, b: Any, path: str = "") -> None:
         assert a == b, path
 
 
-STATE = ("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers", "global_step", "simulator")
+STATE = (
+    "state_dict",
+    "current_model_state",
+    "averaging_state",
+    "optimizer_states",
+    "lr_schedulers",
+    "global_step",
+    "simulator",
+    "excursions",
+)
 
 
 @pytest.mark.parametrize(
-    ("killed_at", "late"), [pytest.param(1, PLAIN, marks=pytest.mark.slow), (5, LATE), pytest.param(5, PLAIN, marks=pytest.mark.slow)]
+    ("killed_at", "saved", "late"),
+    [
+        pytest.param(1, 0, PLAIN, marks=pytest.mark.slow),
+        pytest.param(5, 4, LATE, marks=pytest.mark.slow),
+        pytest.param(5, 4, PLAIN, marks=pytest.mark.slow),
+        (5, 5, (*LATE, "trainer.checkpoint_minutes=1e-9")),  # between validations
+    ],
 )
 def test_a_resumed_run_equals_an_uninterrupted_one(
-    tiny_data: Path, tmp_path: Path, losses: dict[int, list[float]], monkeypatch: pytest.MonkeyPatch, killed_at: int, late: tuple[str, ...]
+    tiny_data: Path,
+    tmp_path: Path,
+    losses: dict[int, list[float]],
+    monkeypatch: pytest.MonkeyPatch,
+    killed_at: int,
+    saved: int,
+    late: tuple[str, ...],
 ) -> None:
     monkeypatch.setattr(sampling, "NUM_LANES", 1)  # every late step goes on from the one before
     whole = tiny(tiny_data, tmp_path, "name=whole", *STEPS, *late)
@@ -112,7 +133,6 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
         interrupt(patch, killed_at, Killed)
         with pytest.raises(Killed):
             fit(parts)
-    saved = killed_at // 2 * 2
     assert (tmp_path / "parts" / "checkpoints" / "last.ckpt").exists() == (saved > 0)
     assert not (tmp_path / "parts" / "metrics.csv").exists()
     assert fit(parts) == value

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
+import signal
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +28,7 @@ from gpe_pl.data.sampling import BatchSize, Sampling
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
+from gpe_pl.run_folder import RunError
 from gpe_pl.schema import node_code, param_names
 from gpe_pl.store import StoreError, write_shard
 from gpe_pl.training.module import MAX_IN_ROW, TrainingError, TrainingModule
@@ -211,7 +214,7 @@ def test_two_processes_train_like_one(mixed: Path, tmp_path: Path, monkeypatch: 
         for key, weight in a["state_dict"].items():  # the averaged ones
             torch.testing.assert_close(b["state_dict"][key], weight, rtol=0, atol=1e-6)
     scores = [list(checkpoint(tmp_path / run, "best")["callbacks"].values()) for run in ("one", "two")]
-    values = [[float(c["best_model_score"]) for c in callbacks if "best_model_score" in c and c["monitor"]] for callbacks in scores]
+    values = [[c["best_score"] for c in callbacks if "best_score" in c] for callbacks in scores]
     assert values[0] and values[1] == pytest.approx(values[0], rel=1e-4)
 
 
@@ -223,6 +226,35 @@ def test_two_processes_resume_where_they_stopped(mixed: Path, tmp_path: Path) ->
     for before, after in zip(whole, rest, strict=True):
         assert after["steps"] == before["steps"][10:]
         assert after["losses"] == before["losses"][10:]
+        for name, weight in before["weights"].items():
+            assert weight.tobytes() == after["weights"][name].tobytes(), name
+
+
+@pytest.mark.slow
+def test_two_processes_stop_and_save_together_when_one_is_interrupted(mixed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the middle of excursions, of which each process has some."""
+    monkeypatch.setattr(sampling, "NUM_LANES", 2)
+    whole = trained_on_ranks(mixed, tmp_path / "whole", BatchSize(3), late=True)
+    plain = Recorded.training_step
+
+    def training_step(self: Recorded, batch: Samples, batch_idx: int) -> torch.Tensor | None:
+        if self.global_step == 14 and ranks.rank() == 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return plain(self, batch, batch_idx)
+
+    def interrupted(rank: int) -> None:
+        with pytest.raises(SystemExit if rank else RunError):
+            trained(mixed, tmp_path / "parts", rank, 2, BatchSize(3), late=True)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Recorded, "training_step", training_step)
+        as_launched(tmp_path / "parts" / "ranks", interrupted)
+    last = checkpoint(tmp_path / "parts", "last")
+    assert last["global_step"] == 15
+    assert all(len(scenes) == 3 for scenes in last["excursions"].values()) and last["excursions"].keys() == {0, 1}
+    rest = trained_on_ranks(mixed, tmp_path / "parts", BatchSize(3), late=True)
+    for before, after in zip(whole, rest, strict=True):
+        assert after["losses"] == before["losses"][15:]
         for name, weight in before["weights"].items():
             assert weight.tobytes() == after["weights"][name].tobytes(), name
 

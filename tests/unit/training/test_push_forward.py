@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch_geometric.data import HeteroData
@@ -19,10 +21,11 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout import SimulationError
+from gpe_pl.store import write_shard
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.push_forward import walked
 from gpe_pl.training.run import TrainingSettings
-from gpe_pl.trajectory import State
+from gpe_pl.trajectory import Motion, State, Trajectory
 from tests.scenes import assert_equal_graphs
 
 
@@ -106,8 +109,7 @@ def test_at_the_end_of_the_truth_and_after_falling_apart_a_sample_is_at_its_star
     assert_equal_graphs(module._excursions.graphs(simulator, turns[1]), usual)
 
 
-def test_a_checkpoint_ends_all_excursions(data: WindowDataset, simulator: LearnedSimulator) -> None:
-    """A resumed run has none, so one that goes on may have none either."""
+def test_a_validation_ends_all_excursions(data: WindowDataset, simulator: LearnedSimulator) -> None:
     module = TrainingModule(simulator, num_steps=10)
     turns = visits(data, [(0, 0)], 0, 3)
     module.loss(turns[0])
@@ -118,7 +120,7 @@ def test_a_checkpoint_ends_all_excursions(data: WindowDataset, simulator: Learne
     expected = batched([turns[2][0].graph(data.builder, state, 2)])
     going_on = copy.deepcopy(module._excursions).graphs(simulator, turns[2])
     assert not torch.equal(going_on["sand"].target, expected["sand"].target)
-    module.on_save_checkpoint({})
+    module.on_validation_start()
     assert_equal_graphs(module._excursions.graphs(simulator, turns[2]), expected)
 
 
@@ -165,3 +167,29 @@ def test_settings_of_older_runs_are_known_again() -> None:
     assert "push_correction" not in new.as_dict() and new.push_forward == PushForward(7, 4)
     newer = replace(new, push_correction=0.2)
     assert newer.as_dict()["push_correction"] == 0.2 and newer.push_forward == PushForward(7, 4, 0.2)
+
+
+def test_walls_that_move_go_on_moving_on_the_way(
+    store: Path, new_trajectory: Callable[..., Trajectory], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A first visit knows the walls for one frame only, later ones farther."""
+    still = new_trajectory(0, num_frames=6)
+    pos = still.boundary.pos + 0.01 * np.arange(6)[:, None, None].astype(np.float32)
+    motion = Motion(pos, np.ones_like(pos), np.repeat(still.boundary.normal[None], 6, axis=0))
+    write_shard(store / "moving" / "shard-00000.h5", [replace(still, boundary=replace(still.boundary, vel=motion.vel[0], motion=motion))])
+    data = WindowDataset(stored := open_split(store, "moving"), GraphBuilder(GraphConfig(history=2), stored[0].window(0, 1).metadata))
+    module = TrainingModule(
+        LearnedSimulator(GPE(data.builder.spec, num_message_passing_steps=1, hidden_channels=8), data.builder), num_steps=10
+    )
+    seen: list[torch.Tensor] = []
+    plain = Start.graph
+
+    def graph(self: Start, builder: GraphBuilder, state: State, step: int) -> HeteroData:
+        seen.append(state.boundary.pos)
+        return plain(self, builder, state, step)
+
+    monkeypatch.setattr(Start, "graph", graph)
+    for starts in visits(data, [(0, 0)], 0, 3):
+        module.loss(starts)
+    first = data.locate(0)[1]
+    assert [torch.equal(p, torch.from_numpy(pos[first + step]).double()) for step, p in enumerate(seen)] == [True, True, True]

@@ -1,0 +1,333 @@
+"""What a run keeps: the best checkpoint wherever its folder lies, one when it is interrupted and every few minutes. No file says where files go."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch.loggers import CSVLogger
+
+from gpe_pl.data import sampling
+from gpe_pl.data.datamodule import TrajectoryDataModule
+from gpe_pl.data.noise import Noise
+from gpe_pl.data.sampling import BatchSize
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator
+from gpe_pl.models.gpe import GPE
+from gpe_pl.run_folder import RunError, claim
+from gpe_pl.store import write_shard
+from gpe_pl.training.callbacks import RolloutValidation
+from gpe_pl.training.checkpoints import Checkpoints
+from gpe_pl.training.interruption import Interruption
+from gpe_pl.training.module import TrainingModule
+from gpe_pl.training.run import TrainerSettings, TrainingSettings, train
+from gpe_pl.trajectory import Trajectory
+
+STEPS, INTERVAL = 9, 3
+STATE = (
+    "state_dict",
+    "current_model_state",
+    "averaging_state",
+    "optimizer_states",
+    "lr_schedulers",
+    "global_step",
+    "excursions",
+    "skipped",
+)
+
+
+class Killed(BaseException):
+    """Stands for the end of the process."""
+
+
+@pytest.fixture
+def data(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> Path:
+    """Trajectories that can be learned from."""
+    root = tmp_path / "grains"
+    for split, seeds in (("train", (0, 1)), ("val", (2,))):
+        made = [new_trajectory(seed, num_frames=8, num_nodes=12, split=split) for seed in seeds]
+        steps = [np.random.default_rng(t.metadata.seed).normal(scale=3e-3, size=t.pos.shape) for t in made]
+        moved = [replace(t, pos=(t.pos[0] + np.cumsum(s, axis=0)).astype(np.float32)) for t, s in zip(made, steps, strict=True)]
+        write_shard(root / split / "shard-00000.h5", moved)
+    (root / "statistics.json").write_text(json.dumps({"acceleration_std": 50.0}))
+    return root
+
+
+@pytest.fixture
+def scores(monkeypatch: pytest.MonkeyPatch) -> dict[int, float]:
+    """What the validation after each step finds; later ones are worse."""
+    found = {3: 1.0, 6: 2.0, 9: 3.0}
+    steps: list[int] = []
+    monkeypatch.setattr(RolloutValidation, "_mse", lambda *_: found[steps[-1]])
+    plain = RolloutValidation.on_validation_epoch_end
+
+    def on_validation_epoch_end(self: RolloutValidation, trainer: Any, module: Any) -> None:
+        steps.append(trainer.global_step)
+        plain(self, trainer, module)
+
+    monkeypatch.setattr(RolloutValidation, "on_validation_epoch_end", on_validation_epoch_end)
+    return found
+
+
+@pytest.fixture(autouse=True)
+def _signals() -> Iterator[None]:
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(number) for number in numbers]
+    yield
+    after = [signal.getsignal(number) for number in numbers]
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+    assert after == before  # training gives them back
+
+
+def trained(
+    root: Path, run: Path, push_share: float = 0.0, minutes: float = math.inf, at: dict[int, Callable[[], None]] | None = None
+) -> Path:
+    """Train in a folder, or go on; ``at`` does something before steps."""
+
+    class Disturbed(TrainingModule):
+        def training_step(self, batch: Any, batch_idx: int) -> torch.Tensor | None:
+            (at or {}).get(self.global_step, lambda: None)()
+            return super().training_step(batch, batch_idx)
+
+    module_data = TrajectoryDataModule(root, GraphConfig(history=2), Noise("velocity", 0.1), BatchSize(2), seed=1)
+    torch.manual_seed(0)
+    simulator = LearnedSimulator(GPE(module_data.builder.spec, num_message_passing_steps=1, hidden_channels=4), module_data.builder)
+    simulator.fit_statistics(module_data.statistics_sample(), module_data.parameter_ranges())
+    settings = TrainingSettings(
+        num_steps=STEPS, val_interval=INTERVAL, num_val_rollouts=1, val_rollout_steps=2, warmup_steps=2, push_share=push_share, push_steps=2
+    )
+    module = Disturbed(simulator, STEPS, warmup_steps=2, compile="off")
+    run.mkdir(parents=True, exist_ok=True)
+    trainer = TrainerSettings(progress=False, checkpoint_minutes=minutes)
+    return train(module, module_data, settings, trainer, [CSVLogger(run, name="log")], run)
+
+
+def stop(error: type[BaseException]) -> Callable[[], None]:
+    def action() -> None:
+        raise error
+
+    return action
+
+
+def send(number: int) -> Callable[[], None]:
+    return lambda: os.kill(os.getpid(), number)
+
+
+def stored(run: Path, name: str = "last") -> dict[str, Any]:
+    return torch.load(run / "checkpoints" / f"{name}.ckpt", weights_only=True)
+
+
+def same(a: Any, b: Any) -> bool:
+    """Nested values with tensors, bit for bit."""
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, torch.Tensor):
+        return a.dtype == b.dtype and a.numpy().tobytes() == b.numpy().tobytes()
+    return bool(a == b)
+
+
+def assert_like(run: Path, whole: Path) -> None:
+    """Both checkpoints hold the same, and know the same of the best one."""
+    for name in ("last", "best"):
+        a, b = stored(run, name), stored(whole, name)
+        assert [key for key in STATE if not same(a[key], b[key])] == []
+    assert stored(run)["callbacks"]["Checkpoints"] == stored(whole)["callbacks"]["Checkpoints"]
+
+
+def test_a_run_that_was_moved_knows_its_best_checkpoint(data: Path, tmp_path: Path, scores: dict[int, float]) -> None:
+    trained(data, tmp_path / "whole")
+    assert stored(tmp_path / "whole", "best")["global_step"] == 3
+    with pytest.raises(Killed):
+        trained(data, tmp_path / "here" / "run", at={7: stop(Killed)})
+    shutil.move(tmp_path / "here", tmp_path / "there")
+    assert trained(data, tmp_path / "there" / "run") == tmp_path / "there" / "run" / "checkpoints" / "best.ckpt"
+    assert stored(tmp_path / "there" / "run", "best")["global_step"] == 3
+    assert_like(tmp_path / "there" / "run", tmp_path / "whole")
+    assert stored(tmp_path / "there" / "run")["callbacks"]["Checkpoints"] == {"best_score": 1.0, "best_step": 3}
+    assert not (tmp_path / "here").exists()
+
+
+def test_without_the_best_checkpoint_the_next_validation_makes_one(data: Path, tmp_path: Path, scores: dict[int, float]) -> None:
+    with pytest.raises(Killed):
+        trained(data, tmp_path / "run", at={7: stop(Killed)})
+    (tmp_path / "run" / "checkpoints" / "best.ckpt").unlink()
+    trained(data, tmp_path / "run")
+    assert stored(tmp_path / "run", "best")["global_step"] == 9
+
+
+@pytest.mark.parametrize("push_share", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
+def test_a_checkpoint_between_validations_is_as_good_as_any(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, push_share: float
+) -> None:
+    monkeypatch.setattr(sampling, "NUM_LANES", 1)  # every step goes on from the one before
+    trained(data, tmp_path / "whole", push_share)
+    seen: list[int] = []
+    with pytest.raises(Killed):
+        trained(data, tmp_path / "parts", push_share, 1e-9, at={5: stop(Killed)})
+    found = stored(tmp_path / "parts")
+    assert found["global_step"] == 5  # a step without validation before and after it
+    assert bool(found["excursions"]) == bool(push_share)
+    trained(data, tmp_path / "parts", push_share, at={step: partial(seen.append, step) for step in range(STEPS)})
+    assert seen == [5, 6, 7, 8]
+    assert_like(tmp_path / "parts", tmp_path / "whole")
+
+
+def test_checkpoints_between_validations_come_when_their_time_has_passed(data: Path, tmp_path: Path) -> None:
+    saved = []
+
+    def look() -> None:
+        with suppress(FileNotFoundError):
+            saved.append(stored(tmp_path / "run")["global_step"])
+
+    trained(data, tmp_path / "run", at=dict.fromkeys(range(STEPS), look))
+    assert saved == [3, 3, 3, 6, 6, 6]
+    shutil.rmtree(tmp_path / "run")
+    saved.clear()
+    trained(data, tmp_path / "run", minutes=1e-9, at=dict.fromkeys(range(STEPS), look))
+    assert saved == [1, 2, 3, 4, 5, 6, 7, 8]
+
+
+@pytest.mark.parametrize(
+    ("number", "step", "saved"),
+    [
+        (signal.SIGTERM, 3, 4),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in [(signal.SIGINT, 3, 4), (signal.SIGINT, 2, 3), (signal.SIGTERM, 8, 9)]),
+    ],
+)
+def test_an_interrupted_training_is_saved_where_it_is(data: Path, tmp_path: Path, number: int, step: int, saved: int) -> None:
+    """After a step that a validation follows: after that."""
+    last = tmp_path / "run" / "checkpoints" / "last.ckpt"
+    with pytest.raises(RunError, match=rf"^interrupted; run the same command again to resume from {last}, step {saved}$"):
+        trained(data, tmp_path / "run", at={step: send(number)})
+    assert stored(tmp_path / "run")["global_step"] == saved
+    trained(data, tmp_path / "run")
+    trained(data, tmp_path / "whole")
+    assert_like(tmp_path / "run", tmp_path / "whole")
+
+
+def test_a_second_signal_ends_it_at_once_and_what_is_there_is_named(data: Path, tmp_path: Path) -> None:
+    def twice() -> None:
+        send(signal.SIGINT)()
+        send(signal.SIGINT)()
+
+    with pytest.raises(RunError, match="^interrupted; nothing was saved yet, the same command starts again$"):
+        trained(data, tmp_path / "run", at={1: twice})
+    assert not (tmp_path / "run" / "checkpoints").exists()
+    with pytest.raises(RunError, match=r"^interrupted; run the same command again to resume from .*last.ckpt, step 3$"):
+        trained(data, tmp_path / "run", at={4: twice})
+    assert stored(tmp_path / "run")["global_step"] == 3
+
+
+def test_a_second_signal_while_a_checkpoint_is_written_leaves_the_one_before(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = torch.save
+
+    def save(checkpoint: Any, file: Any) -> None:
+        plain(checkpoint, file)
+        if checkpoint["global_step"] == 5:
+            send(signal.SIGINT)()
+
+    monkeypatch.setattr(torch, "save", save)
+    with pytest.raises(RunError, match=r"last.ckpt, step 3$"):
+        trained(data, tmp_path / "run", at={4: send(signal.SIGINT)})
+    assert stored(tmp_path / "run")["global_step"] == 3
+    assert sorted(path.name for path in (tmp_path / "run" / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
+
+
+def test_signals_that_are_ignored_stay_ignored() -> None:
+    """As Ctrl-C is for jobs that a shell runs in the background."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with Interruption() as interruption:
+            interruption.listen()
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+            assert signal.getsignal(signal.SIGTERM) == interruption._note
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+OTHERS = ["{victim}", "../../victim", "file://{victim}", "memory://victim", "{victim}/chapter.tex"]
+PATHS = ["local://{victim}", *(pytest.param(path, marks=pytest.mark.slow) for path in OTHERS)]
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_no_path_in_a_checkpoint_is_followed(data: Path, tmp_path: Path, scores: dict[int, float], path: str) -> None:
+    """All keys under which Lightning's own callback keeps paths."""
+    run, victim = tmp_path / "run", tmp_path / "victim"
+    with pytest.raises(Killed):
+        trained(data, run, at={4: stop(Killed)})
+    victim.mkdir()
+    (victim / "chapter.tex").write_text("years of work")
+    text = path.format(victim=victim)
+    content = stored(run)
+    paths: dict[str, Any] = dict.fromkeys(
+        ("best_model_path", "last_model_path", "kth_best_model_path", "dirpath", "current_score", "filename"), text
+    )
+    paths |= {"best_k_models": {text: torch.tensor(0.5)}, "best_model_score": torch.tensor(9.0), "kth_value": torch.tensor(9.0)}
+    for key, state in content["callbacks"].items():
+        content["callbacks"][key] = state | paths
+    for monitor in ("'val/rollout_mse'", "None"):
+        rest = "'mode': 'min', 'every_n_train_steps': 0, 'every_n_epochs': 1, 'train_time_interval': None"
+        content["callbacks"][f"ModelCheckpoint{{'monitor': {monitor}, {rest}}}"] = paths
+    torch.save(content | paths, run / "checkpoints" / "last.ckpt")
+    trained(data, run)
+    assert (victim / "chapter.tex").read_text() == "years of work"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["grains", "run", "victim"]
+    assert sorted(p.name for p in (run / "checkpoints").iterdir()) == ["best.ckpt", "last.ckpt"]
+    assert stored(run, "best")["global_step"] == 3
+    assert str(tmp_path) not in (run / "checkpoints" / "last.ckpt").read_bytes().decode(errors="replace")
+
+
+@pytest.mark.parametrize("name", ["checkpoints", "log", "metrics.csv", "rollout_test_00.png"])
+@pytest.mark.parametrize("target", ["../outside", "{folder}/outside", "missing/../../outside"])
+def test_a_link_that_leads_out_of_a_run_folder_is_refused(tmp_path: Path, name: str, target: str) -> None:
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / name).symlink_to(target.format(folder=tmp_path))
+    with pytest.raises(RunError, match=rf"run/{name}: a link that leads out of the run folder"):
+        claim(tmp_path / "run", {"seed": 0})
+    assert [*(tmp_path / "outside").iterdir()] == []
+
+
+def test_a_run_folder_may_be_a_link_itself(tmp_path: Path) -> None:
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk" / "checkpoints").mkdir()
+    (tmp_path / "disk" / "again").symlink_to("checkpoints")
+    (tmp_path / "run").symlink_to("disk")
+    claim(tmp_path / "run", {"seed": 0})
+    assert (tmp_path / "disk" / "config.json").exists()
+
+
+def test_checkpoints_that_are_links_are_replaced_not_followed(data: Path, tmp_path: Path) -> None:
+    trained(data, tmp_path / "first")
+    folder = tmp_path / "run" / "checkpoints"
+    folder.mkdir(parents=True)
+    for name in ("best", "last"):
+        (tmp_path / name).write_text("of someone else")
+        (folder / f"{name}.ckpt").symlink_to(tmp_path / name)
+    (folder / "last.ckpt").unlink()  # else it would be resumed from
+    trained(data, tmp_path / "run")
+    assert (tmp_path / "best").read_text() == "of someone else"
+    assert not (folder / "best.ckpt").is_symlink()
+
+
+@pytest.mark.parametrize("state", [{"best_score": "low", "best_step": 3}, {"best_score": 1.0}, {"best_score": 1.0, "best_step": 3.0}])
+def test_what_is_no_score_is_refused(tmp_path: Path, state: dict[str, Any]) -> None:
+    with pytest.raises(CheckpointError, match="last.ckpt: does not hold the score and step of the best checkpoint"):
+        Checkpoints(tmp_path).load_state_dict(state)
