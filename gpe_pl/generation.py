@@ -33,6 +33,7 @@ from pydantic import Field, InstanceOf
 from pydantic.dataclasses import dataclass
 
 from gpe_pl.atomic import replace_text, replacing
+from gpe_pl.data.motion import ROUNDING_SHARE, motion_of, rounding_fault, rounding_of
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, is_intact, shard_moments, with_checksum
 from gpe_pl.errors import GpeError
 from gpe_pl.names import DataName
@@ -49,6 +50,9 @@ log = logging.getLogger(__name__)
 SPEC_FILE = "dataset.json"
 CONTACT_SHEET_FILE = "contact_sheet.png"
 SHEET_ROWS = 5
+
+ROUNDING_REFUSED = 0.5
+"""Fraction of the accelerations that rounding of stored positions must not exceed; above ``ROUNDING_SHARE`` there is a warning."""
 
 MOST = 1_000_000
 """Trajectories of a split, and frames of a trajectory: far more than anyone needs, and few enough to be listed."""
@@ -408,6 +412,27 @@ def seconds_per_trajectory(spec: DatasetSpec, budget: float = 10.0) -> float:
     return (time.perf_counter() - started) / count
 
 
+def check_rounding(spec: DatasetSpec) -> None:
+    """Refuse a frame interval so short that stored accelerations would be rounding, and warn of one that is nearly so short.
+
+    Where the bounds alone do not exclude it, a training trajectory is simulated and measured.
+
+    Raises:
+        GenerationError: rounding of float32 positions is more than ``ROUNDING_REFUSED`` of the accelerations, or the trajectory failed.
+    """
+    dt = spec.solver.frame_dt
+    rounding = float(rounding_of(np.abs(np.array(spec.scene.bounds)).max(axis=1), dt).max())
+    if rounding <= ROUNDING_SHARE * float(np.linalg.norm(spec.scene.gravity)):  # what meets a wall accelerates by this much at least
+        return
+    trajectory = generate_trajectory(spec, "train", 0)
+    acceleration = motion_of(trajectory.metadata, trajectory.pos).acceleration
+    if fault := rounding_fault(rounding, acceleration):
+        message = f"frame_dt = {dt:g} s: {fault}; choose a longer frame_dt (data.solver.frame_dt=…), or bounds nearer to 0"
+        if rounding > ROUNDING_REFUSED * acceleration:
+            raise GenerationError(message)
+        log.warning(message)
+
+
 def generate(
     root: Path | str, spec: DatasetSpec, num_workers: int = 1, on_progress: Progress | None = None, part: tuple[int, int] = (0, 1)
 ) -> Path:
@@ -430,6 +455,8 @@ def generate(
     if num_workers < 1:
         raise ValueError(f"num_workers must be at least 1, got {num_workers}")
     to_do = plan(root, spec, part)
+    if to_do.missing:
+        check_rounding(spec)
     folder = Path(root) / spec.name / spec.size
     try:
         folder.mkdir(parents=True, exist_ok=True)

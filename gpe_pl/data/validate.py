@@ -24,8 +24,9 @@ import h5py
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
+from gpe_pl.data.motion import motion_of, rounding_fault, rounding_of
 from gpe_pl.geometry import Shape
-from gpe_pl.graphs.islands import Islands, free_since, islands_within
 from gpe_pl.printable import printable
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup
 from gpe_pl.solvers.materials import LIMITS
@@ -45,12 +46,6 @@ from gpe_pl.values import faults, size_conflicts
 
 Finding = tuple[str, str]
 """Name of the field or attribute, and what is wrong with it."""
-
-FREE_FALL_TOLERANCE = 1e-3
-"""An island that no edge ties to the boundary should accelerate like gravity, up to this many times its strength."""
-
-ISLAND_FRAMES = 50
-"""Frames per trajectory, evenly spread, in which islands are looked at."""
 
 SAME_IN_A_DATASET = ("dataset", "materials", "param_names", "frame_dt", "spacing", "connectivity_radius", "dim")
 
@@ -80,9 +75,9 @@ class Group:
     low: np.ndarray = field(default_factory=lambda: np.array(math.inf))
     high: np.ndarray = field(default_factory=lambda: np.array(-math.inf))
     params: dict[str, set[float]] = field(default_factory=dict)
-    num_islands: int = 0
-    num_free: int = 0
-    num_disturbed: int = 0
+    flights: list[FreeFlight] = field(default_factory=list)
+    squared_accelerations: list[tuple[float, int]] = field(default_factory=list)
+    rounding: float = 0.0
 
     def add(self, metadata: Metadata, arrays: dict[str, np.ndarray]) -> None:
         """Count one more trajectory."""
@@ -93,9 +88,10 @@ class Group:
         self.low, self.high = np.minimum(self.low, pos.min((0, 1))), np.maximum(self.high, pos.max((0, 1)))
         for name, column in zip(metadata.param_names, arrays["material_params"].T, strict=True):
             self.params.setdefault(name, set()).update(np.unique(column[~np.isnan(column)]).tolist())
-        for islands, free, disturbed in disturbed_islands(metadata, arrays):
-            self.num_islands, self.num_free = self.num_islands + islands, self.num_free + free
-            self.num_disturbed += disturbed
+        self.flights.append(joined(free_flights(metadata, arrays), metadata.dim))
+        if len(pos) > 2:
+            self.squared_accelerations.append((motion_of(metadata, pos).acceleration ** 2, pos[2:].size))
+            self.rounding = max(self.rounding, float(rounding_of(np.abs(pos).max(axis=(0, 1)), metadata.frame_dt).max()))
 
     def __str__(self) -> str:
         m = self.metadata
@@ -112,47 +108,35 @@ class Group:
             f"  positions {box} m, fastest {self.max_speed:.4g} m/s",
         ]
         lines += [f"  {name}: {len(values)} values, {span(values)}" for name, values in self.params.items() if values]
-        if self.num_free:
-            lines.append(
-                f"  of {self.num_free} islands in free flight ({self.num_islands} island-frames in all), {self.num_disturbed} do not accelerate with g: "
-                f"{self.num_disturbed / self.num_free:.3%} of those in flight, {self.num_disturbed / self.num_islands:.3%} of all; "
-                "above 0.1 % choose a larger connectivity_radius"
-            )
-        elif self.num_islands:
-            lines.append(
-                f"  of {self.num_islands} island-frames none is in free flight: whether the graph shows what the solver does was not tested"
-            )
+        lines += [f"  {line}" for line in (*self._about_rounding(), *self._about_free_flight())]
         return "\n".join(lines)
 
+    @property
+    def flight(self) -> FreeFlight:
+        """Groups in free flight of all trajectories."""
+        return joined(self.flights, self.metadata.dim)
 
-def disturbed_islands(metadata: Metadata, arrays: dict[str, np.ndarray]) -> Iterator[tuple[int, int, int]]:
-    """Whether the graph shows what the solver does, per frame: the number of islands, of free ones, and of free ones that something disturbs.
+    def _about_rounding(self) -> Iterator[str]:
+        squares, counts = zip(*self.squared_accelerations, strict=True) if self.squared_accelerations else ((0.0,), (1,))
+        if fault := rounding_fault(self.rounding, math.sqrt(np.average(squares, weights=counts))):
+            yield f"{fault}: a model would learn noise; a longer frame_dt is needed, or positions nearer to 0"
 
-    A connected component of the graph without a boundary edge is free if it already was so in the frame before, as one island or several: nothing in the
-    graph can tell a model to move it other than by gravity. Where its acceleration, the second difference of positions that a model learns from, differs from
-    g by more than ``FREE_FALL_TOLERANCE`` g and what float32 can resolve, the solver acts on a pair that the graph does not connect.
-    """
-    pos, mass = arrays["pos"].astype(np.float64), arrays["mass"].astype(np.float64)
-    gravity, dt, radius = np.asarray(metadata.gravity), metadata.frame_dt, metadata.connectivity_radius
-    tolerance = FREE_FALL_TOLERANCE * (float(np.linalg.norm(gravity)) or 9.81)
-    resolution = 4 * 2.0**-24 * float(np.max(np.abs(pos), initial=0.0)) / dt**2
-    boundary = arrays["boundary_pos"].astype(np.float64)
-    cells = arrays.get("cells", np.empty((0, 2), np.int64)).astype(np.int64)
-    mesh = np.concatenate([np.stack([cells[:, 0], cells[:, k]]) for k in range(1, cells.shape[1])], axis=1)
-
-    def islands_of(frame: int) -> Islands:
-        return islands_within(radius, pos[frame], boundary[min(frame, len(boundary) - 1)], mesh, metadata.periodicity)
-
-    for frame in np.unique(np.linspace(1, len(pos) - 2, min(len(pos) - 2, ISLAND_FRAMES)).astype(int)).tolist():
-        before, islands = islands_of(frame - 1), islands_of(frame)
-        count = len(islands.is_free)
-        free = free_since(before, islands)
-        window = pos[frame - 1 : frame + 2]
-        if metadata.periodicity:  # relative to the middle, so that crossing the seam is no jump
-            window = metadata.periodicity.shortest(window - pos[frame])
-        acceleration = np.diff([islands.mean(x, mass) for x in window], 2, axis=0)[0] / dt**2
-        limit = np.maximum(tolerance, resolution / np.sqrt(np.bincount(islands.label, minlength=count)))
-        yield count, int(free.sum()), int(np.sum(free & (np.linalg.norm(acceleration - gravity, axis=-1) > limit)))
+    def _about_free_flight(self) -> Iterator[str]:
+        flight = self.flight
+        if flight.num_free:
+            disturbed, free, islands = flight.num_disturbed, flight.num_free, flight.num_islands
+            yield f"islands in free flight accelerate by {vector(flight.typical)} (median), gravity is {vector(np.median(flight.gravity, axis=0))}"
+            yield (
+                f"of {free} islands in free flight ({islands} island-frames in all), {disturbed} do not accelerate with g: "
+                f"{disturbed / free:.3%} of those in flight, {disturbed / islands:.3%} of all; "
+                + (
+                    "they agree on another acceleration: gravity, frame_dt or the unit of length is not that of the data"
+                    if flight.agrees_on_another
+                    else "above 0.1 % choose a larger connectivity_radius"
+                )
+            )
+        elif flight.num_islands:
+            yield f"of {flight.num_islands} island-frames none is in free flight: whether the graph shows what the solver does was not tested"
 
 
 @dataclass

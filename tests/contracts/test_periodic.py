@@ -349,7 +349,7 @@ def test_free_islands_are_followed_over_the_seam(tmp_path: Path, new_trajectory:
     result = validate([tmp_path])
     assert not result.violations
     (group,) = result.groups.values()
-    assert (group.num_free, group.num_disturbed) == (10, 0)
+    assert (group.flight.num_free, group.flight.num_disturbed) == (10, 0)
 
 
 def test_stored_and_read_back(tmp_path: Path, drifting: Trajectory) -> None:

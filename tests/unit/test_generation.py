@@ -209,6 +209,17 @@ def test_killed_at_random_moments(tmp_path, data):
     assert not validate([killed]).violations
 
 
+def test_accelerations_that_would_be_rounding_are_refused_before_they_are_stored(tmp_path, caplog):
+    """Between frames of 2e-5 s a fall is far below what float32 resolves; between frames of 4e-4 s it is near it, which is said."""
+    short = replace(SPEC, solver=replace(SOLVER, frame_dt=2e-5))
+    message = (
+        r"frame_dt = 2e-05 s: positions in float32 round accelerations by 211 m/s², those of the data are .* rms; choose a longer frame_dt"
+    )
+    with pytest.raises(GenerationError, match=message):
+        generate(tmp_path, short)
+    assert not list(tmp_path.iterdir())
+
+
 def test_complete_data_set_is_left_alone(folder):
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("*")}
     seen = []

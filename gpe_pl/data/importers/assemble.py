@@ -16,9 +16,10 @@ import numpy as np
 from gpe_pl import integrators
 from gpe_pl.arrays import ArrayError, nearest_distances
 from gpe_pl.atomic import replacing
-from gpe_pl.data.importers.motion import MotionSummary, better_origin, motion_of
+from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
 from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
+from gpe_pl.data.motion import ROUNDING_SHARE, MotionSummary, better_origin, motion_of, rounding_fault
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments, with_checksum
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
@@ -39,6 +40,10 @@ NUM_SAMPLED = 8
 """Training trajectories from which spacing and neighbours are taken, …"""
 FRAMES_SAMPLED = 3
 """… and frames of each, evenly spread, in which neighbours are counted."""
+FLIGHT_FRAMES = 25
+"""Frames of each of these trajectories in which groups in free flight are looked for."""
+ENOUGH_GROUPS = 20
+"""Groups in free flight, in all frames that were looked at, that tell the gravity of data which do not say it."""
 NUM_SHOWN = 4
 """Rows of the contact sheet."""
 
@@ -53,8 +58,6 @@ VELOCITY_RATIO = 1.25
 """Positions and velocities of a source disagree about time beyond this ratio, …"""
 FRAMES_COMPARED = 200
 """… in these first frames."""
-ROUNDING_SHARE = 0.1
-"""Share of the accelerations that rounding may be: a hundredth of their variance, which no model can learn."""
 TYPED = ("gns", "lagrangebench", "meshgraphnets")
 """Formats with types of nodes."""
 
@@ -162,7 +165,9 @@ class _Survey:
     velocity_ratios: list[float] = field(default_factory=list)
     scenes: dict[bytes, str] = field(default_factory=dict)
     motions: list[tuple[str, str, MotionSummary]] = field(default_factory=list)
+    assumes_gravity: list[bool] = field(default_factory=list)
     suspects: list[Event] = field(default_factory=list)
+    flights: list[tuple[bool, FreeFlight]] = field(default_factory=list)
     common: tuple[float, int, tuple[bool, ...]] | None = None
 
 
@@ -202,7 +207,7 @@ class _Conversion:
             for item in items:
                 try:
                     loaded = self._load(item)
-                    self._accept(split, item.name, loaded.trajectory)
+                    self._accept(split, item.name, loaded)
                 except (Refusal, ArrayError) as refusal:
                     self.report.refusals.append(Event(split, item.name, refusal.frame, str(refusal)))
                     continue
@@ -225,9 +230,10 @@ class _Conversion:
         except (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError) as error:  # what no reader has foreseen
             raise Refusal(f"cannot be read ({type(error).__name__}: {error})") from error
 
-    def _accept(self, split: str, name: str, trajectory: Trajectory) -> None:
+    def _accept(self, split: str, name: str, loaded: Loaded) -> None:
         """Add a trajectory to what is known; raises ``Refusal`` where it does not fit the others."""
-        survey, m, where = self.survey, trajectory.metadata, f"{split}, {name}"
+        survey, trajectory = self.survey, loaded.trajectory
+        m, where = trajectory.metadata, f"{split}, {name}"
         for fault in _faults(trajectory):
             raise Refusal(fault)
         common = (m.frame_dt, m.dim, m.periodic)
@@ -242,7 +248,8 @@ class _Conversion:
         digest = hashlib.sha256(trajectory.pos.tobytes()).digest()
         if survey.scenes.setdefault(digest, where) != where:
             raise Refusal(f"has exactly the positions of {survey.scenes[digest]}: the same scene twice")
-        survey.motions.append((split, name, motion_of(trajectory)))
+        survey.motions.append((split, name, motion_of(m, trajectory.pos)))
+        survey.assumes_gravity.append(loaded.assumes_gravity)
         if trajectory.num_frames < LONG_ENOUGH:
             what = f"has {trajectory.num_frames} frames; models leave it out unless graph.history is below the default, which needs {LONG_ENOUGH}"
             survey.suspects.append(Event(split, name, -1, what))
@@ -253,6 +260,8 @@ class _Conversion:
             survey.suspects.append(Event(split, name, 0, what))
         survey.materials |= set(m.materials)
         survey.bounds.append(m.bounds)
+        if len(survey.flights) < NUM_SAMPLED:
+            survey.flights.append((loaded.assumes_gravity, _free_flight(trajectory)))
         if len(survey.spacings) < NUM_SAMPLED:
             survey.spacings.append(m.spacing)
             survey.distances.append(float(np.median(nearest)))
@@ -298,6 +307,7 @@ class _Conversion:
                 "may be wrong"
             )
         self.facts = replace(facts, frame_dt=frame_dt, periodic=periodic, spacing=spacing, connectivity_radius=radius, bounds=bounds)
+        self._compare_gravity(dim)
         self._compare_with_rounding()
         self._look_for_jumps(radius)
         self._hold_out()
@@ -307,6 +317,39 @@ class _Conversion:
         if not 1 / VELOCITY_RATIO < ratio < VELOCITY_RATIO:
             report.warnings.append(
                 f"nodes move {ratio:.3g} times as far per frame as their velocities say: frame_dt may be {frame_dt * ratio:.3g} s rather than {frame_dt:g} s"
+            )
+
+    def _compare_gravity(self, dim: int) -> None:
+        """Compare gravity with the acceleration of groups in free flight, which decides where nothing else says what it is."""
+        report, flights, usual = self.report, self.survey.flights, self.facts.usual_gravity
+        if any(self.survey.assumes_gravity) and usual is not None:
+            known = f"gravity is not in the source; {vector(usual[:dim])} is the format's usual one"
+            flight = joined((f for assumed, f in flights if assumed), dim)
+            free = f"{flight.num_free} groups in free flight"
+            if flight.num_free >= ENOUGH_GROUPS and flight.agrees_on_another:
+                measured = tuple(float(f"{value:.3g}") for value in flight.typical)
+                report.notes.append(f"{known}, but {free} accelerate by {vector(measured)}, which is stored (gravity=[…])")
+                self.facts = replace(self.facts, usual_gravity=measured)
+                change = np.subtract(measured, usual[:dim])
+                self.survey.motions = [
+                    (split, name, motion.with_gravity(change) if assumed else motion)
+                    for (split, name, motion), assumed in zip(self.survey.motions, self.survey.assumes_gravity, strict=True)
+                ]
+                flights = [(assumed, f.under(measured) if assumed else f) for assumed, f in flights]
+            elif flight.num_free >= ENOUGH_GROUPS:
+                what = "have other accelerations that differ" if 2 * flight.num_disturbed > flight.num_free else "confirm it"
+                report.notes.append(f"{known} and is stored: {free} {what} (gravity=[…])")
+            else:
+                report.notes.append(f"{known} and is stored: {free} are too few to measure it (gravity=[…])")
+        flight = joined((f for _, f in flights), dim)
+        report.free_groups = flight.num_free
+        if flight.num_free:
+            report.free_acceleration = flight.typical.tolist()
+        if flight.agrees_on_another:
+            stored = vector(np.median(flight.gravity, axis=0))
+            report.warnings.append(
+                f"gravity is stored as {stored}, but {flight.num_free} groups in free flight agree on {vector(flight.typical)}: "
+                "gravity=[…], frame_dt=… or the unit of length may be wrong"
             )
 
     def _compare_with_rounding(self) -> None:
@@ -326,10 +369,8 @@ class _Conversion:
                 (motion.precision, nowhere, "write them with more digits"),
                 (np.float32, self.origin, "take a larger time step, or a smaller domain"),
             ):
-                lost = motion.rounding(precision, origin).max()
-                if lost > ROUNDING_SHARE * typical:
-                    what = f"positions in {precision.__name__} round accelerations by {lost:.3g} m/s², those of the data are {typical:.3g} m/s² rms"
-                    suspects.append(Event(split, name, -1, f"{what}: {remedy}"))
+                if fault := rounding_fault(float(motion.rounding(precision, origin).max()), typical, precision):
+                    suspects.append(Event(split, name, -1, f"{fault}: {remedy}"))
                     break
 
     def _look_for_jumps(self, radius: float) -> None:
@@ -471,6 +512,15 @@ def _faults(trajectory: Trajectory) -> Iterator[str]:
     yield from (f"{key} {violation}" for key, violation in m.violations())
     yield from size_conflicts(arrays, m.dim, len(m.param_names))
     yield from map(str, faults(arrays, NODE_TYPES, m.materials, m.param_names))
+
+
+def _free_flight(trajectory: Trajectory) -> FreeFlight:
+    """Groups in free flight of a trajectory, in the precision that its source has."""
+    b = trajectory.boundary
+    arrays = {"pos": trajectory.pos, "mass": trajectory.mass, "boundary_pos": b.pos[None] if b.motion is None else b.motion.pos}
+    if trajectory.cells is not None:
+        arrays["cells"] = trajectory.cells
+    return joined(free_flights(trajectory.metadata, arrays, FLIGHT_FRAMES), trajectory.metadata.dim)
 
 
 def _degrees(trajectory: Trajectory) -> Iterator[tuple[np.ndarray, np.ndarray]]:

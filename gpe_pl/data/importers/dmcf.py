@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -42,7 +41,8 @@ ENDING = ".msgpack.zst"
 PART = re.compile(r"(_\d+)_(\d+)$")
 """The number of a part at the end of a file's name, which the number of its scene precedes."""
 FRAME_DT = 0.02
-GRAVITY = -9.81
+GRAVITY = (0.0, -9.81, 0.0)
+"""Usual in the format [m/s²], where a scene has no ``grav``."""
 MAX_BYTES = 2**32
 """Of one file, unpacked; and no more than ``LARGEST_DEFLATE_RATIO`` times its size, which zstandard exceeds with constants only."""
 BYTES_AT_ONCE = 2**20
@@ -61,7 +61,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     if not scenes:
         raise ImportFailure(f"{path}: {'no such file or folder' if not path.exists() else f'holds no *{ENDING}'}")
     notes = () if settings.frame_dt else (f"frame_dt is not in the source; {FRAME_DT:g} s is the format's usual one (frame_dt=…)",)
-    facts = Facts(FRAME_DT, notes=notes).overridden(settings)
+    facts = Facts(FRAME_DT, usual_gravity=GRAVITY, notes=notes).overridden(settings)
     items = {split: [Item(_scene_of(parts[0]), partial(_load, parts)) for parts in found] for split, found in scenes.items()}
     return Source(facts, items, warnings)
 
@@ -132,21 +132,19 @@ def _load(parts: list[Path], facts: Facts) -> Loaded:
                 nodes.mass = values
             else:
                 nodes.parameters = {"fluid": values}
-    gravity = np.array([0.0, GRAVITY, 0.0])
     if "grav" in first:
         gravity = _array(first, "grav", 0).astype(np.float64).ravel()
         _require_constant(frames, "grav", gravity)
         if gravity.shape != (3,):
             raise Refusal(f"grav has {gravity.size} components, expected 3", 0)
-    elif facts.gravity is None:
-        nodes.notes.append(f"gravity is not in the source; {GRAVITY:g} m/s² along y is the format's usual one (gravity=[…])")
+        nodes.gravity = tuple(gravity.tolist())
     if (pos[..., 2] == pos[0, 0, 2]).all():
         nodes.repairs.append(Repair("the third coordinate never changes and was dropped: the scene is two-dimensional"))
-        nodes.pos, nodes.vel, gravity = pos[..., :2], vel[..., :2], gravity[:2]
+        nodes.pos, nodes.vel = pos[..., :2], vel[..., :2]
         if walls is not None:
             flat = np.linalg.norm(walls[1][:, :2], axis=1) > 0.5  # the others close the third dimension
             nodes.walls = walls[0][flat, :2], walls[1][flat, :2]
-    return build(nodes, facts if facts.gravity is not None else replace(facts, gravity=tuple(gravity.tolist())))
+    return build(nodes, facts)
 
 
 def _require_constant(frames: list[dict[str, Any]], name: str, first: np.ndarray) -> None:

@@ -33,6 +33,8 @@ from gpe_pl.data.importers.source import (
 )
 
 FRAME_DT = 1 / 60
+GRAVITY = (0.0, -9.8, 0.0)
+"""Usual in the format [m/s²], but not in the files; in some of its data sets other forces nearly cancel it."""
 NUM_RIGID = 64
 """Nodes of the box in BoxBath; they come first."""
 GROUND_FRICTION = 0.5
@@ -53,9 +55,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         f"walls {', '.join(sides)} at the extremes of all positions, with friction {GROUND_FRICTION:g}: neither is in the source",
         "frame_dt = 1/60 s is the format's, not in the files",
     ]
-    gravity = (0.0, -9.8, 0.0)
-    notes.append("gravity 9.8 m/s² along −y is the format's, not in the files")
-    facts = Facts(FRAME_DT, gravity=gravity, walls=dict.fromkeys(sides, GROUND_FRICTION), notes=tuple(notes)).overridden(settings)
+    facts = Facts(FRAME_DT, usual_gravity=GRAVITY, walls=dict.fromkeys(sides, GROUND_FRICTION), notes=tuple(notes)).overridden(settings)
     return Source(
         facts,
         {split: [Item(f"{r.parent.name}/{r.name}", partial(_load, r, settings)) for r in found] for split, found in rollouts.items()},

@@ -62,6 +62,8 @@ class Report:
         neighbours: dynamic neighbours of a dynamic node within the radius: ``mean``, ``min``, ``max``, and its ``boundary`` neighbours.
         max_speed, velocity_std, acceleration_std: of the train split [m/s, m/s²], the last without gravity.
         mean_acceleration: of the train split, per axis [m/s²]: what falls freely shows its gravity here.
+        free_groups: number of groups of nodes in free flight, in the frames that were looked at.
+        free_acceleration: median of theirs, per axis [m/s²]; empty if there is none.
         step_in_spacings: the farthest that a node moves in a frame.
         notes: what was assumed or left out, for the whole data set.
         warnings: what looks wrong, and what to do; about the whole data set first, then by trajectory.
@@ -87,6 +89,8 @@ class Report:
     velocity_std: float = 0.0
     acceleration_std: float = 0.0
     mean_acceleration: list[float] = field(default_factory=list)
+    free_groups: int = 0
+    free_acceleration: list[float] = field(default_factory=list)
     step_in_spacings: float = 0.0
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -125,10 +129,12 @@ class Report:
             f"{axis} {low:.6g} … {high:.6g}{' periodic' if repeats else ''}"
             for axis, (low, high), repeats in zip(axes, self.bounds, self.periodic, strict=True)
         )
+        free = ", ".join(f"{a:.3g}" for a in self.free_acceleration)
+        measured = f"; {self.free_groups} groups in free flight accelerate by ({free}) m/s²" if self.free_groups else ""
         rows = [
             ("frame dt", f"{self.frame_dt:.6g} s"),
             ("bounds", f"{box} m"),
-            ("gravity", f"({', '.join(map(_span, self.gravity))}) m/s²"),
+            ("gravity", f"({', '.join(map(_span, self.gravity))}) m/s²{measured}"),
             ("spacing", f"{self.spacing:.4g} m"),
             ("radius", f"{self.connectivity_radius:.4g} m = {self.connectivity_radius / self.spacing:.3g} spacings"),
         ]

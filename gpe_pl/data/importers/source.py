@@ -110,6 +110,8 @@ class Facts:
         spacing, connectivity_radius: in m.
         walls: friction of walls at the bounds, by side.
         parameters: of materials, where all nodes have the same.
+        usual_gravity: what data in the format usually have, per axis [m/s²]; taken where neither the source nor a setting has any, unless groups of nodes in
+            free flight show another one.
         notes: what is assumed, or left out, about all of it; one sentence each.
     """
 
@@ -121,6 +123,7 @@ class Facts:
     connectivity_radius: float | None = None
     walls: Mapping[str, float] = field(default_factory=dict)
     parameters: Mapping[str, float] = field(default_factory=dict)
+    usual_gravity: tuple[float, ...] | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -146,12 +149,15 @@ class Repair:
 
 @dataclass(frozen=True)
 class Loaded:
-    """A trajectory with what was changed in it, what was assumed about the whole data set, and what looks wrong about the trajectory."""
+    """A trajectory with what was changed in it, what was assumed about the whole data set, what looks wrong about the trajectory, and whether its gravity is
+    the usual one of the format, because nothing says what it is.
+    """
 
     trajectory: Trajectory
     repairs: tuple[Repair, ...] = ()
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    assumes_gravity: bool = False
 
 
 @dataclass(frozen=True)
@@ -183,6 +189,7 @@ class Nodes:
         kind: ``schema.NODE_TYPES`` name of each node [node]; boundary nodes are taken out of ``pos``.
         vel: velocities [frame, node, dim], where the source has them.
         mass: of each node, or of all.
+        gravity: [dim] in m/s², where the source has it for each trajectory.
         parameters: of materials, per node or for all.
         walls: positions and normals [boundary_node, dim] of further boundary nodes.
         cells, rest_pos: of a mesh.
@@ -192,6 +199,7 @@ class Nodes:
     kind: np.ndarray
     vel: np.ndarray | None = None
     mass: Any = 1.0
+    gravity: tuple[float, ...] | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict)
     walls: tuple[np.ndarray, np.ndarray] | None = None
     cells: np.ndarray | None = None
@@ -233,6 +241,8 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
             notes.append(f"{spec.name} of {material} is not in the source; {value:g} {spec.unit} is stored (parameters={{{material}: …}})")
         parameters[material] = value if np.ndim(value) == 0 else np.asarray(value)[moving]
     cells = _cells_of(nodes, moving, repairs)
+    gravity = facts.gravity if facts.gravity is not None or nodes.gravity is None else nodes.gravity[: pos.shape[2]]
+    assumes_gravity = gravity is None and facts.usual_gravity is not None
     boundary, wall_repairs, wall_notes = _boundary(nodes, pos, facts)
     return Loaded(
         Trajectory.from_numpy(
@@ -244,7 +254,7 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
             mass=nodes.mass if np.ndim(nodes.mass) == 0 else np.asarray(nodes.mass)[moving],
             bounds=facts.bounds,
             periodic=facts.periodic,
-            gravity=facts.gravity,
+            gravity=facts.usual_gravity[: pos.shape[2]] if gravity is None and facts.usual_gravity is not None else gravity,
             spacing=facts.spacing,
             connectivity_radius=facts.connectivity_radius,
             boundary=boundary,
@@ -254,6 +264,7 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
         (*repairs, *wall_repairs),
         (*notes, *wall_notes),
         tuple(warnings),
+        assumes_gravity,
     )
 
 

@@ -14,7 +14,8 @@ import h5py
 import numpy as np
 import pytest
 
-from gpe_pl.data.validate import disturbed_islands, format_page, main, validate
+from gpe_pl.data.free_flight import free_flights
+from gpe_pl.data.validate import format_page, main, validate
 from gpe_pl.geometry import Sphere
 from gpe_pl.schema import node_code
 from gpe_pl.store import read_trajectory, write_shard
@@ -367,7 +368,7 @@ def test_islands_that_do_not_fall_freely(
     arrays = {"pos": t.pos, "vel": t.vel, "mass": t.mass, "boundary_pos": t.boundary.pos[None]}
     if t.cells is not None:
         arrays["cells"] = t.cells
-    assert list(disturbed_islands(t.metadata, arrays)) == [expected] * 4
+    assert [(f.num_islands, f.num_free, f.num_disturbed) for f in free_flights(t.metadata, arrays)] == [expected] * 4
 
 
 def test_report_counts_disturbed_islands(
@@ -384,4 +385,44 @@ def test_an_island_that_was_tied_a_frame_ago_is_not_in_free_flight(new_trajector
     pos = t.pos.copy()
     pos[::2, :2, 1] -= 0.55  # at the floor in every second frame
     arrays = {"pos": pos, "vel": t.vel, "mass": t.mass, "boundary_pos": t.boundary.pos[None]}
-    assert [free for _, free, _ in disturbed_islands(t.metadata, arrays)] == [0] * 4
+    assert [f.num_free for f in free_flights(t.metadata, arrays)] == [0] * 4
+
+
+def report_of(tmp_path: Path, capsys: pytest.CaptureFixture[str], *trajectories: Trajectory) -> str:
+    write_shard(tmp_path / "shard-00000.h5", trajectories)
+    assert main([str(tmp_path)]) == 0
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize("gravity", [(0.0, -9.81), (0.0, -0.1)])
+def test_free_flight_is_compared_with_gravity(
+    tmp_path: Path, new_trajectory: Callable[..., Trajectory], capsys: pytest.CaptureFixture[str], gravity: tuple[float, float]
+) -> None:
+    """What falls with another acceleration than the stored one does not ask for a larger radius."""
+    t = falling(new_trajectory, 0.0)
+    report = report_of(tmp_path, capsys, replace(t, metadata=replace(t.metadata, gravity=gravity)))
+    assert "islands in free flight accelerate by (0, -9.8" in report
+    assert f"(median), gravity is (0, {gravity[1]:.3g}) m/s²" in report
+    assert ("they agree on another acceleration: gravity, frame_dt or the unit of length" in report) == (gravity[1] == -0.1)
+    assert ("larger connectivity_radius" in report) == (gravity[1] == -9.81)
+
+
+def test_without_gravity_the_scale_of_accelerations_tells_what_is_small(new_trajectory: Callable[..., Trajectory]) -> None:
+    """A pair that accelerates by 0.02 m/s² beside a node that accelerates by ``strong`` on the floor."""
+    t, time = new_trajectory(num_nodes=3, num_frames=6), 0.01 * np.arange(6)[:, None, None]
+    for strong, disturbed in ((100.0, 0), (1.0, 4)):
+        pos = np.array([[0.3, 0.6], [0.35, 0.6], [0.6, 0.02]]) + 0.5 * time**2 * np.array([[0.02, 0.0], [0.02, 0.0], [strong, 0.0]])
+        arrays = {"pos": pos, "mass": t.mass, "boundary_pos": t.boundary.pos[None]}
+        flights = list(free_flights(replace(t.metadata, gravity=(0.0, 0.0)), arrays))
+        assert (sum(f.num_free for f in flights), sum(f.num_disturbed for f in flights)) == (4, disturbed)
+
+
+def test_rounding_of_positions_is_named(
+    tmp_path: Path, new_trajectory: Callable[..., Trajectory], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nodes that fall and meet nothing within 2e-5 s move less than float32 resolves."""
+    t, time = new_trajectory(num_nodes=3, num_frames=6), 2e-5 * np.arange(6)[:, None, None]
+    pos = (np.array([[0.3, 0.6], [0.35, 0.6], [0.8, 0.02]]) + [0.0, -1.0] * time).astype(np.float32)
+    report = report_of(tmp_path, capsys, replace(t, pos=pos, metadata=replace(t.metadata, frame_dt=2e-5, solver_dt=2e-5)))
+    assert "positions in float32 round accelerations by 105 m/s², those of the data are " in report
+    assert "a longer frame_dt is needed" in report

@@ -363,6 +363,53 @@ def test_dpinet_without_a_bath(tmp_path: Path) -> None:
     assert [s.normal for s in trajectory.boundary.shapes] == [(0.0, 1.0, 0.0)]  # type: ignore[attr-defined]
 
 
+def falling_blobs(gravity: float, dt: float, seed: int = 0) -> np.ndarray:
+    """Positions [frame, node, 3] of two blobs above the ground that fall with a gravity of their own, and of a puddle on it that moves to and fro."""
+    rng = np.random.default_rng(seed)
+    places = np.array([[0.0, 1.0, 0.0], [2.0, 1.5, 0.0], [1.0, 0.06, 2.0]])
+    lattice = SPACING * np.stack(np.meshgrid(*[np.arange(3)] * 3), axis=-1).reshape(-1, 3)
+    rest = (places[:, None] + lattice).reshape(-1, 3)
+    time, free = dt * np.arange(12)[:, None], np.repeat([True, True, False], 27)
+    pos = np.repeat(rest[None], 12, axis=0)
+    pos[:, free, 1] += 0.5 * gravity * time**2
+    pos[:, ~free, 0] += 0.02 * np.sin(20 * time + rng.uniform(0, 6))
+    pos[:, ~free, 1] -= rest[:, 1].min()
+    return pos.astype(np.float32)
+
+
+@pytest.mark.parametrize(("real", "settings"), [(-0.1, {}), (-9.8, {}), (-0.1, {"gravity": [0.0, -9.8, 0.0]})])
+def test_free_flight_tells_the_gravity_that_dpinet_does_not(tmp_path: Path, real: float, settings: dict[str, Any]) -> None:
+    for k in range(4):
+        pos = falling_blobs(real, 1 / 60, seed=k)
+        sources.dpinet(tmp_path / "raw" / "train" / str(k), pos, np.gradient(pos, 1 / 60, axis=0))
+    report, stored = imported(tmp_path, tmp_path / "raw", "dpinet", spacing=SPACING, **settings)
+    said = -9.8 if settings else real
+    for trajectory in stored["train"]:
+        np.testing.assert_allclose(trajectory.metadata.gravity, (0.0, said, 0.0), rtol=0.02)
+    np.testing.assert_allclose(report.free_acceleration, (0.0, real, 0.0), rtol=0.02)
+    assert f"groups in free flight accelerate by (0, {real:.2g}" in report.text()
+    measured = [note for note in report.notes if "gravity is not in the source; (0, -9.8, 0) m/s² is the format's usual one" in note]
+    assert len(measured) == (not settings)
+    if not settings:
+        assert ("which is stored" in measured[0], "confirm it" in measured[0]) == (real == -0.1, real == -9.8)
+    doubts = [w for w in report.warnings if w.startswith("gravity is stored as (0, -9.8, 0) m/s², but ")]
+    assert len(doubts) == bool(settings)
+    assert all("groups in free flight agree on (0, -0.1" in w for w in doubts)
+
+
+def test_free_flight_tells_the_gravity_of_dmcf_scenes_that_do_not(tmp_path: Path) -> None:
+    """The second scene says it, and what a scene says is stored."""
+    for k in range(3):
+        pos = falling_blobs(-1.5, 0.02, seed=k)
+        static = {"grav": np.array([0, -3, 0], np.float32)} if k == 1 else {}
+        frames = sources.dmcf_frames(pos, np.gradient(pos, 0.02, axis=0), 0, **static)
+        sources.dmcf(tmp_path / "raw" / "train" / f"sim_{k}.msgpack.zst", frames)
+    report, stored = imported(tmp_path, tmp_path / "raw", "dmcf", spacing=SPACING, holdout=0.0)
+    gravity = [t.metadata.gravity[1] for t in stored["train"]]
+    np.testing.assert_allclose(gravity, (-1.5, -3.0, -1.5), rtol=0.02)
+    assert any("groups in free flight accelerate by (0, -1.5" in note for note in report.notes)
+
+
 # --- DeepLagrangianFluids and DMCF ---------------------------------------------------------------------------------------------------------
 
 

@@ -13,7 +13,7 @@ import pytest
 from gpe_pl import integrators
 from gpe_pl.arrays import ArrayError
 from gpe_pl.data.importers import ImportFailure, ImportSettings, Report, import_dataset, save_dataset
-from gpe_pl.data.importers.motion import motion_of
+from gpe_pl.data.motion import motion_of
 from gpe_pl.data.validate import validate
 from gpe_pl.geometry import Shape, Sphere, domain_walls
 from gpe_pl.store import iter_trajectories
@@ -145,17 +145,19 @@ def test_rounding_is_what_the_formula_says() -> None:
         return np.asarray(integrators.acceleration(vel[1:], vel[:-1], DT))
 
     error = acceleration(exact.astype(np.float32).astype(np.float64)) - acceleration(exact)
-    motion = motion_of(trajectory)
+    motion = motion_of(trajectory.metadata, trajectory.pos)
     np.testing.assert_allclose(motion.rounding(np.float32, np.zeros(2)), np.sqrt((error**2).mean(axis=(0, 1))), rtol=0.1)
     assert motion.acceleration == pytest.approx(np.sqrt((acceleration(exact) ** 2).mean()), rel=1e-6)
+    other = np.array([0.3, -2.0])
+    assert motion.with_gravity(other).acceleration == pytest.approx(np.sqrt(((acceleration(exact) - other) ** 2).mean()), rel=1e-6)
 
 
 def test_frames_too_close_in_time_are_named(tmp_path: Path) -> None:
     slow = [np.repeat(swinging(seed)[:1], 12, axis=0) + 1e-9 * np.arange(12)[:, None, None] ** 2 for seed in range(3)]
     report = converted(tmp_path, "slow", slow)
     assert report.origin == [0.0, 0.0]
-    assert "positions in float32 round accelerations by" in report.warnings[0]
-    assert "take a larger time step" in report.warnings[0]
+    rounding = next(w for w in report.warnings if "positions in float32 round accelerations by" in w)
+    assert "take a larger time step" in rounding
 
 
 @pytest.mark.parametrize("arrays", [{"pos": 1e30 * swinging()}, {"pos": swinging(), "vel": 1e30 * swinging()}])
@@ -186,7 +188,8 @@ def test_jumps_are_named(tmp_path: Path) -> None:
 def test_jumps_late_in_long_trajectories_are_found() -> None:
     pos = swinging(num_frames=600)
     pos[520:, 3] += 1.0
-    motion = motion_of(Trajectory.from_numpy(pos, DT, "sand", {"sand": 30.0}))
+    trajectory = Trajectory.from_numpy(pos, DT, "sand", {"sand": 30.0})
+    motion = motion_of(trajectory.metadata, trajectory.pos)
     assert (motion.frame, motion.node) == (520, 3)
     assert motion.step == pytest.approx(np.sqrt(2), rel=1e-2)
 

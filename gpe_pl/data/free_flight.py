@@ -1,0 +1,133 @@
+"""Groups of nodes in free flight: what touches nothing accelerates by the gravity of the data.
+
+A group is a connected component of the graph, an island. It is in free flight if no boundary node lies within the neighbour radius of its nodes and this was so
+in the frame before, as one island or several. Nothing in the graph tells a model to move it other than by gravity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gpe_pl.graphs.islands import Islands, free_since, islands_within
+from gpe_pl.trajectory import Metadata
+
+TOLERANCE = 1e-3
+"""A free group accelerates with gravity up to this fraction of it; without gravity, of the rms acceleration of all nodes."""
+
+SCATTER = 0.25
+"""Free groups agree on another acceleration if they differ among themselves, in the median, by less than this fraction of its distance from gravity."""
+
+SUBSTANTIAL = 0.1
+"""Another acceleration differs from gravity by at least this fraction of gravity and of the rms acceleration of all nodes; less is a disturbance."""
+
+MOST_FRAMES = 50
+"""Frames of a trajectory, evenly spread, in which groups are looked at."""
+
+
+@dataclass(frozen=True)
+class FreeFlight:
+    """Free groups of one frame, or of many.
+
+    Attributes:
+        num_islands: groups in all frames that were looked at, free or not.
+        acceleration: mean acceleration of each free group [group, dim] in m/s², from the second difference of positions that models learn from.
+        gravity: that of its trajectory [group, dim] in m/s².
+        resolution: what rounding of positions leaves uncertain in ``acceleration`` [group] in m/s².
+        scale: rms acceleration of all nodes in the group's frame [group] in m/s².
+    """
+
+    num_islands: int
+    acceleration: np.ndarray
+    gravity: np.ndarray
+    resolution: np.ndarray
+    scale: np.ndarray
+
+    @property
+    def num_free(self) -> int:
+        return len(self.acceleration)
+
+    @property
+    def tolerance(self) -> np.ndarray:
+        """By how much [group] in m/s² a group may differ from gravity."""
+        strength = np.linalg.norm(self.gravity, axis=-1)
+        return np.maximum(TOLERANCE * np.where(strength > 0, strength, self.scale), self.resolution)
+
+    @property
+    def num_disturbed(self) -> int:
+        """Free groups that do not accelerate with gravity."""
+        return int((np.linalg.norm(self.acceleration - self.gravity, axis=-1) > self.tolerance).sum())
+
+    @property
+    def typical(self) -> np.ndarray:
+        """Median acceleration of the groups [dim] in m/s²; components below their scatter are 0. Needs a free group."""
+        middle = np.median(self.acceleration, axis=0)
+        noise = np.maximum(np.median(np.abs(self.acceleration - middle), axis=0), np.median(self.resolution))
+        return np.where(np.abs(middle) > noise, middle, 0.0)
+
+    @property
+    def agrees_on_another(self) -> bool:
+        """Whether the groups share an acceleration that is not gravity."""
+        if not self.num_free or 2 * self.num_disturbed <= self.num_free:
+            return False
+        excess = self.acceleration - self.gravity
+        middle = np.median(excess, axis=0)
+        distance, scatter = np.linalg.norm(middle), np.median(np.linalg.norm(excess - middle, axis=-1))
+        strength = np.median(np.maximum(np.linalg.norm(self.gravity, axis=-1), self.scale))
+        return bool(distance > SUBSTANTIAL * strength and scatter < SCATTER * distance)
+
+    def under(self, gravity: tuple[float, ...]) -> FreeFlight:
+        """The same groups, compared with another gravity [dim] in m/s²."""
+        return replace(self, gravity=np.broadcast_to(np.asarray(gravity, np.float64), self.acceleration.shape))
+
+
+def joined(flights: Iterable[FreeFlight], dim: int) -> FreeFlight:
+    """All groups of several frames or trajectories."""
+    flights = [nothing(dim), *flights]
+    parts = (np.concatenate([getattr(f, name) for f in flights]) for name in ("acceleration", "gravity", "resolution", "scale"))
+    return FreeFlight(sum(f.num_islands for f in flights), *parts)
+
+
+def nothing(dim: int) -> FreeFlight:
+    """No groups at all."""
+    return FreeFlight(0, np.empty((0, dim)), np.empty((0, dim)), np.empty(0), np.empty(0))
+
+
+def free_flights(metadata: Metadata, arrays: dict[str, np.ndarray], most_frames: int = MOST_FRAMES) -> Iterator[FreeFlight]:
+    """Free groups of a trajectory, frame by frame.
+
+    Args:
+        metadata: of the trajectory.
+        arrays: by the names of ``schema.FIELDS``: ``pos``, ``mass``, ``boundary_pos`` and, for meshes, ``cells``.
+        most_frames: that are looked at.
+    """
+    half_step = float(np.finfo(arrays["pos"].dtype).eps) / 2
+    pos, mass = arrays["pos"].astype(np.float64), arrays["mass"].astype(np.float64)
+    gravity, dt, radius = np.asarray(metadata.gravity), metadata.frame_dt, metadata.connectivity_radius
+    resolution = 4 * half_step * float(np.max(np.abs(pos), initial=0.0)) / dt**2
+    boundary = arrays["boundary_pos"].astype(np.float64)
+    cells = arrays.get("cells", np.empty((0, 2), np.int64)).astype(np.int64)
+    mesh = np.concatenate([np.stack([cells[:, 0], cells[:, k]]) for k in range(1, cells.shape[1])], axis=1)
+
+    def islands_of(frame: int) -> Islands:
+        return islands_within(radius, pos[frame], boundary[min(frame, len(boundary) - 1)], mesh, metadata.periodicity)
+
+    for frame in np.unique(np.linspace(1, len(pos) - 2, min(len(pos) - 2, most_frames)).astype(int)).tolist():
+        before, islands = islands_of(frame - 1), islands_of(frame)
+        count = len(islands.is_free)
+        free = free_since(before, islands)
+        window = pos[frame - 1 : frame + 2]
+        if metadata.periodicity:  # relative to the middle, so that crossing the seam is no jump
+            window = metadata.periodicity.shortest(window - pos[frame])
+        of_nodes = np.diff(window, 2, axis=0)[0] / dt**2
+        acceleration = islands.mean(of_nodes, mass)[free]
+        uncertain = resolution / np.sqrt(np.bincount(islands.label, minlength=count))[free]
+        rms = float(np.sqrt(np.mean(np.sum(of_nodes**2, axis=-1))))
+        yield FreeFlight(count, acceleration, np.broadcast_to(gravity, acceleration.shape), uncertain, np.full(len(acceleration), rms))
+
+
+def vector(values: Iterable[float]) -> str:
+    """An acceleration for messages."""
+    return f"({', '.join(f'{value:.3g}' for value in values)}) m/s²"
