@@ -36,7 +36,7 @@ from gpe_pl.printable import clean_logs, one_line
 from gpe_pl.run_folder import refuse_links
 from gpe_pl.signatures import checked, parameters
 
-WITHOUT_KEY = {"comparison", "experiment", "scene", "solver"}
+WITHOUT_KEY = {"comparison", "experiment", "recipe", "scene", "solver"}
 """Config groups that fill other keys than one of their own."""
 
 plugins.register()  # conf/ names them

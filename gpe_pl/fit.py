@@ -21,7 +21,6 @@ def fit(cfg: DictConfig) -> float:
 
     from gpe_pl.data.datamodule import TrajectoryDataModule
     from gpe_pl.data.dataset import open_split, window_counts
-    from gpe_pl.data.noise import Noise
     from gpe_pl.data.sampling import BatchSize
     from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
     from gpe_pl.graphs.features import GraphConfig
@@ -49,12 +48,14 @@ def fit(cfg: DictConfig) -> float:
     first_frame = evaluation.first_frame(graph.history)
     logger = construct(LoggerSettings, cfg.logger, "logger")
     new_model = bind(model_class(cfg.model._target_), {k: v for k, v in cfg.model.items() if k != "_target_"}, "model", "spec")
-    noise = Noise(training.noise, training.noise_std, training.noise_correction)
     batch_size = construct(BatchSize, cfg.batching, "batching", num_graphs=training.batch_size)
 
     start = None if cfg.start_from is None else LearnedSimulator.from_checkpoint(cfg.start_from)
-    if start is not None:
-        start.check_scene(scene_metadata(cfg, "train"))
+    if start is not None or training.position_noise_of_domain:  # what cannot be trained is said before data are generated
+        scenes = scene_metadata(cfg, "train")
+        training.noise.check(scenes)
+        if start is not None:
+            start.check_scene(scenes)
 
     run_dir = output_dir(cfg)
     Path(cfg.paths.data).mkdir(parents=True, exist_ok=True)
@@ -67,7 +68,7 @@ def fit(cfg: DictConfig) -> float:
     def data() -> TrajectoryDataModule:
         stress = bool(cfg.model.get("stress", False))
         return TrajectoryDataModule(
-            root, graph, noise, batch_size, cfg.seed, trainer.num_workers, stress=stress, sampling=training.sampling
+            root, graph, training.noise, batch_size, cfg.seed, trainer.num_workers, stress=stress, sampling=training.sampling
         )
 
     def new_module(training: TrainingSettings) -> TrainingModule:

@@ -75,7 +75,7 @@ class PortableStep(nn.Module):
         metadata = simulator.builder.metadata
         self.simulator, self.spec, self.scales = simulator, simulator.builder.spec, simulator.builder.scales
         self.meshes = _meshes(self.spec)
-        self.frame_dt, self.periodicity, self.features = metadata.frame_dt, metadata.periodicity, simulator.builder.config.features
+        self.frame_dt, self.periodicity, self.config = metadata.frame_dt, metadata.periodicity, simulator.builder.config
 
     def forward(self, scene: Scene) -> tuple[Scene, Scene]:
         """The next positions and velocity history; acceleration [m/s²], gravity included, and stress [Pa] at nodes where the model has one."""
@@ -117,7 +117,7 @@ class PortableStep(nn.Module):
             data.num_bodies = torch.full((1,), sum(scene[f"body.{m}"].shape[0] for m in self.meshes))  # at most
         pos, vel, normal, friction, restitution = (scene[f"boundary.{name}"] for name in BOUNDARY_FIELDS)
         boundary = Boundary(pos, vel, normal, friction, restitution)
-        data[BOUNDARY].x = boundary_features(boundary, self.scales).float()
+        data[BOUNDARY].x = boundary_features(self.config, boundary, self.scales).float()
         self._add_radius_edges(data, scene, boundary)
         self._add_mesh(data, scene)
         return data
@@ -145,7 +145,7 @@ class PortableStep(nn.Module):
             displacement = self.periodicity.shortest(pos[target][i] - pos[source][j])
             relative_velocity = vel[target][i] - vel[source][j]
             normal = boundary.normal[j] if source == BOUNDARY else None
-            odd, even = edge_features(self.features, displacement, relative_velocity, normal, self.scales)
+            odd, even = edge_features(self.config.features, displacement, relative_velocity, normal, self.scales)
             store.odd, store.even = odd.float(), even.float()
             store.offset = store.odd[:, : self.spec.dim]
 
@@ -178,7 +178,7 @@ class PortableStep(nn.Module):
             difference = values[target][i] - values[source][j]
             level_of_source = None if name == CELL else torch.full((j.shape[0],), level_of(source))
             odd, even = mesh_features(
-                self.features, difference[:, :dim], difference[:, dim : 2 * dim], difference[:, -dim:], level_of_source, self.scales
+                self.config.features, difference[:, :dim], difference[:, dim : 2 * dim], difference[:, -dim:], level_of_source, self.scales
             )
             store.odd, store.even = odd.float(), even.float()
 

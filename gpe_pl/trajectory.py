@@ -378,6 +378,11 @@ class Metadata:
     def dim(self) -> int:
         return len(self.bounds)
 
+    @property
+    def longest_side(self) -> float:
+        """Extent of the domain [m] along its longest axis."""
+        return max(high - low for low, high in self.bounds)
+
     @cached_property
     def periodicity(self) -> Periodicity:
         return Periodicity(self.bounds, self.periodic)

@@ -57,6 +57,10 @@ class TrajectoryDataModule(L.LightningDataModule):
 
     Attributes:
         push_forward: when batches are starts for own steps of the model rather than graphs; None: never.
+
+    Raises:
+        StoreError: a split or its statistics are missing or damaged.
+        NoiseError: the noise is too large for the spacing of the data.
     """
 
     def __init__(
@@ -84,6 +88,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         whole = len(train) == len(stored)
         std = statistics["acceleration_std"] if whole else acceleration_std(t.window(0, t.num_frames) for t in train)
         unit = std * self.metadata.frame_dt
+        noise.check(self.metadata, unit)
         self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress)
         self.val_set = WindowDataset(val, self.builder, stress=stress)
         if sampling == "activity":

@@ -273,7 +273,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         trajectories: of the split.
         builder: makes the graphs.
         noise: applied to inputs; None for evaluation.
-        velocity_unit: acceleration std × frame interval [m/s], the unit of velocity noise.
+        velocity_unit: root mean square acceleration × frame interval [m/s], the unit of velocity noise.
         seed: of the noise.
         stress: also give the Cauchy stress at t+1, ``stress_target`` [node, component] in Pa, of materials that have one.
 
@@ -342,7 +342,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         pos = truth[: history + 2]
         if self.noise is not None:
             rng = np.random.default_rng((self.seed, sample))
-            pos = self.noise.apply(pos, self.velocity_unit, dt, rng)
+            pos = self.noise.apply(pos, self.builder.metadata.longest_side, self.velocity_unit, dt, rng)
         velocities = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
         gravity = np.asarray(trajectory.metadata.gravity)
         past = np.ascontiguousarray(velocities[:-1].swapaxes(0, 1))
@@ -367,7 +367,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         if self.probability is not None:
             about["weight"] = 1 / (len(self) * float(self.probability[window]))
         if start is not None:
-            correction = self.noise.correction if self.noise is not None and self.noise.kind == "velocity" else 0.0
+            correction = 0.0 if self.noise is None else self.noise.correction
             return Start(state, torch.from_numpy(truth[history:]), stress, correction, start.correction, about, sample, start.lane)
         target = integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity
         return training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[-1], about)

@@ -1,21 +1,31 @@
 """Training noise: new position windows, consistent in velocity and position; the stored data is never touched.
 
-A window holds positions x[t−H … t+1] [history + 2, node, dim]. Both kinds are additive on positions, so velocities and the target acceleration follow from
+A window holds positions x[t−H … t+1] [history + 2, node, dim]. Both noises are added to positions, so velocities and the target acceleration follow from
 the noisy window by the integrator's own formulas.
 
-- ``paper``: the same offset on every position, the target's included (paper, section 3.2): velocities and target stay as they are.
-- ``velocity``: a random walk over the H velocities, integrated to positions; the next velocity stays the true one, so the target corrects the velocity
+- Position noise: the same offset on every position, the target's included (paper, section 3.2): velocities and target stay as they are.
+- Velocity noise: a random walk over the H velocities, integrated to positions; the next velocity stays the true one, so the target corrects the velocity
   noise exactly and the position noise not at all [Sanchez-Gonzalez et al. 2020, as in their published code].
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float64
 from pydantic import Field
 
-NoiseKind = Literal["paper", "velocity"]
+from gpe_pl.errors import GpeError
+from gpe_pl.trajectory import Metadata
+
+MAX_SPACINGS = 0.5
+"""Largest standard deviation of noise in rest spacings: beyond it, nodes change places with their neighbours."""
+ROUNDING = 1e-5
+"""Of the largest value that a message names."""
+
+
+class NoiseError(GpeError, ValueError):
+    """Noise is too large for the spacing of the data; the message names the key, its value and the largest that is allowed."""
 
 
 @dataclass(frozen=True)
@@ -23,34 +33,63 @@ class Noise:
     """Gaussian noise on the inputs of dynamic nodes.
 
     Attributes:
-        kind: see the module's text.
-        std: for ``paper`` in m; for ``velocity`` in units of the data's acceleration std × frame interval, that is of one frame's velocity change.
-        correction: of ``velocity``, the share of the last position's noise that the target takes back within the step; a model that is to bring nodes back to
-            where they belong needs some [γ of Pfaff et al. 2021, appendix A.2.2].
+        position_of_domain: standard deviation of the position noise, as a fraction of the domain's longest side.
+        velocity_of_change: standard deviation of the velocity noise in units of one frame's velocity change, which is the root mean square acceleration
+            (without gravity's) × frame interval.
+        correction: fraction of the noise on the last position that the target takes back within the step; a model that is to bring nodes back to where they
+            belong needs some [γ of Pfaff et al. 2021, appendix A.2.2]; the paper has none.
     """
 
-    kind: NoiseKind = "velocity"
-    std: Annotated[float, Field(ge=0, le=100)] = 0.3
+    position_of_domain: Annotated[float, Field(ge=0, le=1)] = 0.0
+    velocity_of_change: Annotated[float, Field(ge=0, le=100)] = 0.3
     correction: Annotated[float, Field(ge=0, le=1)] = 0.0
 
+    def check(self, metadata: Metadata, velocity_unit: float = 0.0) -> None:
+        """Refuse noise that is large beside the spacing of a data set.
+
+        Args:
+            metadata: of the data set.
+            velocity_unit: root mean square acceleration × frame interval [m/s]; 0 where it is not known yet: then velocity noise is not checked.
+
+        Raises:
+            NoiseError: the noise on positions, or on the way within a frame, has a standard deviation of more than ``MAX_SPACINGS``.
+        """
+        spacing = metadata.spacing
+        for key, value, unit in (
+            ("training.position_noise_of_domain", self.position_of_domain, metadata.longest_side),
+            ("training.velocity_noise_of_change", self.velocity_of_change, velocity_unit * metadata.frame_dt),
+        ):
+            if value * unit > MAX_SPACINGS * spacing * (1 + ROUNDING):
+                raise NoiseError(
+                    f"{key}={value:g} moves nodes by {value * unit:.3g} m, which is {value * unit / spacing:.3g} spacings of {spacing:.3g} m; "
+                    f"more than {MAX_SPACINGS:g} spacings are refused: choose at most {MAX_SPACINGS * spacing / unit:.6g}"
+                )
+
     def apply(
-        self, window: Float64[np.ndarray, "window node dim"], velocity_unit: float, frame_dt: float, rng: np.random.Generator
+        self,
+        window: Float64[np.ndarray, "window node dim"],
+        longest_side: float,
+        velocity_unit: float,
+        frame_dt: float,
+        rng: np.random.Generator,
     ) -> Float64[np.ndarray, "window node dim"]:
-        """A noisy copy of a position window.
+        """A noisy copy of a position window; without noise the window itself.
 
         Args:
             window: x[t−H … t+1] in m.
-            velocity_unit: acceleration std × frame interval [m/s].
+            longest_side: of the domain [m].
+            velocity_unit: root mean square acceleration × frame interval [m/s].
             frame_dt: frame interval [s].
             rng: source of randomness.
         """
-        if self.std == 0:
+        if self.position_of_domain == self.velocity_of_change == 0:
             return window
-        if self.kind == "paper":
-            return window + rng.normal(scale=self.std, size=window.shape[1:])
-        history = window.shape[0] - 2
-        steps = rng.normal(scale=self.std * velocity_unit / np.sqrt(history), size=(history, *window.shape[1:]))
         offset = np.zeros_like(window)
-        offset[1:-1] = np.cumsum(np.cumsum(steps, axis=0) * frame_dt, axis=0)
+        if self.position_of_domain:
+            offset[:-1] = rng.normal(scale=self.position_of_domain * longest_side, size=window.shape[1:])
+        if self.velocity_of_change:
+            history = window.shape[0] - 2
+            steps = rng.normal(scale=self.velocity_of_change * velocity_unit / np.sqrt(history), size=(history, *window.shape[1:]))
+            offset[1:-1] += np.cumsum(np.cumsum(steps, axis=0) * frame_dt, axis=0)
         offset[-1] = (1 - self.correction) * offset[-2]
         return window + offset

@@ -164,7 +164,7 @@ class GraphBuilder:
             edges[relation] = torch.from_numpy(pairs).to(device)
 
         boundary = _trim(state.boundary, edges) if self.config.trim_boundary else state.boundary
-        data[BOUNDARY].x = self._rounded(boundary_features(boundary, self.scales))
+        data[BOUNDARY].x = self._rounded(boundary_features(self.config, boundary, self.scales))
         pos[BOUNDARY], vel[BOUNDARY] = boundary.pos, boundary.vel
         for relation in relations:
             if relation not in edges:

@@ -43,6 +43,7 @@ class GraphConfig:
 
     Attributes:
         features: edge features, ``paper`` or ``contact``.
+        boundary_condition: boundary nodes have normal, friction and restitution beside their velocity; without it, velocity only (paper).
         history: velocities per node.
         connectivity_spacings: neighbour radius in rest spacings; None takes the data set's radius.
         trim_boundary: leave out boundary nodes without an edge, which cannot influence anything.
@@ -52,6 +53,7 @@ class GraphConfig:
     """
 
     features: Features = "contact"
+    boundary_condition: bool = True
     history: Annotated[int, Field(ge=1, le=20)] = HISTORY
     connectivity_spacings: Annotated[float, Field(gt=0)] | None = None
     trim_boundary: bool = True
@@ -94,7 +96,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
     elif config.num_levels is not None:
         num_levels = config.num_levels
     else:
-        num_levels = levels_of(max(high - low for low, high in metadata.bounds), metadata.spacing)
+        num_levels = levels_of(metadata.longest_side, metadata.spacing)
     relations = (*radius_relations(materials), *(mesh_relations(materials, num_levels) if meshes else ()))
     motion = (config.history + 1) * dim
     virtual = {grid(level): motion + 1 for level in range(1, num_levels + 1)}
@@ -102,7 +104,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
     return FeatureSpec(
         dim=dim,
         materials=materials,
-        node_channels={**dict.fromkeys(materials, motion), BOUNDARY: 2 * dim + 2, **virtual},
+        node_channels={**dict.fromkeys(materials, motion), BOUNDARY: 2 * dim + 2 if config.boundary_condition else dim, **virtual},
         param_channels={m: len(param_names((m,))) for m in materials},
         relations=relations,
         odd_channels={r: odd for r, (odd, _) in channels.items()},
@@ -134,11 +136,16 @@ def material_features(velocity_history: Float64[Tensor, "node history dim"], gra
     return torch.cat([motion, (gravity / scales.acceleration).expand(n, -1)], dim=1)
 
 
-def boundary_features(boundary: Boundary, scales: Scales) -> Tensor:
-    """Velocity, normal and boundary condition of boundary nodes [boundary_node, 2 dim + 2]; friction μ enters as μ/(1+μ), so no-slip is 1."""
+def boundary_features(config: GraphConfig, boundary: Boundary, scales: Scales) -> Tensor:
+    """Velocity of boundary nodes [boundary_node, dim], or with ``boundary_condition`` also normal, friction and restitution [boundary_node, 2 dim + 2].
+
+    Friction μ enters as μ/(1+μ), so no-slip is 1.
+    """
+    velocity = boundary.vel / scales.velocity
+    if not config.boundary_condition:
+        return velocity
     friction = boundary.friction / (1 + boundary.friction)
-    condition = torch.stack([friction, boundary.restitution], dim=1)
-    return torch.cat([boundary.vel / scales.velocity, boundary.normal, condition], dim=1)
+    return torch.cat([velocity, boundary.normal, torch.stack([friction, boundary.restitution], dim=1)], dim=1)
 
 
 def edge_features(

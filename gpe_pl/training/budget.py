@@ -25,7 +25,7 @@ from gpe_pl.data.dataset import Samples, WindowDataset, collated
 from gpe_pl.data.sampling import NUM_LANES, BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
 from gpe_pl.machine import gemm_rate
-from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
+from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule, clipped_norm
 from gpe_pl.training.run import TrainerSettings, TrainingSettings
 
 log = logging.getLogger(__name__)
@@ -78,7 +78,7 @@ def step_time(
     module: TrainingModule,
     data: WindowDataset,
     size: BatchSize,
-    gradient_clip: float,
+    gradient_clip: float | None,
     push_forward: PushForward | None = None,
     limit: float = math.inf,
 ) -> float:
@@ -98,7 +98,7 @@ def step_time(
         for _ in range(count):
             optimizer.zero_grad()
             module.loss(next(batches)).backward()
-            torch.nn.utils.clip_grad_norm_(module.parameters(), gradient_clip)
+            torch.nn.utils.clip_grad_norm_(module.parameters(), clipped_norm(gradient_clip))
             optimizer.step()
         if on_gpu:
             torch.cuda.synchronize()

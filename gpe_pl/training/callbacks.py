@@ -45,10 +45,11 @@ class RolloutValidation(Callback):
     Args:
         trajectories: ground truth.
         num_steps: rollout length in frames.
+        containment: put particles that cross a wall back on its surface.
     """
 
-    def __init__(self, trajectories: list[Trajectory], num_steps: int) -> None:
-        self.trajectories, self.num_steps = trajectories, num_steps
+    def __init__(self, trajectories: list[Trajectory], num_steps: int, containment: bool = True) -> None:
+        self.trajectories, self.num_steps, self.containment = trajectories, num_steps, containment
 
     def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         simulator: Any = pl_module.simulator
@@ -71,7 +72,8 @@ class RolloutValidation(Callback):
             guard = Guard(bounds=bounds, margin=size, max_speed=1e3)
             starts.append(Start(simulator.initial_state(trajectory, history), truth.num_frames - 1, truth.metadata, guard))
             worst.append(size**2)  # a rollout that stopped early counts as lost from there on
-        predictions = rollouts(Contained(simulator, self.trajectories[0].metadata.frame_dt), starts)
+        contained = Contained(simulator, self.trajectories[0].metadata.frame_dt) if self.containment else simulator
+        predictions = rollouts(contained, starts)
         errors = [per_frame_mse(p, t)[1:] for p, t in zip(predictions, truths, strict=True)]
         means = [float(np.where(np.isfinite(e), e, w).mean()) for e, w in zip(errors, worst, strict=True)]
         everywhere = [

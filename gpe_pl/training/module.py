@@ -42,6 +42,11 @@ RESUMED = {
 log = logging.getLogger(__name__)
 
 
+def clipped_norm(gradient_clip: float | None) -> float:
+    """The largest norm of a gradient; infinite without clipping: then the norm is only looked at."""
+    return math.inf if gradient_clip is None else gradient_clip
+
+
 def _rows(tensor: Tensor) -> int:
     """Nodes or edges in a tensor of a graph; ``edge_index`` has its edges in columns."""
     return tensor.shape[1] if tensor.dtype == torch.int64 and tensor.dim() == 2 else tensor.shape[0]
@@ -200,8 +205,8 @@ class TrainingModule(L.LightningModule):
     def configure_gradient_clipping(
         self, optimizer: torch.optim.Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
-        """Clip by norm; a gradient that is not finite is dropped before it spoils the weights."""
-        norm = torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), math.inf if gradient_clip_val is None else gradient_clip_val)
+        """Clip by norm, if that is wanted; a gradient that is not finite is dropped before it spoils the weights."""
+        norm = torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), clipped_norm(gradient_clip_val))
         if not torch.isfinite(norm):
             if not self._skipped or self._skipped[-1] != self.global_step:  # else its loss was not finite either
                 self._skip("gradient norm", norm)

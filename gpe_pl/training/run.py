@@ -23,7 +23,7 @@ from pydantic import Field
 
 from gpe_pl.atomic import replacing
 from gpe_pl.data.datamodule import TrajectoryDataModule
-from gpe_pl.data.noise import NoiseKind
+from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import PushForward, Sampling
 from gpe_pl.machine import keep_freed_memory
 from gpe_pl.run_folder import CONFIG, RunError, config_in, differences
@@ -42,6 +42,8 @@ class TrainingSettings:
 
     ``budget_minutes``, of one core or GPU, replaces ``num_steps`` (see ``training.budget``). The last ``push_share`` of the steps start where the model
     has come to in up to ``push_steps`` steps of its own; ``push_correction`` of the way that its velocity has gone astray is to be taken back within a step.
+    ``gradient_clip`` and ``ema_decay`` are switched off by None. ``val_containment`` puts particles that cross a wall back in the rollouts of the validation,
+    which choose the best checkpoint.
     """
 
     num_steps: Annotated[int, Field(ge=1)]
@@ -51,10 +53,10 @@ class TrainingSettings:
     final_learning_rate: Annotated[float, Field(gt=0)] = 1e-5
     schedule: Schedule = "cosine"
     warmup_steps: Annotated[int, Field(ge=0)] = 100
-    gradient_clip: Annotated[float, Field(gt=0)] = 1.0
-    ema_decay: Annotated[float, Field(ge=0, lt=1)] = 0.999
-    noise: NoiseKind = "velocity"
-    noise_std: Annotated[float, Field(ge=0, le=100)] = 0.3
+    gradient_clip: Annotated[float, Field(gt=0)] | None = 1.0
+    ema_decay: Annotated[float, Field(ge=0, lt=1)] | None = 0.999
+    position_noise_of_domain: Annotated[float, Field(ge=0, le=1)] = 0.0
+    velocity_noise_of_change: Annotated[float, Field(ge=0, le=100)] = 0.3
     noise_correction: Annotated[float, Field(ge=0, le=1)] = 0.0
     sampling: Sampling = "uniform"
     push_share: Annotated[float, Field(ge=0, le=1)] = 0.0
@@ -65,6 +67,7 @@ class TrainingSettings:
     val_interval: Annotated[int, Field(ge=1)] = 1000
     num_val_rollouts: Annotated[int, Field(ge=1)] = 4
     val_rollout_steps: Annotated[int, Field(ge=1)] = 100
+    val_containment: bool = True
 
     def __post_init__(self) -> None:
         if self.num_steps > self.val_interval and self.num_steps % self.val_interval:
@@ -82,6 +85,11 @@ class TrainingSettings:
             del values["push_steps"]
             values.pop("push_correction", None)
         return values
+
+    @property
+    def noise(self) -> Noise:
+        """On the inputs."""
+        return Noise(self.position_noise_of_domain, self.velocity_noise_of_change, self.noise_correction)
 
     @property
     def push_forward(self) -> PushForward | None:
@@ -156,9 +164,10 @@ def train(
     interruption = Interruption()
     checkpoints = Checkpoints(run_dir / "checkpoints", 60 * trainer_settings.checkpoint_minutes, interruption)
     steps = min(training.val_rollout_steps, datamodule.val_trajectories(1)[0].num_frames - datamodule.builder.config.history - 1)
+    averages = [] if training.ema_decay is None else [WarmAverage(training.ema_decay)]
     own: list[Callback] = [
-        RolloutValidation(datamodule.val_trajectories(training.num_val_rollouts), steps),
-        WarmAverage(training.ema_decay),
+        RolloutValidation(datamodule.val_trajectories(training.num_val_rollouts), steps, training.val_containment),
+        *averages,
         LearningRateMonitor(),
         checkpoints,
     ]

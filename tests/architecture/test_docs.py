@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 import yaml
@@ -74,7 +74,8 @@ def test_help_names_every_choice(command: str) -> None:
 def test_help_says_the_defaults(command: str) -> None:
     GlobalHydra.instance().clear()
     file, cfg = OmegaConf.load(ROOT / "conf" / f"{command}.yaml"), compose(command, [])
-    chosen = {group: choice for default in file.defaults if OmegaConf.is_dict(default) for group, choice in default.items()}
+    defaults: Any = OmegaConf.to_container(file.defaults)  # interpolations as they are
+    chosen = {group: choice for default in defaults if isinstance(default, dict) for group, choice in default.items()}
     compared = 0
     for keys, said in re.findall(r"^(\w\S*(?:, \w\S*)*) .*\(([^()]+)\)$", listed_help(file), re.MULTILINE):
         for key, value in zip(keys.split(", "), said.split(", "), strict=False):

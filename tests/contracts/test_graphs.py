@@ -195,6 +195,15 @@ def test_boundary_nodes_tell_sticky_from_slip() -> None:
     assert (build(bouncing.to_torch())[BOUNDARY].x[:, 5] == 0.5).all()
 
 
+def test_boundary_nodes_may_have_their_velocity_only() -> None:
+    """As in the paper: the other channels are those that normal, friction and restitution would have."""
+    s = scenes.state(5)
+    s = replace(s, boundary=replace(s.boundary, vel=np.ones_like(s.boundary.vel))).to_torch()
+    plain, full = (builder(trim_boundary=False, boundary_condition=b) for b in (False, True))
+    assert (plain.spec.node_channels[BOUNDARY], full.spec.node_channels[BOUNDARY]) == (2, 6)
+    assert torch.equal(plain(s)[BOUNDARY].x, full(s)[BOUNDARY].x[:, :2])
+
+
 def test_trimming_the_boundary_changes_no_prediction() -> None:
     full, trimmed = (builder(TWO, trim_boundary=t) for t in (False, True))
     s = scenes.state(40, TWO).to_torch()

@@ -20,6 +20,7 @@ from omegaconf import DictConfig
 
 from gpe_pl.data import sampling
 from gpe_pl.data.datamodule import TrajectoryDataModule
+from gpe_pl.data.noise import NoiseError
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation import StartError, read_rows
 from gpe_pl.finished_runs import validation_curve
@@ -147,6 +148,41 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     assert curves[0] == curves[1]
     assert curves[0][0] == [2, 4, 6]
     assert (tmp_path / "whole" / "metrics.csv").read_bytes() == (tmp_path / "parts" / "metrics.csv").read_bytes()
+
+
+def test_the_papers_recipe_trains_without_average_and_clipping(
+    tiny_data: Path, tmp_path: Path, losses: dict[int, list[float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Weights are those of the last step, after steps along whole gradients, and walls stop nothing in the rollouts that choose them."""
+    clips = []
+    configure = TrainingModule.configure_gradient_clipping
+
+    def clipping(self: TrainingModule, optimizer: Any, gradient_clip_val: float | None = None, **rest: Any) -> None:
+        clips.append(gradient_clip_val)
+        configure(self, optimizer, gradient_clip_val, **rest)
+
+    monkeypatch.setattr(TrainingModule, "configure_gradient_clipping", clipping)
+    contained = []
+    monkeypatch.setattr(callbacks, "Contained", lambda *args: contained.append(args))
+    cfg = tiny(tiny_data, tmp_path, "name=paper", "recipe=paper", "graph.history=1")
+    fit(cfg)
+    assert clips == [None, None] and not contained
+    saved = checkpoint(cfg)
+    assert "averaging_state" not in saved
+    assert saved["lr_schedulers"][0]["base_lrs"] == [5e-5]
+    assert saved["lr_schedulers"][0]["_last_lr"] == pytest.approx([1e-6])
+    written = json.loads((tmp_path / "paper" / "config.json").read_text())
+    assert written["training"]["position_noise_of_domain"] == 5e-4 and written["training"]["gradient_clip"] is None
+
+
+def test_a_noise_of_metres_is_refused_before_data_are_generated(tmp_path: Path) -> None:
+    cfg = tiny(tmp_path / "data", tmp_path, "recipe=paper", "training.position_noise_of_domain=0.3")
+    with pytest.raises(
+        NoiseError,
+        match=r"^training.position_noise_of_domain=0.3 moves nodes by 0.3 m, which is 14.4 spacings .* at most 0.0104167$",
+    ):
+        fit(cfg)
+    assert not (tmp_path / "data").exists()
 
 
 @pytest.mark.slow

@@ -103,7 +103,7 @@ def test_optuna_searches_with_any_launcher(tiny_data: Path, tmp_path: Path) -> N
     assert result.returncode == 0, result.stdout + result.stderr
     assert "best of 3 trials" in result.stdout
     best = json.loads((tmp_path / "search" / "best.json").read_text())
-    assert set(best["values"]) == {"training.learning_rate", "training.noise_std"}
+    assert set(best["values"]) == {"training.learning_rate", "training.velocity_noise_of_change"}
     assert len(finished(tmp_path)) == 3
     assert (tmp_path / "search" / "table.md").exists()
     again = subprocess.run(command, capture_output=True, text=True, timeout=500)

@@ -124,6 +124,7 @@ def complaint(name: str, *overrides: str) -> str:
     ("name", "override", "words"),
     [
         ("fit", "trianing.num_steps=5", ["trianing.num_steps: unknown key 'trianing'; valid keys: ", "training", "experiment"]),
+        ("fit", "training.noise_std=0.3", ["unknown key 'noise_std'; valid keys of training: ", "velocity_noise_of_change"]),
         ("fit", "training.num_stpes=5", ["training.num_stpes: unknown key 'num_stpes'; valid keys of training: ", "num_steps"]),
         ("fit", "model.interation=odd", ["unknown key 'interation'; valid keys of model: ", "interaction"]),
         ("fit", "data.scene.num_partcles=3", ["unknown key 'num_partcles'; valid keys of data.scene: ", "num_particles"]),
@@ -132,6 +133,7 @@ def complaint(name: str, *overrides: str) -> str:
         ("fit", "experimnt=sand", ["unknown key 'experimnt'; valid keys: ", " experiment,"]),
         ("fit", "modle=gpe", ["unknown key 'modle'; valid keys: ", " model,"]),
         ("fit", "model=gep", ["'model/gep'", "gpe"]),
+        ("fit", "recipe=papr", ["'recipe/papr'", "paper"]),
         ("fit", "experiment=snad", ["'experiment/snad'", "ablation_momentum", "sand"]),
         ("fit", "size=tyni", ["'size/tyni'", "paper small tiny"]),
         ("fit", "~training.num_stpes", ["training.num_stpes"]),
@@ -175,11 +177,13 @@ def test_a_misspelling_beside_a_sweep_gets_the_valid_ones() -> None:
     [
         ("training.num_steps=0", "training.num_steps=0: input should be greater than or equal to 1"),
         ("training.num_steps=", "training.num_steps='': input should be a valid integer"),
-        ("training.noise=papr", "training.noise='papr': input should be 'paper' or 'velocity'"),
+        ("training.sampling=unform", "training.sampling='unform': input should be 'uniform' or 'activity'"),
         ("training.learning_rate=inf", "training.learning_rate=inf: input should be a finite number"),
         ("model.interaction=ood", "model.interaction='ood': input should be 'directed', 'negated', 'odd' or 'odd_even'"),
         ("model.hidden_channels=-1", "model.hidden_channels=-1: input should be greater"),
         ("+model.foo=1", "model.foo: unknown key; valid keys: interaction"),
+        ("training.velocity_noise_of_change=-1", "training.velocity_noise_of_change=-1: input should be greater"),
+        ("training.gradient_clip=0", "training.gradient_clip=0: input should be greater"),
         ("+training.foo=1", "training.foo: unknown key; valid keys: num_steps"),
         ("graph.history=0", "graph.history=0: input should be greater"),
         ("training.val_interval=7", "training: val_interval=7 must divide num_steps="),
@@ -360,9 +364,10 @@ def test_commands_fail_in_one_line(tmp_path: Path, command: str, arguments: list
 
 
 def test_a_table_by_model_has_a_default() -> None:
-    table = ["data=mixed", "+comparison=equal_steps", "data.comparison.noise_std.default=0.5", "++data.comparison.noise_std.GNS=2.0"]
-    assert compose("fit", *table).training.noise_std == 0.5
-    assert compose("fit", *table, "model=gns").training.noise_std == 2.0
+    table = ["data=mixed", "+comparison=equal_steps", "data.comparison.velocity_noise_of_change.default=0.5"]
+    table += ["++data.comparison.velocity_noise_of_change.GNS=2.0"]
+    assert compose("fit", *table).training.velocity_noise_of_change == 0.5
+    assert compose("fit", *table, "model=gns").training.velocity_noise_of_change == 2.0
 
 
 def test_a_path_with_an_equals_sign_is_taken_as_typed(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ ERRORS = {  # of two seeds, by domain, model and noise
 
 def write_run(folder: Path, domain: str, model: str, noise: float, seed: int, errors: list[float]) -> None:
     folder.mkdir(parents=True)
-    training = {"noise_std": noise, "num_steps": 1000 + int(noise), "val_interval": 10 + int(noise)}
+    training = {"velocity_noise_of_change": noise, "num_steps": 1000 + int(noise), "val_interval": 10 + int(noise)}
     config = {"seed": seed, "data": {"name": domain}, "model": {"_target_": f"gpe_pl.models.x.{model}"}, "training": training}
     (folder / "config.json").write_text(json.dumps(config))
     rows = [Row(LEARNED, "val", k, "seen", 20.0, "rollout_mse", "full", value) for k, value in enumerate(errors)]
@@ -39,7 +39,7 @@ def trials(tmp_path: Path) -> Path:
 def test_the_best_setting_of_each_model_is_bold(trials: Path) -> None:
     report_trials(trials)
     rows = [[c.strip() for c in line.strip("|").split("|")] for line in (trials / "trials.md").read_text().splitlines() if "|" in line]
-    assert rows[0] == ["domain", "model", "noise_std", "seeds", "one-step nMSE", "val"]
+    assert rows[0] == ["domain", "model", "velocity_noise_of_change", "seeds", "one-step nMSE", "val"]
     assert rows[2:] == [
         ["sand", "GNS", "0.3", "1", "–", "1 of 2 failed"],
         ["sand", "GNS", "1.0", "1", "–", "**7** [7, 7]"],
@@ -54,7 +54,7 @@ def test_the_csv_has_a_line_per_run_and_split(trials: Path) -> None:
         lines = list(csv.DictReader(handle))
     assert len(lines) == 5
     failed = next(line for line in lines if line["num_failed"] == "1")
-    assert (failed["model"], failed["noise_std"], failed["rollout_mse"]) == ("GNS", "0.3", "inf")
+    assert (failed["model"], failed["velocity_noise_of_change"], failed["rollout_mse"]) == ("GNS", "0.3", "inf")
 
 
 def test_seeds_and_steps_are_not_settings(tmp_path: Path) -> None:
@@ -92,4 +92,4 @@ def test_a_table_of_models_does_not_outlive_a_comparison_of_settings(tmp_path: P
     write_run(tmp_path / "trial", "sand", "GPE", 1.0, 0, [1e-3])
     report_trials(tmp_path)
     assert not (tmp_path / "table1.md").exists()
-    assert "compares settings now (training.noise_std)" in caplog.text
+    assert "compares settings now (training.velocity_noise_of_change)" in caplog.text

@@ -38,9 +38,7 @@ def root(store: Path) -> Path:
 
 
 def datamodule(root: Path, step: int = 0, **settings: Any) -> TrajectoryDataModule:
-    module = TrajectoryDataModule(
-        root, GraphConfig(history=2), Noise("velocity", 0.5), **{"batch_size": BatchSize(2), "seed": 1, **settings}
-    )
+    module = TrajectoryDataModule(root, GraphConfig(history=2), Noise(0.0, 0.5), **{"batch_size": BatchSize(2), "seed": 1, **settings})
     module.trainer = SimpleNamespace(global_step=step)  # type: ignore[assignment]
     return module
 
@@ -125,7 +123,7 @@ def test_statistics_are_those_of_noisy_inputs(root: Path) -> None:
     assert len(sample) == 4
     assert [int(s.frame) for s in sample] == [module.train_set.locate(k)[1] for k in (0, 2, 3, 5)]
     assert module.train_set.velocity_unit == pytest.approx(50.0 * module.metadata.frame_dt)
-    clean = TrajectoryDataModule(root, GraphConfig(history=2), Noise("velocity", 0.0), BatchSize(2))
+    clean = TrajectoryDataModule(root, GraphConfig(history=2), Noise(0.0, 0.0), BatchSize(2))
     assert not torch.equal(sample[0]["sand"].x, next(clean.statistics_sample(4))["sand"].x)
 
 

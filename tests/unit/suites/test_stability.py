@@ -234,16 +234,16 @@ def test_runs_of_one_model_are_told_apart_by_their_training(spec: DatasetSpec, s
 
     plain, tuned = subject(spec, scenes), subject(spec, scenes, **SHIPPED)
     runs = [
-        made("a", plain, noise_std=0.3),
-        made("bb", tuned, noise_std=0.3),
-        made("ccc", tuned, noise_std=0.0),
-        made("dddd", tuned, noise_std=0.0),
+        made("a", plain, velocity_noise_of_change=0.3),
+        made("bb", tuned, velocity_noise_of_change=0.3),
+        made("ccc", tuned, velocity_noise_of_change=0.0),
+        made("dddd", tuned, velocity_noise_of_change=0.0),
     ]
     found = trained_on(spec, runs)
     assert {label: run.folder.name for label, (_, run) in found.items()} == {
         "GPE 2 × 8": "a",
-        "GPE 2 × 8 geometry angular, noise_std=0.3": "bb",
-        "GPE 2 × 8 geometry angular, noise_std=0.0": "ccc",
+        "GPE 2 × 8 geometry angular, velocity_noise_of_change=0.3": "bb",
+        "GPE 2 × 8 geometry angular, velocity_noise_of_change=0.0": "ccc",
     }
 
 

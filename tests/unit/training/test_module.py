@@ -208,6 +208,16 @@ def test_the_decay_warms_up(decay: float) -> None:
     assert expected == 29 if decay == 0 else 1 < expected < 29
 
 
+@pytest.mark.parametrize(("clip", "norm"), [(None, 5.0), (2.0, 2.0)])
+def test_gradients_are_clipped_only_if_that_is_wanted(clip: float | None, norm: float) -> None:
+    m = module()
+    first = next(p for p in m.simulator.parameters() if p.requires_grad)
+    first.grad = torch.zeros_like(first)
+    first.grad.view(-1)[:2] = torch.tensor([3.0, 4.0])
+    m.configure_gradient_clipping(torch.optim.Adam(m.parameters()), clip)
+    assert float(first.grad.norm()) == pytest.approx(norm)
+
+
 def test_a_gradient_that_is_not_finite_is_dropped(caplog: pytest.LogCaptureFixture) -> None:
     """An infinite slope at a finite loss: the weights must not see it."""
     m = module()

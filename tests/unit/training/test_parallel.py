@@ -157,7 +157,7 @@ class Recorded(TrainingModule):
 def trained(root: Path, run: Path, rank: int, num_ranks: int, size: BatchSize, num_steps: int = 20, late: bool = False) -> dict[str, Any]:
     """Weights, and what each step of this rank was given."""
     kind: Sampling = "activity" if late else "uniform"
-    data = TrajectoryDataModule(root, GraphConfig(history=2), Noise("velocity", 0.1), size, seed=1, sampling=kind)
+    data = TrajectoryDataModule(root, GraphConfig(history=2), Noise(0.0, 0.1), size, seed=1, sampling=kind)
     torch.manual_seed(5 + rank)  # ranks start from the weights of the first
     simulator = LearnedSimulator(GPE(data.builder.spec, num_message_passing_steps=2, hidden_channels=8), data.builder)
     simulator.fit_statistics(data.statistics_sample(), data.parameter_ranges())
@@ -282,7 +282,7 @@ def test_numbers_that_go_bad_on_one_rank_are_skipped_on_all_and_stop_all(mixed: 
 )
 def test_batches_too_small_for_all_ranks_are_refused(mixed: Path, tmp_path: Path, size: BatchSize, message: str) -> None:
     def on_rank(_: int) -> None:
-        data = TrajectoryDataModule(mixed, GraphConfig(history=2), Noise("velocity", 0.1), size, seed=1)
+        data = TrajectoryDataModule(mixed, GraphConfig(history=2), Noise(0.0, 0.1), size, seed=1)
         data.trainer = SimpleNamespace(global_step=0)  # type: ignore[assignment]
         with pytest.raises(StoreError, match=message):
             data.train_dataloader()

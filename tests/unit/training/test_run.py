@@ -44,7 +44,7 @@ def test_the_same_configuration_is_the_same_run(tmp_path: Path, config: dict[str
 def test_what_data_and_sizes_offer_is_no_part_of_a_run(tmp_path: Path) -> None:
     """Older runs wrote it down; new settings there must not make other runs of them."""
     offered = {
-        "data": {"name": "sand", "comparison": {"noise_std": 1.0}, "larger": {"scene": {"max_bodies": 6}}},
+        "data": {"name": "sand", "comparison": {"velocity_noise_of_change": 1.0}, "larger": {"scene": {"max_bodies": 6}}},
         "size": {"name": "tiny", "comparison": {"budget_minutes": 1.0, "seeds": "0,1"}},
     }
     now = without_tables({**CONFIG, **offered})
