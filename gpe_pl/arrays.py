@@ -102,7 +102,7 @@ def checked_bounds(bounds: Any, periodic: tuple[bool, ...], pos: np.ndarray, bou
         if len(boundary_pos):
             points += [boundary_pos.min(axis=0), boundary_pos.max(axis=0)]
         low, high = np.min(points, axis=0).astype(np.float64), np.max(points, axis=0).astype(np.float64)
-        thin = np.where(high > low, 0.0, 0.5 * max(float(np.max(high - low)), 1.0))  # a row of nodes has no height
+        thin = np.where(high > low, 0.0, 0.5 * (float(np.max(high - low)) or 1.0))  # a row of nodes has no height
         return tuple(zip((low - thin).tolist(), (high + thin).tolist(), strict=True))
     array = numbers("bounds", bounds, {"axis": dim, "low and high": 2}).astype(np.float64)
     checked = tuple((float(low), float(high)) for low, high in array)

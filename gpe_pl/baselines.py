@@ -5,11 +5,9 @@ from dataclasses import dataclass, replace
 from array_api_compat import array_namespace
 
 from gpe_pl import integrators
-from gpe_pl.geometry import signed_distance
+from gpe_pl.geometry import signed_distance, surface_tolerance
 from gpe_pl.trajectory import Array, State
 
-TOUCH = 1e-6
-"""Distance [m] below which a node at rest counts as touching a boundary."""
 NUM_BISECTIONS = 30
 
 
@@ -29,30 +27,49 @@ class ConstantVelocity:
 
 
 @dataclass(frozen=True)
+class StopsAtWalls:
+    """Every node keeps its velocity until it touches a wall or obstacle, where it sticks. Needs no gravity, so it is right where that is not known."""
+
+    dt: float
+
+    def step(self, state: State) -> State:
+        return _sticking(state, self.dt, 0.0 * state.gravity)
+
+
+@dataclass(frozen=True)
 class Ballistic:
     """Free fall until a node touches a wall or obstacle, where it sticks."""
 
     dt: float
 
     def step(self, state: State) -> State:
-        xp = array_namespace(state.pos)
-        shapes = state.boundary.shapes
-        pos, vel = integrators.advance(state.pos, state.vel, state.gravity, self.dt)
-        stuck = xp.all(state.vel == 0, axis=-1) & (signed_distance(shapes, state.pos) < TOUCH)
-        hit = (signed_distance(shapes, pos) <= 0) & ~stuck
-        if bool(xp.any(hit)):
-            pos = xp.where(hit[:, None], self._touchdown(state, pos), pos)
-        pos = xp.where(stuck[:, None], state.pos, pos)
-        vel = xp.where((hit | stuck)[:, None], xp.zeros_like(vel), vel)
-        return _later(state, self.dt, state.periodicity.wrapped(pos), vel)
+        return _sticking(state, self.dt, state.gravity)
 
-    @staticmethod
-    def _touchdown(state: State, end: Array) -> Array:
-        """The last free points on the straight paths from the state's positions to ``end``, by bisection."""
-        xp = array_namespace(end)
-        free, inside = state.pos, end
-        for _ in range(NUM_BISECTIONS):
-            middle = (free + inside) / 2
-            is_free = (signed_distance(state.boundary.shapes, middle) >= 0)[:, None]
-            free, inside = xp.where(is_free, middle, free), xp.where(is_free, inside, middle)
-        return free
+
+BASELINES = {"ballistic": Ballistic, "stops_at_walls": StopsAtWalls, "constant_velocity": ConstantVelocity}
+"""What evaluations compare a model with, by the name in their tables; each takes the frame interval [s]."""
+
+
+def _sticking(state: State, dt: float, acceleration: Array) -> State:
+    """The state after a step with a constant acceleration [dim]; what touches a wall or obstacle on the way stays there."""
+    xp = array_namespace(state.pos)
+    shapes = state.boundary.shapes
+    pos, vel = integrators.advance(state.pos, state.vel, acceleration, dt)
+    stuck = xp.all(state.vel == 0, axis=-1) & (signed_distance(shapes, state.pos) < surface_tolerance(shapes))
+    hit = (signed_distance(shapes, pos) <= 0) & ~stuck
+    if bool(xp.any(hit)):
+        pos = xp.where(hit[:, None], _touchdown(state, pos), pos)
+    pos = xp.where(stuck[:, None], state.pos, pos)
+    vel = xp.where((hit | stuck)[:, None], xp.zeros_like(vel), vel)
+    return _later(state, dt, state.periodicity.wrapped(pos), vel)
+
+
+def _touchdown(state: State, end: Array) -> Array:
+    """The last free points on the straight paths from the state's positions to ``end``, by bisection."""
+    xp = array_namespace(end)
+    free, inside = state.pos, end
+    for _ in range(NUM_BISECTIONS):
+        middle = (free + inside) / 2
+        is_free = (signed_distance(state.boundary.shapes, middle) >= 0)[:, None]
+        free, inside = xp.where(is_free, middle, free), xp.where(is_free, inside, middle)
+    return free

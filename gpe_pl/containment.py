@@ -6,16 +6,13 @@ from dataclasses import dataclass, replace
 
 from array_api_compat import array_namespace
 
-from gpe_pl.geometry import outward_normal, signed_distance
+from gpe_pl.geometry import outward_normal, signed_distance, surface_tolerance
 from gpe_pl.rollout import SimulationError, Simulator, step_all
 from gpe_pl.trajectory import Array, State
 
-TOLERANCE = 1e-6
-"""Penetration [m] below which a particle counts as being on the surface."""
-
 
 def contain(state: State, dt: float) -> tuple[State, Array]:
-    """Move penetrating nodes along the surface normal back to the surface of the boundary's shapes.
+    """Move nodes deeper than ``geometry.surface_tolerance`` along the surface normal back to the surface of the boundary's shapes.
 
     Where surfaces meet so narrowly that this does not lead out, a node returns to where the step began.
     Velocities, and the last entry of the velocity history, change by displacement / ``dt``, so that they still are differences of positions.
@@ -30,7 +27,8 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
     shapes = state.boundary.shapes
     pos = state.pos
     xp = array_namespace(pos)
-    inside = signed_distance(shapes, pos) < -TOLERANCE
+    tolerance = surface_tolerance(shapes)
+    inside = signed_distance(shapes, pos) < -tolerance
     if not bool(xp.any(inside)):
         return state, inside
     rows = xp.nonzero(inside)[0]
@@ -40,10 +38,10 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
         for shape in shapes:
             depth = xp.clip(-shape.signed_distance(moved), 0.0, None)
             if bool(xp.any(depth > 0)):  # finding normals of shapes that nothing is in would take most of the time
-                moved = moved + depth[:, None] * outward_normal(shape, moved, step=1e-6)
+                moved = moved + depth[:, None] * outward_normal(shape, moved, step=tolerance)
         if moved is before:
             break
-    caught = signed_distance(shapes, moved) < -TOLERANCE
+    caught = signed_distance(shapes, moved) < -tolerance
     moved = xp.where(caught[:, None], pos[rows] - state.vel[rows] * dt, moved)
     new_pos, vel = xp.asarray(pos, copy=True), xp.asarray(state.vel, copy=True)
     new_pos[rows] = moved

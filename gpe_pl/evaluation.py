@@ -19,10 +19,11 @@ from pydantic import Field
 
 from gpe_pl.approximate import approximate
 from gpe_pl.atomic import replace_text, replacing
-from gpe_pl.baselines import Ballistic, ConstantVelocity
-from gpe_pl.containment import TOLERANCE, Contained
+from gpe_pl.baselines import BASELINES
+from gpe_pl.containment import Contained
 from gpe_pl.data.dataset import WindowDataset, long_enough, open_split, usable
 from gpe_pl.errors import GpeError
+from gpe_pl.geometry import surface_tolerance
 from gpe_pl.graphs.batching import batched
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
@@ -38,7 +39,7 @@ EXACT = "learned, exact"
 """The same model without the approximate levels of ``Skips``, where a rollout has some."""
 Export = Literal["vtk", "npz", "mp4", "model"]
 MAX_SPEED_FACTOR = 20.0
-"""A learned rollout faster than this many times the fastest particle of the ground truth has exploded."""
+"""A learned rollout has exploded when it is so many times faster than the fastest particle of the ground truth and than what crosses the domain in its time."""
 ONE_STEP_WINDOWS = 256
 VIEWER_BYTES = 2**26
 """A viewer's arrays before compression; longer rollouts show every so many frames."""
@@ -190,12 +191,12 @@ def _predict(
         dt, steps, spacing = truth.metadata.frame_dt, truth.num_frames - 1, truth.metadata.spacing
         prediction = predicted[scene]
         predictions = {label: prediction} if exact is None else {label: prediction, EXACT: exact[scene]}
-        for name, baseline in (("ballistic", Ballistic(dt)), ("constant_velocity", ConstantVelocity(dt))):
-            predictions[name] = rollout(baseline, trajectory.state(start_frame, start_frame), steps, truth.metadata)
+        for name, baseline in BASELINES.items():
+            predictions[name] = rollout(baseline(dt), trajectory.state(start_frame, start_frame), steps, truth.metadata)
         num_steps = truth.num_nodes * max(1, prediction.num_frames - 1)
         extra = {"num_good_frames": float(prediction.num_frames - 1)}
         if truth.boundary.shapes:  # nodes alone have no inside
-            extra["share_outside_at_end"] = _share_outside(prediction, steps, steps, tolerance=TOLERANCE)
+            extra["share_outside_at_end"] = _share_outside(prediction, steps, steps, tolerance=surface_tolerance(truth.boundary.shapes))
             extra["share_corrected"] = totals[scene]["num_corrected"] / num_steps
             if scene < len(free):
                 extra["share_outside_uncontained"] = _share_outside(free[scene], 1, steps, tolerance=1e-3 * spacing)
@@ -217,8 +218,9 @@ def _start(simulator: LearnedSimulator, start_frame: int, trajectory: Trajectory
     """Where a rollout begins, and limits far beyond what the ground truth does."""
     bounds = truth.metadata.bounds
     size = max(high - low for low, high in bounds)
+    across = size / (trajectory.num_frames * truth.metadata.frame_dt)  # where everything rests
     speed = float(np.linalg.norm(trajectory.vel, axis=-1).max(initial=0.0))
-    guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, size), bounds=bounds, margin=size, spacing=truth.metadata.spacing)
+    guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, across), bounds=bounds, margin=size, spacing=truth.metadata.spacing)
     return Start(simulator.initial_state(trajectory, start_frame), truth.num_frames - 1, truth.metadata, guard)
 
 

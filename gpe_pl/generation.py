@@ -36,6 +36,7 @@ from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.data.motion import ROUNDING_SHARE, motion_of, rounding_fault, rounding_of
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, is_intact, shard_moments, with_checksum
 from gpe_pl.errors import GpeError
+from gpe_pl.geometry import ON_SURFACE
 from gpe_pl.names import DataName
 from gpe_pl.progress import Progress
 from gpe_pl.rollout import Guard, SimulationError, Simulator, rollout
@@ -255,7 +256,7 @@ def generate_trajectory(
     metadata = trajectory_metadata(spec, split, index)
     label = f"split {split}, index {index}, seed {metadata.seed}"
     state = initial_state(spec, split, index, values)
-    guard = Guard(bounds=spec.scene.bounds, margin=1e-6)
+    guard = Guard(bounds=spec.scene.bounds, margin=ON_SURFACE * max(high - low for low, high in spec.scene.bounds))
     trajectory = rollout(spec.solver, state, (num_frames or spec.num_frames) - 1, metadata, guard)
     if trajectory.termination is not None:
         stop = trajectory.termination

@@ -21,6 +21,10 @@ from array_api_compat import array_namespace, device
 Array = Any
 
 
+ON_SURFACE = 1e-6
+"""Fraction of the extent of a boundary within which a point lies on its surface: some ten roundings of a position in single precision."""
+
+
 @runtime_checkable
 class Shape(Protocol):
     """A rigid boundary with its boundary condition."""
@@ -33,6 +37,11 @@ class Shape(Protocol):
     @property
     def restitution(self) -> float: ...
 
+    @property
+    def extent(self) -> float:
+        """Largest side of the box around it [m]."""
+        ...
+
     def signed_distance(self, points: Array) -> Array: ...
 
     def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]: ...
@@ -41,6 +50,10 @@ class Shape(Protocol):
 def _like(values: Sequence[float] | np.ndarray, points: Array) -> Array:
     """``values`` with the backend, precision and device of ``points``."""
     return array_namespace(points).asarray(values, dtype=points.dtype, device=device(points))
+
+
+def _largest_side(low: Sequence[float], high: Sequence[float]) -> float:
+    return max(b - a for a, b in zip(low, high, strict=True))
 
 
 def _norm(x: Array) -> Array:
@@ -92,6 +105,10 @@ class Wall:
     restitution: float = 0.0
     kind: ClassVar[str] = "wall"
 
+    @property
+    def extent(self) -> float:
+        return _largest_side(self.low, self.high)
+
     def signed_distance(self, points: Array) -> Array:
         axis = int(np.argmax(np.abs(self.normal)))
         return points[..., axis] * self.normal[axis] - self.offset
@@ -116,6 +133,10 @@ class Sphere:
     restitution: float = 0.0
     kind: ClassVar[str] = "sphere"
 
+    @property
+    def extent(self) -> float:
+        return 2.0 * self.radius
+
     def signed_distance(self, points: Array) -> Array:
         return _norm(points - _like(self.center, points)) - self.radius
 
@@ -134,6 +155,10 @@ class Bowl:
     restitution: float = 0.0
     kind: ClassVar[str] = "bowl"
 
+    @property
+    def extent(self) -> float:
+        return 2.0 * self.radius
+
     def signed_distance(self, points: Array) -> Array:
         return self.radius - _norm(points - _like(self.center, points))
 
@@ -151,6 +176,10 @@ class Box:
     friction: float
     restitution: float = 0.0
     kind: ClassVar[str] = "box"
+
+    @property
+    def extent(self) -> float:
+        return _largest_side(self.low, self.high)
 
     def signed_distance(self, points: Array) -> Array:
         xp = array_namespace(points)
@@ -229,6 +258,11 @@ class Polygon:
         x, y = v[:, 0], v[:, 1]
         if np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) <= 0:
             raise ValueError(f"polygon vertices must run counter-clockwise and enclose an area, got {self.vertices}")
+
+    @property
+    def extent(self) -> float:
+        x, y = zip(*self.vertices, strict=True)
+        return _largest_side((min(x), min(y)), (max(x), max(y)))
 
     def signed_distance(self, points: Array) -> Array:
         xp = array_namespace(points)
@@ -318,6 +352,10 @@ class DistanceGrid:
     def values(self) -> np.ndarray:
         """Signed distances at the nodes [m], read-only float32 of shape ``counts``."""
         return self._values  # type: ignore[attr-defined, no-any-return]
+
+    @property
+    def extent(self) -> float:
+        return self.spacing * (max(self.counts) - 1)
 
     def signed_distance(self, points: Array) -> Array:
         return self._interpolate(points)[0]
@@ -455,6 +493,11 @@ def signed_distance(shapes: tuple[Shape, ...], points: Array) -> Array:
     for shape in shapes:
         distance = xp.minimum(distance, shape.signed_distance(points))
     return distance
+
+
+def surface_tolerance(shapes: tuple[Shape, ...]) -> float:
+    """Distance [m] below which a point counts as being on a surface: ``ON_SURFACE`` of the largest shape's extent, so that it is the same in any unit."""
+    return ON_SURFACE * max((shape.extent for shape in shapes), default=0.0)
 
 
 def thickness(shape: Shape) -> float:

@@ -205,7 +205,8 @@ class LearnedSimulator(nn.Module):
         self.acceleration_std.copy_(rms)
         stress = [g[m].stress_target for g in graphs for m in self.builder.spec.stress_channels if "stress_target" in g[m]]
         if stress:
-            self.stress_std.copy_(torch.cat(stress).double().square().mean().sqrt().clamp(min=1.0))
+            rms = torch.cat(stress).double().square().mean().sqrt()
+            self.stress_std.copy_(torch.where(rms > 0, rms, 1.0))
         if parameter_ranges is None:
             params = {m: torch.cat([g[m].material_params for g in graphs]) for m, _ in self.trained_ranges()}
             parameter_ranges = {m: torch.stack([p.amin(dim=0), p.amax(dim=0)]) for m, p in params.items() if len(p)}

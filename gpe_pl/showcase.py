@@ -19,8 +19,8 @@ from pydantic import Field
 
 from gpe_pl.approximate import approximate
 from gpe_pl.atomic import replace_text
-from gpe_pl.containment import TOLERANCE, Contained
-from gpe_pl.geometry import signed_distance
+from gpe_pl.containment import Contained
+from gpe_pl.geometry import signed_distance, surface_tolerance
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.machine import environment, peak_resident
 from gpe_pl.rollout import Guard, Simulator, Start, frames, unsound
@@ -170,7 +170,7 @@ class _Tally:
             "peak_memory": (peak_resident(), "B"),
             "share_corrected": (self.num_corrected / particle_steps, "1"),
             "share_too_fast": (self.num_too_fast / particle_steps, "1"),
-            "share_outside_at_end": (_share_deeper(self.end, TOLERANCE), "1"),
+            "share_outside_at_end": (_share_deeper(self.end, surface_tolerance(self.end.boundary.shapes)), "1"),
             "max_speed": (self.top_speed, "m/s"),
         }
         return [Record(metric, float(value), unit) for metric, (value, unit) in found.items()]

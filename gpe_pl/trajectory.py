@@ -25,7 +25,7 @@ from gpe_pl.arrays import (
     typical_spacing,
     velocities_of,
 )
-from gpe_pl.geometry import Shape, moved
+from gpe_pl.geometry import Shape, moved, surface_tolerance
 from gpe_pl.periodicity import NOWHERE, Periodicity, PeriodicityError
 from gpe_pl.rigid_parts import carried_along
 from gpe_pl.schema import BOUNDARY, MATERIALS, STICKY, node_code, param_names
@@ -83,11 +83,12 @@ class Boundary:
     def sample(cls, shapes: tuple[Shape, ...], spacing: float, dim: int) -> Boundary:
         """Sample shapes into nodes at most ``spacing`` [m] apart; nodes that lie inside another shape are left out."""
         pos, normal, friction, restitution = [np.empty((0, dim))], [np.empty((0, dim))], [np.empty(0)], [np.empty(0)]
+        rounding = 1e-3 * surface_tolerance(shapes)
         for shape in shapes:
             p, n = shape.sample(spacing)
             for other in shapes:
                 if other is not shape:
-                    keep = other.signed_distance(p) > -1e-9 * max(1.0, spacing)
+                    keep = other.signed_distance(p) > -rounding
                     p, n = p[keep], n[keep]
             pos.append(p)
             normal.append(n)

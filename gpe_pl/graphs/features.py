@@ -35,6 +35,7 @@ GAP_SCALE = 0.2
 GAP_LIMIT = 6.0
 """… and clipped here, so that the channel resolves contact and saturates beyond it."""
 TINY = 1e-12
+"""Length of an edge between coincident nodes, in rest spacings or widths of a level."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +168,7 @@ def edge_features(
     relative = displacement / scales.radius
     if features == "paper":
         return relative, displacement.new_empty((displacement.shape[0], 0))
-    distance = (displacement.square().sum(dim=1, keepdim=True) + TINY**2).sqrt()
+    distance = (displacement.square().sum(dim=1, keepdim=True) + (TINY * scales.spacing) ** 2).sqrt()
     unit = displacement / distance  # zero for coincident nodes
     velocity = relative_velocity / scales.velocity
     gap = ((distance / scales.spacing - 1) / GAP_SCALE).clamp(-GAP_LIMIT, GAP_LIMIT)

@@ -21,7 +21,7 @@ import torch
 from pydantic import Field
 
 from gpe_pl.approximate import approximate
-from gpe_pl.baselines import Ballistic, ConstantVelocity
+from gpe_pl.baselines import BASELINES
 from gpe_pl.containment import Contained
 from gpe_pl.errors import GpeError
 from gpe_pl.finished_runs import Run
@@ -222,9 +222,9 @@ def _simulators(
     for label, (simulator, _) in models.items():
         at = _Restricted(Resolved(simulator.initial_state(data, history), lambda pos: pos), False)
         yield label, "learned", Contained(approximate(simulator), dt), at
-    for name, baseline in ((BALLISTIC, Ballistic(dt)), ("constant velocity", ConstantVelocity(dt))):
+    for name, baseline in BASELINES.items():
         state = data.state(history, history)
-        yield name, "trivial", baseline, _Restricted(Resolved(state, lambda pos: pos), False)
+        yield name.replace("_", " "), "trivial", baseline(dt), _Restricted(Resolved(state, lambda pos: pos), False)
 
 
 def _solver(spec: DatasetSpec, factor: float) -> Any | None:

@@ -69,7 +69,7 @@ class RolloutValidation(Callback):
         for trajectory, truth in zip(trajectories, truths, strict=True):
             bounds = truth.metadata.bounds
             size = max(high - low for low, high in bounds)
-            guard = Guard(bounds=bounds, margin=size, max_speed=1e3)
+            guard = Guard(bounds=bounds, margin=size)  # what is so fast that it matters escapes within a frame
             starts.append(Start(simulator.initial_state(trajectory, history), truth.num_frames - 1, truth.metadata, guard))
             worst.append(size**2)  # a rollout that stopped early counts as lost from there on
         contained = Contained(simulator, self.trajectories[0].metadata.frame_dt) if self.containment else simulator

@@ -118,7 +118,7 @@ def test_a_shipped_model_is_named(tiny_data: Path, tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "shipped")
     LearnedSimulator.from_checkpoint(tmp_path / "fit" / "checkpoints" / "best.ckpt").save(tmp_path / "shipped" / "sand.ckpt")
     rows = evaluate(tiny_data, tmp_path, "sand", "evaluation.num_pictures=0")
-    assert {r.model for r in rows} == {"learned", "ballistic", "constant_velocity"}
+    assert {r.model for r in rows} == {"learned", "ballistic", "stops_at_walls", "constant_velocity"}
     with pytest.raises(ConfigError, match=r"checkpoint=None: name the folder of a run.*, or a shipped model: sand"):
         evaluate(tiny_data, tmp_path, "null")
 
@@ -221,7 +221,7 @@ def test_the_canyon_is_compared_with_the_solver_and_shown(tmp_path: Path, capsys
     show = [f"data.showcase.{key}" for key in ("num_steps=2", "scene.num_particles=50", "scene.bounds=[[0,3],[0,1.5],[0,1.5]]")]
     smaller = ["data.sizes.tiny.d3.num_particles=50", "data.showcase.scene.reservoir=null", "evaluation.num_pictures=0", *show]
     rows = evaluate(tmp_path, tmp_path, tmp_path / "water.ckpt", "data=fluid", "scene=canyon", *smaller)
-    assert {r.model for r in rows} == {"learned", "ballistic", "constant_velocity"}
+    assert {r.model for r in rows} == {"learned", "ballistic", "stops_at_walls", "constant_velocity"}
     assert (tmp_path / "evaluation_test_unseen" / "showcase.json").exists()
     printed = capsys.readouterr().out
     assert re.search(r"rollout_mse +learned", printed) and "showcase  share_corrected" in printed

@@ -370,7 +370,7 @@ def test_metrics_hold_the_model_and_the_baselines(tiny_data: Path, tmp_path: Pat
     rows = list(read_rows(tmp_path / "fit" / "metrics.csv"))
     for split, groups in (("test", {"seen"}), ("test_unseen", {"interpolated", "extrapolated"})):
         mse = [r for r in rows if r.split == split and r.metric == "rollout_mse"]
-        assert {r.model for r in mse} == {"learned", "ballistic", "constant_velocity"}
+        assert {r.model for r in mse} == {"learned", "ballistic", "stops_at_walls", "constant_velocity"}
         assert {r.horizon for r in mse} == {"5", "full"}
         assert {r.parameter_group for r in mse} == groups
         assert all(np.isfinite(r.value) and r.value >= 0 and np.isfinite(r.parameter) for r in mse)
@@ -511,5 +511,5 @@ def test_a_sweep_ends_with_table_and_plot(tiny_data: Path, tmp_path: Path) -> No
     val = {(r["interaction"], r["seed"]): float(r["value"]) for r in rows if r["split"] == "val"}
     assert val["negated", "0"] == validation_curve(folder / "model.interaction=negated" / "seed=0")[1][-1]
     table = (folder / "table.md").read_text()
-    assert all(f"| {name} |" in table for name in ("negated", "odd", "ballistic", "constant_velocity"))
+    assert all(f"| {name} |" in table for name in ("negated", "odd", "ballistic", "stops_at_walls", "constant_velocity"))
     assert (folder / "validation_loss.png").stat().st_size > 1000

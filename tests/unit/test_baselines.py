@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gpe_pl.baselines import Ballistic, ConstantVelocity
+from gpe_pl.baselines import Ballistic, ConstantVelocity, StopsAtWalls
 from gpe_pl.geometry import Box, Polygon, Shape, Sphere, domain_walls, signed_distance
 from gpe_pl.rollout import rollout
 from gpe_pl.trajectory import Boundary, State
@@ -22,9 +22,9 @@ OBSTACLES: tuple[Shape, ...] = (
 )
 
 
-def state(pos: np.ndarray, vel: np.ndarray, shapes: tuple[Shape, ...] = ()) -> State:
+def state(pos: np.ndarray, vel: np.ndarray, shapes: tuple[Shape, ...] = (), spacing: float = 0.1) -> State:
     s = scenes.state(len(pos), walls=False)
-    return replace(s, pos=pos, vel=vel, velocity_history=None, boundary=Boundary.sample(shapes, 0.1, 2))
+    return replace(s, pos=pos, vel=vel, velocity_history=None, boundary=Boundary.sample(shapes, spacing, 2))
 
 
 def cloud(shapes: tuple[Shape, ...], count: int = 500) -> State:
@@ -88,6 +88,49 @@ def test_a_node_at_rest_on_a_wall_stays_there() -> None:
     start = state(np.array([[0.5, 0.0], [0.0, 0.7], [0.5, 1.0], [0.3, 0.45]]), np.zeros((4, 2)), shapes)
     result = rollout(Ballistic(DT), start, 10, scenes.metadata())
     np.testing.assert_array_equal(result.pos[-1], start.pos)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "torch"])
+def test_constant_velocity_stops_at_walls(backend: str) -> None:
+    shapes = WALLS + OBSTACLES
+    start = cloud(shapes)
+    assert start.gravity[1] == G  # which it knows nothing of
+    result = rollout(StopsAtWalls(DT), start.to_torch() if backend == "torch" else start, 120, scenes.metadata())
+    distance = signed_distance(shapes, result.pos)
+    assert distance.min() >= 0
+    at_rest = (result.vel == 0).all(axis=-1)
+    frame = np.arange(121)[:, None, None]
+    free = np.where(at_rest[:, :, None], result.pos, start.pos + frame * DT * start.vel)
+    np.testing.assert_allclose(result.pos, free, atol=1e-12)
+    assert at_rest[-1].mean() > 0.9 and distance[-1][at_rest[-1]].max() < 1e-6
+    for node, landed in enumerate(at_rest.argmax(axis=0)):
+        if at_rest[-1, node]:
+            assert (result.pos[landed:, node] == result.pos[landed, node]).all()
+
+
+def test_constant_velocity_stops_on_its_path() -> None:
+    after = StopsAtWalls(DT).step(state(np.array([[0.2, 0.03], [0.2, 0.03]]), np.array([[2.0, -4.0], [2.0, 4.0]]), WALLS))
+    np.testing.assert_allclose(after.pos, [[0.2 + 2.0 * 0.03 / 4.0, 0.0], [0.22, 0.07]], atol=1e-9)
+    np.testing.assert_array_equal(after.vel, [[0.0, 0.0], [2.0, 4.0]])
+
+
+@pytest.mark.parametrize("length", [2.0**-20, 1e-3, 1e6])
+@pytest.mark.parametrize("time", [2.0**-12, 1.0, 1e4])
+@pytest.mark.parametrize("baseline", [Ballistic, StopsAtWalls])
+def test_baselines_are_the_same_in_any_unit(baseline: type, length: float, time: float) -> None:
+    """Nodes that rest on a surface within rounding stay there, others fall, whatever the unit."""
+    shapes = (*domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.3), Sphere((0.3, 0.3), 0.15, 0.3))
+    scaled = (*domain_walls(((0.0, length), (0.0, length)), 0.3), Sphere((0.3 * length, 0.3 * length), 0.15 * length, 0.3))
+    pos = np.array([[0.2, 0.9], [0.5, 1e-8], [0.3, 0.45 + 1e-8], [0.8, 1e-4], [0.6, 0.5]])
+    vel = np.array([[0.5, -1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [9.0, 0.0]])
+    start = state(pos, vel, shapes)
+    other = replace(state(length * pos, length / time * vel, scaled, spacing=0.1 * length), gravity=start.gravity * length / time**2)
+    expected = rollout(baseline(DT), start, 30, scenes.metadata())
+    result = rollout(baseline(time * DT), other, 30, scenes.metadata())
+    np.testing.assert_allclose(result.pos / length, expected.pos, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(expected.pos[-1, 1:3], pos[1:3])
+    if baseline is Ballistic:
+        assert expected.pos[-1, 3, 1] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_ballistic_of_no_nodes() -> None:

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl.containment import TOLERANCE, Contained, contain
-from gpe_pl.geometry import Box, Polygon, Shape, Sphere, domain_walls, outward_normal, signed_distance
+from gpe_pl.containment import Contained, contain
+from gpe_pl.geometry import Box, Polygon, Shape, Sphere, domain_walls, outward_normal, signed_distance, surface_tolerance
 from gpe_pl.trajectory import Boundary, State
 from tests import scenes
 
 DT = 0.01
 WALLS = domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.3)
+TOLERANCE = surface_tolerance(WALLS)
 OBSTACLES = (
     Sphere((0.3, 0.4), 0.1, 0.3),
     Box((0.6, 0.2), (0.8, 0.35), 0.3),
@@ -27,7 +28,7 @@ WEDGES = (Sphere((0.2, 0.1), 0.1, 0.3), Sphere((0.41, 0.1), 0.11, 0.3), Box((0.6
 """Obstacles that touch a wall or each other."""
 
 
-def moved(shapes: tuple[Shape, ...], before: np.ndarray, after: np.ndarray, history: int = 0, dim: int = 2) -> State:
+def moved(shapes: tuple[Shape, ...], before: np.ndarray, after: np.ndarray, history: int = 0, dim: int = 2, spacing: float = 0.1) -> State:
     """The state after a step from one set of positions to another."""
     s = scenes.state(len(before), history=history or 1, walls=False, dim=dim)
     vel = (after - before) / DT
@@ -35,7 +36,7 @@ def moved(shapes: tuple[Shape, ...], before: np.ndarray, after: np.ndarray, hist
     if history:
         assert s.velocity_history is not None
         past = np.concatenate([s.velocity_history[:, :-1], vel[:, None]], axis=1)
-    boundary = Boundary.sample(shapes, 0.1, dim)
+    boundary = Boundary.sample(shapes, spacing, dim)
     return replace(s, pos=after, vel=vel, velocity_history=past, boundary=boundary)
 
 
@@ -131,6 +132,42 @@ class Moves:
 
     def step(self, state: State) -> Any:
         return replace(state, pos=state.pos + DT * state.vel)
+
+
+def cave(length: float) -> tuple[Shape, ...]:
+    """Walls, a disc, a box and a polygon in lengths of which the domain's is one."""
+    corners = ((0.5, 0.6), (0.8, 0.65), (0.6, 0.85))
+    return (
+        *domain_walls(((0.0, length), (0.0, length)), 0.3),
+        Sphere((0.3 * length, 0.4 * length), 0.1 * length, 0.3),
+        Box((0.6 * length, 0.2 * length), (0.8 * length, 0.35 * length), 0.3),
+        Polygon(tuple((x * length, y * length) for x, y in corners), 0.3),
+    )
+
+
+@pytest.mark.parametrize("scale", [2.0**-40, 2.0**-20, 2.0**20, 1e-6, 1e6])
+def test_containment_is_the_same_in_any_unit_of_length(scale: float) -> None:
+    before, after = steps_from_free_space(cave(1.0), 0.05, count=1000)
+    after[:3] = [[0.5, -2e-6], [0.5, -0.5e-6], [0.9, -1e-3]]
+    expected, corrected = contain(moved(cave(1.0), before, after), DT)
+    result, also = contain(moved(cave(scale), scale * before, scale * after, spacing=0.1 * scale), DT)
+    np.testing.assert_array_equal(also, corrected)
+    assert corrected[:3].tolist() == [True, False, True]
+    if np.log2(scale).is_integer():
+        np.testing.assert_array_equal(result.pos, scale * expected.pos)
+        np.testing.assert_array_equal(result.vel, scale * expected.vel)
+    else:
+        np.testing.assert_allclose(result.pos, scale * expected.pos, rtol=0, atol=1e-6 * scale)
+
+
+@pytest.mark.parametrize("scale", [2.0**-40, 1e-9, 1e6])
+def test_nodes_on_edges_of_walls_are_kept_in_any_unit_of_length(scale: float) -> None:
+    """Walls share their edges; nodes inside an obstacle go."""
+    expected = Boundary.sample(cave(1.0), 0.1, 2)
+    assert len(Boundary.sample(cave(scale), 0.1 * scale, 2).pos) == len(expected.pos)
+    house = (*domain_walls(((0.0, scale), (0.0, scale)), 0.3), Box((0.4 * scale, 0.0), (0.6 * scale, 0.2 * scale), 0.3))
+    floor = Boundary.sample(house, 0.01 * scale, 2)
+    assert signed_distance(house, floor.pos).min() > -1e-9 * scale
 
 
 def test_contained_states_know_how_many_nodes_were_corrected() -> None:

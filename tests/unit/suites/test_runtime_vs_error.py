@@ -114,7 +114,7 @@ def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
     settings = Settings({}, [], factors=[2.0], step_factors=[2], num_trajectories=1, horizons=[10])
     points, order = compare(spec, {"GPE 1 × 8": (untrained(), 60.0)}, settings)
     by_name = {p.name: p for p in points}
-    assert {DATA, "GPE 1 × 8", "ballistic", "constant velocity"} < set(by_name)
+    assert {DATA, "GPE 1 × 8", "ballistic", "stops at walls", "constant velocity"} < set(by_name)
     assert by_name[DATA].error("10") < by_name["solver, spacing × 2"].error("10") < by_name["constant velocity"].error("10")
     assert by_name[DATA].error("10") < by_name["solver, steps × 2"].error("10") < by_name["constant velocity"].error("10")
     assert all(p.cost > 0 and set(p.mse) == {"10", "full"} for p in points)

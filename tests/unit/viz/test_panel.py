@@ -18,7 +18,7 @@ class Diamond:
     """A shape that no module has heard of."""
 
     kind: ClassVar[str] = "diamond"
-    friction, restitution = 0.3, 0.0
+    friction, restitution, extent = 0.3, 0.0, 0.5
 
     def __init__(self, dim):
         self.up = np.eye(dim)[-1]
