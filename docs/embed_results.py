@@ -17,7 +17,7 @@ README = DOCS.parent / "README.md"
 BLOCK = re.compile(r"(<!-- begin (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
 FILES = (
     *("table.md", "table.csv", "metrics.csv", "config.json", "results.json"),
-    *("table1.md", "table1.csv", "table1.png", "error_by_parameter.png", "step_times.json"),
+    *("table1.md", "table1_ratios.md", "table1.csv", "table1.png", "error_by_parameter.png", "step_times.json"),
     *("trials.md", "trials.csv"),
     *("validation_loss.png", "error_curve_*.png", "rollout_test_*.png", "rollout_test_00.gif", "stress_*_00.png"),
     *("long_horizon_*.png", "perturbation_*.png", "scaling.png", "cost_error_*.png"),

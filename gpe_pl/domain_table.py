@@ -1,6 +1,8 @@
 """Table 1 of the paper from a sweep over domains, models and seeds: one table of numbers for machines, one for people, and two figures.
 
-The number judged is the rollout MSE over all frames, mean over the trajectories of a domain's unseen material parameters, median over seeds.
+The number judged is the rollout MSE over all frames, mean over the trajectories of a domain's unseen material parameters, median over seeds. A failed rollout
+counts as ballistic flight in the same scene (``finished_runs.rollout_errors``). One rule holds for all domains; a column of its own has the ratio by the other
+one, in which a failed rollout is infinitely wrong.
 """
 
 from __future__ import annotations
@@ -10,25 +12,38 @@ import logging
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from gpe_pl.atomic import replace_text, replacing
+from gpe_pl.baselines import BASELINES
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation import LEARNED
-from gpe_pl.finished_runs import Run, axes_of, distinct_runs, finished_runs, groups_of, shared_table, shared_trajectories, values_by_seed
+from gpe_pl.finished_runs import (
+    STAND_IN,
+    Run,
+    axes_of,
+    distinct_runs,
+    finished_runs,
+    groups_of,
+    rollout_errors,
+    shared_table,
+    shared_trajectories,
+    values_by_seed,
+)
 from gpe_pl.markdown import table_row
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio, median_of_means
 from gpe_pl.parameter_curves import PARAMETER_FIGURE, parameter_curves
 
 log = logging.getLogger(__name__)
 
-TABLE_CSV, TABLE_MD, FIGURE = "table1.csv", "table1.md", "table1.png"
-TABLES = (TABLE_CSV, TABLE_MD, FIGURE, PARAMETER_FIGURE)
+TABLE_CSV, TABLE_MD, RATIOS_MD, FIGURE = "table1.csv", "table1.md", "table1_ratios.md", "table1.png"
+TABLES = (TABLE_CSV, TABLE_MD, RATIOS_MD, FIGURE, PARAMETER_FIGURE)
 OWN = "GPE"
 NOT_LEARNED = 2.0
-"""A model that is not this many times better than ballistic flight has learned nothing worth comparing."""
+"""A model that is not this many times better than the best trivial baseline has learned nothing worth comparing."""
 
 PAPER = {
     "sand": {"DPINet": 5.15, "GNS": 3.80, "ContinuousConvNet": 3.51, "GPE": 2.37},
@@ -39,8 +54,14 @@ PAPER = {
 }
 """Yang et al. 2022, table 1: average MSE ×1e-3 in the paper's own units, which are not ours; only ratios compare."""
 
-INTERPOLATED, UNSEEN = "test_unseen/interpolated", "test_unseen"
-"""Judged are unseen values that lie between trained ones; of solids also those outside, as in the paper (trained on 1–4 MPa, tested on 0.5–10 MPa)."""
+JUDGED = "test_unseen"
+"""Judged are all scenes with material parameters that training did not have, between the trained values and outside, in every domain. The paper says what it
+tests on for solids alone, and does so (trained on 1–4 MPa, tested on 0.5–10 MPa)."""
+
+PAPER_COLUMN = "paper"
+
+TRIVIAL_SHOWN = ("ballistic", "stops_at_walls")
+"""Trivial baselines with a column and a line in the figure; runs of earlier versions lack the second."""
 
 SAME_IN_A_ROW = ("data.", "evaluation.data.", "evaluation.containment", "evaluation.hold_parameters", "evaluation.static_friction")
 """Configuration keys, by how they begin, that all models of a domain need alike to be compared."""
@@ -52,13 +73,22 @@ class TableError(GpeError, ValueError):
 
 @dataclass(frozen=True)
 class Cell:
-    """A model in a domain: its interval [m²], the errors of single rollouts [seed, trajectory] [m²], infinite for failed ones, and that of ballistic
-    flight [m²].
+    """A model in a domain.
+
+    Attributes:
+        errors: of single rollouts [seed, trajectory] in m²; failed ones as the rule has it.
+        num_failed: rollouts that had to be stopped.
+        trivial: mean error of each trivial baseline that was evaluated [m²].
     """
 
-    interval: Interval
     errors: np.ndarray
-    ballistic: float
+    num_failed: int
+    trivial: dict[str, float]
+
+    @cached_property
+    def interval(self) -> Interval:
+        """Mean over trajectories, median over seeds [m²]."""
+        return bootstrap_interval(self.errors, statistic=median_of_means)
 
     @property
     def median(self) -> float:
@@ -67,12 +97,7 @@ class Cell:
 
     @property
     def is_learned(self) -> bool:
-        return self.interval.estimate * NOT_LEARNED <= self.ballistic
-
-
-def judged_group(run: Run) -> str:
-    """The trajectories that a run is judged on, as a split or part of one."""
-    return UNSEEN if any(key.startswith("data.parameters.solid.") for key in run.config) else INTERPOLATED
+        return self.interval.estimate * NOT_LEARNED <= min(self.trivial.values())
 
 
 def compares_models(folder: Path) -> bool:
@@ -98,9 +123,16 @@ def report_domains(folder: Path) -> None:
     _check(folder, domains, by_cell)
     _write_csv(folder / TABLE_CSV, runs)
     cells: dict[tuple[str, str], Cell] = {}
+    strict: dict[tuple[str, str], Cell] = {}
     for domain in domains:
-        cells |= {(domain, model): cell for model, cell in _row({m: by_cell[d, m] for d, m in by_cell if d == domain}, domain).items()}
-    replace_text(folder / TABLE_MD, _markdown(domains, models, cells, by_cell))
+        for model, pair in _row({m: by_cell[d, m] for d, m in by_cell if d == domain}, domain).items():
+            cells[domain, model], strict[domain, model] = pair
+    ratios = _ratios(domains, cells, strict, by_cell)
+    replace_text(folder / TABLE_MD, _markdown(domains, models, cells, ratios, by_cell))
+    replace_text(
+        folder / RATIOS_MD,
+        "\n".join([*_lines(["domain", *ratios[0]], [[d, *row.values()] for d, row in zip(domains, ratios, strict=True)]), ""]),
+    )
     _figures(folder, domains, models, cells, by_cell)
 
 
@@ -145,25 +177,26 @@ def _first_frame(run: Run) -> int | None:
     return run.config.get("graph.history") if frame is None else frame
 
 
-def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, Cell]:
-    """The cells of a domain, on the trajectories that all its runs have evaluated."""
+def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, Cell]]:
+    """The cells of a domain by model, on the trajectories that all its runs have evaluated: as it is judged, and with failed rollouts infinitely wrong."""
     found = {}
     for model, runs in by_model.items():
-        group = judged_group(runs[0])
-        values = [values_by_seed(runs, name, group, "rollout_mse", "full") for name in (LEARNED, "ballistic")]
-        if all(values):
-            found[model] = values
-    trajectories = shared_trajectories(*(table for values in found.values() for table in values))
+        values = {name: values_by_seed(runs, name, JUDGED, "rollout_mse", "full") for name in (LEARNED, *BASELINES)}
+        if values[LEARNED] and values[STAND_IN]:
+            found[model] = {name: table for name, table in values.items() if table}
+    trajectories = shared_trajectories(*(table for values in found.values() for table in values.values()))
     if not trajectories:
         return {}
-    num_evaluated = max(len(seed) for own, _ in found.values() for seed in own)
+    num_evaluated = max(len(seed) for values in found.values() for seed in values[LEARNED])
     if len(trajectories) < num_evaluated:
         log.warning("%s: judged on the %d of %d trajectories that all runs have evaluated", domain, len(trajectories), num_evaluated)
     row = {}
-    for model, (own, trivial) in found.items():
-        errors = shared_table(own, trajectories)
-        ballistic = float(shared_table(trivial[:1], trajectories).mean())
-        row[model] = Cell(bootstrap_interval(errors, statistic=median_of_means), errors, ballistic)
+    for model, values in found.items():
+        errors = shared_table(values.pop(LEARNED), trajectories)
+        judged = shared_table(rollout_errors(by_model[model], JUDGED, "full"), trajectories)
+        trivial = {name: float(shared_table(table[:1], trajectories).mean()) for name, table in values.items()}
+        num_failed = int((~np.isfinite(errors)).sum())
+        row[model] = Cell(judged, num_failed, trivial), Cell(errors, num_failed, trivial)
     return row
 
 
@@ -183,16 +216,21 @@ def _write_csv(path: Path, runs: Sequence[Run]) -> None:
         writer.writerows([*key, value] for key, value in sorted(lines.items()))
 
 
-def _markdown(domains: list[str], models: list[str], cells: dict[tuple[str, str], Cell], by_cell: dict[tuple[str, str], list[Run]]) -> str:
-    other_scenes = any(key.startswith("evaluation.data.scene") for runs in by_cell.values() for run in runs for key in run.config)
-    papers = {} if other_scenes else {domain: [_paper_ratio(domain)] for domain in domains}
-    header = ["domain", *models, "ballistic", f"{OWN} / best baseline", *(["paper"] if papers else [])]
-    lines = [table_row(header), "|" + "---|" * len(header)]
-    for domain in domains:
-        own = {m: cells[domain, m] for m in models if (domain, m) in cells}
-        ballistic = next((c.ballistic for c in own.values()), float("nan"))
-        texts = [_text(own.get(m)) for m in models]
-        lines.append(table_row([domain, *texts, f"{1e3 * ballistic:.3g}", _ratio(own), *papers.get(domain, [])]))
+def _markdown(
+    domains: list[str],
+    models: list[str],
+    cells: dict[tuple[str, str], Cell],
+    ratios: list[dict[str, str]],
+    by_cell: dict[tuple[str, str], list[Run]],
+) -> str:
+    shown = [name for name in TRIVIAL_SHOWN if any(name in c.trivial for c in cells.values())]
+    rows = []
+    for domain, ratio in zip(domains, ratios, strict=True):
+        trivial: dict[str, float] = next((c.trivial for (d, _), c in cells.items() if d == domain), {})
+        texts = [_text(cells.get((domain, m))) for m in models]
+        numbers = [f"{1e3 * trivial[name]:.3g}" if name in trivial else "–" for name in shown]
+        rows.append([domain, *texts, *numbers, *ratio.values()])
+    lines = _lines(["domain", *models, *(name.replace("_", " ") for name in shown), *ratios[0]], rows)
     budget = ["", "Training, one row per model: steps and seeds.", "", table_row(["domain", *models]), "|" + "---|" * (len(models) + 1)]
     for domain in domains:
         steps = [
@@ -203,12 +241,30 @@ def _markdown(domains: list[str], models: list[str], cells: dict[tuple[str, str]
         ]
         budget.append(table_row([domain, *steps]))
     note = (
-        "Rollout MSE ×1e-3 [m²] over all frames on material parameters not seen in training (between the trained ones; of solids also outside, where all "
-        "models get the nearest trained value): mean over trajectories, median over seeds, 95 % bootstrap interval over both; a rollout that had to be "
-        "stopped has failed, and the mean with it. A model that is not twice as good as ballistic flight is *not learned* and wins nothing. Ratio: over the "
-        "best baseline that has learned, with its interval, on the same trajectories; bold where that excludes 1."
-    ) + (" Last column: the paper's ratio, from its table 1; its units are not ours." if papers else "")
+        "Rollout MSE ×1e-3 [m²] over all frames on material parameters not seen in training, between the trained ones and outside (where all models get "
+        "the nearest trained value): mean over trajectories, median over seeds, 95 % bootstrap interval over both. A rollout that had to be stopped has "
+        "failed, and counts as ballistic flight in the same scene. A model that is not twice as good as the best trivial baseline is *not learned* and wins "
+        "nothing. Ratio: over the best baseline that has learned, with its interval, on the same trajectories; bold where that excludes 1. *failed = ∞*: "
+        "the same ratio if the error of a failed rollout were infinite, and the mean with it."
+    ) + (" Last column: the paper's ratio, from its table 1; its units are not ours." if PAPER_COLUMN in ratios[0] else "")
     return "\n".join([*lines, "", note, *_medians(domains, models, cells), *budget, ""])
+
+
+def _ratios(
+    domains: list[str], cells: dict[tuple[str, str], Cell], strict: dict[tuple[str, str], Cell], by_cell: dict[tuple[str, str], list[Run]]
+) -> list[dict[str, str]]:
+    """For each domain the ratios by their columns: as it is judged, by the other rule, and the paper's where its scenes are meant."""
+    other_scenes = any(key.startswith("evaluation.data.scene") for runs in by_cell.values() for run in runs for key in run.config)
+    rows = []
+    for domain in domains:
+        own, other = ({m: cell for (d, m), cell in table.items() if d == domain} for table in (cells, strict))
+        paper = {} if other_scenes else {PAPER_COLUMN: _paper_ratio(domain)}
+        rows.append({f"{OWN} / best baseline": _ratio(own), f"{OWN} / best baseline, failed = ∞": _ratio(other)} | paper)
+    return rows
+
+
+def _lines(header: list[str], rows: list[list[str]]) -> list[str]:
+    return [table_row(header), "|" + "---|" * len(header), *map(table_row, rows)]
 
 
 def _medians(domains: list[str], models: list[str], cells: dict[tuple[str, str], Cell]) -> list[str]:
@@ -228,10 +284,8 @@ def _text(cell: Cell | None) -> str:
         return "–"
     i = cell.interval
     numbers = f"{1e3 * i.estimate:.3g} [{1e3 * i.low:.3g}, {1e3 * i.high:.3g}]"
-    failed = int((~np.isfinite(cell.errors)).sum())
-    if failed:
-        known = numbers if np.isfinite(i.estimate) else f"median {1e3 * cell.median:.3g}"
-        numbers = f"{known}, {failed} of {cell.errors.size} failed"
+    if cell.num_failed:
+        numbers = f"{numbers}, {cell.num_failed} of {cell.errors.size} failed"
     return numbers if cell.is_learned else f"*not learned* ({numbers})"
 
 
@@ -261,7 +315,12 @@ def _figures(
     from gpe_pl.viz.comparison import comparison_figure
 
     shown = {d: {m: cells[d, m].interval for m in models if (d, m) in cells} for d in domains}
-    references = {d: next(c.ballistic for (domain, _), c in cells.items() if domain == d) for d in domains if shown[d]}
+    trivial = {d: next(c.trivial for (domain, _), c in cells.items() if domain == d) for d in domains if shown[d]}
+    references = {
+        name.replace("_", " "): {d: t[name] for d, t in trivial.items() if name in t}
+        for name in TRIVIAL_SHOWN
+        if any(name in t for t in trivial.values())
+    }
     if any(shown.values()):
         comparison_figure({d: s for d, s in shown.items() if s}, references, "rollout MSE [m²]").savefig(folder / FIGURE, dpi=150)
     by_domain = {d: {m: by_cell[d, m] for m in models if (d, m) in by_cell} for d in domains}

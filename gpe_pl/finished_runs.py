@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import logging
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl.evaluation import Row, read_rows
+from gpe_pl.evaluation import LEARNED, Row, read_rows
 from gpe_pl.run_folder import config_in
 
 log = logging.getLogger(__name__)
@@ -111,6 +112,23 @@ def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon
         rows = [r for r in run.rows if r.model == model and r.metric == metric and r.horizon == horizon and split in groups_of(r)]
         table.append({r.trajectory: r.value for r in sorted(rows, key=lambda r: r.trajectory)})
     return [t for t in table if t]
+
+
+STAND_IN = "ballistic"
+"""Trivial model whose error a failed rollout gets."""
+
+
+def rollout_errors(runs: list[Run], split: str, horizon: str) -> Values:
+    """Rollout MSE [m²] of learned models as tables judge it: a failed rollout gets the error of ballistic flight in the same scene over the same frames.
+
+    It stays infinite where ballistic flight was not evaluated. ``values_by_seed`` has the errors as they are.
+    """
+    errors = []
+    for run in runs:
+        trivial = dict(*values_by_seed([run], STAND_IN, split, "rollout_mse", horizon))
+        for seed in values_by_seed([run], LEARNED, split, "rollout_mse", horizon):
+            errors.append({k: value if math.isfinite(value) else trivial.get(k, value) for k, value in seed.items()})
+    return errors
 
 
 def shared_trajectories(*values: Values) -> list[int]:

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from gpe_pl.atomic import replace_text, replacing
+from gpe_pl.baselines import BASELINES
 from gpe_pl.evaluation import LEARNED, Row, read_rows
 from gpe_pl.finished_runs import (
     UNSEEN_GROUPS,
@@ -21,6 +22,7 @@ from gpe_pl.finished_runs import (
     distinct_runs,
     finished_runs,
     groups_of,
+    rollout_errors,
     shared_table,
     validation_curve,
     values_by_seed,
@@ -34,7 +36,6 @@ from gpe_pl.timing import paired_ratio, paired_times
 
 log = logging.getLogger(__name__)
 
-TRIVIAL = ("ballistic", "constant_velocity")
 STRESS_METRICS = ("von_mises_error", "stress_error")
 SWEEP_MD = "table.md"
 
@@ -84,7 +85,7 @@ def summary(rows: list[Row]) -> str:
     """Means over trajectories as plain text: a line per split, metric and model, a column per horizon. Trivial models have their rollout MSE only."""
     groups: dict[tuple[str, str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
-        if row.model not in TRIVIAL or row.metric == "rollout_mse":
+        if row.model not in BASELINES or row.metric == "rollout_mse":
             for split in groups_of(row):
                 groups[split, row.metric, row.model][row.horizon].append(row.value)
     horizons = sorted({row.horizon for row in rows} - {"1", "full"}, key=int)
@@ -214,15 +215,17 @@ def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]],
             }
             cells = []
             for h in horizons:
-                values = values_by_seed(runs, LEARNED, split, "rollout_mse", h)
-                cells.append(_interval(values, 1e3) + _factor(trivial[h] / _mean(values)) if values else "–")
+                values = rollout_errors(runs, split, h)
+                failed = _failed(values_by_seed(runs, LEARNED, split, "rollout_mse", h))
+                cells.append(_interval(values, 1e3) + _factor(trivial[h] / _mean(values)) + failed if values else "–")
             lines.append(table_row([*(key or (LEARNED,)), split, *cells]))
         for baseline in baselines:
             cells = [_interval(values_by_seed([first], baseline, split, "rollout_mse", h), 1e3) for h in horizons]
             lines.append(table_row([baseline, *[""] * (len(names) - 1), split, *cells]))
     note = (
         "Rollout MSE ×1e-3 [m²] over frames 1 … h, nodes and axes: mean over trajectories and seeds, 95 % bootstrap interval over both (too narrow where "
-        "seeds or trajectories are few), and how many times lower than the best trivial baseline (bold where it is lower)."
+        "seeds or trajectories are few), and how many times lower than the best trivial baseline (bold where it is lower). A rollout that had to be "
+        "stopped has failed, and counts as ballistic flight in the same scene."
     )
     if "test_unseen" in splits:
         note += " `test_unseen` holds material parameters that training did not have, between the trained ones and outside their range."
@@ -262,6 +265,13 @@ def _factor(ratio: float) -> str:
 
 def _mean(values: Values) -> float:
     return float(np.mean([v for seed in values for v in seed.values()])) if values else float("nan")
+
+
+def _failed(values: Values) -> str:
+    """How many rollouts failed, if any did."""
+    numbers = [value for seed in values for value in seed.values()]
+    failed = sum(not np.isfinite(value) for value in numbers)
+    return f", {failed} of {len(numbers)} failed" if failed else ""
 
 
 def _percent(values: Values) -> str:

@@ -1,6 +1,7 @@
 """Trials of settings for several models or domains: within each, which setting did best.
 
-The number compared is the rollout MSE over all frames, mean over the trajectories of a split, median over seeds.
+The number compared is the rollout MSE over all frames, mean over the trajectories of a split, median over seeds; failed rollouts count as in
+``finished_runs.rollout_errors``.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.domain_table import TABLE_MD, TABLES, domain_of, model_of
 from gpe_pl.evaluation import LEARNED
-from gpe_pl.finished_runs import Run, axes_of, finished_runs, shared_table, validation_curve, values_by_seed
+from gpe_pl.finished_runs import Run, axes_of, finished_runs, rollout_errors, shared_table, validation_curve, values_by_seed
 from gpe_pl.markdown import table_row
 from gpe_pl.metrics import BOTH, bootstrap_interval, median_of_means
 
@@ -60,7 +61,8 @@ def report_trials(folder: Path) -> None:
             lines.append(table_row([domain, model, *v, str(len(runs)), f"{np.mean(losses):.3f}" if losses else "–", *cells]))
     note = (
         "Rollout MSE ×1e-3 [m²] over all frames: mean over the trajectories of a split, median over seeds, 95 % bootstrap interval over both (of one seed "
-        "it says nothing about training by other seeds); a rollout that had to be stopped has failed, and the mean with it. Bold: best of a domain and model. "
+        "it says nothing about training by other seeds). A rollout that had to be stopped has failed, and counts as ballistic flight in the same scene. Bold: "
+        "best of a domain and model. "
         "One-step nMSE: of the validation split, relative to free fall."
     )
     replace_text(folder / TRIALS_MD, "\n".join([*lines, "", note, ""]))
@@ -91,17 +93,19 @@ def _settings(runs: list[Run]) -> list[str]:
 
 
 def _error(runs: list[Run], split: str) -> float:
-    errors = shared_table(values_by_seed(runs, LEARNED, split, "rollout_mse", "full"))
+    errors = shared_table(rollout_errors(runs, split, "full"))
     return float(median_of_means(errors, BOTH)) if errors.size else float("inf")
 
 
 def _cell(runs: list[Run], split: str, error: float, *, is_best: bool) -> str:
-    errors = shared_table(values_by_seed(runs, LEARNED, split, "rollout_mse", "full"))
-    if not np.isfinite(error):
-        return f"{int((~np.isfinite(errors)).sum())} of {errors.size} failed"
-    i = bootstrap_interval(errors, statistic=median_of_means)
+    as_they_are = shared_table(values_by_seed(runs, LEARNED, split, "rollout_mse", "full"))
+    failed = f"{int((~np.isfinite(as_they_are)).sum())} of {as_they_are.size} failed"
+    if not np.isfinite(error):  # without ballistic flight beside it
+        return failed
+    i = bootstrap_interval(shared_table(rollout_errors(runs, split, "full")), statistic=median_of_means)
     text = f"{1e3 * error:.3g}"
-    return f"{f'**{text}**' if is_best else text} [{1e3 * i.low:.3g}, {1e3 * i.high:.3g}]"
+    cell = f"{f'**{text}**' if is_best else text} [{1e3 * i.low:.3g}, {1e3 * i.high:.3g}]"
+    return cell if np.isfinite(as_they_are).all() else f"{cell}, {failed}"
 
 
 def _write_csv(path: Path, groups: dict[tuple[str, str], list[Run]], settings: list[str], columns: list[str], splits: list[str]) -> None:

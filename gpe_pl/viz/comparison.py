@@ -1,5 +1,6 @@
 """Figures that compare models over domains: errors with their intervals, and errors against the material parameter."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -13,14 +14,14 @@ from gpe_pl.viz.coloring import PALETTE
 from gpe_pl.viz.film_strip import TEXT_WIDTH, new_figure
 
 
-def comparison_figure(intervals: Mapping[str, Mapping[str, Interval]], references: Mapping[str, float], label: str) -> Figure:
-    """A group per domain, a mark with its interval per model, on a logarithmic axis; a line across each group marks its reference.
+def comparison_figure(intervals: Mapping[str, Mapping[str, Interval]], references: Mapping[str, Mapping[str, float]], label: str) -> Figure:
+    """A group per domain, a mark with its interval per model, on a logarithmic axis; a line across each group marks each reference.
 
     An interval without an upper end reaches out of the figure, and a mark that is itself infinite stands as a triangle at its top.
 
     Args:
         intervals: by domain and model.
-        references: by domain, such as the error of ballistic flight.
+        references: by name and domain, such as the error of ballistic flight.
         label: of the vertical axis.
     """
     figure = new_figure(TEXT_WIDTH, 2.6)
@@ -45,15 +46,15 @@ def comparison_figure(intervals: Mapping[str, Mapping[str, Interval]], reference
                 "", (place, 1.0), (place, value), top, axes.transData, {"arrowstyle": "->", "color": color, "shrinkA": 0, "shrinkB": 0}
             )
         axes.plot(x[~finite], np.ones((~finite).sum()), "^", markersize=5, color=color, transform=top, clip_on=False)
-    for d, domain in enumerate(intervals):
-        axes.plot(
-            [d - 0.4, d + 0.4], [references[domain]] * 2, color="0.5", linestyle=":", linewidth=1, label="ballistic" if d == 0 else None
-        )
+    for (name, by_domain), style in zip(references.items(), itertools.cycle((":", "--"))):
+        places = [(d, by_domain[domain]) for d, domain in enumerate(intervals) if domain in by_domain]
+        for k, (d, value) in enumerate(places):
+            axes.plot([d - 0.4, d + 0.4], [value] * 2, color="0.5", linestyle=style, linewidth=1, label=None if k else name)
     axes.set_xticks(range(len(intervals)), list(intervals), fontsize=8)
     axes.set_ylabel(label, fontsize=8)
     axes.tick_params(axis="y", which="both", labelsize=7)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(fontsize=7, frameon=False, ncols=len(models) + 1, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    axes.legend(fontsize=7, frameon=False, ncols=len(models) + len(references), loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return figure
 
 

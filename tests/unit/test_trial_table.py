@@ -25,7 +25,8 @@ def write_run(folder: Path, domain: str, model: str, noise: float, seed: int, er
     config = {"seed": seed, "data": {"name": domain}, "model": {"_target_": f"gpe_pl.models.x.{model}"}, "training": training}
     (folder / "config.json").write_text(json.dumps(config))
     rows = [Row(LEARNED, "val", k, "seen", 20.0, "rollout_mse", "full", value) for k, value in enumerate(errors)]
-    write_rows(folder / "metrics.csv", [*rows, Row("ballistic", "val", 0, "seen", 20.0, "rollout_mse", "full", 1e-9)])
+    flight = [Row("ballistic", "val", k, "seen", 20.0, "rollout_mse", "full", 20e-3) for k in range(len(errors))]
+    write_rows(folder / "metrics.csv", [*rows, *flight])
 
 
 @pytest.fixture
@@ -41,7 +42,7 @@ def test_the_best_setting_of_each_model_is_bold(trials: Path) -> None:
     rows = [[c.strip() for c in line.strip("|").split("|")] for line in (trials / "trials.md").read_text().splitlines() if "|" in line]
     assert rows[0] == ["domain", "model", "velocity_noise_of_change", "seeds", "one-step nMSE", "val"]
     assert rows[2:] == [
-        ["sand", "GNS", "0.3", "1", "–", "1 of 2 failed"],
+        ["sand", "GNS", "0.3", "1", "–", "10.5 [1, 20], 1 of 2 failed"],
         ["sand", "GNS", "1.0", "1", "–", "**7** [7, 7]"],
         ["sand", "GPE", "0.3", "2", "–", "3.5 [1, 6]"],
         ["sand", "GPE", "1.0", "1", "–", "**2** [2, 2]"],
