@@ -1,11 +1,13 @@
 """Trivial simulators that any learned model has to beat."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from array_api_compat import array_namespace
 
 from gpe_pl import integrators
 from gpe_pl.geometry import signed_distance, surface_tolerance
+from gpe_pl.rollout import Simulator
 from gpe_pl.trajectory import Array, State
 
 NUM_BISECTIONS = 30
@@ -46,7 +48,11 @@ class Ballistic:
         return _sticking(state, self.dt, state.gravity)
 
 
-BASELINES = {"ballistic": Ballistic, "stops_at_walls": StopsAtWalls, "constant_velocity": ConstantVelocity}
+BASELINES: dict[str, Callable[[float], Simulator]] = {
+    "ballistic": Ballistic,
+    "stops_at_walls": StopsAtWalls,
+    "constant_velocity": ConstantVelocity,
+}
 """What evaluations compare a model with, by the name in their tables; each takes the frame interval [s]."""
 
 

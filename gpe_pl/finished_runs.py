@@ -125,7 +125,7 @@ def rollout_errors(runs: list[Run], split: str, horizon: str) -> Values:
     """
     errors = []
     for run in runs:
-        trivial = dict(*values_by_seed([run], STAND_IN, split, "rollout_mse", horizon))
+        trivial: dict[int, float] = dict(*values_by_seed([run], STAND_IN, split, "rollout_mse", horizon))
         for seed in values_by_seed([run], LEARNED, split, "rollout_mse", horizon):
             errors.append({k: value if math.isfinite(value) else trivial.get(k, value) for k, value in seed.items()})
     return errors

@@ -119,8 +119,11 @@ def test_constant_velocity_stops_on_its_path() -> None:
 @pytest.mark.parametrize("baseline", [Ballistic, StopsAtWalls])
 def test_baselines_are_the_same_in_any_unit(baseline: type, length: float, time: float) -> None:
     """Nodes that rest on a surface within rounding stay there, others fall, whatever the unit."""
-    shapes = (*domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.3), Sphere((0.3, 0.3), 0.15, 0.3))
-    scaled = (*domain_walls(((0.0, length), (0.0, length)), 0.3), Sphere((0.3 * length, 0.3 * length), 0.15 * length, 0.3))
+    shapes: tuple[Shape, ...] = (*domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.3), Sphere((0.3, 0.3), 0.15, 0.3))
+    scaled: tuple[Shape, ...] = (
+        *domain_walls(((0.0, length), (0.0, length)), 0.3),
+        Sphere((0.3 * length, 0.3 * length), 0.15 * length, 0.3),
+    )
     pos = np.array([[0.2, 0.9], [0.5, 1e-8], [0.3, 0.45 + 1e-8], [0.8, 1e-4], [0.6, 0.5]])
     vel = np.array([[0.5, -1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [9.0, 0.0]])
     start = state(pos, vel, shapes)

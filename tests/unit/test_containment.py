@@ -165,7 +165,7 @@ def test_nodes_on_edges_of_walls_are_kept_in_any_unit_of_length(scale: float) ->
     """Walls share their edges; nodes inside an obstacle go."""
     expected = Boundary.sample(cave(1.0), 0.1, 2)
     assert len(Boundary.sample(cave(scale), 0.1 * scale, 2).pos) == len(expected.pos)
-    house = (*domain_walls(((0.0, scale), (0.0, scale)), 0.3), Box((0.4 * scale, 0.0), (0.6 * scale, 0.2 * scale), 0.3))
+    house: tuple[Shape, ...] = (*domain_walls(((0.0, scale), (0.0, scale)), 0.3), Box((0.4 * scale, 0.0), (0.6 * scale, 0.2 * scale), 0.3))
     floor = Boundary.sample(house, 0.01 * scale, 2)
     assert signed_distance(house, floor.pos).min() > -1e-9 * scale
 
