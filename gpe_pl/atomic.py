@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import psutil
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
@@ -38,16 +40,8 @@ def replace_text(path: Path, text: str) -> None:
 
 
 def _is_running(pid: str) -> bool:
-    """Whether there is such a process on this machine; on Windows, where asking could end it, always."""
-    if not pid.isdigit() or os.name == "nt":
-        return True
-    try:
-        os.kill(int(pid), 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
+    """Whether there is such a process on this machine."""
+    return not pid.isdigit() or psutil.pid_exists(int(pid))
 
 
 def _flush(path: Path) -> None:

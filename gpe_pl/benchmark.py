@@ -36,6 +36,7 @@ def benchmark(cfg: DictConfig) -> None:
     import torch
     from omegaconf import OmegaConf
 
+    from gpe_pl.locks import held
     from gpe_pl.machine import environment, keep_freed_memory
     from gpe_pl.simulate import dataset
 
@@ -49,14 +50,14 @@ def benchmark(cfg: DictConfig) -> None:
         raise ConfigError("trainer.accelerator=gpu: PyTorch finds no GPU here; choose trainer=cpu")
     keep_freed_memory()  # as trainings and evaluations do
     cases = getattr(settings, "cases", None)  # of a suite about data sets
-    records, table = suite.run(settings) if cases is None else suite.run(settings, {k: dataset(*c.overrides) for k, c in cases.items()})
     folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, figure in getattr(suite, "figures", lambda _: {})(records).items():
-        figure.savefig(folder / f"{name}.png", dpi=150)
-    results = {"environment": environment(), "settings": without_folder(asdict(settings), cfg.paths.runs), "records": records}
-    for name, text in (("results.json", json.dumps(results, indent=1)), ("table.md", table + "\n")):
-        replace_text(folder / name, text)
+    with held(folder):
+        records, table = suite.run(settings) if cases is None else suite.run(settings, {k: dataset(*c.overrides) for k, c in cases.items()})
+        for name, figure in getattr(suite, "figures", lambda _: {})(records).items():
+            figure.savefig(folder / f"{name}.png", dpi=150)
+        results = {"environment": environment(), "settings": without_folder(asdict(settings), cfg.paths.runs), "records": records}
+        for name, text in (("results.json", json.dumps(results, indent=1)), ("table.md", table + "\n")):
+            replace_text(folder / name, text)
     print(table)
     failures: list[str] = getattr(suite, "failures", lambda _: [])(records)
     if failures:

@@ -6,6 +6,8 @@ type or out of range is refused by the signature of the class or function that t
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import importlib
 import json
 import os
@@ -323,7 +325,26 @@ def output_dir(cfg: DictConfig) -> Path:
 
 
 class Report(Callback):
-    """Aggregates what a command has run, a single run or a sweep, when it ends: tables and figures in the folder of the results."""
+    """Holds the folder of the results of a command, a single run or a sweep, from before anything is written to it, and writes tables and figures when the
+    command ends.
+    """
+
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        self._hold(Path(config.hydra.run.dir))
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        self._hold(Path(config.hydra.sweep.dir))
+
+    def _hold(self, folder: Path) -> None:
+        """Until the process ends. Ends it if another command writes to the folder."""
+        from gpe_pl.locks import held
+
+        stack = contextlib.ExitStack()
+        try:
+            stack.enter_context(held(folder))
+        except (GpeError, OSError) as error:
+            _fail(error)
+        atexit.register(stack.close)
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         """Before Hydra writes into the folder."""

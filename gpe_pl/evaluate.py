@@ -22,6 +22,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     """Roll a trained model out on one split of a data set, and in the scene's showcase if it has one; numbers and pictures go to ``{paths.runs}/{name}``."""
     from gpe_pl.evaluation import EvaluationSettings, evaluate
     from gpe_pl.learned_simulator import LearnedSimulator
+    from gpe_pl.locks import held
     from gpe_pl.names import run_name
     from gpe_pl.pretrained import names
     from gpe_pl.report import conclusion
@@ -45,13 +46,14 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
         simulator.check_scene(scene, _own_data(simulator) or "data=… size=…")
     shown = None if cfg.data.get("showcase") is None else _showcase(cfg, simulator)
     folder = Path(cfg.paths.runs) / run_name(cfg.name)
-    claim(folder, _identity(evaluated), results=["*"])
-    try:
-        evaluate(simulator, ensure_split(evaluated, cfg.split), settings, folder)
-    finally:
-        release(folder)
-    if shown is not None:
-        shown(folder)
+    with held(folder):
+        claim(folder, _identity(evaluated), results=["*"])
+        try:
+            evaluate(simulator, ensure_split(evaluated, cfg.split), settings, folder)
+        finally:
+            release(folder)
+        if shown is not None:
+            shown(folder)
     print(conclusion(folder))
     print(folder)
 

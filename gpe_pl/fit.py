@@ -13,10 +13,20 @@ if TYPE_CHECKING:
 
 def fit(cfg: DictConfig) -> float:
     """Generate what data is missing, train or resume, evaluate; returns the mean full-length rollout MSE [m²] on the first split evaluated."""
+    from gpe_pl.locks import held
+    from gpe_pl.names import data_name, run_name
+
+    data_name(cfg.data.name, "data.name")
+    if cfg.reuse is not None:
+        run_name(cfg.reuse, "reuse")
+    with held(output_dir(cfg)):
+        return _fit(cfg, output_dir(cfg))
+
+
+def _fit(cfg: DictConfig, run_dir: Path) -> float:
     from functools import cache
 
     import lightning as L
-    from filelock import FileLock
     from omegaconf import OmegaConf
 
     from gpe_pl.data.datamodule import TrajectoryDataModule
@@ -25,7 +35,6 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
-    from gpe_pl.names import data_name, run_name
     from gpe_pl.pretrained import fingerprint
     from gpe_pl.run_folder import RunError, claim, without_tables
     from gpe_pl.simulate import ensure_data, evaluated_config, scene_metadata
@@ -36,9 +45,6 @@ def fit(cfg: DictConfig) -> float:
 
     if type(cfg.seed) is not int or cfg.seed < 0:
         raise ConfigError(f"seed={cfg.seed!r}: must be an integer of at least 0")
-    data_name(cfg.data.name, "data.name")
-    if cfg.reuse is not None:
-        run_name(cfg.reuse, "reuse")
     if not (cfg.start_from is None or isinstance(cfg.start_from, str)):
         raise ConfigError(f"start_from={cfg.start_from!r}: must be null, the folder of a run, a checkpoint or a shipped model")
     training = construct(TrainingSettings, cfg.training, "training")
@@ -57,11 +63,8 @@ def fit(cfg: DictConfig) -> float:
         if start is not None:
             start.check_scene(scenes)
 
-    run_dir = output_dir(cfg)
-    Path(cfg.paths.data).mkdir(parents=True, exist_ok=True)
-    with FileLock(Path(cfg.paths.data) / f".{cfg.data.name}.lock"):  # runs of a sweep start at the same time
-        root = ensure_data(cfg)
-        evaluated = ensure_data(evaluated_config(cfg)) if cfg.evaluation.data else root
+    root = ensure_data(cfg)
+    evaluated = ensure_data(evaluated_config(cfg)) if cfg.evaluation.data else root
     device = set_up(trainer)
 
     @cache

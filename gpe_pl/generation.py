@@ -24,6 +24,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Protocol, cast, runtime_checkable
@@ -37,6 +38,7 @@ from gpe_pl.data.motion import ROUNDING_SHARE, motion_of, rounding_fault, roundi
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, is_intact, shard_moments, with_checksum
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import ON_SURFACE
+from gpe_pl.locks import held
 from gpe_pl.names import DataName
 from gpe_pl.progress import Progress
 from gpe_pl.rollout import Guard, SimulationError, Simulator, rollout
@@ -450,20 +452,40 @@ def generate(
     Returns:
         The folder of the data set, ``root/name/size``.
 
+    Waits while another process generates the same data. A data set that is complete is only read.
+
     Raises:
         GenerationError: the folder holds a data set of another spec, the disk is too small, or a trajectory failed.
+        FolderError: the folder cannot be made or written.
     """
     if num_workers < 1:
         raise ValueError(f"num_workers must be at least 1, got {num_workers}")
+    folder = Path(root) / spec.name / spec.size
     to_do = plan(root, spec, part)
+    needed = [SPEC_FILE, STATISTICS_FILE, *([] if part[0] else [CONTACT_SHEET_FILE])]
+    if not to_do.missing and all((folder / name).is_file() for name in needed):
+        _claim(folder, spec)
+        if on_progress is not None:
+            on_progress(to_do.num_done, to_do.num_done)
+        return folder
     if to_do.missing:
         check_rounding(spec)
+    with written(root, spec, part, waits=True):
+        _generate(folder, plan(root, spec, part), spec, num_workers, on_progress, part)
+    return folder
+
+
+def written(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1), waits: bool = False) -> AbstractContextManager[None]:
+    """Inside, no other process writes the data set, or the same part of it; arguments and errors are those of ``locks.held``."""
     folder = Path(root) / spec.name / spec.size
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise GenerationError(f"{folder}: cannot be made ({error}); choose another folder with paths.data") from None
-    _claim(folder, spec)
+    if part[1] == 1:
+        return held(folder, "paths.data", waits)
+    return held(folder.with_name(f"{spec.size}-part-{part[0]}-of-{part[1]}"), "paths.data", waits, makes=False)
+
+
+def _generate(folder: Path, to_do: Plan, spec: DatasetSpec, num_workers: int, on_progress: Progress | None, part: tuple[int, int]) -> None:
+    with held(folder, "paths.data", waits=True):  # where parts are generated at once, one of them says what the data are
+        _claim(folder, spec)
     if not to_do.fits:
         raise GenerationError(
             f"{folder}: {to_do.num_missing} trajectories need up to {to_do.bytes_needed / 2**30:.3g} GiB, the disk has "
@@ -490,7 +512,6 @@ def generate(
             paths = [shard_path(folder, *shard) for shard in train]
             moments = {str(path): sums for path, sums in _run(pool, shard_moments, [(path,) for path in paths])}
             _write_json(statistics, with_checksum(combined([moments[str(path)] for path in paths])))
-    return folder
 
 
 def _draw_contact_sheet(spec: DatasetSpec, path: Path, pool: Executor | None) -> None:

@@ -112,8 +112,7 @@ def evaluated_config(cfg: DictConfig) -> DictConfig:
 
 def simulate(cfg: DictConfig) -> None:
     """Generate a data set, or what is missing of it or damaged, and say beforehand what a large one takes."""
-    from gpe_pl.generation import CONTACT_SHEET_FILE, discard_damaged, generate, plan, seconds_per_trajectory
-    from gpe_pl.progress import progress_bar
+    from gpe_pl.generation import CONTACT_SHEET_FILE, written
 
     if not (cfg.num_workers is None or (isinstance(cfg.num_workers, int) and cfg.num_workers >= 1)):
         raise ConfigError(f"num_workers={cfg.num_workers!r}: must be null (one per core) or an integer of at least 1")
@@ -121,11 +120,22 @@ def simulate(cfg: DictConfig) -> None:
         raise ConfigError(f"part={cfg.part!r}, num_parts={cfg.num_parts!r}: must be integers with 0 <= part < num_parts")
     spec, num_workers = dataset_spec(cfg), cfg.num_workers or os.cpu_count() or 1
     part = (cfg.part, cfg.num_parts)
-    there = sum(path.stat().st_size for path in (Path(cfg.paths.data) / spec.name / spec.size).glob("*/shard-*.h5"))
+    with written(cfg.paths.data, spec, part):
+        folder = _simulate(cfg.paths.data, spec, part, num_workers)
+    for path in (folder / CONTACT_SHEET_FILE, folder):
+        if path.exists():  # only the first part draws the sheet
+            print(path)
+
+
+def _simulate(root: str, spec: DatasetSpec, part: tuple[int, int], num_workers: int) -> Path:
+    from gpe_pl.generation import discard_damaged, generate, plan, seconds_per_trajectory
+    from gpe_pl.progress import progress_bar
+
+    there = sum(path.stat().st_size for path in (Path(root) / spec.name / spec.size).glob("*/shard-*.h5"))
     if there > AUTOMATIC_BYTES:
         print(f"{spec.name} {spec.size}: checking {there / 2**30:.1f} GiB that are there", flush=True)
-    discard_damaged(cfg.paths.data, spec, num_workers, part)
-    missing = plan(cfg.paths.data, spec, part)
+    discard_damaged(root, spec, num_workers, part)
+    missing = plan(root, spec, part)
     if missing.bytes_needed > AUTOMATIC_BYTES:
         print(
             f"{spec.name} {spec.size}: {missing.num_missing} trajectories to simulate, up to {missing.bytes_needed / 2**30:.1f} GiB "
@@ -136,10 +146,7 @@ def simulate(cfg: DictConfig) -> None:
             hours = missing.num_missing * seconds_per_trajectory(spec) / num_workers / 3600
             print(f"{spec.name} {spec.size}: about {hours:.1f} h on {num_workers} cores", flush=True)
     with progress_bar(f"{spec.name} {spec.size}") as on_progress:
-        folder = generate(cfg.paths.data, spec, num_workers, on_progress, part)
-    for path in (folder / CONTACT_SHEET_FILE, folder):
-        if path.exists():  # only the first part draws the sheet
-            print(path)
+        return generate(root, spec, num_workers, on_progress, part)
 
 
 main = entry_point("simulate")(simulate)

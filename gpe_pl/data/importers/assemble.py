@@ -23,6 +23,7 @@ from gpe_pl.data.motion import ROUNDING_SHARE, MotionSummary, better_origin, mot
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments, with_checksum
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
+from gpe_pl.locks import held
 from gpe_pl.names import NameRefused, data_name
 from gpe_pl.periodicity import PeriodicityError
 from gpe_pl.progress import Progress
@@ -147,9 +148,13 @@ def _free_folder(root: Path, name: str) -> Path:
         folder = root / data_name(name) / FOLDER
     except NameRefused as error:
         raise ImportFailure(str(error)) from None
+    _check_free(folder)
+    return folder
+
+
+def _check_free(folder: Path) -> None:
     if folder.exists():
         raise ImportFailure(f"{folder}: exists already, and imported data are never overwritten; delete it, or choose another name=…")
-    return folder
 
 
 @dataclass
@@ -188,15 +193,17 @@ class _Conversion:
 
     def run(self) -> Report:
         """Look, decide, write."""
-        self._look()
-        self._decide()
-        with replacing(self.folder) as part:
-            for split in SPLITS:  # train first: what is unseen is told by it
-                if split in self.survey.good:
-                    self._write(part, split, self.survey.good[split])
-            self._summarize(part)
-            self.report.warnings += [str(suspect) for suspect in self.survey.suspects]
-            self.report.write(part)
+        with held(self.folder, "paths.data", makes=False):
+            _check_free(self.folder)  # again: the other command may just have ended
+            self._look()
+            self._decide()
+            with replacing(self.folder) as part:
+                for split in SPLITS:  # train first: what is unseen is told by it
+                    if split in self.survey.good:
+                        self._write(part, split, self.survey.good[split])
+                self._summarize(part)
+                self.report.warnings += [str(suspect) for suspect in self.survey.suspects]
+                self.report.write(part)
         return self.report
 
     # --- first pass ------------------------------------------------------------------------------------------------------------------------
