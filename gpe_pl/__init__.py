@@ -17,6 +17,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from gpe_pl.caches import prepare
+
 if TYPE_CHECKING:
     from gpe_pl.containment import Contained as Contained
     from gpe_pl.data.importers.assemble import save_dataset as save_dataset
@@ -39,6 +41,8 @@ if TYPE_CHECKING:
     from gpe_pl.viz.figures import rollout_figure as rollout_figure
     from gpe_pl.viz.video import write_animation as write_animation
     from gpe_pl.viz.viewer import write_viewer as write_viewer
+
+prepare()  # before Numba and Matplotlib are imported
 
 _MODULES = {
     "Boundary": "trajectory",

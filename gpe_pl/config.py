@@ -34,7 +34,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.launcher import RESULT, USAGE_ERROR, SweepError, end_with_sweep
 from gpe_pl.names import NameRefused, run_name, sweep_name
 from gpe_pl.pretrained import model_name
-from gpe_pl.printable import clean_logs, one_line
+from gpe_pl.printable import clean_logs, one_line, speak_utf8
 from gpe_pl.run_folder import refuse_links
 from gpe_pl.signatures import checked, parameters
 
@@ -187,7 +187,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
                 _check_top_level(cfg, config_name)
                 value = task(cfg)
                 if RESULT in os.environ:
-                    Path(os.environ[RESULT]).write_text(json.dumps(value))
+                    Path(os.environ[RESULT]).write_text(json.dumps(value), encoding="utf-8")
                 return value
             except InterpolationKeyError as error:
                 if verbose:
@@ -206,6 +206,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
         def main() -> Any:
             if not CONF.is_dir():
                 _fail(ConfigError(f"{CONF} not found: install gpe_pl from a clone with `pip install -e .`"))
+            speak_utf8()
             clean_logs()
             sys.argv[1:] = [quoted(argument) for argument in sys.argv[1:]]
             os.environ["HYDRA_FULL_ERROR"] = "1"  # let exceptions reach us instead of Hydra's own report
@@ -223,7 +224,11 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             except OSError as error:  # before the command itself begins: Hydra makes the folder of the results
                 if verbose:
                     raise
-                _fail(error)
+                _fail(
+                    OSError(
+                        f"{error.filename}: cannot be made or written ({error.strerror}); choose another folder with paths.runs=… or paths.data=…"
+                    )
+                )
 
         return main
 
@@ -394,4 +399,4 @@ class Report(Callback):
             report_sweep(folder)
             table = folder / SWEEP_MD
         if table.exists():  # not where no run has finished
-            print(table.read_text())
+            print(table.read_text(encoding="utf-8"))

@@ -210,7 +210,7 @@ def _write_csv(path: Path, runs: Sequence[Run]) -> None:
             for split in groups_of(row):
                 groups[domain_of(run), model, seed, split, row.metric, row.horizon].append(row.value)
         lines |= {key: float(np.mean(values)) for key, values in groups.items()}
-    with replacing(path) as part, open(part, "w", newline="") as handle:
+    with replacing(path) as part, open(part, "w", newline="", encoding="utf-8") as handle:
         writer = csv.writer(handle)
         writer.writerow(["domain", "model", "seed", "split", "metric", "horizon", "value"])
         writer.writerows([*key, value] for key, value in sorted(lines.items()))

@@ -93,7 +93,7 @@ def validation_curve(run_dir: Path) -> tuple[np.ndarray, np.ndarray]:
     """Steps and one-step validation loss of a run, over all its starts."""
     points: dict[int, float] = {}
     for path in sorted(run_dir.glob("log/version_*/metrics.csv"), key=lambda p: int(p.parent.name.partition("_")[2])):
-        with open(path, newline="") as handle:
+        with open(path, newline="", encoding="utf-8") as handle:
             for line in csv.DictReader(handle):
                 if line.get("val/one_step_nmse"):
                     points[int(line["step"]) + 1] = float(line["val/one_step_nmse"])

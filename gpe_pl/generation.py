@@ -387,7 +387,7 @@ def discard_damaged(root: Path | str, spec: DatasetSpec, num_workers: int = 1, p
 
 def _has_intact_statistics(path: Path) -> bool:
     try:
-        return is_intact(json.loads(path.read_text()))
+        return is_intact(json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError):
         return False
 
@@ -568,7 +568,7 @@ def _claim(folder: Path, spec: DatasetSpec) -> None:
         _write_json(path, {"spec": values, "sha256": sha256})
         return
     try:
-        stored = json.loads(path.read_text())["spec"]
+        stored = json.loads(path.read_text(encoding="utf-8"))["spec"]
     except (ValueError, KeyError, TypeError):
         raise GenerationError(f"{path}: unreadable; delete the folder {folder} and run simulate again") from None
     differing = _differences(stored, values)

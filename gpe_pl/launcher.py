@@ -85,7 +85,7 @@ class Job:
                 code = process.wait()
         if code:
             return self.failed((UsageError if code == USAGE_ERROR else SweepError)(self._last_words(code)))
-        value = json.loads(result.read_text())
+        value = json.loads(result.read_text(encoding="utf-8"))
         result.unlink()
         return JobReturn(self.overrides, status=JobStatus.COMPLETED, _return_value=value)
 
@@ -102,7 +102,7 @@ class Job:
             return self.failed(SweepError(f"{type(error).__name__}: {lines[-1]} (see {self.folder / LOG})"))
 
     def _last_words(self, code: int) -> str:
-        lines = (self.folder / LOG).read_text(errors="replace").splitlines()
+        lines = (self.folder / LOG).read_text(encoding="utf-8", errors="replace").splitlines()
         last = next((line for line in reversed(lines) if line.strip()), f"ended with code {code}")
         return f"{last.removeprefix('error: ')} (see {self.folder / LOG})"
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import logging
+import sys
 
 LONGEST = 4000
 """Characters of a message. Names can have tens of thousands."""
@@ -10,7 +12,7 @@ LONGEST = 4000
 
 def printable(text: str) -> str:
     """The text with its control characters, text directions, line ends and whatever else is not shown as escapes."""
-    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in _decoded(text))
 
 
 def one_line(text: str, longest: int = LONGEST) -> str:
@@ -18,7 +20,15 @@ def one_line(text: str, longest: int = LONGEST) -> str:
     if len(text) > longest:
         head, tail = text[: longest * 3 // 4], text[-(longest // 4) :]
         text = f"{head} … ({len(text) - len(head) - len(tail)} characters) … {tail}"
-    return printable(" ".join(part for line in text.splitlines() if (part := line.strip())).replace("\t", " "))
+    return printable(" ".join(part for line in _decoded(text).splitlines() if (part := line.strip())).replace("\t", " "))
+
+
+def _decoded(text: str) -> str:
+    """Names of files that Python has read in another encoding than UTF-8, as UTF-8 where they are."""
+    try:
+        return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    except UnicodeEncodeError:  # not from the name of a file
+        return text
 
 
 class LogRecord(logging.LogRecord):
@@ -26,6 +36,13 @@ class LogRecord(logging.LogRecord):
 
     def getMessage(self) -> str:
         return one_line(super().getMessage())
+
+
+def speak_utf8() -> None:
+    """What this process prints from now on is UTF-8 whatever the locale, and what cannot be encoded an escape."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(encoding="utf-8", errors="backslashreplace")
 
 
 def clean_logs() -> None:

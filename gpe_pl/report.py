@@ -116,7 +116,7 @@ def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
         if len(steps):
             groups["val", "one_step_nmse", "1"].append(float(losses[-1]))
         lines += [[*key, run.config.get("seed"), *group, float(np.mean(values))] for group, values in sorted(groups.items())]
-    with replacing(path) as part, open(part, "w", newline="") as handle:
+    with replacing(path) as part, open(part, "w", newline="", encoding="utf-8") as handle:
         writer = csv.writer(handle)
         writer.writerow([*(_column(a) for a in axes), "seed", "split", "metric", "horizon", "value"])
         writer.writerows(lines)

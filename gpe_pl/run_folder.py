@@ -72,7 +72,7 @@ def without_tables(values: dict[str, Any]) -> dict[str, Any]:
 def config_in(path: Path) -> dict[str, Any]:
     """The configuration that a run has left in a file; raises ``RunError`` if that is damaged."""
     try:
-        values = dict(json.loads(path.read_text()))
+        values = dict(json.loads(path.read_text(encoding="utf-8")))
         return without_tables(values)  # which older runs wrote down
     except (ValueError, TypeError, AttributeError):
         raise RunError(f"{path} is damaged; delete the folder {path.parent} or choose another name=…") from None

@@ -109,7 +109,7 @@ def _cell(runs: list[Run], split: str, error: float, *, is_best: bool) -> str:
 
 
 def _write_csv(path: Path, groups: dict[tuple[str, str], list[Run]], settings: list[str], columns: list[str], splits: list[str]) -> None:
-    with replacing(path) as part, open(part, "w", newline="") as handle:
+    with replacing(path) as part, open(part, "w", newline="", encoding="utf-8") as handle:
         writer = csv.writer(handle)
         writer.writerow(["domain", "model", *columns, "num_steps", "seed", "split", "num_trajectories", "num_failed", "rollout_mse"])
         for (domain, model), runs in sorted(groups.items()):

@@ -33,7 +33,7 @@ def data_statistics(root: Path | str) -> dict[str, float]:
     """Statistics of the train split, as written beside it by ``simulate``."""
     path = Path(root) / "statistics.json"
     try:
-        statistics = json.loads(path.read_text())
+        statistics = json.loads(path.read_text(encoding="utf-8"))
         if not is_intact(statistics):
             raise ValueError("checksum mismatch")
         return {"acceleration_std": float(statistics["acceleration_std"])}

@@ -27,7 +27,7 @@ from pydantic import TypeAdapter, ValidationError
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.motion import motion_of, rounding_fault, rounding_of
 from gpe_pl.geometry import Shape
-from gpe_pl.printable import printable
+from gpe_pl.printable import printable, speak_utf8
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup
 from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.store import (
@@ -417,6 +417,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("paths", nargs="*", metavar="PATH", help="shard, or folder of shards")
     parser.add_argument("--format-page", action="store_true", help="print the description of the format as Markdown")
     options = parser.parse_args(arguments)
+    speak_utf8()
     if options.format_page:
         print(format_page(), end="")
         return 0

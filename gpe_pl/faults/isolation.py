@@ -95,7 +95,7 @@ def _received(connection: Connection, limit: float, count: int) -> Iterator[Verd
 
 
 def _attack(faults: Sequence[Fault], answers: Connection, folder: str) -> None:
-    with open(os.devnull, "w") as null:  # what a fault prints is of no interest
+    with open(os.devnull, "wb") as null:  # what a fault prints is of no interest
         os.dup2(null.fileno(), 1)
         os.dup2(null.fileno(), 2)
     for number, fault in enumerate(faults):
@@ -148,7 +148,7 @@ def run(command: str, arguments: Sequence[str], limit: float = 600.0, prepare: C
         process.join(limit)
         code = process.exitcode
         end(process)
-        return Ended(code, output.read_text(errors="replace") if output.exists() else "")
+        return Ended(code, output.read_text(encoding="utf-8", errors="replace") if output.exists() else "")
 
 
 def end(process: Any) -> None:

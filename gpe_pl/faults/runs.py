@@ -81,7 +81,7 @@ def digests(folder: Path) -> dict[str, str]:
             stored = load_checkpoint(path)
             found[name] = _digest({key: stored[key] for key in SAVED})
         elif path.suffix == ".json":
-            found[name] = _digest(json.loads(path.read_text()))
+            found[name] = _digest(json.loads(path.read_text(encoding="utf-8")))
         elif path.suffix == ".h5" or path.name in ("metrics.csv", "table.csv", "table.md"):
             found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
     return found
@@ -119,7 +119,7 @@ def incomplete(folder: Path) -> list[str]:
             elif path.suffix == ".ckpt":
                 load_checkpoint(path)
             elif path.suffix == ".json":
-                json.loads(path.read_text())
+                json.loads(path.read_text(encoding="utf-8"))
         except Exception as error:
             found.append(f"{path.name}: {error}")
     return found
@@ -176,7 +176,12 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
             try:
                 if isolation.waited(process, moment):  # it was faster; from the start again
                     if process.exitcode != 0:
-                        problem = problem or isolation.Ended(process.exitcode, (folder / "output").read_text(errors="replace")).verdict()
+                        problem = (
+                            problem
+                            or isolation.Ended(
+                                process.exitcode, (folder / "output").read_text(encoding="utf-8", errors="replace")
+                            ).verdict()
+                        )
                     if moments:
                         break
                     duration *= 0.9
@@ -188,7 +193,7 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
             finally:
                 isolation.end(process)
             moments.append(f"{kind.name} after {moment:.2f} s")
-            output = (folder / "output").read_text(errors="replace")
+            output = (folder / "output").read_text(encoding="utf-8", errors="replace")
             if kind is signal.SIGTERM and "Traceback (most recent call last)" in output:
                 problem = problem or Verdict("traceback", output.strip().splitlines()[-1][:200])
             if broken := incomplete(own):
@@ -312,7 +317,7 @@ def read_only(command: Command, limit: float, folder: Path) -> Verdict:
 
 def file_in_the_way(command: Command, limit: float, folder: Path) -> Verdict:
     """Run a command where a file lies in place of the folder that it writes to."""
-    (folder / ("data" if command.data is None else "runs")).write_text("a file")
+    (folder / ("data" if command.data is None else "runs")).write_text("a file", encoding="utf-8")
     return isolation.run(command.module, command.given(folder), limit).verdict("accepted")
 
 

@@ -154,7 +154,7 @@ def training_seconds(run: Run) -> float:
     model = str(run.config["model._target_"]).rpartition(".")[2]
     about = f"{run.config['data.name']} {run.config['size.name']} {model} "
     steps, budget = float(run.config["training.num_steps"]), 60 * float(run.config.get("size.comparison.budget_minutes") or math.inf)
-    times = {} if path is None else json.loads(path.read_text())
+    times = {} if path is None else json.loads(path.read_text(encoding="utf-8"))
     return max((steps * t for key, t in times.items() if key.startswith(about) and steps * t <= budget), default=math.nan)
 
 

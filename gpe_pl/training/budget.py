@@ -208,7 +208,7 @@ def _read(path: Path) -> dict[str, float]:
     if not path.exists():
         return {}
     try:
-        times = json.loads(path.read_text())
+        times = json.loads(path.read_text(encoding="utf-8"))
         return {str(key): float(value) for key, value in times.items()}
     except (OSError, ValueError, AttributeError, TypeError) as error:
         raise BudgetError(f"{path}: not a file of step times ({error}); delete it to measure again") from None

@@ -85,7 +85,7 @@ def run_id(run_dir: Path) -> str:
     path = run_dir / RUN_ID
     if not path.exists():
         replace_text(path, os.urandom(6).hex())
-    return path.read_text().strip()
+    return path.read_text(encoding="utf-8").strip()
 
 
 def publish(loggers: Iterable[Logger], run_dir: Path, results: Mapping[str, float]) -> None:

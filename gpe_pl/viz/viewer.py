@@ -101,12 +101,12 @@ def write_viewer(
     scene, arrays = _scene({name: trajectory.with_moving_boundary() for name, trajectory in trajectories.items()}, stride)
     parts = {
         "title": html.escape(title),
-        "style": (PAGE / "viewer.css").read_text(),
+        "style": (PAGE / "viewer.css").read_text(encoding="utf-8"),
         "arrays": "\n".join(_element(name, *value) for name, value in arrays.items()),
         "scene": json.dumps(scene, allow_nan=False).replace("<", "\\u003c"),
-        "script": "\n".join((PAGE / name).read_text() for name in ("data.js", "render.js", "viewer.js")),
+        "script": "\n".join((PAGE / name).read_text(encoding="utf-8") for name in ("data.js", "render.js", "viewer.js")),
     }
-    page = re.sub(r"\{\{(\w+)\}\}", lambda slot: parts[slot[1]], (PAGE / "viewer.html").read_text())
+    page = re.sub(r"\{\{(\w+)\}\}", lambda slot: parts[slot[1]], (PAGE / "viewer.html").read_text(encoding="utf-8"))
     replace_text(path, page)
     return float(scene["rounding"])
 

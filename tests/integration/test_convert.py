@@ -193,7 +193,7 @@ def test_imported_data_are_not_simulated() -> None:
     [
         (["format=gsn"], "format='gsn': input should be 'gns', 'lagrangebench'"),
         (["frame_dt=-1"], "frame_dt=-1: input should be greater than 0"),
-        (["name=a/b"], "name='a/b': string should match pattern"),
+        (["name=a/b"], "name='a/b': must be a folder's name"),
         (["materials={7:mud}"], "unknown material 'mud'; known: sand"),
         (["parameters={mud:1}"], "unknown material 'mud'"),
         (["walls={front:1}"], "walls: unknown side 'front'; known: x_low"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import json
 import os
 import shutil
@@ -15,9 +16,13 @@ from pathlib import Path
 
 import pytest
 from filelock import UnixFileLock
+from omegaconf import OmegaConf
 
-from gpe_pl import locks
+from gpe_pl import locks, save_dataset
+from gpe_pl.config import Report
 from gpe_pl.locks import FolderError, held
+from gpe_pl.trajectory import Trajectory
+from tests.runs import DATA, compose, generate_tiny
 
 ROOT = Path(__file__).parents[2]
 OTHER = """
@@ -144,6 +149,58 @@ def test_a_folder_that_cannot_be_made_names_the_key(tmp_path: Path) -> None:
     (tmp_path / "runs").write_text("a file", encoding="utf-8")
     with pytest.raises(FolderError, match=r"runs/a: cannot be made \(Not a directory\); choose another folder with paths\.data=…"):
         held(tmp_path / "runs" / "a", "paths.data").__enter__()
+
+
+@pytest.mark.parametrize(
+    ("command", "overrides", "folder"),
+    [
+        ("fit", DATA, "runs/fit"),
+        ("fit", ["name=sweep/a", *DATA], "runs/sweep/a"),
+        ("evaluate", ["checkpoint=sand", "size=small", "name=e"], "runs/e"),
+        ("benchmark", ["suite=speed"], "runs/benchmark/speed"),
+        ("simulate", DATA, "data/sand/tiny"),
+        ("simulate", [*DATA, "part=1", "num_parts=2"], "data/sand/tiny-part-1-of-2"),
+    ],
+)
+def test_commands_refuse_a_folder_that_another_writes_to(tmp_path: Path, command: str, overrides: list[str], folder: str) -> None:
+    """Fast: nothing is computed before."""
+    module = importlib.import_module(f"gpe_pl.{command}")
+    tasks = {"evaluate": "evaluate_checkpoint"}
+    paths = [f"paths.runs={tmp_path}/runs", *([] if command == "benchmark" else [f"paths.data={tmp_path}/data"])]
+    cfg = compose(command, *overrides, *paths)
+    with held_elsewhere(tmp_path / folder):
+        with pytest.raises(FolderError, match=f"{folder}: another command writes to it"):
+            getattr(module, tasks.get(command, command))(cfg)
+        assert not list((tmp_path / folder).rglob("*"))
+
+
+def test_imports_refuse_a_data_set_that_another_writes(tmp_path: Path, trajectory: Trajectory) -> None:
+    (tmp_path / "mine").mkdir()
+    other = (
+        f"from pathlib import Path\nfrom gpe_pl.locks import held\nwith held(Path({str(tmp_path / 'mine' / 'imported')!r}), makes=False):"
+    )
+    code = f"{other}\n    print('held', flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    ) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"held\n"
+        with pytest.raises(FolderError, match="imported: another command writes to it"):
+            save_dataset(tmp_path, "mine", train=[trajectory, trajectory, trajectory])
+        process.kill()
+
+
+@pytest.mark.parametrize("kind", ["run", "sweep"])
+def test_hydra_starts_nothing_in_a_folder_that_another_writes_to(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
+    config = OmegaConf.create({"hydra": {kind: {"dir": str(tmp_path / "a")}}})
+    start = Report().on_run_start if kind == "run" else Report().on_multirun_start
+    with held_elsewhere(tmp_path / "a"), pytest.raises(SystemExit, match="2"):
+        start(config)
+    assert capsys.readouterr().err.startswith(f"error: {tmp_path}/a: another command writes to it (process ")
+
+
+def test_complete_data_are_read_where_nothing_can_be_written(tiny_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(locks, "_acquired", lambda *_: pytest.fail("reading needs no lock"))
+    generate_tiny(tiny_data)
 
 
 def test_long_names_have_locks_too(tmp_path: Path) -> None:

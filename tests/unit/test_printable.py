@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import logging
-import time
 
 import pytest
 
@@ -21,15 +20,15 @@ def test_a_message_is_one_line_that_steers_no_terminal() -> None:
     assert one_line("  two  spaces\n\n  and a\ttab\n") == "two  spaces and a tab"
     assert one_line("Δt = 3 µs, 'größe' 数") == "Δt = 3 µs, 'größe' 数"
     assert printable("a\nb") == "a\\nb"
+    assert printable("größe".encode().decode("ascii", "surrogateescape")) == "größe"  # as in an ASCII locale
+    assert printable("\udcff \ud800") == "\\udcff \\ud800"
 
 
 def test_long_messages_lose_their_middle() -> None:
     text = one_line("begin " + "\x1b" * 60_000 + " end", 100)
     assert text.startswith("begin ") and text.endswith(" end") and "(59910 characters)" in text
     assert len(one_line(str(StoreError("x" * 10**6)))) < 2 * LONGEST
-    started = time.process_time()
-    one_line(" " * 10**6 + "\n" * 10**6)
-    assert time.process_time() - started < 5  # not quadratic
+    assert one_line(" " * 10**6 + "\n" * 10**6) == "… (1996000 characters) …"  # would take minutes if its time were quadratic
 
 
 @pytest.mark.parametrize("error", [GpeError, StoreError])

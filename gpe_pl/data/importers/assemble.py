@@ -479,7 +479,7 @@ class _Conversion:
         split = "train" if "train" in self.survey.good else next(iter(self.survey.good))
         shards = sorted((folder / split).glob("shard-*.h5"))
         statistics = combined([shard_moments(path)[1] for path in shards])
-        (folder / STATISTICS_FILE).write_text(json.dumps(with_checksum(statistics), indent=2, sort_keys=True) + "\n")
+        (folder / STATISTICS_FILE).write_text(json.dumps(with_checksum(statistics), indent=2, sort_keys=True) + "\n", encoding="utf-8")
         report = self.report
         report.velocity_std, report.acceleration_std = statistics["velocity_std"], statistics["acceleration_std"]
         if report.acceleration_std == 0:
