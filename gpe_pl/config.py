@@ -335,7 +335,12 @@ class Report(Callback):
     """
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        self._hold(Path(config.hydra.run.dir))
+        folder = Path(config.hydra.run.dir)
+        try:
+            refuse_links(folder)
+        except GpeError as error:
+            _fail(error)
+        self._hold(folder)
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         self._hold(Path(config.hydra.sweep.dir))
@@ -350,13 +355,6 @@ class Report(Callback):
         except (GpeError, OSError) as error:
             _fail(error)
         atexit.register(stack.close)
-
-    def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        """Before Hydra writes into the folder."""
-        try:
-            refuse_links(Path(config.hydra.run.dir))
-        except GpeError as error:
-            _fail(error)
 
     def on_run_end(self, config: DictConfig, **_: Any) -> None:
         self._report(Path(config.hydra.run.dir), is_sweep=False)
