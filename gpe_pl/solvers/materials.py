@@ -19,10 +19,10 @@ from gpe_pl.schema import MATERIALS
 SAND, SNOW, ELASTOMER = 0, 1, 2
 """Codes under which ``respond`` calls the laws."""
 
-LAMBDA, MU, COEFFICIENT, SMALLEST, LARGEST, MAX_HARDENING, VISCOSITY = range(7)
-"""Columns of a particle's constants: Lamé parameters at rest [Pa], slope of the cone in strains (sand) or ξ (snow), three of snow's constants, and the
-kinematic viscosity [m²/s]."""
-NUM_CONSTANTS = 7
+LAMBDA, MU, COEFFICIENT, SMALLEST, LARGEST, MAX_HARDENING, VISCOSITY, MEMORY = range(8)
+"""Columns of a particle's constants: Lamé parameters at rest [Pa], slope of the cone in strains (sand) or ξ (snow), three of snow's constants, the
+kinematic viscosity [m²/s], and for how long a particle keeps a velocity that the grid does not hold, per grid spacing [s/m]."""
+NUM_CONSTANTS = 8
 
 
 class Limits(NamedTuple):
@@ -174,16 +174,19 @@ class Elastomer:
     Attributes:
         poisson_ratio: below 0.5.
         density: mass per volume at rest [kg/m³].
+        memory_cells: grid cells that a pressure wave crosses while what the grid does not hold of a particle's velocity decays to 1/e, however long the
+            substeps are; 0 drops it in every substep (APIC), and then shorter substeps lose more energy.
     """
 
     poisson_ratio: PoissonRatio = 0.3
     density: Positive = 1000.0
+    memory_cells: Annotated[float, Field(ge=0)] = 10.0
     law: ClassVar[int] = ELASTOMER
 
     def constants(self, youngs_modulus: np.ndarray, dim: int) -> np.ndarray:
         """What the law reads [node, constant]."""
         lam, mu = lame_parameters(youngs_modulus, self.poisson_ratio)
-        return _constants(len(youngs_modulus), LAMBDA=lam, MU=mu)
+        return _constants(len(youngs_modulus), LAMBDA=lam, MU=mu, MEMORY=self.memory_cells / np.sqrt((lam + 2.0 * mu) / self.density))
 
     @property
     def smallest_stiffness(self) -> float:

@@ -6,40 +6,17 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, no_type_check
+from typing import no_type_check
 
 import numpy as np
 from numba import njit
 
 from gpe_pl.schema import STICKY
-from gpe_pl.solvers.materials import VISCOSITY
-from gpe_pl.solvers.mpm import transfer_2d, transfer_3d
+from gpe_pl.solvers.materials import MEMORY, VISCOSITY
+from gpe_pl.solvers.mpm import smoothing, transfer_2d, transfer_3d
 from gpe_pl.solvers.mpm.collider import keep_out
 
 OK, NOT_FINITE, ESCAPE, TOO_MANY_SUBSTEPS = 0, 1, 2, 3
-
-
-class Particles(NamedTuple):
-    """Arrays of all particles, C-contiguous; the first five change in place.
-
-    Attributes:
-        pos, vel: [node, dim] in m and m/s.
-        deformation, affine, plastic: as in ``MPMInternal``.
-        mass: [node] in kg.
-        specific_volume: volume per mass at rest [node] in m³/kg.
-        law: code of the constitutive law [node].
-        constants: what the law reads [node, constant], see ``materials``.
-    """
-
-    pos: np.ndarray
-    vel: np.ndarray
-    deformation: np.ndarray
-    affine: np.ndarray
-    plastic: np.ndarray
-    mass: np.ndarray
-    specific_volume: np.ndarray
-    law: np.ndarray
-    constants: np.ndarray
 
 
 @njit(cache=True, error_model="numpy")
@@ -48,7 +25,7 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
     """Advance the particles in place by one frame; returns a status, the node that caused it, the number of substeps and the last one's length.
 
     Positions follow velocities half a substep later, so gravity acts over the mean of a substep and the one before: then a body in free flight stays on its
-    parabola although substeps change.
+    parabola although substeps change. Particles are deformed by as much time as they have moved, which is the substep before.
     """
     inv, dim, gravity_squared = 1.0 / spacing, len(counts), 0.0
     for axis in range(dim):
@@ -56,12 +33,17 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
     # a particle at rest may fall by no more than a quarter of cfl cells, so with its speed it moves at most 1.25 cfl cells
     fall_rate = 2.0 * math.sqrt(math.sqrt(gravity_squared) / (cfl * spacing))
     # what a viscosity makes of the rate of deformation of a particle's surroundings must not change its sign (see ``transfer_2d.deform``)
-    diffusion_rate = 0.0
+    diffusion_rate, remembers = 0.0, False
     for p in range(particles.pos.shape[0]):
         diffusion_rate = max(diffusion_rate, 8.0 * inv * inv * particles.constants[p, VISCOSITY])
+        remembers = remembers or particles.constants[p, MEMORY] > 0.0
     grid, active = np.zeros((collider.distance.shape[0], dim + 1)), np.zeros((3, 2), dtype=np.int64)
     flat, stress = grid.reshape(-1), np.empty((particles.pos.shape[0], 3 * dim - 3))
     remaining, substeps = frame_dt, 0
+    remainder = smoothing.Remainder(
+        np.empty(particles.vel.shape), np.empty(particles.affine.shape), np.empty(particles.vel.shape), np.empty(particles.mass.shape),
+        np.zeros(grid.shape if remembers else (0, dim + 1)), np.zeros(stress.shape),
+    )  # fmt: skip
     squared = transfer_2d.squared_wave_speed(particles) if dim == 2 else transfer_3d.squared_wave_speed(particles)
     while True:
         status, node, speed = _survey(particles.pos, particles.vel, bounds, origin, counts, spacing, active)
@@ -76,12 +58,15 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
         h = remaining / count
         remaining = remaining - h if count > 1 else 0.0
         substeps += 1
+        if remembers:
+            _clear(remainder.grid, active, counts)
+            smoothing.set_aside(particles, remainder, active, counts, origin, inv, h)
         _clear(grid, active, counts)
         if dim == 2:
-            squared = transfer_2d.deform(particles, stress, h)
+            squared = transfer_2d.deform(particles, stress, last_substep)
             transfer_2d.particles_to_grid(particles, stress, flat, counts, origin, inv, h)
         else:
-            squared = transfer_3d.deform(particles, stress, h)
+            squared = transfer_3d.deform(particles, stress, last_substep)
             transfer_3d.particles_to_grid(particles, stress, flat, counts, origin, inv, h)
         _move_grid(grid, collider, gravity, 0.5 * (h + last_substep) if last_substep > 0.0 else h, active, counts)
         last_substep = h
@@ -89,6 +74,8 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
             transfer_2d.grid_to_particles(particles, flat, counts, origin, inv, h)
         else:
             transfer_3d.grid_to_particles(particles, flat, counts, origin, inv, h)
+        if remembers:
+            smoothing.give_back(particles, remainder, counts, inv, h)
         keep_out(particles.pos, particles.vel, collider, counts, origin, inv)
 
 

@@ -13,9 +13,10 @@ from pydantic.dataclasses import dataclass as validated_dataclass
 from gpe_pl.geometry import check_whole_cells
 from gpe_pl.rollout import SimulationError
 from gpe_pl.schema import MATERIALS, NODE_TYPES, node_code, param_names
-from gpe_pl.solvers.materials import LIMITS, NUM_CONSTANTS, Elastomer, Fluid, Sand, Snow, check_limits
+from gpe_pl.solvers.materials import LIMITS, MEMORY, NUM_CONSTANTS, Elastomer, Fluid, Sand, Snow, check_limits
 from gpe_pl.solvers.mpm.collider import Collider, collider
-from gpe_pl.solvers.mpm.frame import ESCAPE, NOT_FINITE, OK, Particles, advance
+from gpe_pl.solvers.mpm.frame import ESCAPE, NOT_FINITE, OK, advance
+from gpe_pl.solvers.mpm.particles import Particles
 from gpe_pl.trajectory import Boundary, State
 
 PADDING = 3
@@ -31,20 +32,22 @@ class MPMInternal:
 
     Attributes:
         deformation: elastic deformation gradient F [node, dim, dim].
-        affine: APIC velocity gradient C [node, dim, dim] in 1/s.
+        affine: affine part of the velocity that the particle brings to the grid [node, dim, dim] in 1/s, C of APIC.
+        gradient: velocity gradient of the grid at the particle [node, dim, dim] in 1/s, by which it deforms.
         plastic: plastic state [node]: the volume correction of sand, ``J_P - 1`` of snow.
         last_substep: length of the substep before [s]; 0 where there is none.
     """
 
     deformation: np.ndarray
     affine: np.ndarray
+    gradient: np.ndarray
     plastic: np.ndarray
     last_substep: np.ndarray = field(default_factory=lambda: np.zeros(()))
 
     @classmethod
     def at_rest(cls, num_nodes: int, dim: int) -> MPMInternal:
         """Undeformed particles that do not rotate."""
-        return cls(np.tile(np.eye(dim), (num_nodes, 1, 1)), np.zeros((num_nodes, dim, dim)), np.zeros(num_nodes))
+        return cls(np.tile(np.eye(dim), (num_nodes, 1, 1)), *np.zeros((2, num_nodes, dim, dim)), np.zeros(num_nodes))
 
 
 @validated_dataclass(frozen=True, config={"extra": "forbid"})
@@ -77,7 +80,7 @@ class MPM:
     max_substeps: Annotated[int, Field(ge=1)] = 1000
 
     name: ClassVar[str] = "mpm"
-    version: ClassVar[str] = "3"
+    version: ClassVar[str] = "4"
     stores_stress: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
@@ -108,8 +111,8 @@ class MPM:
         """Advance one frame.
 
         Raises:
-            SimulationError: with reason ``input`` (arrays or obstacles that do not fit the solver), ``nan``, ``escape`` (a particle left the domain
-                through an open side or started outside) or ``explosion`` (more than ``max_substeps``).
+            SimulationError: with reason ``input`` (arrays or obstacles that do not fit the solver, or no ``internal`` where it is needed), ``nan``,
+                ``escape`` (a particle left the domain through an open side or started outside) or ``explosion`` (more than ``max_substeps``).
         """
         internal = state.internal if state.internal is not None else MPMInternal.at_rest(state.num_nodes, len(self.bounds))
         particles = self._particles(state, internal)
@@ -137,7 +140,7 @@ class MPM:
             velocity_history=None,
             time=state.time + self.frame_dt,
             num_substeps=num_substeps,
-            internal=MPMInternal(particles.deformation, particles.affine, particles.plastic, np.array(last_substep)),
+            internal=MPMInternal(particles.deformation, particles.affine, particles.gradient, particles.plastic, np.array(last_substep)),
         )
 
     def _collider(self, boundary: Boundary, origin: tuple[float, ...], counts: tuple[int, ...]) -> Collider:
@@ -161,6 +164,7 @@ class MPM:
             raise SimulationError(f"internal state is of type {type(internal).__name__}, expected MPMInternal or None", reason="input")
         shapes["internal.deformation"] = (internal.deformation, (num_nodes, dim, dim))
         shapes["internal.affine"] = (internal.affine, (num_nodes, dim, dim))
+        shapes["internal.gradient"] = (internal.gradient, (num_nodes, dim, dim))
         shapes["internal.plastic"] = (internal.plastic, (num_nodes,))
         for name, (array, expected) in shapes.items():
             if np.shape(array) != expected:
@@ -184,8 +188,9 @@ class MPM:
         # np.array copies: the kernels work in place and the caller's arrays must not change
         changing = (state.pos, state.vel, internal.deformation, internal.affine, internal.plastic)
         pos, vel, deformation, affine, plastic = (np.array(x, dtype=np.float64, order="C") for x in changing)
+        gradient = np.array(internal.gradient, dtype=np.float64, order="C") if np.any(constants[:, MEMORY] > 0) else affine
         mass = np.array(state.mass, dtype=np.float64)
-        return Particles(pos, vel, deformation, affine, plastic, mass, specific_volume, law, constants)
+        return Particles(pos, vel, deformation, affine, gradient, plastic, mass, specific_volume, law, constants)
 
     @staticmethod
     def _require(good: np.ndarray, message: str, reason: str = "input") -> None:

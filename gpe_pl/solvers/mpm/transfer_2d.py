@@ -41,14 +41,19 @@ def squared_wave_speed(particles):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def deform(particles, stress, h):
-    """Deform the particles by ``h C`` and write their Kirchhoff stress [node, 3] in Pa; returns the new ``squared_wave_speed``.
+    """Deform the particles by ``h ∇v`` and write their Kirchhoff stress [node, 3] in Pa; returns the new ``squared_wave_speed``.
 
-    Viscosity ν adds ``2 ρ ν dev C``, symmetrised and in plane strain. The transfer that follows takes ``8 h ν / Δ²`` of it away, whatever the positions.
+    Viscosity ν adds ``2 ρ ν dev ∇v``, symmetrised and in plane strain. The transfer that follows takes ``8 h ν / Δ²`` of it away, whatever the positions.
     """
-    deformation, affine, plastic, specific_volume = particles.deformation, particles.affine, particles.plastic, particles.specific_volume
+    deformation, gradient, plastic, specific_volume = (
+        particles.deformation,
+        particles.gradient,
+        particles.plastic,
+        particles.specific_volume,
+    )
     law, constants, squared = particles.law, particles.constants, 0.0
     for p in range(plastic.shape[0]):
-        c00, c01, c10, c11 = affine[p, 0, 0], affine[p, 0, 1], affine[p, 1, 0], affine[p, 1, 1]
+        c00, c01, c10, c11 = gradient[p, 0, 0], gradient[p, 0, 1], gradient[p, 1, 0], gradient[p, 1, 1]
         f00, f01, f10, f11 = deformation[p, 0, 0], deformation[p, 0, 1], deformation[p, 1, 0], deformation[p, 1, 1]
         f00, f01, f10, f11, plastic[p], stress[p, 0], stress[p, 1], stress[p, 2], stiffness = laws_2d.respond(
             law[p],
@@ -103,8 +108,8 @@ def particles_to_grid(particles, stress, grid, counts, origin, inv, h):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def grid_to_particles(particles, grid, counts, origin, inv, h):
-    """Velocities and affine parts from the grid, and new positions."""
-    pos, vel, affine = particles.pos, particles.vel, particles.affine
+    """Velocities and their gradients from the grid, and new positions."""
+    pos, vel, gradient = particles.pos, particles.vel, particles.gradient
     stride = counts[1]
     for p in range(pos.shape[0]):
         x, y = (pos[p, 0] - origin[0]) * inv, (pos[p, 1] - origin[1]) * inv
@@ -124,5 +129,5 @@ def grid_to_particles(particles, grid, counts, origin, inv, h):
             u, v = u + wx[k] * s0, v + wx[k] * s1
             c00, c01, c10, c11 = c00 + mx[k] * s0, c01 + wx[k] * m0, c10 + mx[k] * s1, c11 + wx[k] * m1
         scale = 4.0 * inv
-        affine[p, 0, 0], affine[p, 0, 1], affine[p, 1, 0], affine[p, 1, 1] = scale * c00, scale * c01, scale * c10, scale * c11
+        gradient[p, 0, 0], gradient[p, 0, 1], gradient[p, 1, 0], gradient[p, 1, 1] = scale * c00, scale * c01, scale * c10, scale * c11
         pos[p, 0], pos[p, 1], vel[p, 0], vel[p, 1] = pos[p, 0] + h * u, pos[p, 1] + h * v, u, v

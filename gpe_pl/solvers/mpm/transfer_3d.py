@@ -45,11 +45,16 @@ def squared_wave_speed(particles):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def deform(particles, stress, h):
-    """Deform the particles by ``h C`` and write their Kirchhoff stress [node, 6] in Pa; returns the new ``squared_wave_speed``."""
-    deformation, affine, plastic, specific_volume = particles.deformation, particles.affine, particles.plastic, particles.specific_volume
+    """Deform the particles by ``h ∇v`` and write their Kirchhoff stress [node, 6] in Pa; returns the new ``squared_wave_speed``."""
+    deformation, gradient, plastic, specific_volume = (
+        particles.deformation,
+        particles.gradient,
+        particles.plastic,
+        particles.specific_volume,
+    )
     law, constants, squared = particles.law, particles.constants, 0.0
     for p in range(plastic.shape[0]):
-        c, f = _matrix(affine, p), _matrix(deformation, p)
+        c, f = _matrix(gradient, p), _matrix(deformation, p)
         trial = (
             f[0] + h * (c[0] * f[0] + c[1] * f[3] + c[2] * f[6]),
             f[1] + h * (c[0] * f[1] + c[1] * f[4] + c[2] * f[7]),
@@ -115,8 +120,8 @@ def particles_to_grid(particles, stress, grid, counts, origin, inv, h):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def grid_to_particles(particles, grid, counts, origin, inv, h):
-    """Velocities and affine parts from the grid, and new positions."""
-    pos, vel, affine = particles.pos, particles.vel, particles.affine
+    """Velocities and their gradients from the grid, and new positions."""
+    pos, vel, gradient = particles.pos, particles.vel, particles.gradient
     stride_x, stride_y = counts[1] * counts[2], counts[2]
     for p in range(pos.shape[0]):
         x, y, z = (pos[p, 0] - origin[0]) * inv, (pos[p, 1] - origin[1]) * inv, (pos[p, 2] - origin[2]) * inv
@@ -142,7 +147,7 @@ def grid_to_particles(particles, grid, counts, origin, inv, h):
                 c10, c11, c12 = c10 + s1 * da, c11 + s1 * db, c12 + share * m1
                 c20, c21, c22 = c20 + s2 * da, c21 + s2 * db, c22 + share * m2
         scale = 4.0 * inv
-        gradient = (scale * c00, scale * c01, scale * c02, scale * c10, scale * c11, scale * c12, scale * c20, scale * c21, scale * c22)
-        _store(affine, p, gradient)
+        rate = (scale * c00, scale * c01, scale * c02, scale * c10, scale * c11, scale * c12, scale * c20, scale * c21, scale * c22)
+        _store(gradient, p, rate)
         vel[p, 0], vel[p, 1], vel[p, 2] = u, v, w
         pos[p, 0], pos[p, 1], pos[p, 2] = pos[p, 0] + h * u, pos[p, 1] + h * v, pos[p, 2] + h * w
