@@ -49,7 +49,7 @@ class Replay:
     trajectory: Trajectory
 
     def step(self, state: State) -> State:
-        frame = round(state.time / self.trajectory.metadata.frame_dt) + 1
+        frame = round((state.time - self.trajectory.start_time) / self.trajectory.metadata.frame_dt) + 1
         return self.trajectory.state(frame)
 
 
@@ -330,6 +330,7 @@ class _Recording:
             cells=None if state.cells is None else _numpy(state.cells),
             stress=Stress(np.stack([s.node for s in known]), np.stack([s.cell for s in known])) if has_stress else None,
             termination=self.termination,
+            start_time=state.time,
         )
 
 

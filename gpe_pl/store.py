@@ -322,6 +322,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         rest_pos=arrays.get("rest_pos"),
         cells=arrays.get("cells"),
         stress=Stress(arrays["node_stress"], arrays["cell_stress"]) if "node_stress" in arrays else None,
+        start_time=metadata.frame_dt * (0 if frames is None else frames.start or 0),
     )
 
 

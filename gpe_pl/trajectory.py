@@ -280,7 +280,7 @@ class State:
         num_corrected: nodes that containment put back in coming here from the frame before.
         num_asleep: nodes that a simulator left alone in coming here from the frame before.
         lost_impulse: momentum [kg m/s], in sum of magnitudes, that it took from them.
-        internal: opaque part of a solver (deformation gradient, …), carried so that a restart equals a run-through.
+        internal: opaque part of a solver (deformation gradient, …), carried so that a restart equals a run-through. Stored frames lack it.
         periodicity: axes along which space repeats.
     """
 
@@ -440,6 +440,7 @@ class Trajectory:
         rest_pos, cells: reference configuration of meshes, as in ``State``.
         stress: of the mesh in every frame.
         termination: set when a rollout stopped before its last frame.
+        start_time: of the first frame, in s since the start of the scene; not stored.
     """
 
     metadata: Metadata
@@ -453,6 +454,7 @@ class Trajectory:
     cells: np.ndarray | None = None
     stress: Stress | None = None
     termination: Termination | None = field(default=None, compare=False)
+    start_time: float = field(default=0.0, compare=False)
 
     @classmethod
     def from_numpy(
@@ -572,8 +574,8 @@ class Trajectory:
         rest_pos = None if self.rest_pos is None else self.rest_pos.astype(np.float64)
         stress = None if self.stress is None else Stress(self.stress.node[frame], self.stress.cell[frame])
         return State(
-            pos, vel, self.node_type, self.mass, self.material_params, self.boundary.at(frame), gravity, past, frame * self.metadata.frame_dt,
-            rest_pos, self.cells, stress, periodicity=self.metadata.periodicity,
+            pos, vel, self.node_type, self.mass, self.material_params, self.boundary.at(frame), gravity, past,
+            self.start_time + frame * self.metadata.frame_dt, rest_pos, self.cells, stress, periodicity=self.metadata.periodicity,
         )  # fmt: skip
 
     def seen_from(self, origin: np.ndarray) -> Trajectory:
@@ -590,7 +592,15 @@ class Trajectory:
     def frames(self, start: int, stop: int | None = None) -> Trajectory:
         """The frames ``start:stop`` as a trajectory of their own."""
         stress = None if self.stress is None else Stress(self.stress.node[start:stop], self.stress.cell[start:stop])
-        return replace(self, pos=self.pos[start:stop], vel=self.vel[start:stop], boundary=self.boundary.at(start, stop), stress=stress)
+        first, _, _ = slice(start, stop).indices(self.num_frames)
+        return replace(
+            self,
+            pos=self.pos[start:stop],
+            vel=self.vel[start:stop],
+            boundary=self.boundary.at(start, stop),
+            stress=stress,
+            start_time=self.start_time + first * self.metadata.frame_dt,
+        )
 
     def with_moving_boundary(self) -> Trajectory:
         """For pictures and other programs: boundary nodes that move in a prescribed way as further nodes, of type ``boundary``, after the others.

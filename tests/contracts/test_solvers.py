@@ -126,13 +126,20 @@ def test_restart_equals_run_through(case):
     assert_same_bytes(run(fresh, middle, 15), run(solver, state, 40))
 
 
-def test_internal_state_matters(case):
-    """Without its internal part a restart differs, so the test above cannot pass by accident."""
+@pytest.mark.parametrize("start_of_part", [False, True], ids=["frame", "first frame of a part"])
+def test_stored_frame_is_continued_or_refused(case, start_of_part):
+    """A stored frame has positions and velocities only. A solver that needs more refuses it; the others go on as if they had not stopped."""
     solver, state = case
-    middle = run(solver, state, 40)
-    if middle.internal is None:
-        pytest.skip("this solver keeps nothing besides position and velocity")
-    assert not np.array_equal(solver.step(replace(middle, internal=None)).pos, solver.step(middle).pos)
+    whole = rollout(solver, state, 30, metadata(solver.materials, state.dim))
+    middle = whole.frames(20).state(0) if start_of_part else whole.state(20)
+    assert middle.internal is None
+    rest = rollout(solver, middle, 10, whole.metadata)
+    if solver.name == "mpm":
+        assert rest.num_frames == 1 and rest.termination is not None
+        assert rest.termination.reason == "input" and "the state at 0.1 s has no internal part" in rest.termination.message
+    else:
+        np.testing.assert_array_equal(rest.pos, whole.pos[20:])
+        np.testing.assert_array_equal(rest.vel, whole.vel[20:])
 
 
 def test_a_parameter_outside_the_limits_is_refused(case):

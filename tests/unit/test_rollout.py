@@ -58,6 +58,16 @@ def test_oracle_survives_hundreds_of_inexact_time_steps(new_trajectory: New) -> 
     np.testing.assert_array_equal(rollout(Replay(long), long.state(0), 699, long.metadata).pos, long.pos)
 
 
+def test_part_of_a_trajectory_knows_when_it_begins(trajectory: Trajectory) -> None:
+    """Also one that was predicted from a frame after the first."""
+    dt, part = trajectory.metadata.frame_dt, trajectory.frames(2)
+    assert [part.state(k).time for k in (0, 3)] == pytest.approx([2 * dt, 5 * dt])
+    assert part.frames(-2).state(0).time == pytest.approx((trajectory.num_frames - 2) * dt)
+    again = rollout(Replay(part), part.state(1), 2, part.metadata)
+    np.testing.assert_array_equal(again.pos, trajectory.pos[3:6])
+    assert again.state(2).time == pytest.approx(5 * dt)
+
+
 def test_no_steps(trajectory: Trajectory) -> None:
     result = rollout(Replay(trajectory), trajectory.state(2), 0, trajectory.metadata)
     np.testing.assert_array_equal(result.pos, trajectory.pos[2:3])

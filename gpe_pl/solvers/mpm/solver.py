@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
@@ -21,6 +22,9 @@ from gpe_pl.trajectory import Boundary, State
 
 PADDING = 3
 """Cells between the domain and the edge of the grid: room for the kernel of a particle on a wall, or one cell behind it."""
+
+UNDEFORMED = 1e-3
+"""Relative change of the distance between two nodes of a cell up to which a mesh counts as undeformed: far more than the rounding of stored positions."""
 
 KNOWN = ("sand", "snow", "elastomer", "fluid")
 """Materials that have a law; also the names of the solver's settings that hold their constants."""
@@ -47,12 +51,16 @@ class MPMInternal:
     @classmethod
     def at_rest(cls, num_nodes: int, dim: int) -> MPMInternal:
         """Undeformed particles that do not rotate."""
-        return cls(np.tile(np.eye(dim), (num_nodes, 1, 1)), *np.zeros((2, num_nodes, dim, dim)), np.zeros(num_nodes))
+        still = np.zeros((num_nodes, dim, dim))
+        return cls(np.tile(np.eye(dim), (num_nodes, 1, 1)), still, still.copy(), np.zeros(num_nodes))
 
 
 @validated_dataclass(frozen=True, config={"extra": "forbid"})
 class MPM:
     """Material point solver; a ``Simulator``.
+
+    How particles are deformed cannot be told from their positions, so a state is either the start of a scene, where nothing is deformed, or one that ``step``
+    returned, with its ``internal`` part. Frames of a stored or predicted trajectory after the first one are refused.
 
     Each step advances one frame by substeps that satisfy ``h (c + |v|_max) <= cfl Δ``, with c the fastest elastic wave in any particle as it is deformed and
     hardened now, ``h² |g| <= cfl Δ / 4`` and ``8 h ν <= Δ²``. They are chosen from the current state alone, so a restart repeats a run-through bit by bit.
@@ -116,6 +124,8 @@ class MPM:
         """
         internal = state.internal if state.internal is not None else MPMInternal.at_rest(state.num_nodes, len(self.bounds))
         particles = self._particles(state, internal)
+        if state.internal is None:
+            self._require_undeformed(state)
         origin = tuple(low - PADDING * self.grid_spacing for low, _ in self.bounds)
         counts = tuple(round((high - low) / self.grid_spacing) + 1 + 2 * PADDING for low, high in self.bounds)
         status, node, num_substeps, last_substep = advance(
@@ -142,6 +152,22 @@ class MPM:
             num_substeps=num_substeps,
             internal=MPMInternal(particles.deformation, particles.affine, particles.gradient, particles.plastic, np.array(last_substep)),
         )
+
+    def _require_undeformed(self, state: State) -> None:
+        remedy = "start at frame 0 of a scene, or step on from the state that the solver returned"
+        if state.time > 0:
+            message = (
+                f"the state at {state.time:g} s has no internal part (how its particles are deformed), which MPM cannot find out; {remedy}"
+            )
+            raise SimulationError(message, reason="input")
+        if state.rest_pos is not None and state.cells is not None:
+            stretch, node = _largest_stretch(np.asarray(state.pos), np.asarray(state.rest_pos), np.asarray(state.cells))
+            if stretch > UNDEFORMED:
+                message = (
+                    f"the state has no internal part, but its cells are stretched or compressed by up to {100 * stretch:.3g} % against rest_pos "
+                    f"(node {node}); {remedy}"
+                )
+                raise SimulationError(message, reason="input", node=node)
 
     def _collider(self, boundary: Boundary, origin: tuple[float, ...], counts: tuple[int, ...]) -> Collider:
         if np.any(np.asarray(boundary.vel) != 0) or np.any(np.asarray(boundary.restitution) != 0):
@@ -211,3 +237,14 @@ class MPM:
             f"{where} under gravity {np.asarray(gravity).tolist()} m/s² would need more than {self.max_substeps} substeps in one frame"
         )
         return SimulationError(message, reason="explosion", node=node)
+
+
+def _largest_stretch(pos: np.ndarray, rest_pos: np.ndarray, cells: np.ndarray) -> tuple[float, int]:
+    """Largest relative change of a distance between two nodes of a cell, and one of the nodes."""
+    pairs = np.concatenate([cells[:, pair] for pair in itertools.combinations(range(cells.shape[1]), 2)])
+    rest, now = (np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1) for x in (rest_pos, pos))
+    change = np.abs(now - rest) / np.where(rest > 0, rest, math.inf)
+    if len(change) == 0:
+        return 0.0, -1
+    worst = int(np.argmax(change))
+    return float(change[worst]), int(pairs[worst, 0])

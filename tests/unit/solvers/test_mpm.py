@@ -160,6 +160,31 @@ def test_extra_arrays_of_the_state_are_carried():
     assert after.cells is mesh.cells and after.rest_pos is mesh.rest_pos
 
 
+def meshed(dim):
+    """A block of elastomer at rest with one cell, and its solver."""
+    state = scene(dim, "elastomer")
+    cells = np.array([[0, 1, 20, 21]] if dim == 2 else [[0, 1, 20]])
+    return MPM(bounds=bounds(dim), grid_spacing=CELL, materials=("elastomer",)), replace(state, rest_pos=state.pos.copy(), cells=cells)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_deformed_mesh_without_internal_state_is_refused(dim):
+    """What was moved or turned as a whole, by rounding or by less than a thousandth is undeformed."""
+    solver, state = meshed(dim)
+    turn = np.eye(dim)
+    turn[:2, :2] = [[0.6, -0.8], [0.8, 0.6]]
+    middle = state.pos.mean(axis=0)
+    for pos in (state.pos + 0.01, middle + (state.pos - middle) @ turn.T, state.pos.astype(np.float32), 1.0005 * state.pos):
+        solver.step(replace(state, pos=pos))
+    squeezed = replace(state, pos=state.pos * np.array([1.0] * (dim - 1) + [0.9]))
+    with pytest.raises(
+        SimulationError, match=r"cells are stretched or compressed by up to .* % against rest_pos .*start at frame 0"
+    ) as caught:
+        solver.step(squeezed)
+    assert caught.value.reason == "input" and caught.value.node in state.cells
+    solver.step(replace(squeezed, internal=internal(state)))
+
+
 def bounce(dim, modulus, cfl):
     """Height that the centre of a block rises to again after a fall, over the height of the fall."""
     height, spacing, bottom = 0.1, CELL / 2, np.eye(dim)[-1]
