@@ -22,6 +22,8 @@ from pydantic import TypeAdapter, ValidationError
 from gpe_pl.atomic import replacing
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import Shape, shape_from_dict, shape_to_dict
+from gpe_pl.hdf5_arrays import attribute, dataset_in, is_named, is_own, obstacle
+from gpe_pl.json_text import parsed
 from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, SCHEMA_VERSION, node_code
 from gpe_pl.trajectory import Boundary, Metadata, Motion, Stress, Trajectory
 from gpe_pl.values import faults, size_conflicts
@@ -94,9 +96,6 @@ def digest(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
 COMPRESSION = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
 """Lossless: a quarter less disk for particles, more for meshes; higher levels save a per cent."""
 
-LARGEST_DEFLATE_RATIO = 1032
-"""Deflate cannot compress better than this (RFC 1951: 258 bytes by two bits)."""
-
 
 def _chunks(array: np.ndarray, dims: tuple[str, ...]) -> tuple[int, ...]:
     """Whole arrays in one chunk, except that frames are cut into chunks of about 256 kB."""
@@ -154,7 +153,7 @@ def open_shard(path: Path | str) -> Iterator[h5py.File]:
         raise StoreError(f"{path}: no such file; generate data with `python -m gpe_pl.simulate`")
     try:
         with h5py.File(path, "r") as file:
-            version = file.attrs.get("schema_version")
+            version = attribute(file, "schema_version")
             if not isinstance(version, np.integer) or version != SCHEMA_VERSION:
                 raise StoreError(
                     f"{path}: schema version {version}, this version of gpe_pl reads {SCHEMA_VERSION}; regenerate or convert the data"
@@ -174,9 +173,9 @@ def _where(group: h5py.Group) -> str:
 
 def open_group(file: h5py.File, name: str) -> h5py.Group:
     """The group of one trajectory."""
-    if name not in file:
+    if not is_named(file, name):
         raise StoreError(f"{file.filename}: no trajectory {name!r}; it has {len(file)} trajectories")
-    if not isinstance(file.get(name, getlink=True), h5py.HardLink) or not isinstance(file[name], h5py.Group):
+    if not is_own(file, name) or not isinstance(file[name], h5py.Group):
         raise StoreError(
             f"{file.filename}: {name!r} is not a trajectory of this file; delete the shard and generate or import the data again"
         )
@@ -187,28 +186,36 @@ def read_text(group: h5py.Group, key: str) -> str:
     """A text attribute of a trajectory."""
     if key not in group.attrs:
         raise StoreError(f"{_where(group)}: attribute {key!r} is missing; delete the shard and generate or import the data again")
-    stored = group.attrs.get_id(key)
-    if stored.shape != () or stored.dtype.kind != "S":  # text of variable length has kind "O" and is not safe to read from a damaged file
+    text = attribute(group, key)
+    if not isinstance(text, bytes):  # text of variable length is not safe to read from a damaged file
+        stored = group.attrs.get_id(key)
         raise StoreError(f"{_where(group)}: attribute {key!r} is {stored.dtype}{list(stored.shape)}, expected text of fixed length")
-    return group.attrs[key].decode()
+    return text.decode()
 
 
-def read_field(group: h5py.Group, key: str, frames: slice | None = None) -> np.ndarray:
-    """One stored array, compared with ``schema.FIELDS`` before any of it is read; only ``frames`` of it where it has frames."""
+def open_field(group: h5py.Group, key: str) -> h5py.Dataset:
+    """One stored array, compared with ``schema.FIELDS`` before any of it is read."""
     spec, where = FIELDS[key], f"{_where(group)}: field {key!r}"
-    if key not in group:
+    if not is_named(group, key):
         raise StoreError(f"{where} is missing; delete the shard and generate or import the data again")
-    dataset = group[key] if isinstance(group.get(key, getlink=True), h5py.HardLink) else None
-    if not isinstance(dataset, h5py.Dataset) or dataset.is_virtual or dataset.external:
+    dataset = dataset_in(group, key)
+    if dataset is None:
         raise StoreError(f"{where} is not an array inside this file; a shard must not refer to other files")
     if dataset.shape is None or len(dataset.shape) != len(spec.dims) or dataset.dtype != np.dtype(spec.dtype):
         raise StoreError(f"{where} is {dataset.dtype}{list(dataset.shape or ())}, expected {spec.dtype} [{', '.join(spec.dims)}]")
-    if dataset.id.get_storage_size() * LARGEST_DEFLATE_RATIO < dataset.nbytes:  # a huge shape without data must not fill the memory
-        raise StoreError(f"{where} declares {dataset.nbytes} bytes but the file holds {dataset.id.get_storage_size()}, compressed")
+    if (reason := obstacle(dataset)) is not None:
+        raise StoreError(f"{where} {reason}")
+    return dataset
+
+
+def read_field(group: h5py.Group, key: str, frames: slice | None = None) -> np.ndarray:
+    """What a stored array holds; only ``frames`` of it where it has frames."""
+    spec, dataset = FIELDS[key], open_field(group, key)
     try:
         has_frames = spec.dims[0] == "frame" or (spec.dims[0] == MOTION and dataset.shape[0] > 1)
         return dataset[frames] if frames is not None and has_frames else dataset[()]
     except (OSError, RuntimeError):
+        where = f"{_where(group)}: field {key!r}"
         raise StoreError(f"{where} is damaged (checksum mismatch); delete the shard and generate or import the data again") from None
 
 
@@ -228,7 +235,7 @@ def metadata_of(group: h5py.Group) -> Metadata:
     """The metadata of a trajectory's group; every key must be there with the right type, and no other."""
     try:
         text = read_text(group, "metadata")
-        values = json.loads(text)
+        values = parsed(text)
         known = {f.name for f in fields(Metadata)}
         if not isinstance(values, dict) or set(values) != known:
             raise ValueError(f"keys {sorted(set(values) ^ known)} missing or unknown")
@@ -236,29 +243,29 @@ def metadata_of(group: h5py.Group) -> Metadata:
     except StoreError:
         raise
     except ValidationError as error:
-        wrong = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        wrong = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors(include_url=False)[:5])
         raise StoreError(f"{_where(group)}: metadata unreadable: {wrong}") from None
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError) as error:
         raise StoreError(f"{_where(group)}: metadata unreadable: {error}") from None
 
 
 def shapes_of(group: h5py.Group) -> tuple[Shape, ...]:
     """The obstacle and wall geometry of a trajectory's group."""
     try:
-        return tuple(shape_from_dict(s) for s in json.loads(read_text(group, "shapes")))
+        return tuple(shape_from_dict(s) for s in parsed(read_text(group, "shapes")))
     except StoreError:
         raise
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError, AttributeError, ArithmeticError, LookupError) as error:
         raise StoreError(f"{_where(group)}: attribute 'shapes' is unreadable: {error}") from None
 
 
 def node_types_of(group: h5py.Group) -> tuple[str, ...]:
     """The names behind the integers of ``node_type`` in a trajectory's group; all of them are in ``schema.NODE_TYPES``."""
     try:
-        names = tuple(json.loads(read_text(group, "node_types")))
+        names = tuple(parsed(read_text(group, "node_types")))
     except StoreError:
         raise
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError) as error:
         raise StoreError(f"{_where(group)}: attribute 'node_types' is unreadable: {error}") from None
     unknown = [name for name in names if name not in NODE_TYPES]
     if unknown:
@@ -284,7 +291,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
     with open_shard(path) as file:
         group = open_group(file, name)
         metadata = metadata_of(group)
-        arrays = {key: read_field(group, key, frames) for key, spec in FIELDS.items() if spec.required or key in group}
+        arrays = {key: read_field(group, key, frames) for key, spec in FIELDS.items() if spec.required or is_named(group, key)}
         if verify:
             attributes = {key: read_text(group, key) for key in ("metadata", "shapes", "node_types")}
             if digest(arrays, attributes) != read_text(group, "sha256"):

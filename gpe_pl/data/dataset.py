@@ -23,7 +23,7 @@ from gpe_pl.data.noise import Noise
 from gpe_pl.data.statistics import FRAMES_AT_ONCE
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
-from gpe_pl.store import StoreError, UnsoundError, open_group, open_shard, read_trajectory, shards, trajectory_names
+from gpe_pl.store import StoreError, UnsoundError, open_field, open_group, open_shard, read_trajectory, shards, trajectory_names
 from gpe_pl.trajectory import State, Trajectory
 
 log = logging.getLogger(__name__)
@@ -79,7 +79,7 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
     stored = []
     for path in paths:
         with open_shard(path) as file:
-            shapes = {name: open_group(file, name)["pos"].shape[:2] for name in sorted(file)}
+            shapes = {name: open_field(open_group(file, name), "pos").shape[:2] for name in sorted(file)}
         for name, (num_frames, num_nodes) in shapes.items():
             held = None
             if hold:

@@ -27,6 +27,8 @@ from pydantic import TypeAdapter, ValidationError
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.motion import motion_of, rounding_fault, rounding_of
 from gpe_pl.geometry import Shape
+from gpe_pl.hdf5_arrays import attribute, is_named
+from gpe_pl.json_text import parsed
 from gpe_pl.printable import printable, speak_utf8
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup
 from gpe_pl.solvers.materials import LIMITS
@@ -196,17 +198,17 @@ def _check_file(path: Path, result: Result, seen: dict[str, str], reference: dic
 
 
 def _check_shard(file: h5py.File) -> Iterator[Finding]:
-    count = file.attrs.get("num_trajectories")
+    count = attribute(file, "num_trajectories")
     if not isinstance(count, np.integer) or count != len(file):
         yield "num_trajectories", f"is {count}, but the file holds {len(file)} trajectories"
     if len(file) == 0:
         yield "", "no trajectories"
     expected = {key: spec.unit for key, spec in FIELDS.items()}
     try:
-        units = json.loads(read_text(file, "units"))
+        units = parsed(read_text(file, "units"))
     except StoreError as error:
         yield "units", str(error).split(": ", 1)[-1]
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         yield "units", f"is not JSON: {error}"
     else:
         if units != expected:
@@ -219,7 +221,7 @@ def _check_trajectory(group: h5py.Group, path: Path) -> tuple[Metadata, dict[str
     findings = list(_check_metadata(metadata, path))
     arrays: dict[str, np.ndarray] = {}
     for key, spec in FIELDS.items():
-        if key in group or spec.required:
+        if spec.required or is_named(group, key):
             try:
                 arrays[key] = read_field(group, key)
             except StoreError as error:
@@ -249,8 +251,8 @@ def _check_metadata(m: Metadata, path: Path) -> Iterator[Finding]:
             yield key, "is empty; it is needed to tell where the data come from"
     yield from m.violations()
     try:
-        json.loads(m.config)
-    except (ValueError, RecursionError):
+        parsed(m.config)
+    except ValueError:
         yield "config", "is not JSON"
     if m.split not in SPLITS:
         yield "split", f"is {m.split!r}, must be one of {', '.join(SPLITS)}"

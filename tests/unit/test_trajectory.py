@@ -187,7 +187,7 @@ def test_huge_shape_without_data_is_refused_before_it_fills_the_memory(shard: Pa
     with h5py.File(shard, "r+") as file:
         del file["00000"]["pos"]
         file["00000"].create_dataset("pos", (2**20, 2**20, 2), "float32", chunks=(1, 12, 2))
-    with pytest.raises(StoreError, match="field 'pos' declares 8796093022208 bytes"):
+    with pytest.raises(StoreError, match="field 'pos' claims 8796093022208 bytes, the file holds"):
         read_trajectory(shard, "00000")
 
 

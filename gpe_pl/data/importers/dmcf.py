@@ -35,7 +35,7 @@ from gpe_pl.data.importers.source import (
     natural,
     split_folders,
 )
-from gpe_pl.store import LARGEST_DEFLATE_RATIO
+from gpe_pl.hdf5_arrays import LARGEST_DEFLATE_RATIO
 
 ENDING = ".msgpack.zst"
 PART = re.compile(r"(_\d+)_(\d+)$")

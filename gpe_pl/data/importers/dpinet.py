@@ -31,6 +31,7 @@ from gpe_pl.data.importers.source import (
     natural,
     split_folders,
 )
+from gpe_pl.hdf5_arrays import is_named
 
 FRAME_DT = 1 / 60
 GRAVITY = (0.0, -9.8, 0.0)
@@ -75,7 +76,7 @@ def _has_clusters(rollout: Path) -> bool:
         return False
     try:
         with hdf5.opened(files[0]) as file:
-            return "clusters" in file
+            return is_named(file, "clusters")
     except Refusal:
         return False
 
@@ -91,9 +92,9 @@ def _load(rollout: Path, settings: ImportSettings, facts: Facts) -> Loaded:
     for k, path in enumerate(files):
         try:
             with hdf5.opened(path) as file:
-                if "shape_quats" in file:
+                if is_named(file, "shape_quats"):
                     raise Refusal("has shape_quats: moving walls or grippers, of which the files do not hold the shape")
-                clusters = clusters or "clusters" in file
+                clusters = clusters or is_named(file, "clusters")
                 for name, arrays in (("positions", pos), ("velocities", vel)):
                     arrays.append(hdf5.array(file, name, "node, component", "f"))
                     if arrays[-1].shape != (len(pos[0]), 3):

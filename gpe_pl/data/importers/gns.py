@@ -43,6 +43,7 @@ from gpe_pl.data.importers.source import (
     split_files,
     typed,
 )
+from gpe_pl.hdf5_arrays import is_named
 
 TYPES = {0: "solid", 3: "boundary", 5: "fluid", 6: "sand", 7: "snow"}
 PACKED = "gns_data"
@@ -159,7 +160,7 @@ def _in_hdf5(path: Path, dim: int, length: int | None, settings: ImportSettings)
             group = file[name]
             pos = hdf5.array(group, "positions", "frame, node, dim", "f")
             types = hdf5.array(group, "particle_type", "node", "iu")
-            value = hdf5.array(group, "material_property", "node") if "material_property" in group else None
+            value = hdf5.array(group, "material_property", "node") if is_named(group, "material_property") else None
         if pos.shape[2] != dim:
             raise Refusal(f"positions have {pos.shape[2]} components, bounds have {dim}")
         return _loaded(pos, types, value, length, settings, facts)

@@ -11,7 +11,7 @@ import numpy as np
 
 from gpe_pl.data.importers.source import ImportFailure, Refusal, natural
 from gpe_pl.errors import GpeError
-from gpe_pl.store import LARGEST_DEFLATE_RATIO
+from gpe_pl.hdf5_arrays import dataset_in, is_named, is_own, obstacle
 
 
 @contextmanager
@@ -40,11 +40,7 @@ def groups(path: Path) -> list[str]:
     """Names of a file's groups, by their numbers; raises ``ImportFailure``."""
     try:
         with opened(path) as file:
-            names = [
-                name
-                for name in sorted(file, key=natural)
-                if isinstance(file.get(name, getlink=True), h5py.HardLink) and isinstance(file[name], h5py.Group)
-            ]
+            names = [name for name in sorted(file, key=natural) if is_own(file, name) and isinstance(file[name], h5py.Group)]
     except Refusal as refusal:
         raise ImportFailure(f"{path}: {refusal}") from None
     if not names:
@@ -62,20 +58,20 @@ def array(group: h5py.Group, name: str, axes: str, kinds: str = "fiu") -> np.nda
         kinds: NumPy's letters for the types that it may have.
 
     Raises:
-        Refusal: it is missing, of another type or shape, larger than the file can hold, or damaged.
+        Refusal: it is missing, of another type or shape, larger than the file can hold, stored in a way that takes far more than it holds, or damaged.
     """
-    if name not in group:
+    if not is_named(group, name):
         raise Refusal(f"has no {name!r}; there are {', '.join(map(repr, sorted(group)[:10])) or 'no arrays'}")
-    dataset = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
-    if not isinstance(dataset, h5py.Dataset) or dataset.is_virtual or dataset.external:
+    dataset = dataset_in(group, name)
+    if dataset is None:
         raise Refusal(f"{name!r} is not an array inside this file")
     count = len(axes.split(", "))
     if dataset.shape is None or dataset.dtype.kind not in kinds or len(dataset.shape) != count:
         raise Refusal(
             f"{name!r} is {dataset.dtype}{list(dataset.shape or ())}, expected {'integers' if 'f' not in kinds else 'numbers'} [{axes}]"
         )
-    if dataset.nbytes > dataset.id.get_storage_size() * LARGEST_DEFLATE_RATIO:  # a huge shape without data must not fill the memory
-        raise Refusal(f"{name!r} claims {dataset.nbytes} bytes, the file holds {dataset.id.get_storage_size()}")
+    if (reason := obstacle(dataset)) is not None:
+        raise Refusal(f"{name!r} {reason}")
     try:
         return np.asarray(dataset[()])
     except (OSError, RuntimeError, MemoryError) as error:

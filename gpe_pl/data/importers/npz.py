@@ -13,12 +13,12 @@ import numpy as np
 from numpy.lib import format as npy
 
 from gpe_pl.data.importers.source import ImportFailure, Refusal
-from gpe_pl.store import LARGEST_DEFLATE_RATIO
+from gpe_pl.hdf5_arrays import LARGEST_DEFLATE_RATIO
 
 HEADERS: dict[tuple[int, int], Any] = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 DAMAGE = (
-    *(OSError, EOFError, KeyError, ValueError, MemoryError, NotImplementedError, zipfile.BadZipFile, zlib.error),
+    *(OSError, EOFError, KeyError, ValueError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error),
     *(pickle.UnpicklingError, AttributeError, ImportError),
 )
 """What reading a damaged archive, or a pickle that was asked for, can raise."""
@@ -29,7 +29,7 @@ def names(path: Path) -> list[str]:
     try:
         with zipfile.ZipFile(path) as archive:
             return [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
-    except (OSError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         raise ImportFailure(f"{path}: not a readable .npz archive ({error})") from None
 
 
@@ -45,11 +45,13 @@ def read(path: Path, name: str, allow_pickle: bool = False) -> np.ndarray:
             member = archive.getinfo(f"{name}.npy")
             if member.file_size > max(member.compress_size, 1) * LARGEST_DEFLATE_RATIO:
                 raise Refusal(f"{name!r} claims {member.file_size} bytes, the archive holds {member.compress_size}")
+            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise Refusal(f"{name!r} is compressed in another way than NumPy does; write it with numpy.savez_compressed")
             with archive.open(member) as file:
                 version = npy.read_magic(file)
                 if version not in HEADERS:
                     raise Refusal(f"{name!r} has version {version} of the .npy format, expected one of {', '.join(map(str, HEADERS))}")
-                shape, _, dtype = HEADERS[version](file)
+                shape, dtype = _header(file, version, name)
                 if dtype.hasobject and not allow_pickle:
                     raise ImportFailure(
                         f"{path}: {name!r} is an array of Python objects, a pickle, which can run any code when it is read. If you trust whoever wrote "
@@ -66,3 +68,14 @@ def read(path: Path, name: str, allow_pickle: bool = False) -> np.ndarray:
         if isinstance(error, (Refusal, ImportFailure)):
             raise
         raise Refusal(f"{name!r} is damaged ({error})") from None
+
+
+def _header(file: Any, version: tuple[int, int], name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type of an array; NumPy reads headers as Python text, for which damaged ones raise anything."""
+    try:
+        shape, _, dtype = HEADERS[version](file)
+    except Exception as error:
+        raise Refusal(f"{name!r} is damaged (header: {type(error).__name__}: {str(error)[:100]})") from None
+    if any(type(n) is not int or n < 0 for n in shape):
+        raise Refusal(f"{name!r} is damaged (header: its shape is {str(shape)[:100]})")
+    return shape, dtype

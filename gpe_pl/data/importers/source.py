@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,6 +15,7 @@ from pydantic import Field
 from gpe_pl.arrays import estimated_normals, numbers
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import domain_walls
+from gpe_pl.json_text import parsed
 from gpe_pl.names import DataName
 from gpe_pl.periodicity import NOWHERE, Periodicity
 from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES
@@ -399,10 +399,10 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > MAX_JSON_BYTES:
             raise ImportFailure(f"{path}: has {path.stat().st_size} bytes, far more than a description of data")
-        values = json.loads(path.read_bytes())
+        values = parsed(path.read_bytes())
     except OSError as error:
         raise ImportFailure(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ImportFailure(f"{path}: is not JSON ({error})") from None
     if not isinstance(values, dict):
         raise ImportFailure(f"{path}: expected a JSON object, found {type(values).__name__}")

@@ -133,6 +133,11 @@ def test_pickles_in_own_arrays_are_never_opened(tmp_path: Path) -> None:
     assert not (tmp_path / "trace").exists()
 
 
+def headed(text: str) -> bytes:
+    """An array file with a header of its own and four bytes of data."""
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode() + b"\0" * 4
+
+
 def npy(shape: tuple[int, ...], data: bytes, dtype: str = "<f4") -> bytes:
     """An array file that claims a shape and has other data."""
     header = repr({"descr": dtype, "fortran_order": False, "shape": shape}).encode()
@@ -148,6 +153,11 @@ def npy(shape: tuple[int, ...], data: bytes, dtype: str = "<f4") -> bytes:
         (b"hello", "'pos' is damaged"),
         (b"\x93NUMPY\x07\x00" + b"\0" * 100, "has version"),
         (npy((4,), b"ab" * 4, "<U1"), "'pos' claims <U1"),
+        (headed("(" * 5000), r"'pos' is damaged \(header: "),
+        (headed("{'descr': [" + "(" * 50 + "], 'fortran_order': False, 'shape': (1,)}"), r"'pos' is damaged \(header: "),
+        (headed("{'descr': '<f4', 'fortran_order': False, 'shape': (True,)}"), r"'pos' is damaged \(header: its shape is \(True,\)"),
+        (headed("{'descr': '<f4', 'fortran_order': False, 'shape': (-1, -1)}"), r"'pos' is damaged \(header: its shape is \(-1, -1\)"),
+        (headed("-" * 9000 + "1"), r"'pos' is damaged \(header: "),
     ],
 )
 def test_an_array_file_that_lies(tmp_path: Path, member: bytes, message: str) -> None:
@@ -162,6 +172,14 @@ def test_an_array_file_that_lies(tmp_path: Path, member: bytes, message: str) ->
     text = unreadable(tmp_path, "arrays")
     assert text.startswith("train, 2.npz: ")
     assert re.search(message, text), text
+
+
+def test_an_archive_compressed_in_another_way(tmp_path: Path) -> None:
+    (tmp_path / "raw").mkdir()
+    with zipfile.ZipFile(tmp_path / "raw" / "a.npz", "w", zipfile.ZIP_LZMA) as archive:
+        for name in ("pos", "frame_dt", "materials", "params_sand"):
+            archive.writestr(f"{name}.npy", npy((), b"\0" * 4))
+    refused(tmp_path, "arrays", "is compressed in another way than NumPy does")
 
 
 def test_an_archive_that_blows_up(tmp_path: Path) -> None:
