@@ -44,7 +44,7 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
     caught = signed_distance(shapes, moved) < -tolerance
     moved = xp.where(caught[:, None], pos[rows] - state.vel[rows] * dt, moved)
     new_pos, vel = xp.asarray(pos, copy=True), xp.asarray(state.vel, copy=True)
-    new_pos[rows] = moved
+    new_pos[rows] = state.periodicity.wrapped(moved)
     vel[rows] = vel[rows] + (moved - pos[rows]) / dt
     history = state.velocity_history
     if history is not None:

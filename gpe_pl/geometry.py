@@ -12,7 +12,7 @@ import itertools
 import math
 import zlib
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
@@ -451,39 +451,6 @@ def _thin(points: np.ndarray, normals: np.ndarray, distance: float) -> np.ndarra
             near = np.asarray(tree.query_ball_point(point, distance))
             free[near[normals[near] @ normals[k] > -0.5]] = False
     return np.array(kept, dtype=np.int64)
-
-
-SHAPES: dict[str, type] = {cls.kind: cls for cls in (Wall, Sphere, Bowl, Box, Polygon, DistanceGrid)}
-
-
-def shape_to_dict(shape: Shape) -> dict[str, Any]:
-    """Plain values from which ``shape_from_dict`` rebuilds the shape."""
-    return {"kind": shape.kind, **asdict(shape)}  # type: ignore[call-overload]
-
-
-def shape_from_dict(values: dict[str, Any]) -> Shape:
-    """Rebuild a shape; raises ``ValueError`` that names an unknown kind or key."""
-    values = dict(values)
-    kind = values.pop("kind", None)
-    if kind not in SHAPES:
-        raise ValueError(f"unknown shape kind {kind!r}; known: {', '.join(SHAPES)}")
-
-    def tuples(value: Any) -> Any:
-        return tuple(tuples(v) for v in value) if isinstance(value, (list, tuple)) else value
-
-    try:
-        return SHAPES[kind](**{key: tuples(value) for key, value in values.items()})
-    except TypeError as error:
-        raise ValueError(f"shape {kind!r}: {error}") from None
-
-
-def moved(shape: Shape, by: np.ndarray) -> Shape:
-    """The shape displaced by ``by`` [dim] in m."""
-    values = shape_to_dict(shape)
-    values |= {name: (values[name] + by).tolist() for name in ("center", "low", "high", "vertices", "origin") if name in values}
-    if isinstance(shape, Wall):
-        values["offset"] += float(np.dot(shape.normal, by))
-    return shape_from_dict(values)
 
 
 def signed_distance(shapes: tuple[Shape, ...], points: Array) -> Array:

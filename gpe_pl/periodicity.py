@@ -57,14 +57,18 @@ class Periodicity:
         return difference - self._turns(difference, round_down=False) if self else difference
 
     def wrapped(self, pos: Array) -> Array:
-        """Positions [..., dim] in m inside the domain along periodic axes; the same object where no axis repeats."""
+        """Positions [..., dim] in m inside the domain, ``low <= x < high`` in their own precision, along periodic axes; the same object where no axis repeats.
+
+        What is inside stays bit for bit.
+        """
         if not self:
             return pos
         xp = array_namespace(pos)
         low, high = (self._row([b[side] for b in self.bounds], pos) for side in (0, 1))
-        inside = pos - self._turns(pos - low, round_down=True)
-        repeats = self._row([float(p) for p in self.periodic], pos) > 0
-        return xp.where(repeats & (inside >= high), low, inside)  # rounding can lead to the upper bound itself
+        folded = pos - self._turns(pos - low, round_down=True)
+        folded = xp.where((folded < low) | (folded >= high), low, folded)  # where rounding led out, beside a bound: one place on a torus
+        folds = (self._row([float(p) for p in self.periodic], pos) > 0) & ~((pos >= low) & (pos < high))
+        return xp.where(folds, folded, pos)
 
     def from_corner(self, pos: Array) -> Array:
         """Positions [..., dim] in m from the domain's lower corner, below the period along periodic axes: what a k-d tree takes."""

@@ -21,10 +21,11 @@ from pydantic import TypeAdapter, ValidationError
 
 from gpe_pl.atomic import replacing
 from gpe_pl.errors import GpeError
-from gpe_pl.geometry import Shape, shape_from_dict, shape_to_dict
+from gpe_pl.geometry import Shape
 from gpe_pl.hdf5_arrays import attribute, dataset_in, is_named, is_own, obstacle
 from gpe_pl.json_text import parsed
 from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, SCHEMA_VERSION, node_code
+from gpe_pl.shape_values import shape_from_dict, shape_to_dict
 from gpe_pl.trajectory import Boundary, Metadata, Motion, Stress, Trajectory
 from gpe_pl.values import faults, size_conflicts
 

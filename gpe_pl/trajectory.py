@@ -25,10 +25,12 @@ from gpe_pl.arrays import (
     typical_spacing,
     velocities_of,
 )
-from gpe_pl.geometry import Shape, moved, surface_tolerance
+from gpe_pl.geometry import Shape, surface_tolerance
 from gpe_pl.periodicity import NOWHERE, Periodicity, PeriodicityError
+from gpe_pl.repeated_shapes import repeated
 from gpe_pl.rigid_parts import carried_along
 from gpe_pl.schema import BOUNDARY, MATERIALS, STICKY, node_code, param_names
+from gpe_pl.shape_values import moved
 
 Array = Any
 """A NumPy array or a torch tensor."""
@@ -80,8 +82,9 @@ class Boundary:
     motion: Motion | None = None
 
     @classmethod
-    def sample(cls, shapes: tuple[Shape, ...], spacing: float, dim: int) -> Boundary:
-        """Sample shapes into nodes at most ``spacing`` [m] apart; nodes that lie inside another shape are left out."""
+    def sample(cls, shapes: tuple[Shape, ...], spacing: float, dim: int, periodicity: Periodicity = NOWHERE) -> Boundary:
+        """Sample shapes, and their images in periodic domains, into nodes at most ``spacing`` [m] apart; nodes that lie inside another shape are left out."""
+        shapes = repeated(tuple(shapes), periodicity)
         pos, normal, friction, restitution = [np.empty((0, dim))], [np.empty((0, dim))], [np.empty(0)], [np.empty(0)]
         rounding = 1e-3 * surface_tolerance(shapes)
         for shape in shapes:
@@ -95,7 +98,8 @@ class Boundary:
             friction.append(np.full(len(p), shape.friction))
             restitution.append(np.full(len(p), shape.restitution))
         x = np.concatenate(pos)
-        return cls(x, np.zeros_like(x), np.concatenate(normal), np.concatenate(friction), np.concatenate(restitution), tuple(shapes))
+        sampled = cls(x, np.zeros_like(x), np.concatenate(normal), np.concatenate(friction), np.concatenate(restitution), tuple(shapes))
+        return sampled.inside(periodicity)
 
     @classmethod
     def empty(cls, dim: int) -> Boundary:
@@ -171,6 +175,23 @@ class Boundary:
         normals = _unit(normal) if given else carried_along(path, np.asarray(first.normal, np.float64), periodicity)
         inside = np.stack([periodicity.wrapped(frame) for frame in path])
         return replace(first, motion=Motion(inside, vel, normals)).at(0)
+
+    def inside(self, periodicity: Periodicity) -> Boundary:
+        """The same, of NumPy arrays, in a periodic domain: nodes are inside, those that meet at a seam exist once, and shapes know their images."""
+        if not periodicity:
+            return self
+        pos, motion = periodicity.wrapped(self.pos), self.motion
+        close = 1e-6 * float(periodicity.period[list(periodicity.axes)].min())
+        j, i = search_tree(pos, periodicity).query_pairs(close, output_type="ndarray").reshape(-1, 2).T
+        same = (self.normal[i] * self.normal[j]).sum(axis=1) > 0.999  # two walls meet in a corner, where each has its node
+        if motion is not None:
+            same &= (np.abs(periodicity.shortest(motion.pos[:, i] - motion.pos[:, j])) <= close).all(axis=(0, 2))
+            same &= ((motion.normal[:, i] * motion.normal[:, j]).sum(axis=2) > 0.999).all(axis=0)
+        kept = np.setdiff1d(np.arange(len(pos)), i[same])
+        if motion is not None:
+            motion = Motion(motion.pos[:, kept], motion.vel[:, kept], motion.normal[:, kept])
+        pos, vel, normal, friction, restitution = (x[kept] for x in (pos, self.vel, self.normal, self.friction, self.restitution))
+        return Boundary(pos, vel, normal, friction, restitution, repeated(self.shapes, periodicity), motion)
 
     def to_numpy(self) -> Boundary:
         """The same with NumPy arrays of its own."""
@@ -495,6 +516,7 @@ class Trajectory:
             spacing: rest spacing of neighbours [m]; None takes the median distance to the nearest node in the first frame.
             connectivity_radius: neighbour radius [m] that sees what acts on a node; None takes ``arrays.RADIUS_SPACINGS`` spacings.
             boundary: walls and obstacles, for example ``Boundary.sample(domain_walls(bounds, friction), spacing, dim)`` or ``Boundary.from_numpy(…)``.
+                In periodic domains its nodes are folded like others, those that meet at a seam become one, and shapes have images.
             cells: nodes of each cell [cell, corner] of meshes of elastomers and solids.
             rest_pos: undeformed positions [node, dim] of meshes in m; None takes those of the first frame.
             dataset, split: where the trajectory belongs; ``save_dataset`` overrides both.
@@ -517,6 +539,7 @@ class Trajectory:
         repeats = flags("periodic", periodic, dim)
         bounds = checked_bounds(bounds, repeats, pos, way)
         periodicity = Periodicity(bounds, repeats)
+        boundary = boundary.inside(periodicity)
         if periodicity:
             pos = np.stack([periodicity.wrapped(frame.astype(np.float64)).astype(pos.dtype) for frame in pos])
         codes, columns, names = checked_materials(materials, params, num_nodes)

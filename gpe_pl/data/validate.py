@@ -30,6 +30,7 @@ from gpe_pl.geometry import Shape
 from gpe_pl.hdf5_arrays import attribute, is_named
 from gpe_pl.json_text import parsed
 from gpe_pl.printable import printable, speak_utf8
+from gpe_pl.repeated_shapes import Repeated
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup
 from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.store import (
@@ -306,7 +307,9 @@ def _check_shapes(m: Metadata, arrays: dict[str, np.ndarray], shapes: tuple[Shap
     """Shapes, and whether boundary nodes lie on them where their positions are ``sound``."""
     pos = arrays["boundary_pos"]
     for k, shape in enumerate(shapes):
-        if message := _bad_shape(shape, m.dim):
+        if isinstance(shape, Repeated) and shape.periodicity != m.periodicity:
+            yield "shapes", f"shape {k} repeats along {shape.periodicity}, the domain along {m.periodicity}"
+        elif message := _bad_shape(shape, m.dim):
             sound = False
             yield "shapes", f"shape {k} ({shape.kind}): {message}"
     if shapes and sound and m.spacing > 0 and not m.solver.startswith("import/"):  # of imported boundaries some may be known by points only
@@ -316,6 +319,8 @@ def _check_shapes(m: Metadata, arrays: dict[str, np.ndarray], shapes: tuple[Shap
 
 
 def _bad_shape(shape: Shape, dim: int) -> str | None:
+    if isinstance(shape, Repeated):
+        return _bad_shape(shape.shape, dim)
     values: dict[str, Any] = asdict(shape)  # type: ignore[call-overload]
     try:
         TypeAdapter(type(shape)).validate_json(json.dumps(values), strict=True)
@@ -409,7 +414,7 @@ Values are finite and at most 1.8e19 in magnitude. The reader refuses others, an
 |---|---|
 {metadata}
 
-`shapes` holds the geometry that the boundary nodes were sampled from; `gpe_pl.geometry` rebuilds it.
+`shapes` holds the geometry that the boundary nodes were sampled from; `gpe_pl.shape_values` rebuilds it.
 """
 
 

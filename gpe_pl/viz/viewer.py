@@ -179,11 +179,7 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
 
 def _inside(trajectory: Trajectory) -> Trajectory:
     """The same with all nodes inside the domain along its periodic axes."""
-    pos = np.array(trajectory.pos)
-    for axis, ((low, high), periodic) in enumerate(zip(trajectory.metadata.bounds, trajectory.metadata.periodic, strict=True)):
-        if periodic:
-            pos[..., axis] = low + np.mod(pos[..., axis] - low, high - low)
-    return replace(trajectory, pos=pos)
+    return replace(trajectory, pos=trajectory.metadata.periodicity.wrapped(trajectory.pos))
 
 
 def _colors(trajectories: Mapping[str, Trajectory]) -> list[ColorBy]:

@@ -14,7 +14,6 @@ import torch
 from scipy.spatial import cKDTree
 
 from gpe_pl.geometry import (
-    SHAPES,
     Bowl,
     Box,
     DistanceGrid,
@@ -23,12 +22,10 @@ from gpe_pl.geometry import (
     Sphere,
     Wall,
     domain_walls,
-    moved,
     outward_normal,
-    shape_from_dict,
-    shape_to_dict,
     signed_distance,
 )
+from gpe_pl.shape_values import SHAPES, moved, shape_from_dict, shape_to_dict
 from gpe_pl.trajectory import Boundary
 
 CONCAVE = ((0.2, 0.2), (0.9, 0.1), (0.5, 0.5), (0.8, 0.9), (0.2, 0.8))

@@ -7,8 +7,7 @@
 Keys are the arguments of ``Trajectory.from_numpy``, which documents them; ``params_{material}`` stands for ``params[material]``, and ``boundary_pos``,
 ``boundary_normal``, ``boundary_vel``, ``boundary_friction`` and ``boundary_restitution`` for those of ``Boundary.from_numpy``, or of ``Boundary.moving`` if
 ``boundary_pos`` is [frame, boundary_node, dim], where ``boundary_normal`` may be of the first frame or of every frame. Without it normals are estimated.
-Needed are ``pos``, ``frame_dt``, ``materials`` and
-``params_…``; the settings of the command override what the files say.
+Needed are ``pos``, ``frame_dt``, ``materials`` and ``params_…``; the settings of the command override what the files say.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl.arrays import estimated_normals, numbers
+from gpe_pl.arrays import estimated_normals, flags, numbers
 from gpe_pl.data.importers import npz
 from gpe_pl.data.importers.source import (
     Facts,
@@ -35,6 +34,7 @@ from gpe_pl.data.importers.source import (
     split_folders,
     walls_at_bounds,
 )
+from gpe_pl.periodicity import NOWHERE, Periodicity
 from gpe_pl.trajectory import Boundary, Trajectory
 
 KEYS = (
@@ -95,6 +95,7 @@ def _load(path: Path, facts: Facts) -> Loaded:
     given = {"frame_dt", "bounds", "periodic", "gravity", "spacing", "connectivity_radius"}
     values |= {name: value for name in given if (value := getattr(facts, name)) is not None}
     values["params"] = {**{m: v for m, v in facts.parameters.items() if m in np.unique(values["materials"])}, **values["params"]}
+    space = _periodicity(values)
     wall = {name.removeprefix("boundary_"): values.pop(name) for name in names if name.startswith("boundary_")}
     notes: list[str] = []
     if wall:
@@ -103,18 +104,25 @@ def _load(path: Path, facts: Facts) -> Loaded:
         moves = wall["pos"].ndim == 3
         if "normal" not in wall:
             points, visited = (wall["pos"][0], values["pos"][0]) if moves else (wall["pos"], values["pos"])
-            wall["normal"] = estimated_normals(points, visited, facts.periodicity)
+            wall["normal"] = estimated_normals(points, visited, space)
             notes.append("normals of boundary nodes are estimated: they point to where the other nodes have been")
         if moves:
             wall.pop("vel", None)  # follows from the positions
-            wall |= {"frame_dt": values["frame_dt"], "periodicity": facts.periodicity}
+            wall |= {"frame_dt": values["frame_dt"], "periodicity": space}
         make = Boundary.moving if moves else Boundary.from_numpy
         values["boundary"] = make(wall.pop("pos"), wall.pop("normal"), **wall)
     if facts.walls:
         dim = numbers("pos", values["pos"], {"frame": None, "node": None, "dim": None}).shape[2]
-        bounds = None
-        if "bounds" in values:
-            rows = numbers("bounds", values["bounds"], {"axis": dim, "low and high": 2})
-            bounds = tuple((float(low), float(high)) for low, high in rows)
-        values["boundary"] = joined(dim, values.get("boundary", Boundary.empty(dim)), walls_at_bounds(replace(facts, bounds=bounds), dim))
+        bounds = tuple((float(low), float(high)) for low, high in values["bounds"]) if "bounds" in values else None
+        here = replace(facts, bounds=bounds, periodic=space.periodic or None)
+        values["boundary"] = joined(dim, values.get("boundary", Boundary.empty(dim)), walls_at_bounds(here, dim))
     return Loaded(Trajectory.from_numpy(**values), notes=tuple(notes))
+
+
+def _periodicity(values: dict[str, Any]) -> Periodicity:
+    """Where the space of a file repeats, after what the settings say instead."""
+    if "bounds" not in values:
+        return NOWHERE  # a periodic axis without bounds is refused with the trajectory
+    dim = numbers("pos", values["pos"], {"frame": None, "node": None, "dim": None}).shape[2]
+    rows = numbers("bounds", values["bounds"], {"axis": dim, "low and high": 2})
+    return Periodicity(tuple((float(low), float(high)) for low, high in rows), flags("periodic", values.get("periodic"), dim))

@@ -329,7 +329,8 @@ def walls_at_bounds(facts: Facts, dim: int) -> Boundary:
     spacing = facts.spacing or (max(high - low for low, high in facts.bounds) / 50)
     sides = [f"{axis}_{side}" for axis in "xyz"[:dim] for side in ("low", "high")]
     walls = domain_walls(facts.bounds, {side: facts.walls.get(side, 0.0) for side in sides})
-    return Boundary.sample(tuple(wall for wall, side in zip(walls, sides, strict=True) if side in facts.walls), spacing, dim)
+    named = tuple(wall for wall, side in zip(walls, sides, strict=True) if side in facts.walls)
+    return Boundary.sample(named, spacing, dim, facts.periodicity)
 
 
 def joined(dim: int, *parts: Boundary) -> Boundary:

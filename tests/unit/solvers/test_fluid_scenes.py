@@ -14,8 +14,9 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 from scipy.spatial import cKDTree
 
-from gpe_pl.geometry import Bowl, Box, DistanceGrid, domain_walls, shape_from_dict, shape_to_dict, signed_distance
+from gpe_pl.geometry import Bowl, Box, DistanceGrid, domain_walls, signed_distance
 from gpe_pl.schema import STICKY, node_code
+from gpe_pl.shape_values import shape_from_dict, shape_to_dict
 from gpe_pl.solvers.fluid_scenes import CLEARANCE, FluidScene, TerrainOptions
 from gpe_pl.terrain_files import TerrainError
 from gpe_pl.trajectory import State
