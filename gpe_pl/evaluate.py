@@ -47,9 +47,10 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     shown = None if cfg.data.get("showcase") is None else _showcase(cfg, simulator)
     folder = Path(cfg.paths.runs) / run_name(cfg.name)
     with held(folder):
-        claim(folder, _identity(evaluated), results=["*"])
+        root = ensure_split(evaluated, cfg.split)
+        claim(folder, _identity(evaluated, root), results=["*"])
         try:
-            evaluate(simulator, ensure_split(evaluated, cfg.split), settings, folder)
+            evaluate(simulator, root, settings, folder)
         finally:
             release(folder)
         if shown is not None:
@@ -58,11 +59,13 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     print(folder)
 
 
-def _identity(cfg: DictConfig) -> dict[str, Any]:
+def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
     """What the numbers of an evaluation depend on, and what they are about."""
     from omegaconf import OmegaConf
 
+    from gpe_pl.data.checksum import split_checksum
     from gpe_pl.pretrained import fingerprint
+    from gpe_pl.run_folder import DATA_CHECKSUMS
 
     values: Any = OmegaConf.to_container(cfg, resolve=True)
     without = ("splits", "data", "num_pictures", "export")  # more pictures may be asked for later
@@ -70,6 +73,7 @@ def _identity(cfg: DictConfig) -> dict[str, Any]:
     return {
         "checkpoint": fingerprint(cfg.checkpoint),
         "split": cfg.split,
+        DATA_CHECKSUMS: {cfg.split: split_checksum(root, cfg.split)},
         "evaluation": evaluation,
         **{k: values[k] for k in ("data", "rollout")},
     }

@@ -7,14 +7,14 @@ import json
 import logging
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gpe_pl.evaluation import LEARNED, Row, read_rows
-from gpe_pl.run_folder import config_in
+from gpe_pl.run_folder import DATA_CHECKSUMS, config_in
 
 log = logging.getLogger(__name__)
 
@@ -24,11 +24,12 @@ UNSEEN_GROUPS = ("interpolated", "extrapolated")
 
 @dataclass(frozen=True)
 class Run:
-    """A finished run: its folder, its flattened configuration and its rows."""
+    """A finished run: its folder, its flattened configuration, its rows, and the checksums of its data, by key of the configuration."""
 
     folder: Path
     config: dict[str, Any]
     rows: list[Row]
+    data: dict[str, str] = field(default_factory=dict)
 
 
 UNSAID: dict[str, Any] = {"training.sampling": "uniform", "training.push_share": 0.0, "training.push_correction": 1.0}
@@ -47,16 +48,31 @@ def finished_runs(folder: Path) -> list[Run]:
     for path in sorted(folder.rglob("metrics.csv")):
         config = path.parent / "config.json"
         if config.exists():
-            values = UNSAID | {key: value for key, value in _flatten(config_in(config)) if key not in WITHOUT_CONSEQUENCE}
+            said = {key: value for key, value in _flatten(config_in(config)) if key not in WITHOUT_CONSEQUENCE}
+            data = {key: str(said.pop(key)) for key in list(said) if DATA_CHECKSUMS in key.split(".")}
+            values = UNSAID | said
             if values.keys() >= TRAINED:
-                runs.append(Run(path.parent, values, list(read_rows(path))))
+                runs.append(Run(path.parent, values, list(read_rows(path)), data))
             else:
                 log.warning(
                     "%s is not of a training run (%s) and is left out of the report",
                     path.parent,
                     ", ".join(sorted(TRAINED - values.keys())),
                 )
+    _warn_of_replaced_data(runs)
     return runs
+
+
+def _warn_of_replaced_data(runs: list[Run]) -> None:
+    """Say where two runs used data of one description that hold different things, as when data are imported again under the same name."""
+    first: dict[str, Run] = {}
+    for run in runs:
+        description = {
+            key: value for key, value in run.config.items() if key.partition(".")[0] == "data" or key.startswith("evaluation.data.")
+        }
+        before = first.setdefault(json.dumps(description, sort_keys=True), run)
+        if any(before.data.get(key, value) != value for key, value in run.data.items()):
+            log.warning("%s and %s used different data of the same name; their errors do not compare", before.folder, run.folder)
 
 
 def distinct_runs(runs: list[Run]) -> list[Run]:

@@ -29,6 +29,7 @@ def _fit(cfg: DictConfig, run_dir: Path) -> float:
     import lightning as L
     from omegaconf import OmegaConf
 
+    from gpe_pl.data.checksum import split_checksum
     from gpe_pl.data.datamodule import TrajectoryDataModule
     from gpe_pl.data.dataset import open_split, window_counts
     from gpe_pl.data.sampling import BatchSize
@@ -36,8 +37,8 @@ def _fit(cfg: DictConfig, run_dir: Path) -> float:
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
     from gpe_pl.pretrained import fingerprint
-    from gpe_pl.run_folder import RunError, claim, without_tables
-    from gpe_pl.simulate import ensure_data, evaluated_config, scene_metadata
+    from gpe_pl.run_folder import DATA_CHECKSUMS, RunError, claim, without_tables
+    from gpe_pl.simulate import IMPORTED, ensure_data, evaluated_config, scene_metadata
     from gpe_pl.training.budget import PauseForMeasurements, mean_step_time, step_time_key, within_budget
     from gpe_pl.training.module import TrainingModule
     from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, set_up, train
@@ -83,12 +84,15 @@ def _fit(cfg: DictConfig, run_dir: Path) -> float:
         names = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "stress_weight", "compile")
         return TrainingModule(simulator, **{n: getattr(training, n) for n in names})
 
+    checksums = {split: split_checksum(root, split) for split in ("train", "val")}
+    evaluated_checksums = {split: split_checksum(evaluated, split) for split in evaluation.splits}
     resolved: Any = OmegaConf.to_container(cfg, resolve=True)
     settings = without_tables(resolved)
     unusual = {"batching": settings["batching"]} if batch_size.max_nodes is not None else {}  # as runs had it before there was a choice
     callbacks: list[L.Callback] = []
     if training.budget_minutes is not None:
-        key = step_time_key(settings, training, trainer)
+        imported = checksums["train"] if settings["data"]["size"] == IMPORTED else None
+        key = step_time_key(settings, training, trainer, imported)
         times = Path(cfg.paths.runs) / (cfg.reuse or cfg.name) / "step_times.json"
         callbacks.append(PauseForMeasurements(times))
         training = within_budget(
@@ -101,7 +105,8 @@ def _fit(cfg: DictConfig, run_dir: Path) -> float:
     settings["training"] = training.as_dict()
     trained = {k: settings[k] for k in ("seed", "size", "data", "graph", "model", "training")} | unusual
     trained |= {} if cfg.start_from is None else {"start_from": fingerprint(cfg.start_from)}
-    config = trained | {"evaluation": settings["evaluation"]}
+    trained |= {DATA_CHECKSUMS: checksums}
+    config = trained | {"evaluation": settings["evaluation"] | {DATA_CHECKSUMS: evaluated_checksums}}
     if evaluation.static_friction and not graph.islands:
         raise ConfigError(f"evaluation.static_friction={evaluation.static_friction:g}: needs graph.islands=true, which model=gpe_tuned has")
     claim(run_dir, config)

@@ -34,6 +34,7 @@ from pydantic import Field, InstanceOf
 from pydantic.dataclasses import dataclass
 
 from gpe_pl.atomic import replace_text, replacing
+from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.motion import ROUNDING_SHARE, motion_of, rounding_fault, rounding_of
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, is_intact, shard_moments, with_checksum
 from gpe_pl.errors import GpeError
@@ -392,6 +393,14 @@ def _has_intact_statistics(path: Path) -> bool:
         return False
 
 
+def _has_statistics_of(path: Path, data: str) -> bool:
+    """Whether a file holds the statistics of the data with this checksum, and not of shards that were there before."""
+    try:
+        return bool(json.loads(path.read_text())["data_sha256"] == data)
+    except (OSError, ValueError, TypeError, KeyError):
+        return False
+
+
 def _compile(spec: DatasetSpec) -> None:
     """Compile the solver, or load what was compiled before, which is too quick to be spoken of."""
     notice = threading.Timer(3.0, log.info, ["compiling the solver, once on this machine: about a minute"])
@@ -508,10 +517,12 @@ def _generate(folder: Path, to_do: Plan, spec: DatasetSpec, num_workers: int, on
             if on_progress is not None:
                 on_progress(done, total)
         train = [(split, k) for split, k in _shards(spec) if split == "train"]
-        if not statistics.is_file() and all(_is_complete(spec, folder, *shard) for shard in train):
+        if all(_is_complete(spec, folder, *shard) for shard in train) and not _has_statistics_of(
+            statistics, split_checksum(folder, "train")
+        ):
             paths = [shard_path(folder, *shard) for shard in train]
             moments = {str(path): sums for path, sums in _run(pool, shard_moments, [(path,) for path in paths])}
-            _write_json(statistics, with_checksum(combined([moments[str(path)] for path in paths])))
+            _write_json(statistics, with_checksum(combined([moments[str(path)] for path in paths]), split_checksum(folder, "train")))
 
 
 def _draw_contact_sheet(spec: DatasetSpec, path: Path, pool: Executor | None) -> None:

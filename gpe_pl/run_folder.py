@@ -11,6 +11,8 @@ from gpe_pl.atomic import replace_text
 from gpe_pl.errors import GpeError
 
 CONFIG = "config.json"
+DATA_CHECKSUMS = "data_sha256"
+"""Key of a configuration: the checksums of the splits that were used. Data of one name may be replaced."""
 OFFERED = ("comparison", "larger")
 """Tables of ``data`` and ``size`` that other keys are taken from."""
 

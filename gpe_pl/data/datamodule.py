@@ -15,6 +15,7 @@ from torch.utils.data import DataLoader
 from torch_geometric.data import HeteroData
 
 from gpe_pl import ranks
+from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.dataset import HeldGraphs, WindowDataset, collated, long_enough, open_split, usable
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling, probabilities
@@ -36,9 +37,13 @@ def data_statistics(root: Path | str) -> dict[str, float]:
         statistics = json.loads(path.read_text(encoding="utf-8"))
         if not is_intact(statistics):
             raise ValueError("checksum mismatch")
+        if statistics["data_sha256"] != split_checksum(root, "train"):
+            raise ValueError("it is of other data than those in train")
         return {"acceleration_std": float(statistics["acceleration_std"])}
+    except StoreError:
+        raise
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{path}: cannot be read ({error}); generate or import the data again") from None
+        raise StoreError(f"{path}: cannot be used ({error}); generate or import the data again") from None
 
 
 class TrajectoryDataModule(L.LightningDataModule):

@@ -86,9 +86,10 @@ def combined(moments: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def with_checksum(statistics: dict[str, Any]) -> dict[str, Any]:
-    """Statistics as they are stored: with a SHA-256 digest of their values."""
-    return {**statistics, "sha256": _checksum(statistics)}
+def with_checksum(statistics: dict[str, Any], data: str) -> dict[str, Any]:
+    """Statistics as they are stored: with the checksum of the data that they are of (``split_checksum``), and a SHA-256 digest of all values."""
+    values = {**statistics, "data_sha256": data}
+    return {**values, "sha256": _checksum(values)}
 
 
 def is_intact(stored: dict[str, Any]) -> bool:

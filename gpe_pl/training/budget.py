@@ -43,15 +43,17 @@ SAME_MACHINE = 1.4
 """Rates further apart than this factor are of different machines, or of a busy one."""
 
 
-def step_time_key(config: dict[str, Any], training: TrainingSettings, trainer: TrainerSettings) -> str:
+def step_time_key(config: dict[str, Any], training: TrainingSettings, trainer: TrainerSettings, data: str | None = None) -> str:
     """A name for what the time of a training step depends on.
 
     Args:
         config: of the run, resolved, without the tables of data and sizes (``run_folder.without_tables``), as offers to others must not change the name.
         training, trainer: the same settings as objects.
+        data: checksum of imported data, of which the configuration says only the name; None: it says how the data are made.
     """
     parts = {k: config[k] for k in ("graph", "model", "data")} | {"batch_size": training.batch_size, "device": trainer.device}
     # only what is not as in the first files of step times, so that those stay known
+    parts |= {} if data is None else {"data_sha256": data}
     parts |= {} if config["batching"]["max_nodes"] is None else {"batching": config["batching"]}
     parts |= {} if training.compile == "off" else {"compile": training.compile}
     parts |= {} if trainer.matmul_precision == "highest" else {"matmul_precision": trainer.matmul_precision}

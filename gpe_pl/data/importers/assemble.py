@@ -16,6 +16,7 @@ import numpy as np
 from gpe_pl import integrators
 from gpe_pl.arrays import ArrayError, nearest_distances
 from gpe_pl.atomic import replacing
+from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
 from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
@@ -479,7 +480,8 @@ class _Conversion:
         split = "train" if "train" in self.survey.good else next(iter(self.survey.good))
         shards = sorted((folder / split).glob("shard-*.h5"))
         statistics = combined([shard_moments(path)[1] for path in shards])
-        (folder / STATISTICS_FILE).write_text(json.dumps(with_checksum(statistics), indent=2, sort_keys=True) + "\n", encoding="utf-8")
+        stored = with_checksum(statistics, split_checksum(folder, split))
+        (folder / STATISTICS_FILE).write_text(json.dumps(stored, indent=2, sort_keys=True) + "\n", encoding="utf-8")
         report = self.report
         report.velocity_std, report.acceleration_std = statistics["velocity_std"], statistics["acceleration_std"]
         if report.acceleration_std == 0:

@@ -15,11 +15,12 @@ import numpy as np
 import pytest
 import torch
 
+from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.dataset import HeldGraphs, WindowDataset
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
-from gpe_pl.data.statistics import motion
+from gpe_pl.data.statistics import motion, with_checksum
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.store import StoreError, read_trajectory, trajectory_names, write_shard
 from gpe_pl.trajectory import Trajectory
@@ -33,8 +34,13 @@ def root(store: Path) -> Path:
         ]
         shard.unlink()
         write_shard(shard, calmer)
-    (store / "statistics.json").write_text(json.dumps({"acceleration_std": 50.0}))
-    return store
+    return described(store)
+
+
+def described(root: Path) -> Path:
+    """The data set, with statistics of its training trajectories as they are now."""
+    (root / "statistics.json").write_text(json.dumps(with_checksum({"acceleration_std": 50.0}, split_checksum(root, "train"))))
+    return root
 
 
 def datamodule(root: Path, step: int = 0, **settings: Any) -> TrajectoryDataModule:
@@ -149,7 +155,7 @@ def test_missing_statistics_are_a_readable_error(root: Path, content: str | None
     path.unlink()
     if content is not None:
         path.write_text(content)
-    with pytest.raises(StoreError, match=r"statistics.json: cannot be read .* generate or import the data again"):
+    with pytest.raises(StoreError, match=r"statistics.json: cannot be used .* generate or import the data again"):
         datamodule(root)
 
 
@@ -167,7 +173,7 @@ def with_another(root: Path, change: Callable[[Trajectory], Trajectory], num_sou
     sound = replace(jumping, pos=(jumping.pos[:1] + swing).astype(np.float32))
     shard.unlink()
     write_shard(shard, [*[sound] * num_sound, *[change(sound)] * num_changed])
-    return root
+    return described(root)
 
 
 def moved(frame: int, to: float) -> Callable[[Trajectory], Trajectory]:

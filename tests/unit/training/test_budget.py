@@ -216,3 +216,16 @@ def test_own_steps_weigh_as_they_occur_and_share_the_time_to_measure(
     times = [budget.mean_step_time(module, data, BatchSize(2), replace(settings, push_share=s)) for s in (0.0, 0.25)]
     assert times == pytest.approx([0.1, 0.2])
     assert limits == [15.0, 7.5, 7.5]
+
+
+def test_step_times_of_imported_data_are_known_by_what_the_data_hold() -> None:
+    config = {
+        "graph": {},
+        "model": {"_target_": "a.GPE"},
+        "data": {"name": "mine"},
+        "size": {"name": "tiny"},
+        "batching": {"max_nodes": None},
+    }
+    training, trainer = TrainingSettings(num_steps=2, val_interval=1), TrainerSettings()
+    first, second = (step_time_key(config, training, trainer, data) for data in ("0123", "4567"))
+    assert first != second
