@@ -44,6 +44,7 @@ from gpe_pl.names import DataName
 from gpe_pl.progress import Progress
 from gpe_pl.rollout import Guard, SimulationError, Simulator, rollout
 from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup
+from gpe_pl.solvers.caution import unresolved
 from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.store import StoreError, read_trajectory, trajectory_names, write_shard
@@ -183,15 +184,15 @@ class DatasetSpec:
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """Settings of scene and solver, with the solver's name and version."""
+        """Settings of scene and solver, with the solver's name, version and largest substep."""
         scene, solver = asdict(cast(Any, self.scene)), asdict(cast(Any, self.solver))
         return {
             "scene": {"kind": type(self.scene).__name__, **scene},
-            "solver": {**solver, "name": self.solver.name, "version": self.solver.version},
+            "solver": {**solver, "name": self.solver.name, "version": self.solver.version, "solver_dt": self.solver.solver_dt},
         }
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain JSON values; includes what else the bytes depend on: the solver's name and version, and the content of the scene's files."""
+        """Plain JSON values; includes what else the bytes depend on: the solver's name, version and largest substep, and the content of the scene's files."""
         files = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in self.scene.input_files.values()}
         return json.loads(json.dumps({**asdict(self), **self.provenance, "input_files": files}))  # type: ignore[call-overload]
 
@@ -479,6 +480,9 @@ def generate(
         return folder
     if to_do.missing:
         check_rounding(spec)
+        every = {name: sorted({*v.seen, *v.interpolated, *v.extrapolated}) for name, v in spec.parameters.items()}
+        for caution in unresolved(spec.solver, every, initial_state(spec, "train", 0)):
+            log.warning("%s %s: %s", spec.name, spec.size, caution)
     with written(root, spec, part, waits=True):
         _generate(folder, plan(root, spec, part), spec, num_workers, on_progress, part)
     return folder
@@ -583,6 +587,12 @@ def _claim(folder: Path, spec: DatasetSpec) -> None:
     except (ValueError, KeyError, TypeError):
         raise GenerationError(f"{path}: unreadable; delete the folder {folder} and run simulate again") from None
     differing = _differences(stored, values)
+    made_by, now = ({key: spec.get("solver", {}).get(key) for key in ("name", "version")} for spec in (stored, values))
+    if made_by["name"] == now["name"] and made_by["version"] != now["version"]:
+        raise GenerationError(
+            f"{folder}: holds data of version {made_by['version']} of the solver {now['name']}; this is version {now['version']}, whose trajectories are "
+            "others. Delete the folder to generate the data again, or choose another data set name"
+        )
     if differing:
         raise GenerationError(
             f"{folder}: holds a data set with other settings: {'; '.join(differing[:5])}. Delete the folder, choose another data set name or size, "

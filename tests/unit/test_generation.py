@@ -38,7 +38,7 @@ from gpe_pl.generation import (
 )
 from gpe_pl.progress import progress_bar
 from gpe_pl.schema import SPLITS
-from gpe_pl.simulate import dataset_spec
+from gpe_pl.simulate import dataset, dataset_spec
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.scenes import BodyScene
 from gpe_pl.store import iter_trajectories, read_trajectory
@@ -233,6 +233,35 @@ def test_other_spec_is_refused_by_key(folder):
     with pytest.raises(GenerationError, match=r"seed is 1, now 2; solver\.cfl is 0\.5, now 0\.4") as error:
         generate(folder.parents[1], other)
     assert "Delete the folder" in str(error.value)
+
+
+def test_data_of_another_version_of_the_solver_are_refused(tmp_path):
+    """By the version, although settings differ too; the time step is part of what is compared."""
+    few = replace(SPEC, num_train=1, num_val=0, num_test=0, num_test_unseen=0, num_frames=3)
+    made = generate(tmp_path, few) / "dataset.json"
+    values = json.loads(made.read_text())
+    assert values["spec"]["solver"]["solver_dt"] == SOLVER.solver_dt
+    values["spec"]["solver"]["solver_dt"] /= 2
+    made.write_text(json.dumps(values))
+    with pytest.raises(GenerationError, match=r"solver\.solver_dt is .*, now .*Delete the folder"):
+        generate(tmp_path, few)
+    values["spec"]["solver"] |= {"version": "1", "cfl": 0.1}
+    made.write_text(json.dumps(values))
+    with pytest.raises(
+        GenerationError, match=rf"holds data of version 1 of the solver mpm; this is version {SOLVER.version}, .*Delete the folder"
+    ):
+        generate(tmp_path, few)
+
+
+def test_what_the_solver_does_not_resolve_is_said(tmp_path, caplog):
+    """Viscosities below the grid's own; where data are complete, nothing is said again."""
+    spec = replace(dataset("data=fluid", "dimension=2", "size=tiny"), num_train=1, num_val=0, num_test=0, num_test_unseen=0, num_frames=3)
+    generate(tmp_path, spec)
+    (said,) = (record.message for record in caplog.records if record.levelname == "WARNING")
+    assert "kinematic_viscosity = 0.001, 0.0015, 0.002 m^2/s is below 0.00214 m^2/s" in said
+    caplog.clear()
+    generate(tmp_path, spec)
+    assert not caplog.records
 
 
 def test_folder_with_foreign_shards_is_refused(tmp_path):

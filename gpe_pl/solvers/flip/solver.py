@@ -162,6 +162,11 @@ class FLIP:
         rate = math.inf if self.pic == 1 else -math.log1p(-self.pic) / SHARE_TIME
         return rate * self.grid_spacing**2 / 6.0
 
+    @property
+    def smallest_resolved(self) -> dict[str, float]:
+        """Smallest parameter of each material that is not below what the grid adds to it."""
+        return {MATERIAL: self.numerical_viscosity}
+
     def compile_kernels(self) -> None:
         """Compile every kernel and fill Numba's cache on disk, so that worker processes started afterwards only load it; good for 2D and 3D."""
         bounds = ((0.0, 1.0), (0.0, 1.0))

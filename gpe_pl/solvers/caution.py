@@ -1,0 +1,59 @@
+"""What a solver does not resolve, said before data are made with it; ``docs/results/convergence.md`` has measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from gpe_pl.schema import MATERIALS
+from gpe_pl.trajectory import State
+
+CELLS_ACROSS = 4
+"""Cells that a body should have across: one of two triangles bends as if it were half as stiff again."""
+
+THIN_SHARE = 0.1
+"""Of the nodes of a mesh: less is not worth a word."""
+
+
+def unresolved(solver: Any, parameters: Mapping[str, Sequence[float]], state: State) -> Iterator[str]:
+    """One sentence for each thing that the solver does not resolve of these parameter values and of a scene's initial state."""
+    for material, smallest in getattr(solver, "smallest_resolved", {}).items():
+        name, unit = MATERIALS[material].name, MATERIALS[material].unit
+        values = [value for value in parameters.get(material, ()) if value < smallest]
+        if values:
+            yield (
+                f"{name} = {', '.join(f'{value:g}' for value in values)} {unit} is below {smallest:.3g} {unit}, which the grid of the solver {solver.name} "
+                "adds by itself: such trajectories differ little; choose a smaller grid_spacing, or leave these values out"
+            )
+    if state.cells is not None and solver.stores_stress:
+        share = float(np.mean(thin_nodes(np.asarray(state.cells), state.num_nodes, state.dim)))
+        if share > THIN_SHARE:
+            yield (
+                f"of the first scene, {100 * share:.0f} % of the nodes are where the mesh has fewer than {CELLS_ACROSS} cells across: it is too stiff "
+                "in bending there; choose more cells (data.scene.num_cells=…)"
+            )
+
+
+def thin_nodes(cells: np.ndarray, num_nodes: int, dim: int) -> np.ndarray:
+    """Nodes [node] that no part of a mesh holds which is ``CELLS_ACROSS`` cells thick; cells [cell, corner] of one kind.
+
+    A morphological opening along the edges: what is not within as many cells of a node that is half of ``CELLS_ACROSS`` from the surface.
+    """
+    corners = cells.shape[1]
+    pairs = np.repeat(cells, corners, axis=1).ravel(), np.tile(cells, (1, corners)).ravel()
+    near = sparse.csr_array((np.ones(len(pairs[0]), dtype=np.int64), pairs), shape=(num_nodes, num_nodes))
+    facets = [np.delete(np.arange(corners), k) for k in range(corners)]
+    if dim == 2:
+        facets = [np.array([k, (k + 1) % corners]) for k in range(corners)]
+    sides, count = np.unique(np.sort(np.concatenate([cells[:, facet] for facet in facets]), axis=1), axis=0, return_counts=True)
+    outer = np.zeros(num_nodes, dtype=bool)
+    outer[np.unique(sides[count == 1])] = True
+    for _ in range(CELLS_ACROSS // 2 - 1):
+        outer |= near @ outer > 0
+    thick = ~outer
+    for _ in range(CELLS_ACROSS // 2):
+        thick |= near @ thick > 0
+    return ~thick
