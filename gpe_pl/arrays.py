@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from gpe_pl import integrators
+from gpe_pl.cells import fitting_kinds, stacked
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import check_bounds
 from gpe_pl.periodicity import NOWHERE, Periodicity
-from gpe_pl.schema import LARGEST, MATERIALS, MESH_MATERIALS, NODE_TYPES, node_code, param_names
+from gpe_pl.schema import CELL_KINDS, LARGEST, MATERIALS, MESH_MATERIALS, NODE_TYPES, node_code, param_names
 
 RADIUS_SPACINGS = 2.0
 """Neighbour radius in rest spacings where none is given: about 12 neighbours in the plane and 32 in space."""
@@ -151,24 +152,66 @@ def checked_materials(
     return codes, columns, present
 
 
-def checked_cells(cells: Any, codes: np.ndarray) -> np.ndarray:
-    """Cells [cell, corner] whose nodes exist and are of one material that can have a mesh."""
-    array = np.asarray(cells)
-    if array.dtype.kind not in "iu" or array.ndim != 2 or array.shape[1] not in (3, 4):
-        raise ArrayError(f"cells: is {array.dtype}{list(array.shape)}, expected integers [cell, 3 or 4 corners]")
+def checked_cells(cells: Any, codes: np.ndarray, dim: int) -> tuple[np.ndarray, int]:
+    """Cells [cell, corner] whose nodes exist and are of one material that can have a mesh, and their dimension.
+
+    Args:
+        cells: of one kind [cell, corner], or by kind.
+        codes: types of the nodes [node].
+        dim: of space.
+    """
+    if not isinstance(cells, Mapping):
+        array = _integers("cells", cells)
+        kinds = fitting_kinds(array.shape[1], dim)
+        if not kinds:
+            known = ", ".join(f"{kind} {corners}" for kind, (own_dim, corners) in CELL_KINDS.items() if own_dim <= dim)
+            raise ArrayError(f"cells: has shape {list(array.shape)}, expected [cell, corner] with as many corners as a kind has: {known}")
+        if len(kinds) > 1:
+            raise ArrayError(
+                f"cells: with {array.shape[1]} corners in 3D they are {' or '.join(kinds)}; say which: cells={{{kinds[0]!r}: …}}"
+            )
+        groups = {kinds[0]: _checked_kind("cells", array, kinds[0], codes)}
+    else:
+        possible = [kind for kind, (own_dim, _) in CELL_KINDS.items() if own_dim <= dim]
+        for kind in cells:
+            if kind not in possible:
+                raise ArrayError(f"cells: unknown kind {kind!r:.80}; in {dim}D there are {', '.join(possible)}")
+        groups = {kind: _checked_kind(f"cells[{kind!r}]", _integers(f"cells[{kind!r}]", cells[kind]), kind, codes) for kind in cells}
+    dims = {CELL_KINDS[kind][0] for kind in groups}
+    if len(dims) != 1:
+        raise ArrayError(f"cells: has {', '.join(groups) or 'no kind'}; the cells of a trajectory are all surfaces or all volumes")
+    return stacked(groups), dims.pop()
+
+
+def _integers(name: str, cells: Any) -> np.ndarray:
+    try:
+        array = np.asarray(cells)
+    except ValueError:
+        raise ArrayError(
+            f"{name}: rows have different lengths; give cells by kind, such as {{'triangle': …, 'quadrilateral': …}}"
+        ) from None
+    if array.dtype.kind not in "iu" or array.ndim != 2:
+        raise ArrayError(f"{name}: is {array.dtype}{list(array.shape)}, expected integers [cell, corner]")
+    return array
+
+
+def _checked_kind(name: str, array: np.ndarray, kind: str, codes: np.ndarray) -> np.ndarray:
+    """Cells [cell, corner] of one kind."""
+    if array.shape[1] != CELL_KINDS[kind][1]:
+        raise ArrayError(f"{name}: has shape {list(array.shape)}, expected [cell, {CELL_KINDS[kind][1]}]")
     wrong = ((array < 0) | (array >= len(codes))).any(axis=1) | (np.diff(np.sort(array, axis=1), axis=1) == 0).any(axis=1)
     if wrong.any():
         cell = int(wrong.argmax())
-        raise ArrayError(f"cells: cell {cell} has the nodes {array[cell].tolist()}; they must be different ones of the {len(codes)} nodes")
-    kinds = codes[array]
-    wrong = (kinds != kinds[:, :1]).any(axis=1) | ~np.isin(kinds[:, 0], [node_code(m) for m in MESH_MATERIALS])
+        raise ArrayError(f"{name}: cell {cell} has the nodes {array[cell].tolist()}; they must be different ones of the {len(codes)} nodes")
+    types = codes[array]
+    wrong = (types != types[:, :1]).any(axis=1) | ~np.isin(types[:, 0], [node_code(m) for m in MESH_MATERIALS])
     if wrong.any():
         cell = int(wrong.argmax())
-        found = ", ".join(sorted({NODE_TYPES[code] for code in kinds[cell]}))
+        found = ", ".join(sorted({NODE_TYPES[code] for code in types[cell]}))
         raise ArrayError(
-            f"cells: cell {cell} has nodes of {found}; a cell is of one material, and meshes are of {', '.join(MESH_MATERIALS)}"
+            f"{name}: cell {cell} has nodes of {found}; a cell is of one material, and meshes are of {', '.join(MESH_MATERIALS)}"
         )
-    return array.astype(np.int32)
+    return array
 
 
 def velocities_of(pos: np.ndarray, frame_dt: float, periodicity: Periodicity) -> np.ndarray:

@@ -10,21 +10,24 @@ import base64
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from jaxtyping import Float
 
 from gpe_pl.atomic import replace_text, replacing
+from gpe_pl.cells import is_corner, kinds_of
 from gpe_pl.graphs.islands import unwrapped
 from gpe_pl.graphs.multiscale import cell_edges
 from gpe_pl.metrics import displacement
+from gpe_pl.schema import CELL_KINDS
 from gpe_pl.store import stored_arrays, stored_attributes
 from gpe_pl.trajectory import Trajectory, von_mises
 
 VERTEX = 1
-CELL_TYPES = {(2, 3): 5, (2, 4): 9, (3, 3): 5, (3, 4): 10}
-"""VTK's numbers of triangle, quadrilateral and tetrahedron, by dimension and corners."""
+CELL_TYPES = {"triangle": 5, "quadrilateral": 9, "tetrahedron": 10, "hexahedron": 12}
+"""VTK's numbers of kinds of cells."""
 
 SYMMETRIC = {4: (0, 2, 3, 1), 6: (0, 3, 5, 1, 4, 2)}
 """Where VTK's components XX, YY, ZZ, XY, YZ, XZ stand in a stress of so many components; in plane strain the last two are zero."""
@@ -66,7 +69,7 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
         stride: every so many frames.
 
     Raises:
-        ValueError: another file type, a stride that is not positive, or a ground truth with other nodes.
+        ValueError: another file type, a stride that is not positive, a ground truth with other nodes, or a cell of no kind in ``schema.CELL_KINDS``.
     """
     path = Path(path)
     if path.suffix != ".pvd":
@@ -80,37 +83,54 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     trajectory = trajectory.with_moving_boundary()
     ground_truth = None if ground_truth is None else ground_truth.with_moving_boundary()
     folder = path.with_suffix("")
+    cells, num_particles = _cells(trajectory)
+    mesh = np.empty((0, 3), np.int64) if trajectory.cells is None else trajectory.cells.astype(np.int64)
+    edges = cell_edges(mesh, trajectory.num_nodes)
     folder.mkdir(parents=True, exist_ok=True)
-    cells, types, is_vertex = _cells(trajectory)
-    edges = cell_edges(cells[0].astype(np.int64), trajectory.num_nodes)
     moved = _displacements(trajectory, edges)
     entries = []
     for frame in range(0, trajectory.num_frames, stride):
         name = f"frame_{frame:05d}.vtu"
-        points, in_cells = _point_data(trajectory, frame, ground_truth), _cell_data(trajectory, frame, int(is_vertex.sum()))
+        points, in_cells = _point_data(trajectory, frame, ground_truth), _cell_data(trajectory, frame, num_particles)
         if moved is not None:
             points["displacement"] = _in_3d(moved[frame])
         pos, _ = unwrapped(trajectory.pos[frame].astype(np.float64), edges, trajectory.metadata.periodicity)
-        replace_text(folder / name, _grid(pos.astype(trajectory.pos.dtype), cells, types, points, in_cells))
+        replace_text(folder / name, _grid(pos.astype(trajectory.pos.dtype), cells, points, in_cells))
         time = frame * trajectory.metadata.frame_dt
         entries.append(f'<DataSet timestep="{time:.9g}" part="0" file={quoteattr(f"{folder.name}/{name}")}/>')
     boundary = trajectory.boundary
     if len(boundary.pos):
         data = {"normal": _in_3d(boundary.normal), "friction": boundary.friction, "restitution": boundary.restitution}
-        vertices = [np.arange(len(boundary.pos))[:, None]]
-        replace_text(folder / "boundary.vtu", _grid(boundary.pos, vertices, np.full(len(boundary.pos), VERTEX), data, {}))
+        replace_text(folder / "boundary.vtu", _grid(boundary.pos, _vertices(np.arange(len(boundary.pos))), data, {}))
     replace_text(path, _document("Collection", "<Collection>\n" + "\n".join(entries) + "\n</Collection>"))
 
 
-def _cells(trajectory: Trajectory) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """Nodes of all cells, by number of corners, with their VTK types and whether they are particles; cells of the mesh come first."""
-    mesh = trajectory.cells
-    if mesh is None or len(mesh) == 0:
-        mesh = np.empty((0, 3), int)
-    loose = np.setdiff1d(np.arange(trajectory.num_nodes), mesh)[:, None]
-    is_vertex = np.repeat([False, True], [len(mesh), len(loose)])
-    types = np.where(is_vertex, VERTEX, CELL_TYPES[trajectory.metadata.dim, mesh.shape[1]])
-    return [mesh, loose], types, is_vertex
+class _Cells(NamedTuple):
+    """Cells as VTK has them: nodes of one after the other, and the number of corners and VTK type of each [cell]."""
+
+    nodes: np.ndarray
+    corners: np.ndarray
+    types: np.ndarray
+
+
+def _vertices(nodes: np.ndarray) -> _Cells:
+    """A cell for each particle."""
+    return _Cells(nodes, np.ones(len(nodes), int), np.full(len(nodes), VERTEX))
+
+
+def _cells(trajectory: Trajectory) -> tuple[_Cells, int]:
+    """All cells, those of the mesh first, and the number of particles, which come after them."""
+    loose = _vertices(np.arange(trajectory.num_nodes))
+    if trajectory.cells is None or len(trajectory.cells) == 0:
+        return loose, len(loose.nodes)
+    cells = trajectory.cells
+    kinds, own = kinds_of(cells, trajectory.cell_dim, trajectory.metadata.dim), is_corner(cells)
+    if (kinds < 0).any():
+        cell = int(kinds.argmin())
+        raise ValueError(f"cell {cell} has the nodes {cells[cell].tolist()}, which is none of {', '.join(CELL_KINDS)}")
+    loose = _vertices(np.setdiff1d(np.arange(trajectory.num_nodes), cells))
+    mesh = _Cells(cells[own], own.sum(axis=1), np.array([CELL_TYPES[kind] for kind in CELL_KINDS])[kinds])
+    return _Cells(*(np.concatenate(parts) for parts in zip(mesh, loose, strict=True))), len(loose.nodes)
 
 
 def _displacements(trajectory: Trajectory, edges: np.ndarray) -> np.ndarray | None:
@@ -157,17 +177,14 @@ def _in_3d(values: Float[np.ndarray, "row dim"]) -> Float[np.ndarray, "row 3"]:
     return np.pad(values, ((0, 0), (0, 3 - values.shape[1])))
 
 
-def _grid(
-    pos: np.ndarray, cells: list[np.ndarray], types: np.ndarray, points: Mapping[str, np.ndarray], in_cells: Mapping[str, np.ndarray]
-) -> str:
+def _grid(pos: np.ndarray, cells: _Cells, points: Mapping[str, np.ndarray], in_cells: Mapping[str, np.ndarray]) -> str:
     """A ``.vtu`` document."""
-    corners = np.concatenate([np.full(len(group), group.shape[1]) for group in cells])
     parts = [
         _array("Points", _in_3d(pos)).join(("<Points>", "</Points>")),
         "<Cells>",
-        _array("connectivity", np.concatenate([group.ravel() for group in cells]).astype(np.int64)),
-        _array("offsets", np.cumsum(corners).astype(np.int64)),
-        _array("types", types.astype(np.uint8)),
+        _array("connectivity", cells.nodes.astype(np.int64)),
+        _array("offsets", np.cumsum(cells.corners).astype(np.int64)),
+        _array("types", cells.types.astype(np.uint8)),
         "</Cells>",
         "<PointData>",
         *(_array(name, values) for name, values in points.items()),
@@ -176,7 +193,7 @@ def _grid(
         *(_array(name, values) for name, values in in_cells.items()),
         "</CellData>",
     ]
-    piece = f'<Piece NumberOfPoints="{len(pos)}" NumberOfCells="{len(types)}">\n' + "\n".join(parts) + "\n</Piece>"
+    piece = f'<Piece NumberOfPoints="{len(pos)}" NumberOfCells="{len(cells.types)}">\n' + "\n".join(parts) + "\n</Piece>"
     return _document("UnstructuredGrid", f"<UnstructuredGrid>\n{piece}\n</UnstructuredGrid>")
 
 

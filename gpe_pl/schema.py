@@ -57,6 +57,9 @@ MATERIALS: dict[str, MaterialParameter] = {
 MESH_MATERIALS = ("elastomer", "solid")
 """Materials that keep their neighbours: with ``graph.mesh`` they are connected along their cells."""
 
+CELL_KINDS: dict[str, tuple[int, int]] = {"triangle": (2, 3), "quadrilateral": (2, 4), "tetrahedron": (3, 4), "hexahedron": (3, 8)}
+"""Kinds of mesh cells with their dimension and number of corners, which are in VTK's order."""
+
 BOUNDARY = "boundary"
 NODE_TYPES: tuple[str, ...] = (*MATERIALS, BOUNDARY)
 RADIUS, CELL, SAME, DOWN = "radius", "cell", "same", "down"
@@ -130,6 +133,7 @@ Values = Literal[
     "node types",  # of the data set's materials
     "parameters",  # finite where a node's material has the parameter, and positive where it enters by its logarithm
     "nodes",  # row of a node
+    "dimension of cells",  # 2 or 3, and at most that of space
 ]
 """What a stored array may hold; ``gpe_pl.values`` compares."""
 
@@ -171,7 +175,22 @@ FIELDS: dict[str, Field] = {
         ("boundary_node",), "float32", "1", "fraction of the normal velocity that a bounce returns", values="0 to 1"
     ),
     "rest_pos": Field(("node", "dim"), "float32", "m", "undeformed positions of mesh nodes", required=False),
-    "cells": Field(("cell", "corner"), "int32", "1", "node indices of each mesh cell", required=False, values="nodes"),
+    "cells": Field(
+        ("cell", "corner"),
+        "int32",
+        "1",
+        "node indices of each mesh cell; one with fewer corners than others repeats its last",
+        required=False,
+        values="nodes",
+    ),
+    "cell_dim": Field(
+        ("one",),
+        "uint8",
+        "1",
+        "dimension of the cells: 2 for triangles and quadrilaterals, 3 for tetrahedra and hexahedra; without it that of space",
+        required=False,
+        values="dimension of cells",
+    ),
     "node_stress": Field(("frame", "node", "stress"), "float32", "Pa", f"Cauchy stress at nodes: {STRESS_COMPONENTS}", required=False),
     "cell_stress": Field(("frame", "cell", "stress"), "float32", "Pa", "Cauchy stress in cells, components as node_stress", required=False),
     "node_von_mises": Field(("frame", "node"), "float32", "Pa", "von Mises stress at nodes", required=False, values="at least 0"),

@@ -62,6 +62,7 @@ def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
         "boundary_restitution": b.restitution,
         "rest_pos": trajectory.rest_pos,
         "cells": trajectory.cells,
+        "cell_dim": None if trajectory.cells is None or trajectory.cell_dim is None else [trajectory.cell_dim],
     }
     if trajectory.stress is not None:
         for part in ("node", "cell"):
@@ -329,6 +330,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         boundary,
         rest_pos=arrays.get("rest_pos"),
         cells=arrays.get("cells"),
+        cell_dim=int(arrays["cell_dim"][0]) if "cell_dim" in arrays else None,
         stress=Stress(arrays["node_stress"], arrays["cell_stress"]) if "node_stress" in arrays else None,
         start_time=metadata.frame_dt * (0 if frames is None else frames.start or 0),
     )

@@ -295,7 +295,8 @@ class State:
         velocity_history: the last velocities [node, history, dim], oldest first, the last one equal to ``vel``; None for solvers.
         time: seconds since the start.
         rest_pos: undeformed positions [node, dim] in m, where there is a mesh; nodes of no cell have their initial position.
-        cells: nodes of each mesh cell [cell, corner].
+        cells: nodes of each mesh cell [cell, corner]; one with fewer corners than others repeats its last.
+        cell_dim: dimension of the cells, 2 for surfaces in 3D; None: that of space. See ``cells.kinds_of``.
         stress: of the mesh, where the solver computes it.
         num_substeps: that a solver took to come here from the frame before.
         num_corrected: nodes that containment put back in coming here from the frame before.
@@ -317,6 +318,7 @@ class State:
     rest_pos: Array | None = None
     cells: Array | None = None
     stress: Stress | None = None
+    cell_dim: int | None = None
     num_substeps: int = 0
     num_corrected: int = 0
     num_asleep: int = 0
@@ -458,7 +460,7 @@ class Trajectory:
         node_type, mass: [node].
         material_params: [node, param].
         boundary: boundary nodes in the first frame; those that move have a motion of as many frames.
-        rest_pos, cells: reference configuration of meshes, as in ``State``.
+        rest_pos, cells, cell_dim: reference configuration of meshes, as in ``State``.
         stress: of the mesh in every frame.
         termination: set when a rollout stopped before its last frame.
         start_time: of the first frame, in s since the start of the scene; not stored.
@@ -474,6 +476,7 @@ class Trajectory:
     rest_pos: np.ndarray | None = None
     cells: np.ndarray | None = None
     stress: Stress | None = None
+    cell_dim: int | None = None
     termination: Termination | None = field(default=None, compare=False)
     start_time: float = field(default=0.0, compare=False)
 
@@ -493,7 +496,7 @@ class Trajectory:
         spacing: float | int | None = None,
         connectivity_radius: float | int | None = None,
         boundary: Boundary | None = None,
-        cells: Array | None = None,
+        cells: Array | Mapping[str, Array] | None = None,
         rest_pos: Array | None = None,
         dataset: str = "arrays",
         split: str = "train",
@@ -517,7 +520,9 @@ class Trajectory:
             connectivity_radius: neighbour radius [m] that sees what acts on a node; None takes ``arrays.RADIUS_SPACINGS`` spacings.
             boundary: walls and obstacles, for example ``Boundary.sample(domain_walls(bounds, friction), spacing, dim)`` or ``Boundary.from_numpy(…)``.
                 In periodic domains its nodes are folded like others, those that meet at a seam become one, and shapes have images.
-            cells: nodes of each cell [cell, corner] of meshes of elastomers and solids.
+            cells: nodes of each cell [cell, corner] of meshes of elastomers and solids, or such arrays by kind, ``{"quadrilateral": …, "triangle": …}``, where
+                there are several or, with four corners in 3D, the shape does not tell quadrilaterals from tetrahedra. Kinds are those of
+                ``schema.CELL_KINDS``, corners in VTK's order.
             rest_pos: undeformed positions [node, dim] of meshes in m; None takes those of the first frame.
             dataset, split: where the trajectory belongs; ``save_dataset`` overrides both.
 
@@ -549,8 +554,9 @@ class Trajectory:
         vel = velocities_of(pos, frame_dt, periodicity) if vel is None else vel
         shape = {"frame": num_frames, "node": num_nodes, "dim": dim}
         gravity = numbers("gravity", np.zeros(dim) if gravity is None else gravity, {"dim": dim})
+        cell_dim = None
         if cells is not None:
-            cells = checked_cells(cells, codes)
+            cells, cell_dim = checked_cells(cells, codes, dim)
             rest_pos = numbers("rest_pos", pos[0] if rest_pos is None else rest_pos, {"node": num_nodes, "dim": dim}).astype(pos.dtype)
         elif rest_pos is not None:
             raise ArrayError("rest_pos: only meshes have rest positions; pass cells too, or leave it out")
@@ -567,6 +573,7 @@ class Trajectory:
             boundary,
             rest_pos=rest_pos,
             cells=cells,
+            cell_dim=cell_dim,
         )  # fmt: skip
 
     @property
@@ -598,7 +605,7 @@ class Trajectory:
         stress = None if self.stress is None else Stress(self.stress.node[frame], self.stress.cell[frame])
         return State(
             pos, vel, self.node_type, self.mass, self.material_params, self.boundary.at(frame), gravity, past,
-            self.start_time + frame * self.metadata.frame_dt, rest_pos, self.cells, stress, periodicity=self.metadata.periodicity,
+            self.start_time + frame * self.metadata.frame_dt, rest_pos, self.cells, stress, self.cell_dim, periodicity=self.metadata.periodicity,
         )  # fmt: skip
 
     def seen_from(self, origin: np.ndarray) -> Trajectory:

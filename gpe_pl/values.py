@@ -178,6 +178,13 @@ def _nodes(scene: _Scene, array: np.ndarray) -> Iterator[_Found]:
         yield _Found((array < 0) | (array >= count), lambda _: f"no such node, there are {count}")
 
 
+def _dimension_of_cells(scene: _Scene, array: np.ndarray) -> Iterator[_Found]:
+    dim = scene.arrays["pos"].shape[2]
+    bad = (array < 2) | (array > dim)
+    if bad.any():
+        yield _Found(bad, lambda place: f"is {array[place]}, must be 2{' or 3' if dim == 3 else ''} in {dim}D")
+
+
 _RULES: dict[str, _Rule] = {
     "finite": _finite,
     "positive": _within(SMALLEST, LARGEST, "must be positive and finite"),
@@ -187,4 +194,5 @@ _RULES: dict[str, _Rule] = {
     "node types": _node_types,
     "parameters": _parameters,
     "nodes": _nodes,
+    "dimension of cells": _dimension_of_cells,
 }

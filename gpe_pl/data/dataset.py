@@ -358,6 +358,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
             frame * dt,
             trajectory.rest_pos,
             trajectory.cells,
+            cell_dim=trajectory.cell_dim,
             periodicity=trajectory.metadata.periodicity,
         ).to_torch()
         stress = None

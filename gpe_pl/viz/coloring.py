@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.colors import Colormap, LinearSegmentedColormap, ListedColormap, Normalize
 
+from gpe_pl.cells import mean_over_corners
 from gpe_pl.metrics import displacement
 from gpe_pl.schema import BOUNDARY, MATERIALS, node_code
 from gpe_pl.trajectory import Trajectory, von_mises
@@ -109,7 +110,7 @@ class Coloring:
             assert self._truth is not None
             nodes = unknown if trajectory is self._truth else position_error(trajectory, self._truth, frame)
         nodes = np.where(trajectory.node_type == node_code(BOUNDARY), np.nan, nodes)
-        return nodes, nodes[cells].mean(axis=1)
+        return nodes, mean_over_corners(nodes, cells)
 
     def __call__(self, trajectory: Trajectory, frame: int) -> tuple[Float[np.ndarray, "node 4"], Float[np.ndarray, "cell 4"]]:
         """Red, green, blue and opacity of every node and mesh cell."""

@@ -7,6 +7,8 @@ from jaxtyping import Float
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
+from gpe_pl.cells import kinds_of, stacked
+from gpe_pl.schema import CELL_KINDS
 from gpe_pl.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
 from gpe_pl.viz.coloring import Coloring
@@ -26,7 +28,11 @@ MAX_FACES = 30_000
 HAZE, HIDDEN = 0.3, 0.25
 """How much white the far end of a 3D scene gets, and the opacity of what lies behind an obstacle."""
 
-TETRAHEDRON = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+FACES = {
+    "tetrahedron": np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]),
+    "hexahedron": np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]),
+}
+"""Corners of each face of a volume."""
 
 
 def drawn_faces(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
@@ -34,24 +40,39 @@ def drawn_faces(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     cells = trajectory.cells
     if cells is None or len(cells) == 0:
         return np.empty((0, 3), int), np.empty(0, int)
-    if trajectory.metadata.dim == 2 or cells.shape[1] == 3:
+    kinds = kinds_of(cells, trajectory.cell_dim, trajectory.metadata.dim)
+    names = list(CELL_KINDS)
+    if trajectory.metadata.dim == 2 or not np.isin(kinds, [names.index(kind) for kind in FACES]).any():
         return cells, np.arange(len(cells))
-    faces = cells[:, TETRAHEDRON].reshape(-1, 3)
+    rows = {kind: np.flatnonzero(kinds == names.index(kind)) for kind in FACES}
+    faces = stacked(
+        {kind: cells[rows[kind]][:, corners].reshape(-1, corners.shape[1]) for kind, corners in FACES.items() if len(rows[kind])}
+    )
+    of_cell = np.concatenate([np.repeat(rows[kind], len(corners)) for kind, corners in FACES.items()])
     outer = _that_occur_once(faces)
-    return (faces[outer], outer // 4) if len(outer) <= MAX_FACES else (np.empty((0, 3), int), np.empty(0, int))
+    return (faces[outer], of_cell[outer]) if len(outer) <= MAX_FACES else (np.empty((0, 3), int), np.empty(0, int))
 
 
 def outline(trajectory: Trajectory) -> np.ndarray:
     """Edges that only one cell of a 2D mesh has, as nodes [edge, 2]."""
     if trajectory.cells is None or trajectory.metadata.dim == 3:
         return np.empty((0, 2), int)
-    edges = np.stack([trajectory.cells, np.roll(trajectory.cells, -1, axis=1)], axis=-1).reshape(-1, 2)
+    edges = polygon_edges(trajectory.cells)
     return edges[_that_occur_once(edges)]
 
 
+def polygon_edges(polygons: np.ndarray) -> np.ndarray:
+    """Edges [edge, 2] of polygons [polygon, corner]; one with fewer corners than others repeats its last."""
+    edges = np.stack([polygons, np.roll(polygons, -1, axis=1)], axis=-1).reshape(-1, 2)
+    return edges[edges[:, 0] != edges[:, 1]]
+
+
 def _that_occur_once(groups: np.ndarray) -> np.ndarray:
-    """Indices of groups of nodes [group, node] that no other group equals in any order."""
+    """Indices of groups of nodes [group, node] that no other group equals in any order; it does not matter which node a group repeats."""
     nodes = np.sort(groups, axis=1).astype(np.int64)
+    again = nodes[:, 1:] == nodes[:, :-1]
+    nodes[:, 1:][again] = np.broadcast_to(nodes[:, -1:], again.shape)[again]
+    nodes.sort(axis=1)
     key = np.zeros(len(nodes), np.int64)
     for column in nodes.T:
         key = key * (int(groups.max(initial=0)) + 1) + column
@@ -170,7 +191,7 @@ class Panel:
         artist.set_facecolor(colors)
         artist.set_edgecolor(colors * (edge, edge, edge, 1.0))
 
-    def _shade(self, corners: Float[np.ndarray, "face 3 3"]) -> Float[np.ndarray, "face"]:
+    def _shade(self, corners: Float[np.ndarray, "face corner 3"]) -> Float[np.ndarray, "face"]:
         """Brightness of triangles under the light, which falls on either side."""
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normal /= np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)[:, None]

@@ -32,7 +32,7 @@ from gpe_pl.trajectory import Trajectory
 from gpe_pl.viz.camera import AZIMUTH, ELEVATION, vertical_axis
 from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, ColorBy, Coloring, position_error
 from gpe_pl.viz.contact_sheet import telling_color
-from gpe_pl.viz.panel import DOT, drawn_faces, outline
+from gpe_pl.viz.panel import DOT, drawn_faces, outline, polygon_edges
 from gpe_pl.viz.scenery import BACKDROP, surface_points
 
 PAGE = Path(__file__).parent / "page"
@@ -282,12 +282,12 @@ def _focus(trajectory: Trajectory) -> dict[str, Any]:
 def _mesh(trajectory: Trajectory) -> dict[str, np.ndarray]:
     """Triangles and edges of meshes, outlines of 2D meshes, and the nodes that stand for themselves."""
     faces, _ = drawn_faces(trajectory)
-    pairs = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2)
     meshed = np.empty(0, int) if trajectory.cells is None or len(faces) == 0 else trajectory.cells
     fans = [faces[:, [0, k, k + 1]] for k in range(1, faces.shape[1] - 1)]
+    triangles = np.concatenate([np.empty((0, 3), int), *fans])
     return {
-        "triangles": np.concatenate([np.empty((0, 3), int), *fans]),
-        "edges": np.unique(np.sort(pairs, axis=1), axis=0),
+        "triangles": triangles[triangles[:, 1] != triangles[:, 2]],  # a triangle among quadrilaterals repeats its last corner
+        "edges": np.unique(np.sort(polygon_edges(faces), axis=1), axis=0),
         "outline": outline(trajectory),
         "loose": np.setdiff1d(np.arange(trajectory.num_nodes), meshed),
     }

@@ -162,11 +162,33 @@ def test_what_does_not_fit_is_named(changes: dict[str, Any], message: str) -> No
 
 
 @pytest.mark.parametrize(
-    ("cells", "message"), [([[0, 1, 99]], "cell 0 has the nodes .*99"), ([[3, 4, 5], [0, 1, 1]], "cell 1 has the nodes")]
+    ("cells", "message"),
+    [
+        ([[0, 1, 99]], "cell 0 has the nodes .*99"),
+        ([[3, 4, 5], [0, 1, 1]], "cell 1 has the nodes"),
+        (
+            [[0, 1, 6, 5], [1, 2, 7]],
+            "^cells: rows have different lengths; give cells by kind, such as {'triangle': …, 'quadrilateral': …}$",
+        ),
+        ([[0, 1, 2, 3, 4]], r"^cells: has shape \[1, 5\], expected .* as a kind has: triangle 3, quadrilateral 4$"),
+        ({"tetrahedron": [[0, 1, 2, 3]]}, "^cells: unknown kind 'tetrahedron'; in 2D there are triangle, quadrilateral$"),
+        ({"triangle": [[0, 1, 2, 3]]}, r"^cells\['triangle'\]: has shape \[1, 4\], expected \[cell, 3\]$"),
+        ({}, "^cells: has no kind"),
+    ],
 )
 def test_cells_that_do_not_fit(cells: Any, message: str) -> None:
     with pytest.raises(ArrayError, match=message):
         trajectory(materials="solid", params={"solid": 1e6}, cells=cells)
+
+
+def test_four_corners_in_space_are_declared() -> None:
+    shape: dict[str, Any] = {"pos": motion(dim=3), "materials": "solid", "params": {"solid": 1e6}}
+    message = "^cells: with 4 corners in 3D they are quadrilateral or tetrahedron; say which: cells={'quadrilateral': …}$"
+    with pytest.raises(ArrayError, match=message):
+        trajectory(**shape, cells=[[0, 1, 2, 3]])
+    with pytest.raises(ArrayError, match="^cells: has triangle, tetrahedron; the cells of a trajectory are all surfaces or all volumes$"):
+        trajectory(**shape, cells={"triangle": [[0, 1, 2]], "tetrahedron": [[0, 1, 2, 3]]})
+    assert [trajectory(**shape, cells={kind: [[0, 1, 2, 3]]}).cell_dim for kind in ("quadrilateral", "tetrahedron")] == [2, 3]
 
 
 def test_a_radius_of_half_the_period() -> None:

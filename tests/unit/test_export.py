@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
+from gpe_pl.baselines import ConstantVelocity
+from gpe_pl.data.importers import save_dataset
 from gpe_pl.export import write_npz, write_vtk
+from gpe_pl.rollout import rollout
 from gpe_pl.schema import FIELDS, node_code
-from gpe_pl.store import stored_arrays
+from gpe_pl.store import iter_trajectories, stored_arrays
 from gpe_pl.trajectory import Metadata, Stress, Trajectory
 from tests.unit.viz.conftest import block, falling, falling_mesh
 
@@ -74,6 +77,70 @@ def test_meshes_come_back_with_their_stress(tmp_path: Path, dim: int) -> None:
         np.testing.assert_array_equal(found, expected)
     np.testing.assert_allclose(grid.cell_data["von_mises"][0], mesh.stress.cell_von_mises[3])
     assert np.isnan(grid.cell_data["von_mises"][1]).all()
+
+
+GRID = np.arange(9).reshape(3, 3)
+QUADS = np.stack([GRID[:-1, :-1], GRID[1:, :-1], GRID[1:, 1:], GRID[:-1, 1:]], -1).reshape(-1, 4)
+CUBE = [0, 1, 3, 2, 4, 5, 7, 6]
+"""A hexahedron of the corners of a cube in the order of their binary numbers."""
+MESHES: dict[str, tuple[int, int, dict[str, Any]]] = {
+    "quadrilaterals": (2, 9, {"quadrilateral": QUADS}),
+    "a shell of quadrilaterals": (3, 9, {"quadrilateral": QUADS}),
+    "triangles and quadrilaterals": (2, 9, {"triangle": [[0, 3, 4], [0, 4, 1]], "quadrilateral": QUADS[1:]}),
+    "a shell of both": (3, 9, {"quadrilateral": QUADS[1:], "triangle": [[0, 3, 4], [0, 4, 1]]}),
+    "tetrahedra": (3, 5, {"tetrahedron": [[0, 1, 2, 3], [1, 2, 3, 4]]}),
+    "a hexahedron and a tetrahedron": (3, 9, {"hexahedron": [CUBE], "tetrahedron": [[4, 5, 6, 8]]}),
+}
+NAMES = {"triangle": "triangle", "quadrilateral": "quad", "tetrahedron": "tetra", "hexahedron": "hexahedron"}
+
+
+def meshed(name: str) -> Trajectory:
+    """A mesh that swings; where its nodes lie does not matter to the kinds of its cells."""
+    dim, count, cells = MESHES[name]
+    rest = np.random.default_rng(0).uniform(0.3, 0.7, (count, dim))
+    swing = 0.01 * np.sin(np.arange(8)[:, None, None] + rest)
+    return Trajectory.from_numpy(rest + swing, 0.01, "elastomer", {"elastomer": 1e5}, cells=cells)
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_cells_keep_their_kind(tmp_path: Path, name: str) -> None:
+    """Through the store and a rollout to a program that draws them."""
+    made = meshed(name)
+    assert made.cells is not None
+    report = save_dataset(tmp_path, "set", train=[made], holdout=0.0)
+    stored = next(iter_trajectories(report.folder, "train"))
+    rolled = rollout(ConstantVelocity(0.01), stored.state(0), 3, stored.metadata)
+    for trajectory in (made, stored, stored.frames(2), rolled):
+        write_vtk(tmp_path / "a.pvd", trajectory)
+        _, grid = series(tmp_path / "a.pvd")[0]
+        found = {group.type: group.data.tolist() for group in grid.cells if group.type != "vertex"}
+        assert found == {NAMES[kind]: np.asarray(cells).tolist() for kind, cells in MESHES[name][2].items()}
+        alone = {node for group in grid.cells if group.type == "vertex" for node in group.data.ravel().tolist()}
+        assert alone == set(range(made.num_nodes)) - set(np.ravel(made.cells).tolist())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MESHES)
+def test_vtk_itself_sees_the_kinds(tmp_path: Path, name: str) -> None:
+    vtk = pytest.importorskip("vtk", reason="vtk is not installed")
+    write_vtk(tmp_path / "a.pvd", meshed(name))
+    reader = vtk.vtkXMLUnstructuredGridReader()
+    reader.SetFileName(str(tmp_path / "a" / "frame_00000.vtu"))
+    reader.Update()
+    grid = reader.GetOutput()
+    codes = {"triangle": vtk.VTK_TRIANGLE, "quadrilateral": vtk.VTK_QUAD, "tetrahedron": vtk.VTK_TETRA, "hexahedron": vtk.VTK_HEXAHEDRON}
+    wanted = [(codes[kind], cell) for kind, cells in MESHES[name][2].items() for cell in np.asarray(cells).tolist()]
+    for k, (code, nodes) in enumerate(wanted):
+        cell = grid.GetCell(k)
+        assert (cell.GetCellType(), [cell.GetPointId(i) for i in range(cell.GetNumberOfPoints())]) == (code, nodes)
+
+
+def test_cells_of_no_kind_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    mesh = falling_mesh(2)
+    assert mesh.cells is not None
+    with pytest.raises(ValueError, match=r"cell 0 has the nodes \[.*\], which is none of triangle, quadrilateral, tetrahedron, hexahedron"):
+        write_vtk(tmp_path / "a.pvd", replace(mesh, cells=mesh.cells[:, :2]))
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("turns", [0.5, 1.7])

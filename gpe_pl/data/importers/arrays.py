@@ -4,10 +4,11 @@
 
     np.savez("train/00.npz", pos=pos, frame_dt=0.01, materials="fluid", params_fluid=1e-3, bounds=bounds, periodic=[True, False])
 
-Keys are the arguments of ``Trajectory.from_numpy``, which documents them; ``params_{material}`` stands for ``params[material]``, and ``boundary_pos``,
-``boundary_normal``, ``boundary_vel``, ``boundary_friction`` and ``boundary_restitution`` for those of ``Boundary.from_numpy``, or of ``Boundary.moving`` if
-``boundary_pos`` is [frame, boundary_node, dim], where ``boundary_normal`` may be of the first frame or of every frame. Without it normals are estimated.
-Needed are ``pos``, ``frame_dt``, ``materials`` and ``params_…``; the settings of the command override what the files say.
+Keys are the arguments of ``Trajectory.from_numpy``, which documents them; ``params_{material}`` stands for ``params[material]``, ``cells_{kind}`` for
+``cells[kind]``, and ``boundary_pos``, ``boundary_normal``, ``boundary_vel``, ``boundary_friction`` and ``boundary_restitution`` for the arguments of
+``Boundary.from_numpy``, or of ``Boundary.moving`` if ``boundary_pos`` is [frame, boundary_node, dim], where ``boundary_normal`` may be of the first frame or of
+every frame. Without it normals are estimated. Needed are ``pos``, ``frame_dt``, ``materials`` and ``params_…``; the settings of the command override what the
+files say.
 """
 
 from __future__ import annotations
@@ -54,6 +55,8 @@ KEYS = (
     ),
     *(f"boundary_{name}" for name in ("pos", "normal", "vel", "friction", "restitution")),
 )
+PREFIXES = ("params_", "cells_")
+"""Keys that begin so end in a material, or in a kind of cells."""
 SCALARS = ("frame_dt", "spacing", "connectivity_radius")
 
 
@@ -73,14 +76,14 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
 def _load(path: Path, facts: Facts) -> Loaded:
     try:
         names = npz.names(path)
-        values: dict[str, Any] = {name: npz.read(path, name) for name in names if name in KEYS or name.startswith("params_")}
+        values: dict[str, Any] = {name: npz.read(path, name) for name in names if name in KEYS or name.startswith(PREFIXES)}
     except ImportFailure as failure:
         raise Refusal(str(failure)) from None
-    wrong = [name for name in names if name not in KEYS and not name.startswith("params_")]
+    wrong = [name for name in names if name not in KEYS and not name.startswith(PREFIXES)]
     missing = [name for name in ("pos", "frame_dt", "materials") if name not in names]
     if wrong or missing:
         raise Refusal(
-            f"has {f'an unknown key {wrong[0]!r}' if wrong else f'no {missing[0]!r}'}; keys are params_MATERIAL, {', '.join(KEYS)}"
+            f"has {f'an unknown key {wrong[0]!r}' if wrong else f'no {missing[0]!r}'}; keys are params_MATERIAL, cells_KIND, {', '.join(KEYS)}"
         )
     for name in SCALARS:
         if name in values:
@@ -92,6 +95,10 @@ def _load(path: Path, facts: Facts) -> Loaded:
         raise Refusal(f"materials is {materials.dtype}, expected text")
     values["materials"] = materials.item() if materials.ndim == 0 else materials.tolist()
     values["params"] = {name.removeprefix("params_"): values.pop(name) for name in names if name.startswith("params_")}
+    if by_kind := {name.removeprefix("cells_"): values.pop(name) for name in names if name.startswith("cells_")}:
+        if "cells" in values:
+            raise Refusal(f"has cells and cells_{next(iter(by_kind))}; give all of them by kind")
+        values["cells"] = by_kind
     given = {"frame_dt", "bounds", "periodic", "gravity", "spacing", "connectivity_radius"}
     values |= {name: value for name in given if (value := getattr(facts, name)) is not None}
     values["params"] = {**{m: v for m, v in facts.parameters.items() if m in np.unique(values["materials"])}, **values["params"]}

@@ -192,7 +192,8 @@ class Nodes:
         gravity: [dim] in m/s², where the source has it for each trajectory.
         parameters: of materials, per node or for all.
         walls: positions and normals [boundary_node, dim] of further boundary nodes.
-        cells, rest_pos: of a mesh.
+        cells: of a mesh, by kind [cell, corner].
+        rest_pos: of a mesh.
     """
 
     pos: np.ndarray
@@ -202,7 +203,7 @@ class Nodes:
     gravity: tuple[float, ...] | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict)
     walls: tuple[np.ndarray, np.ndarray] | None = None
-    cells: np.ndarray | None = None
+    cells: Mapping[str, np.ndarray] | None = None
     rest_pos: np.ndarray | None = None
     friction: float = ASSUMED_FRICTION
     repairs: list[Repair] = field(default_factory=list)
@@ -276,23 +277,25 @@ def _wider_than_periods(first: np.ndarray, periodicity: Periodicity) -> Iterator
             yield f"nodes spread over {width:.4g} m along {'xyz'[axis]} in the first frame, which is periodic with {period:.4g} m: bounds=… may be wrong"
 
 
-def _cells_of(nodes: Nodes, moving: np.ndarray, repairs: list[Repair]) -> np.ndarray | None:
-    """Cells between moving nodes, renumbered."""
+def _cells_of(nodes: Nodes, moving: np.ndarray, repairs: list[Repair]) -> dict[str, np.ndarray] | None:
+    """Cells between moving nodes by kind, renumbered."""
     if nodes.cells is None:
         return None
-    cells = np.asarray(nodes.cells)
-    if cells.ndim != 2 or cells.dtype.kind not in "iu":
-        raise Refusal(f"cells are {cells.dtype}{list(cells.shape)}, expected integers [cell, corner]")
-    if ((cells < 0) | (cells >= nodes.pos.shape[1])).any():
-        raise Refusal(f"cells name node {cells.max()}, there are {nodes.pos.shape[1]} nodes")
     row = np.full(nodes.pos.shape[1], -1)
     row[moving] = np.arange(len(moving))
-    kept = (row[cells] >= 0).all(axis=1)
-    if not kept.all():
-        repairs.append(
-            Repair(f"{int((~kept).sum())} of {len(cells)} cells have boundary nodes and were left out; the neighbour radius connects these")
-        )
-    return row[cells[kept]] if kept.any() else None
+    found, left_out, total = {}, 0, 0
+    for kind, cells in nodes.cells.items():
+        if cells.ndim != 2 or cells.dtype.kind not in "iu":
+            raise Refusal(f"cells are {cells.dtype}{list(cells.shape)}, expected integers [cell, corner]")
+        if ((cells < 0) | (cells >= nodes.pos.shape[1])).any():
+            raise Refusal(f"cells name node {cells.max()}, there are {nodes.pos.shape[1]} nodes")
+        kept = (row[cells] >= 0).all(axis=1)
+        left_out, total = left_out + int((~kept).sum()), total + len(cells)
+        if kept.any():
+            found[kind] = row[cells[kept]]
+    if left_out:
+        repairs.append(Repair(f"{left_out} of {total} cells have boundary nodes and were left out; the neighbour radius connects these"))
+    return found or None
 
 
 def _boundary(nodes: Nodes, visited: np.ndarray, facts: Facts) -> tuple[Boundary, list[Repair], list[str]]:

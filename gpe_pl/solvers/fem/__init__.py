@@ -156,6 +156,10 @@ class FEM:
         num_nodes, dim = state.num_nodes, len(self.bounds)
         if state.rest_pos is None or state.cells is None:
             raise SimulationError("the state has no mesh: rest_pos and cells are required", reason="input")
+        if state.cell_dim not in (None, dim):
+            raise SimulationError(
+                f"the mesh is a surface in {dim}D; FEM computes triangles and quadrilaterals in 2D, tetrahedra in 3D", reason="input"
+            )
         if state.internal is not None:
             raise SimulationError(f"internal state is of type {type(state.internal).__name__}, expected None", reason="input")
         shapes = {

@@ -288,6 +288,7 @@ HOSTILE = {
         16,
         lambda s: replace(s, node_type=np.where(np.arange(s.num_nodes) == 16, 0, s.node_type).astype(np.uint8)),
     ),
+    "a surface in space": ("input", -1, lambda s: replace(s, cell_dim=s.dim - 1)),
     "no mesh": ("input", -1, lambda s: replace(s, cells=None)),
     "no rest": ("input", -1, lambda s: replace(s, rest_pos=None)),
     "nan rest": ("nan", 3, lambda s: poke(s, "rest_pos", 3, math.nan)),

@@ -82,6 +82,26 @@ def test_outer_faces_point_outward_and_know_their_cell(mesh, dim):
         assert len(outline(mesh)) == 4 * 2
 
 
+def test_cells_are_drawn_by_their_kind(mesh, dim):
+    """Surfaces as they are; of volumes the faces that only one has, also where triangles meet the faces of hexahedra."""
+    number = np.arange(27).reshape(3, 3, 3)
+    if dim == 2:
+        mixed = replace(
+            mesh, cells=np.concatenate([mesh.cells[1:], mesh.cells[:1, [0, 1, 2, 2]], mesh.cells[:1, [0, 2, 3, 3]]]), stress=None
+        )
+        assert len(drawn_faces(mixed)[0]) == 5 and len(outline(mixed)) == len(outline(mesh))
+        return
+    corners = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)]
+    cubes = np.array([[number[i + a, j + b, k + c] for a, b, c in corners] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    assert len(drawn_faces(replace(mesh, cells=cubes, cell_dim=3))[0]) == 6 * 4
+    beside = np.pad([[0, 1, 3, 27], [1, 4, 3, 28], [27, 0, 1, 28]], ((0, 0), (0, 4)), mode="edge")
+    faces, cell = drawn_faces(replace(mesh, cells=np.concatenate([cubes[:1], beside]), cell_dim=3))
+    assert len(faces) == 6 + 3 * 4 - 2 and np.bincount(cell).tolist() == [6, 3, 4, 3]  # the first and the last share a face
+    shell = replace(mesh, cells=cubes[:, :4], cell_dim=2, stress=None)
+    np.testing.assert_array_equal(drawn_faces(shell)[0], shell.cells)
+    assert len(panel_of(shell).mesh.get_paths()) >= len(cubes)  # beside particles of no cell
+
+
 def test_triangles_are_drawn_like_quadrilaterals(mesh, dim):
     if dim == 3:
         pytest.skip("tetrahedra")

@@ -276,6 +276,7 @@ def test_meshgraphnets(tmp_path: Path, container: str) -> None:
         assert not trajectory.rest_pos[:, 2].any()
         cells = [c for c in cloth["cells"][0] if moving[c].all()]
         np.testing.assert_array_equal(np.flatnonzero(moving)[trajectory.cells], cells)
+        assert trajectory.cell_dim == 2
         assert trajectory.metadata.materials == ("elastomer",)
     assert any("3 of 40 cells have boundary nodes" in event.what for event in report.repairs)
 
@@ -296,6 +297,7 @@ def test_a_mesh_of_tetrahedra(tmp_path: Path) -> None:
         sources.mgn_tfrecord(tmp_path / "raw" / f"{SPLITS[k]}.tfrecord", [fields])
     report, stored = imported(tmp_path, tmp_path / "raw", "meshgraphnets", frame_dt=0.1, materials={0: "solid"})
     np.testing.assert_array_equal(stored["train"][0].cells, cells)
+    assert stored["train"][0].cell_dim == 3
     assert stored["train"][0].metadata.materials == ("solid",)
     assert "stress of the source is von Mises' only: left out" in report.notes
 
@@ -547,6 +549,22 @@ def test_own_arrays(tmp_path: Path) -> None:
         np.testing.assert_array_equal(trajectory.boundary.normal, [[0, 1]])
         assert trajectory.boundary.friction == np.float32(0.4)
     assert report.format == "arrays"
+
+
+def test_own_cells_by_kind(tmp_path: Path) -> None:
+    values: dict[str, Any] = {"frame_dt": DT, "materials": "elastomer", "params_elastomer": 1e5}
+    cells: dict[str, Any] = {"cells_triangle": [[0, 1, 2]], "cells_quadrilateral": [[0, 3, 4, 5], [6, 7, 8, 9]]}
+    (tmp_path / "raw").mkdir()
+    for k in range(3):
+        np.savez(
+            tmp_path / "raw" / f"{k}.npz", pos=motion(dim=3, seed=k), **values, **(cells | {"cells": [[0, 1, 2]]} if k == 2 else cells)
+        )
+    report, stored = imported(tmp_path, tmp_path / "raw", "arrays", holdout=0.0)
+    for trajectory in stored["train"]:
+        assert trajectory.cells is not None and trajectory.cell_dim == 2
+        assert trajectory.cells.tolist() == [[0, 1, 2, 2], [0, 3, 4, 5], [6, 7, 8, 9]]
+    (refusal,) = report.refusals
+    assert "has cells and cells_triangle; give all of them by kind" in str(refusal)
 
 
 def write_arrays(folder: Path, seed: int, num_frames: int = 14, gravity: tuple[float, float] = (0.0, 0.0)) -> None:
