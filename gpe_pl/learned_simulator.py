@@ -27,12 +27,12 @@ from gpe_pl.errors import GpeError
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig, history_of
+from gpe_pl.graphs.standardizer import GraphStandardizer, StatisticsSample, named
 from gpe_pl.models.base import Prediction
-from gpe_pl.nn.blocks import Standardize
 from gpe_pl.nn.static_friction import is_held, supported
 from gpe_pl.pretrained import checkpoint_path, names
 from gpe_pl.rollout import SimulationError
-from gpe_pl.schema import BOUNDARY, MATERIALS, EdgeType, FeatureSpec, node_code, role
+from gpe_pl.schema import BOUNDARY, MATERIALS, EdgeType, node_code
 from gpe_pl.signatures import checked
 from gpe_pl.skips import Skips
 from gpe_pl.trajectory import Metadata, State, Stress, Trajectory
@@ -51,80 +51,6 @@ class CheckpointError(GpeError, ValueError):
 
 class SceneError(GpeError, ValueError):
     """A scene does not fit a trained simulator, or holds values that are not finite."""
-
-
-class GraphStandardizer(nn.Module):
-    """Standardises every feature of a graph with training statistics; odd edge channels are only scaled, so they stay odd.
-
-    All levels of virtual nodes share their statistics, so that a graph may have more of them than those in training.
-    """
-
-    mass: Tensor
-
-    def __init__(self, spec: FeatureSpec) -> None:
-        super().__init__()
-        self.spec = spec
-        self.node = nn.ModuleDict({role(t): Standardize(c) for t, c in spec.node_channels.items()})
-        self.params = nn.ModuleDict({m: Standardize(c) for m, c in spec.param_channels.items()})
-        self.odd = nn.ModuleDict({self._key(r): Standardize(spec.odd_channels[r], centered=False) for r in spec.relations})
-        self.even = nn.ModuleDict({self._key(r): Standardize(spec.even_channels[r]) for r in spec.relations})
-        self.register_buffer("mass", torch.ones(()))
-
-    @staticmethod
-    def _key(relation: EdgeType) -> str:
-        source, name, target = relation
-        return f"{role(source)}__{name}__{role(target)}"
-
-    @staticmethod
-    def _material_scale(material: str, params: Tensor) -> Tensor:
-        return params.log() if MATERIALS[material].scale == "log" else params
-
-    def fit(self, graphs: list[HeteroData]) -> None:
-        """Set all statistics from graphs of the training split."""
-
-        def fit(module: nn.Module, values: Iterable[Tensor]) -> None:
-            cast(Standardize, module).fit(values)
-
-        for name, module in self.node.items():
-            fit(module, (g[t].x for g in graphs for t in self.spec.node_types if role(t) == name))
-        for m, module in self.params.items():
-            fit(module, (self._material_scale(m, g[m].material_params) for g in graphs))
-        for key, module in self.odd.items():
-            relations = [r for r in self.spec.relations if self._key(r) == key]
-            fit(module, (g[r].odd for g in graphs for r in relations))
-            fit(self.even[key], (g[r].even for g in graphs for r in relations))
-        mass = [g[m].mass for g in graphs for m in self.spec.materials]
-        if sum(len(x) for x in mass):
-            self.mass.copy_(torch.cat(mass).double().mean())
-
-    def forward(self, data: HeteroData, skip_absent: bool = True, limits: dict[str, Tensor] | None = None) -> HeteroData:
-        """A graph with standardised features; the input is left as it is.
-
-        Args:
-            data: with features in SI units.
-            skip_absent: leaves out features that the graph has no rows of.
-            limits: lowest and highest value [2, param] of each material's parameters; values beyond are taken for these.
-        """
-
-        def wanted(values: Tensor) -> bool:
-            return not skip_absent or values.shape[0] > 0
-
-        out = copy.copy(data)
-        for t in self.spec.node_types:
-            if wanted(data[t].x):
-                out[t].x = self.node[role(t)](data[t].x)
-        for m in self.spec.materials:
-            if wanted(data[m].x):
-                params = data[m].material_params
-                if limits is not None:
-                    params = params.clamp(*limits[m].to(params.dtype))
-                out[m].material_params = self.params[m](self._material_scale(m, params))
-                out[m].mass = data[m].mass / self.mass
-        for relation in self.spec.relations:
-            if wanted(data[relation].odd):
-                out[relation].odd = self.odd[self._key(relation)](data[relation].odd)
-                out[relation].even = self.even[self._key(relation)](data[relation].even)
-        return out
 
 
 class LearnedSimulator(nn.Module):
@@ -152,6 +78,7 @@ class LearnedSimulator(nn.Module):
         self.model, self.builder = model, builder
         self._static_friction = 0.0
         self._warned: set[str] = set()
+        self._unknown: list[str | EdgeType] | None = None  # not looked for yet
         self.standardizer = GraphStandardizer(builder.spec)
         self.register_buffer("acceleration_std", torch.ones((), dtype=torch.float64))
         self.register_buffer("stress_std", torch.ones((), dtype=torch.float64))
@@ -190,25 +117,30 @@ class LearnedSimulator(nn.Module):
     def fit_statistics(self, graphs: Iterable[HeteroData], parameter_ranges: Mapping[str, Tensor] | None = None) -> None:
         """Set feature statistics, the range of material parameters, and the scales of acceleration and stress from training graphs with ``target``.
 
-        Each scale is one scalar for all axes or components and all materials, with mean zero.
+        Each scale is one scalar for all axes or components and all materials, with mean zero. Materials and relations without statistics are named in a
+        warning.
 
         Args:
-            graphs: a sample of the training data.
+            graphs: a sample of the training data; as a ``StatisticsSample``, it knows more graphs of what is rare.
             parameter_ranges: lowest and highest value [2, param] of each material's parameters in all of them; by default in the sample.
         """
-        graphs = list(graphs)
-        self.standardizer.fit(graphs)
-        target = torch.cat([g[m].target for g in graphs for m in self.builder.spec.materials]).double()
+        sample = graphs if isinstance(graphs, StatisticsSample) else StatisticsSample(list(graphs))
+        self._unknown = None
+        if missing := self.standardizer.fit(sample):
+            log.warning(
+                "not in the training windows that statistics are taken from: %s; its features are not standardised", ", ".join(missing)
+            )
+        target = torch.cat([g[m].target for g in sample for m in self.builder.spec.materials]).double()
         rms = target.square().mean().sqrt()
         if not torch.isfinite(rms) or rms == 0:
             raise ValueError(f"the training data's accelerations without gravity have rms {float(rms)}; nothing to learn from")
         self.acceleration_std.copy_(rms)
-        stress = [g[m].stress_target for g in graphs for m in self.builder.spec.stress_channels if "stress_target" in g[m]]
+        stress = [g[m].stress_target for m in self.builder.spec.stress_channels for g in sample.of(m) if "stress_target" in g[m]]
         if stress:
             rms = torch.cat(stress).double().square().mean().sqrt()
             self.stress_std.copy_(torch.where(rms > 0, rms, 1.0))
         if parameter_ranges is None:
-            params = {m: torch.cat([g[m].material_params for g in graphs]) for m, _ in self.trained_ranges()}
+            params = {m: torch.cat([g[m].material_params for g in sample.of(m)]) for m, _ in self.trained_ranges()}
             parameter_ranges = {m: torch.stack([p.amin(dim=0), p.amax(dim=0)]) for m, p in params.items() if len(p)}
         for material, trained in self.trained_ranges():
             if material in parameter_ranges:
@@ -216,7 +148,8 @@ class LearnedSimulator(nn.Module):
 
     @torch.no_grad()
     def start_from(self, trained: LearnedSimulator) -> None:
-        """Take over what another simulator has learned, with the statistics that its weights are made for; trained ranges of parameters then cover both.
+        """Take over what another simulator has learned, with the statistics that its weights are made for, as far as it has them; trained ranges of parameters
+        then cover both.
 
         Raises:
             SceneError: the other one was trained on another frame interval, spacing, dimension or materials.
@@ -228,14 +161,18 @@ class LearnedSimulator(nn.Module):
         if different:
             raise CheckpointError(f"the model to start from is another one or has other graphs; choose {' '.join(different)}")
         ranges = {material: values.clone() for material, values in self.trained_ranges()}
+        statistics = copy.deepcopy(self.standardizer)
         try:
             self.load_state_dict(trained.state_dict())
         except RuntimeError as error:  # one set of weights per level of a mesh, and meshes of other sizes
             raise CheckpointError(f"the model to start from has meshes of other sizes ({_reason(error)})") from None
+        statistics.take_over(self.standardizer)
+        self.standardizer, self._unknown = statistics, None
         for material, values in self.trained_ranges():
-            low, high = ranges[material]
-            values[0].copy_(torch.minimum(values[0], low))
-            values[1].copy_(torch.maximum(values[1], high))
+            known = [r for r in (values.clone(), ranges[material]) if bool(r.isfinite().all())]  # of materials that a training had
+            if known:
+                values[0].copy_(torch.stack(known).amin(dim=0)[0])
+                values[1].copy_(torch.stack(known).amax(dim=0)[1])
 
     def _choices(self) -> dict[str, str]:
         """Overrides that make such a model and such graphs; the radius in spacings, whether the graph's or the data set's."""
@@ -364,7 +301,17 @@ class LearnedSimulator(nn.Module):
         except SimulationError as error:
             return error
 
+    def _warn_of_unknown(self, graphs: list[HeteroData]) -> None:
+        """Name what a scene has and the statistics of the training lack, once each."""
+        if self._unknown is None:
+            self._unknown = self.standardizer.unknown()
+        for kind in [*self._unknown]:
+            if any(len(graph[kind].x if isinstance(kind, str) else graph[kind].odd) for graph in graphs):
+                log.warning("outside the training data: %s has no statistics; its features are not standardised", named(kind))
+                self._unknown.remove(kind)
+
     def _advance_all(self, states: list[State], graphs: list[HeteroData]) -> list[State]:
+        self._warn_of_unknown(graphs)
         data = graphs[0] if len(graphs) == 1 else batched(graphs)
         predicted = self(data)
         new = self.moved(states, graphs, predicted.acceleration)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
-from collections.abc import Iterator
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 
@@ -22,12 +22,17 @@ from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling,
 from gpe_pl.data.statistics import acceleration_std, is_intact
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.schema import MATERIALS, node_code
+from gpe_pl.graphs.standardizer import StatisticsSample
+from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES, grid, node_code, role
 from gpe_pl.store import StoreError
 from gpe_pl.trajectory import Trajectory
 
 NUM_VAL_GRAPHS = 8
 """In a validation batch, where no number of nodes limits it. The error is a quotient of sums over all nodes, whatever the batches."""
+
+
+ENOUGH = 0.25
+"""Fraction of the windows for statistics: what may be in fewer of them gets as many windows of its own."""
 
 
 def data_statistics(root: Path | str) -> dict[str, float]:
@@ -59,6 +64,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         num_val_windows: windows of the one-step validation loss, evenly spread over the ``val`` split.
         stress: samples also hold the stress; see ``WindowDataset``.
         sampling: how often each training window is drawn.
+        num_statistics_windows: windows that features are standardised by, evenly spread over the ``train`` split.
 
     Attributes:
         push_forward: when batches are starts for own steps of the model rather than graphs; None: never.
@@ -79,10 +85,12 @@ class TrajectoryDataModule(L.LightningDataModule):
         num_val_windows: int = 256,
         stress: bool = False,
         sampling: Sampling = "uniform",
+        num_statistics_windows: int = 256,
     ) -> None:
         super().__init__()
         self.root, self.noise, self.batch_size, self.seed = Path(root), noise, batch_size, seed
         self.num_workers, self.num_val_windows = num_workers, num_val_windows
+        self.num_statistics_windows = num_statistics_windows
         self.push_forward: PushForward | None = None
         statistics = data_statistics(root)
         stored = open_split(root, "train")
@@ -99,10 +107,40 @@ class TrajectoryDataModule(L.LightningDataModule):
         if sampling == "activity":
             self.train_set.probability = probabilities(self.train_set.activity())
 
-    def statistics_sample(self, num_windows: int = 256) -> Iterator[HeteroData]:
-        """Training graphs, noise included, evenly spread over the split; for the standardisation of features."""
-        for window in _spread(len(self.train_set), num_windows):
-            yield self.train_set[int(window)]
+    def statistics_sample(self) -> StatisticsSample:
+        """Training graphs, noise included, for the standardisation of features: evenly spread over the split, and over the trajectories of what is rare."""
+        windows = _spread(len(self.train_set), self.num_statistics_windows)
+        return StatisticsSample([self.train_set[int(window)] for window in windows], self._rare_graphs)
+
+    def _rare_graphs(self, roles: frozenset[str]) -> list[HeteroData]:
+        """Graphs evenly spread over the trajectories that have nodes of all these roles.
+
+        None where the sample of the whole split has enough of such trajectories, or all or no trajectories are such.
+        """
+        has = np.array([roles <= own for own in self._roles])
+        if has.all() or not has.any():
+            return []
+        enough = max(1, round(ENOUGH * self.num_statistics_windows))
+        sampled = [self.train_set.locate(int(window))[0] for window in _spread(len(self.train_set), self.num_statistics_windows)]
+        if has[sampled].sum() >= enough:
+            return []
+        counts = np.diff(self.train_set.ends, prepend=0)
+        windows = np.flatnonzero(np.repeat(has, counts))
+        return [self.train_set[int(windows[k])] for k in _spread(len(windows), enough)]
+
+    @cached_property
+    def _roles(self) -> list[frozenset[str]]:
+        """What each training trajectory has nodes of."""
+        found = []
+        for stored in self.train_set.trajectories:
+            first = stored.window(0, 1)
+            roles = {NODE_TYPES[code] for code in np.unique(first.node_type)}
+            if len(first.boundary.pos):
+                roles.add(BOUNDARY)
+            if first.cells is not None and len(first.cells):
+                roles.add(role(grid(1)))
+            found.append(frozenset(roles))
+        return found
 
     def parameter_ranges(self) -> dict[str, torch.Tensor]:
         """Lowest and highest value [2, 1] of each material's parameter in all training trajectories; of materials that occur."""

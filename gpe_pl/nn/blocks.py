@@ -92,20 +92,26 @@ class Standardize(nn.Module):
         self.register_buffer("mean", torch.zeros(channels))
         self.register_buffer("std", torch.ones(channels))
 
-    def fit(self, batches: Iterable[Float[Tensor, "row channel"]]) -> None:
-        """Set the statistics from data, in float64; rows that are not finite are ignored, no rows leave the identity."""
+    @property
+    def is_identity(self) -> bool:
+        """Whether no statistics are set; none of features that vary are exactly these."""
+        return bool((self.mean == 0).all()) and bool((self.std == 1).all())
+
+    def fit(self, batches: Iterable[Float[Tensor, "row channel"]]) -> bool:
+        """Set the statistics from data, in float64; rows that are not finite are ignored, no rows leave the identity. Returns whether there was any row."""
         rows = [b.double() for b in batches if b.shape[0]]
         if not rows:
-            return
+            return False
         x = torch.cat(rows)
         x = x[torch.isfinite(x).all(dim=1)]
         if x.shape[0] == 0:
-            return
+            return False
         mean = x.mean(dim=0) if self.centered else torch.zeros(x.shape[1], dtype=x.dtype)
         std = (x - mean).square().mean(dim=0).sqrt()
         constant = std <= 1e-6 * (1e-6 + mean.abs())
         self.mean.copy_(mean)
         self.std.copy_(torch.where(constant, torch.ones_like(std), std))
+        return True
 
     def forward(self, x: Float[Tensor, "row channel"]) -> Float[Tensor, "row channel"]:
         return (x - self.mean) / self.std if self.centered else x / self.std

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import pickle
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor
+from torch_geometric.data import HeteroData
 
 from gpe_pl import integrators
 from gpe_pl.containment import Contained
@@ -22,6 +24,7 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import CHECKPOINT_FORMAT, CheckpointError, LearnedSimulator, SceneError, UnknownModelError, model_class
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout import Guard, SimulationError, rollout
+from gpe_pl.schema import param_names
 from gpe_pl.store import iter_trajectories, write_shard
 from gpe_pl.trajectory import State, Trajectory
 from tests import scenes
@@ -536,6 +539,38 @@ def test_material_parameters_outside_the_training_data_are_taken_for_the_nearest
     assert torch.equal(simulator.step(state).pos, free)  # nothing in this scene lies beyond
 
 
+def alone(build: GraphBuilder, materials: tuple[str, ...], seed: int = 0) -> tuple[State, HeteroData]:
+    """A state of some of the materials that a builder knows, and its graph with targets."""
+    state = scenes.state(40, materials, seed=seed).to_torch()
+    columns = [param_names(build.metadata.materials).index(name) for name in param_names(materials)]
+    params = state.material_params.new_full((state.num_nodes, len(param_names(build.metadata.materials))), torch.nan)
+    params[:, columns] = state.material_params
+    state = replace(state, material_params=params)
+    graph = build(state)
+    for material in build.spec.materials:
+        graph[material].target = torch.ones(graph[material].num_nodes, 2)
+    return state, graph
+
+
+def test_what_the_statistics_lack_is_named_once_and_never_silently_unscaled(caplog: pytest.LogCaptureFixture) -> None:
+    build = scenes.builder(("sand", "snow"), history=1)
+    simulator = learned(build).eval()
+    state, _ = alone(build, ("sand", "snow"))
+    simulator.step(state)
+    assert not caplog.records  # it has no statistics at all
+    simulator.fit_statistics([alone(build, ("sand",))[1]])
+    assert "that statistics are taken from: snow; its features are not standardised" in caplog.text
+    caplog.clear()
+    simulator.step(alone(build, ("sand",), seed=1)[0])
+    assert not caplog.records
+    for _ in range(2):
+        simulator.step(state)
+    expected = {f"outside the training data: {kind} has no statistics; its features are not standardised" for kind in (
+        "snow", "snow–radius–snow", "sand–radius–snow", "boundary–radius–snow"
+    )}  # fmt: skip
+    assert sorted(r.getMessage() for r in caplog.records) == sorted(expected)
+
+
 # --- training that begins with another simulator's weights --------------------------------------------------------------------------------
 
 
@@ -548,6 +583,19 @@ def fitted(seed: int, history: int = 2, **settings: Any) -> LearnedSimulator:
         graph[material].target = torch.full((graph[material].num_nodes, 2), 1.0 + seed)
     simulator.fit_statistics([graph])
     return simulator
+
+
+def test_a_start_keeps_its_own_statistics_of_what_the_other_training_lacked() -> None:
+    build = scenes.builder(("sand", "snow"), history=1)
+    trained, new = learned(build), learned(build, 1)
+    trained.fit_statistics([alone(build, ("sand",))[1]])
+    new.fit_statistics([alone(build, ("sand", "snow"), seed=1)[1]])
+    sand, snow = (copy.deepcopy(s.standardizer.node[m].state_dict()) for s, m in ((trained, "sand"), (new, "snow")))
+    low, high = (r.clone() for r in dict(new.trained_ranges())["snow"])
+    new.start_from(trained)
+    torch.testing.assert_close(new.standardizer.node["sand"].state_dict(), sand, rtol=0, atol=0)
+    torch.testing.assert_close(new.standardizer.node["snow"].state_dict(), snow, rtol=0, atol=0)
+    assert torch.equal(dict(new.trained_ranges())["snow"], torch.stack([low, high]))
 
 
 def test_a_simulator_starts_from_another_ones_weights_and_statistics() -> None:

@@ -13,7 +13,8 @@ import torch
 from torch_geometric.data import Batch, HeteroData
 
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned_simulator import GraphStandardizer, LearnedSimulator
+from gpe_pl.graphs.standardizer import GraphStandardizer
+from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS

@@ -14,7 +14,7 @@ from torch_geometric.data import Batch, HeteroData
 
 from gpe_pl.graphs.builder import GraphBuilder, GraphError
 from gpe_pl.graphs.multiscale import MeshError, MultiscaleGraph, _cached, build, cell_edges, levels_of, multiscale_graph
-from gpe_pl.learned_simulator import GraphStandardizer
+from gpe_pl.graphs.standardizer import GraphStandardizer
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import BOUNDARY, grid, is_symmetric, node_code
 from gpe_pl.trajectory import State

@@ -18,10 +18,13 @@ import torch
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.dataset import HeldGraphs, WindowDataset
+from gpe_pl.data.importers import save_dataset
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
 from gpe_pl.data.statistics import motion, with_checksum
 from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
 from gpe_pl.store import StoreError, read_trajectory, trajectory_names, write_shard
 from gpe_pl.trajectory import Trajectory
 
@@ -124,25 +127,79 @@ def test_validation_graphs_are_built_when_asked_for_and_held_within_a_limit(root
 
 
 def test_statistics_are_those_of_noisy_inputs(root: Path) -> None:
-    module = datamodule(root)
-    sample = list(module.statistics_sample(4))
+    module = datamodule(root, num_statistics_windows=4)
+    sample = list(module.statistics_sample())
     assert len(sample) == 4
     assert [int(s.frame) for s in sample] == [module.train_set.locate(k)[1] for k in (0, 2, 3, 5)]
     assert module.train_set.velocity_unit == pytest.approx(50.0 * module.metadata.frame_dt)
-    clean = TrajectoryDataModule(root, GraphConfig(history=2), Noise(0.0, 0.0), BatchSize(2))
-    assert not torch.equal(sample[0]["sand"].x, next(clean.statistics_sample(4))["sand"].x)
+    clean = TrajectoryDataModule(root, GraphConfig(history=2), Noise(0.0, 0.0), BatchSize(2), num_statistics_windows=4)
+    assert not torch.equal(sample[0]["sand"].x, next(iter(clean.statistics_sample()))["sand"].x)
 
 
 def test_parameter_ranges_cover_what_the_sample_of_windows_leaves_out(root: Path) -> None:
     def other(trajectory: Trajectory) -> Trajectory:
         return replace(trajectory, material_params=trajectory.material_params + 7.0)
 
-    module = datamodule(with_another(root, other))
-    (sample,) = module.statistics_sample(1)
+    module = datamodule(with_another(root, other), num_statistics_windows=1)
+    (sample,) = module.statistics_sample()
     known = sample["sand"].material_params
     low, high = module.parameter_ranges()["sand"]
     assert float(low) == known.min()
     assert float(high) == pytest.approx(float(known.max()) + 7.0)
+
+
+FRAMES, BLOCK = 4, 0.05 * np.stack(np.meshgrid(np.arange(3), np.arange(3)), -1).reshape(-1, 2)
+
+
+def scene(seed: int, *materials: tuple[str, float]) -> Trajectory:
+    """Nine nodes of each material, with its parameter, that move at random; the materials are far from each other."""
+    rng = np.random.default_rng(seed)
+    first = np.concatenate([BLOCK + np.array([0.5 * k, 0.0]) for k in range(len(materials))])
+    pos = first + np.cumsum(rng.normal(scale=2e-3, size=(FRAMES, *first.shape)), axis=0)
+    names = [name for name, _ in materials for _ in BLOCK]
+    return Trajectory.from_numpy(pos, 0.005, names, dict(materials), bounds=((-1, 2), (-1, 2)), spacing=0.05)
+
+
+def imported(folder: Path, train: list[Trajectory]) -> TrajectoryDataModule:
+    """A data set with these training trajectories of one window each, of which the sample for statistics takes eight."""
+    save_dataset(folder, "made", train=train, val=[scene(1001, ("fluid", 1e-3))], test=[scene(1002, ("fluid", 1e-3))])
+    return TrajectoryDataModule(folder / "made" / "imported", GraphConfig(history=2), Noise(), BatchSize(2), num_statistics_windows=8)
+
+
+def with_statistics(data: TrajectoryDataModule) -> LearnedSimulator:
+    simulator = LearnedSimulator(GPE(data.builder.spec, num_message_passing_steps=1, hidden_channels=4), data.builder)
+    simulator.fit_statistics(data.statistics_sample(), data.parameter_ranges())
+    return simulator
+
+
+def test_a_rare_material_is_standardised_like_any_other(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Sand is in two of twelve trajectories, which the eight windows skip; snow is in a third, far from the fluid."""
+    train = [scene(k, ("fluid", 1e-3)) for k in range(12)]
+    skipped = sorted({*range(12)} - {*np.linspace(0, 11, 8).round().astype(int).tolist()})
+    for place, angle in zip(skipped[:2], (15.0, 40.0), strict=True):
+        train[place] = scene(place, ("sand", angle))
+    train[skipped[2]] = scene(0, ("fluid", 1e-3), ("snow", 7.0))
+    data = imported(tmp_path, train)
+    statistics = with_statistics(data).standardizer.state_dict()
+    assert float(statistics["params.sand.mean"]) == pytest.approx(27.5)
+    assert float(statistics["params.sand.std"]) == pytest.approx(12.5)
+    graphs = [data.train_set[k] for k in skipped[:2]]
+    x = torch.cat([graph["sand"].x for graph in graphs])
+    torch.testing.assert_close(statistics["node.sand.mean"], x.double().mean(dim=0).float())
+    odd = torch.cat([graph["sand", "radius", "sand"].odd for graph in graphs])
+    torch.testing.assert_close(statistics["odd.sand__radius__sand.std"], odd.double().square().mean(dim=0).sqrt().float())
+    assert float(statistics["params.snow.mean"]) == 7.0
+    missing = [r.message for r in caplog.records]
+    assert missing == ["not in the training windows that statistics are taken from: snow–radius–fluid; its features are not standardised"]
+
+
+def test_the_statistics_of_what_is_common_are_those_of_the_sample(root: Path) -> None:
+    """Bit for bit, as with one material."""
+    data = datamodule(root)
+    plain = LearnedSimulator(GPE(data.builder.spec, num_message_passing_steps=1, hidden_channels=4), data.builder)
+    plain.fit_statistics(list(data.statistics_sample()), data.parameter_ranges())
+    for a, b in zip(plain.standardizer.buffers(), with_statistics(data).standardizer.buffers(), strict=True):
+        assert torch.equal(a, b)
 
 
 def test_validation_trajectories_come_from_the_validation_split(root: Path) -> None:

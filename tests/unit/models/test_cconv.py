@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
-from gpe_pl.learned_simulator import GraphStandardizer
+from gpe_pl.graphs.standardizer import GraphStandardizer
 from gpe_pl.models.cconv import ContinuousConvNet, NotAParticleGraphError
 from gpe_pl.nn.continuous_conv import interpolate
 from gpe_pl.schema import BOUNDARY, FeatureSpec

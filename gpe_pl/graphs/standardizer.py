@@ -1,0 +1,149 @@
+"""Standardisation of graphs with the statistics of the training split."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+from torch_geometric.data import HeteroData
+
+from gpe_pl.nn.blocks import Standardize
+from gpe_pl.schema import MATERIALS, EdgeType, FeatureSpec, role
+
+
+def _no_more(roles: frozenset[str]) -> list[HeteroData]:
+    return []
+
+
+@dataclass(frozen=True)
+class StatisticsSample:
+    """Training graphs that statistics are taken from.
+
+    Attributes:
+        graphs: evenly spread over the split.
+        rare: gives graphs of trajectories that have nodes of all these roles (see ``schema.role``), where ``graphs`` has too few of them; none where it has
+            enough.
+    """
+
+    graphs: list[HeteroData]
+    rare: Callable[[frozenset[str]], list[HeteroData]] = _no_more
+
+    def of(self, *roles: str) -> list[HeteroData]:
+        """The graphs to look at for nodes of one role, or edges between two."""
+        return self.rare(frozenset(roles)) or self.graphs
+
+    def __iter__(self) -> Iterator[HeteroData]:
+        return iter(self.graphs)
+
+
+class GraphStandardizer(nn.Module):
+    """Standardises every feature of a graph with training statistics; odd edge channels are only scaled, so they stay odd.
+
+    All levels of virtual nodes share their statistics, so that a graph may have more of them than those in training.
+    """
+
+    mass: Tensor
+
+    def __init__(self, spec: FeatureSpec) -> None:
+        super().__init__()
+        self.spec = spec
+        self.node = nn.ModuleDict({role(t): Standardize(c) for t, c in spec.node_channels.items()})
+        self.params = nn.ModuleDict({m: Standardize(c) for m, c in spec.param_channels.items()})
+        self.odd = nn.ModuleDict({self._key(r): Standardize(spec.odd_channels[r], centered=False) for r in spec.relations})
+        self.even = nn.ModuleDict({self._key(r): Standardize(spec.even_channels[r]) for r in spec.relations})
+        self.register_buffer("mass", torch.ones(()))
+
+    @staticmethod
+    def _key(relation: EdgeType) -> str:
+        source, name, target = relation
+        return f"{role(source)}__{name}__{role(target)}"
+
+    @staticmethod
+    def _material_scale(material: str, params: Tensor) -> Tensor:
+        return params.log() if MATERIALS[material].scale == "log" else params
+
+    def fit(self, graphs: Iterable[HeteroData]) -> list[str]:
+        """Set all statistics from graphs of the training split, those of what is rare from further ones if it is a ``StatisticsSample``.
+
+        Returns:
+            Materials, and relations between what occurs, that no graph has: these are not standardised.
+        """
+
+        def fit(module: nn.Module, values: Iterable[Tensor]) -> bool:
+            return cast(Standardize, module).fit(values)
+
+        sample = graphs if isinstance(graphs, StatisticsSample) else StatisticsSample(list(graphs))
+        looked_at = cache(sample.of)
+
+        missing = []
+        for name, module in self.node.items():
+            found = fit(module, (g[t].x for g in looked_at(name) for t in self.spec.node_types if role(t) == name))
+            if not found and name in self.spec.materials:
+                missing.append(name)
+        for m, module in self.params.items():
+            fit(module, (self._material_scale(m, g[m].material_params) for g in looked_at(m)))
+        for key, module in self.odd.items():
+            relations = [r for r in self.spec.relations if self._key(r) == key]
+            seen = looked_at(role(relations[0][0]), role(relations[0][2]))
+            found = fit(module, (g[r].odd for g in seen for r in relations))
+            fit(self.even[key], (g[r].even for g in seen for r in relations))
+            if not found and any(len(g[r[0]].x) and len(g[r[2]].x) for g in seen for r in relations):
+                missing.append(named(relations[0]))
+        mass = [g[m].mass for g in sample for m in self.spec.materials]
+        if sum(len(x) for x in mass):
+            self.mass.copy_(torch.cat(mass).double().mean())
+        return missing
+
+    def unknown(self) -> list[str | EdgeType]:
+        """Materials and relations without statistics; nothing before any are set."""
+        materials = [m for m in self.spec.materials if cast(Standardize, self.node[m]).is_identity]
+        if len(materials) == len(self.spec.materials):
+            return []
+        return [*materials, *(r for r in self.spec.relations if cast(Standardize, self.odd[self._key(r)]).is_identity)]
+
+    def take_over(self, other: GraphStandardizer) -> None:
+        """The statistics of another one, but for what it has none of."""
+        own = {name: module for name, module in self.named_modules() if isinstance(module, Standardize)}
+        for name, module in other.named_modules():
+            if isinstance(module, Standardize) and not module.is_identity:
+                own[name].load_state_dict(module.state_dict())
+        self.mass.copy_(other.mass)
+
+    def forward(self, data: HeteroData, skip_absent: bool = True, limits: dict[str, Tensor] | None = None) -> HeteroData:
+        """A graph with standardised features; the input is left as it is.
+
+        Args:
+            data: with features in SI units.
+            skip_absent: leaves out features that the graph has no rows of.
+            limits: lowest and highest value [2, param] of each material's parameters; values beyond are taken for these.
+        """
+
+        def wanted(values: Tensor) -> bool:
+            return not skip_absent or values.shape[0] > 0
+
+        out = copy.copy(data)
+        for t in self.spec.node_types:
+            if wanted(data[t].x):
+                out[t].x = self.node[role(t)](data[t].x)
+        for m in self.spec.materials:
+            if wanted(data[m].x):
+                params = data[m].material_params
+                if limits is not None:
+                    params = params.clamp(*limits[m].to(params.dtype))
+                out[m].material_params = self.params[m](self._material_scale(m, params))
+                out[m].mass = data[m].mass / self.mass
+        for relation in self.spec.relations:
+            if wanted(data[relation].odd):
+                out[relation].odd = self.odd[self._key(relation)](data[relation].odd)
+                out[relation].even = self.even[self._key(relation)](data[relation].even)
+        return out
+
+
+def named(kind: str | EdgeType) -> str:
+    """A material or relation in words."""
+    return kind if isinstance(kind, str) else "–".join((role(kind[0]), kind[1], role(kind[2])))
