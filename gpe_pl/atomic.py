@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import os
 import platform
@@ -12,12 +13,24 @@ from pathlib import Path
 
 import psutil
 
+from gpe_pl.errors import GpeError
+
+FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
+"""What systems answer where there is no room: on the disk, in a file, for this user."""
+
+
+class FullDiskError(GpeError, OSError):
+    """There is no room for a file; the message names it."""
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A path beside ``path`` and with its suffix: what is written there takes its place when the block ends well, and is removed otherwise.
 
     Makes the folder where there is none, and removes what processes that were killed have left of earlier attempts.
+
+    Raises:
+        FullDiskError: there is no room.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     start, end = f".{path.stem}.{platform.node()}.", f".part{path.suffix}"
@@ -29,6 +42,12 @@ def replacing(path: Path) -> Iterator[Path]:
         yield part
         _flush(part)
         os.replace(part, path)
+    except OSError as error:
+        if error.errno not in FULL or isinstance(error, FullDiskError):
+            raise
+        raise FullDiskError(
+            f"{path}: cannot be written, there is no room ({os.strerror(error.errno)}); make some, and run the command again"
+        ) from None
     finally:
         _remove(part)
 
@@ -37,6 +56,12 @@ def replace_text(path: Path, text: str) -> None:
     """Write a text file."""
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
+
+
+def replace_bytes(path: Path, content: bytes | bytearray | memoryview) -> None:
+    """Write a file."""
+    with replacing(path) as part:
+        part.write_bytes(content)
 
 
 def _is_running(pid: str) -> bool:

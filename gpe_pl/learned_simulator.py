@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import importlib
 import inspect
+import io
 import json
 import logging
 import zipfile
@@ -22,7 +23,7 @@ from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
 from gpe_pl import integrators
-from gpe_pl.atomic import replacing
+from gpe_pl.atomic import replace_bytes
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
@@ -435,8 +436,9 @@ class LearnedSimulator(nn.Module):
     def save(self, path: Path | str) -> None:
         """Write weights and description alone, which ``from_checkpoint`` reads, atomically; a training checkpoint also holds the optimiser's state."""
         weights = {f"simulator.{name}": value.detach().cpu().clone() for name, value in self.state_dict().items()}
-        with replacing(Path(path)) as part:
-            torch.save({"simulator": self.description(), "state_dict": weights}, part)
+        content = io.BytesIO()  # PyTorch's own writer aborts the process on a full disk
+        torch.save({"simulator": self.description(), "state_dict": weights}, content)
+        replace_bytes(Path(path), content.getbuffer())
 
     @classmethod
     def from_checkpoint(cls, path: Path | str, device: Any = "cpu") -> LearnedSimulator:

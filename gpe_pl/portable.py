@@ -14,6 +14,7 @@ nodes, edges and islands may change from call to call.
 from __future__ import annotations
 
 import copy
+import io
 import json
 import re
 from dataclasses import asdict, dataclass, replace
@@ -27,7 +28,7 @@ from torch.export import Dim
 from torch_geometric.data import HeteroData
 
 from gpe_pl import integrators
-from gpe_pl.atomic import replacing
+from gpe_pl.atomic import replace_bytes
 from gpe_pl.graphs.builder import GraphBuilder, from_centre
 from gpe_pl.graphs.features import boundary_features, edge_features, history_of, material_features, mesh_features, virtual_features
 from gpe_pl.graphs.islands import unwrapped
@@ -294,8 +295,9 @@ def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
     shapes = {name: {k: dims[n] for k, n in enumerate(i.shape) if isinstance(n, str)} for name, i in inputs.items()}
     with torch.no_grad():
         program = torch.export.export(step, (example,), dynamic_shapes=(shapes,))
-    with replacing(path) as part:
-        torch.export.save(program, part, extra_files={DESCRIPTION: json.dumps(_description(simulator, inputs), indent=1)})
+    content = io.BytesIO()  # PyTorch's own writer aborts the process on a full disk
+    torch.export.save(program, content, extra_files={DESCRIPTION: json.dumps(_description(simulator, inputs), indent=1)})
+    replace_bytes(path, content.getbuffer())
 
 
 def _description(simulator: LearnedSimulator, inputs: dict[str, Input]) -> dict[str, Any]:

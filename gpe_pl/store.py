@@ -24,6 +24,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.geometry import Shape
 from gpe_pl.hdf5_arrays import attribute, dataset_in, is_named, is_own, obstacle
 from gpe_pl.json_text import parsed
+from gpe_pl.late_failure import LateFailure
 from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, SCHEMA_VERSION, node_code
 from gpe_pl.shape_values import shape_from_dict, shape_to_dict
 from gpe_pl.trajectory import Boundary, Metadata, Motion, Stress, Trajectory
@@ -117,30 +118,37 @@ def write_shard(path: Path | str, trajectories: Iterable[Trajectory], names: Ite
 
     Raises:
         ValueError: ``names`` are fewer than the trajectories.
+        FullDiskError: there is no room for the file.
     """
     path = Path(path)
     name_of = iter(names) if names is not None else (f"{k:05d}" for k in range(10**9))
     # track_times off and the libver pinned: equal content gives equal bytes
-    with replacing(path) as part, h5py.File(part, "w", libver=("v110", "v110"), track_order=False) as file:
-        file.attrs["schema_version"] = SCHEMA_VERSION
-        _write_text(file, "units", json.dumps({k: f.unit for k, f in FIELDS.items()}, sort_keys=True))
-        count = 0
-        for trajectory in trajectories:
-            name = next(name_of, None)
-            if name is None:
-                raise ValueError(f"{path}: {count} names for more than {count} trajectories")
-            arrays, attributes = stored_arrays(trajectory), stored_attributes(trajectory)
-            group = file.create_group(name)
-            for key, text in attributes.items():
-                _write_text(group, key, text)
-            _write_text(group, "sha256", digest(arrays, attributes))
-            for key, array in arrays.items():
-                empty = array.size == 0
-                options = {} if empty else {"chunks": _chunks(array, FIELDS[key].dims), "fletcher32": True, **COMPRESSION}
-                dataset = group.create_dataset(key, data=array, track_times=False, **options)
-                _write_text(dataset, "unit", FIELDS[key].unit)
-            count += 1
-        file.attrs["num_trajectories"] = count
+    with replacing(path) as part, LateFailure(part) as place:
+        with h5py.File(place, "w", libver=("v110", "v110"), track_order=False) as file:
+            file.attrs["schema_version"] = SCHEMA_VERSION
+            _write_text(file, "units", json.dumps({k: f.unit for k, f in FIELDS.items()}, sort_keys=True))
+            count = 0
+            for trajectory in trajectories:
+                name = next(name_of, None)
+                if name is None:
+                    raise ValueError(f"{path}: {count} names for more than {count} trajectories")
+                _write_trajectory(file.create_group(name), trajectory)
+                place.check()
+                count += 1
+            file.attrs["num_trajectories"] = count
+        place.check()
+
+
+def _write_trajectory(group: h5py.Group, trajectory: Trajectory) -> None:
+    arrays, attributes = stored_arrays(trajectory), stored_attributes(trajectory)
+    for key, text in attributes.items():
+        _write_text(group, key, text)
+    _write_text(group, "sha256", digest(arrays, attributes))
+    for key, array in arrays.items():
+        empty = array.size == 0
+        options = {} if empty else {"chunks": _chunks(array, FIELDS[key].dims), "fletcher32": True, **COMPRESSION}
+        dataset = group.create_dataset(key, data=array, track_times=False, **options)
+        _write_text(dataset, "unit", FIELDS[key].unit)
 
 
 def _write_text(owner: h5py.HLObject, key: str, text: str) -> None:

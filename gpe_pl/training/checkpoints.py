@@ -14,7 +14,7 @@ from lightning.fabric.plugins.io import TorchCheckpointIO
 from lightning.pytorch.callbacks import Checkpoint
 
 from gpe_pl import ranks
-from gpe_pl.atomic import replacing
+from gpe_pl.atomic import replace_bytes
 from gpe_pl.learned_simulator import CheckpointError, load_checkpoint
 from gpe_pl.training.interruption import Interruption
 
@@ -120,8 +120,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         content = io.BytesIO()
         torch.save(checkpoint, content)
-        with replacing(Path(path)) as part:
-            part.write_bytes(content.getbuffer())
+        replace_bytes(Path(path), content.getbuffer())
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = True) -> dict[str, Any]:
         """Only tensors and plain values are unpickled, whatever the caller asks for.
