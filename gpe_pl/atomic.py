@@ -19,8 +19,15 @@ FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 """What systems answer where there is no room: on the disk, in a file, for this user."""
 
 
-class FullDiskError(GpeError, OSError):
-    """There is no room for a file; the message names it."""
+class FullDiskError(GpeError):
+    """There is no room for a file or folder; the message names it."""
+
+    def __init__(self, path: Path, reason: str) -> None:
+        super().__init__(f"{path}: cannot be written, there is no room ({reason}); make some, and run the command again")
+        self.path, self.reason = path, reason
+
+    def __reduce__(self) -> tuple[type[FullDiskError], tuple[Path, str]]:  # crosses process boundaries
+        return type(self), (self.path, self.reason)
 
 
 @contextmanager
@@ -42,14 +49,19 @@ def replacing(path: Path) -> Iterator[Path]:
         yield part
         _flush(part)
         os.replace(part, path)
+    except FullDiskError as error:  # of a file in a folder that is being made
+        raise FullDiskError(path, error.reason) from None
     except OSError as error:
-        if error.errno not in FULL or isinstance(error, FullDiskError):
+        if error.errno is None or error.errno not in FULL:
             raise
-        raise FullDiskError(
-            f"{path}: cannot be written, there is no room ({os.strerror(error.errno)}); make some, and run the command again"
-        ) from None
+        raise FullDiskError(path, os.strerror(error.errno)) from None
     finally:
         _remove(part)
+
+
+def free_bytes(folder: Path) -> int:
+    """Room on the disk of a folder, which need not exist yet."""
+    return shutil.disk_usage(next(place for place in (folder, *folder.absolute().parents) if place.exists())).free
 
 
 def replace_text(path: Path, text: str) -> None:

@@ -39,6 +39,7 @@ def benchmark(cfg: DictConfig) -> None:
     from gpe_pl.locks import held
     from gpe_pl.machine import environment, keep_freed_memory
     from gpe_pl.simulate import dataset
+    from gpe_pl.viz.saving import save_figure
 
     suites = sorted(path.stem for path in (CONF / "suite").glob("*.yaml"))
     if cfg.suite.name not in suites:
@@ -54,7 +55,7 @@ def benchmark(cfg: DictConfig) -> None:
     with held(folder):
         records, table = suite.run(settings) if cases is None else suite.run(settings, {k: dataset(*c.overrides) for k, c in cases.items()})
         for name, figure in getattr(suite, "figures", lambda _: {})(records).items():
-            figure.savefig(folder / f"{name}.png", dpi=150)
+            save_figure(figure, folder / f"{name}.png", dpi=150)
         results = {"environment": environment(), "settings": without_folder(asdict(settings), cfg.paths.runs), "records": records}
         for name, text in (("results.json", json.dumps(results, indent=1)), ("table.md", table + "\n")):
             replace_text(folder / name, text)

@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 
 def convert(cfg: DictConfig) -> None:
     """Import one data set and print the report."""
-    from gpe_pl.data.importers import PAGE_FILE, ImportSettings, draw_contact_sheet, import_dataset
+    from gpe_pl.data.importers import CONTACT_SHEET_FILE, PAGE_FILE, ImportSettings, import_dataset
     from gpe_pl.progress import progress_bar
 
     settings = construct(ImportSettings, {str(key): value for key, value in cfg.items() if key != "paths"}, "")
     with progress_bar(f"{settings.format} {settings.name or ''}") as on_progress:
-        report = import_dataset(cfg.paths.data, settings, on_progress)
+        report = import_dataset(cfg.paths.data, settings, on_progress, contact_sheet=True)
     print(report.text())
     if {"train", "val", "test"} <= set(report.splits):
         print(f"train on it: python -m gpe_pl.fit data=imported data.name={report.name} name={report.name}")
-    print(draw_contact_sheet(report))
-    print(Path(report.folder) / PAGE_FILE)
+    for name in (CONTACT_SHEET_FILE, PAGE_FILE):
+        print(Path(report.folder) / name)
 
 
 main = entry_point("convert")(convert)

@@ -36,6 +36,7 @@ from gpe_pl.finished_runs import (
 from gpe_pl.markdown import table_row
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio, median_of_means
 from gpe_pl.parameter_curves import PARAMETER_FIGURE, parameter_curves
+from gpe_pl.viz.saving import save_figure
 
 log = logging.getLogger(__name__)
 
@@ -322,6 +323,6 @@ def _figures(
         if any(name in t for t in trivial.values())
     }
     if any(shown.values()):
-        comparison_figure({d: s for d, s in shown.items() if s}, references, "rollout MSE [m²]").savefig(folder / FIGURE, dpi=150)
+        save_figure(comparison_figure({d: s for d, s in shown.items() if s}, references, "rollout MSE [m²]"), folder / FIGURE, dpi=150)
     by_domain = {d: {m: by_cell[d, m] for m in models if (d, m) in by_cell} for d in domains}
-    parameter_curves(by_domain).savefig(folder / PARAMETER_FIGURE, dpi=150)
+    save_figure(parameter_curves(by_domain), folder / PARAMETER_FIGURE, dpi=150)

@@ -31,6 +31,7 @@ from gpe_pl.portable import export_model
 from gpe_pl.rollout import Guard, Simulator, Start, rollout, rollouts, share_outside
 from gpe_pl.schema import Split
 from gpe_pl.trajectory import State, Trajectory
+from gpe_pl.viz.saving import save_figure
 
 log = logging.getLogger(__name__)
 
@@ -308,10 +309,10 @@ def _pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predict
     from gpe_pl.viz.viewer import write_viewer
 
     stem = run_dir / f"rollout_{split}_{number:02d}"
-    rollout_figure(truth, predictions).savefig(stem.with_suffix(".png"), dpi=150, bbox_inches="tight")
+    save_figure(rollout_figure(truth, predictions), stem.with_suffix(".png"), dpi=150, bbox_inches="tight")
     if truth.stress is not None and all(p.stress is not None for p in predictions.values()):
         figure = rollout_figure(truth, predictions, color="von_mises")
-        figure.savefig(run_dir / f"stress_{split}_{number:02d}.png", dpi=150, bbox_inches="tight")
+        save_figure(figure, run_dir / f"stress_{split}_{number:02d}.png", dpi=150, bbox_inches="tight")
     stride = max(1, truth.num_frames // 60)
     write_animation(stem.with_suffix(".gif"), truth, predictions, fps=20, stride=stride)
     size = (1 + len(predictions)) * (truth.pos.nbytes + truth.vel.nbytes)
@@ -335,4 +336,4 @@ def _exports(run_dir: Path, split: str, number: int, truth: Trajectory, predicti
 def _error_curve(path: Path, curves: dict[str, list[np.ndarray]], frame_dt: float) -> None:
     from gpe_pl.viz.figures import error_curve_figure
 
-    error_curve_figure(curves, frame_dt).savefig(path, dpi=150)
+    save_figure(error_curve_figure(curves, frame_dt), path, dpi=150)

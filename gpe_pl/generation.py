@@ -16,14 +16,10 @@ import hashlib
 import json
 import logging
 import math
-import multiprocessing
-import os
-import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Mapping
+from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
@@ -33,7 +29,7 @@ import numpy as np
 from pydantic import Field, InstanceOf
 from pydantic.dataclasses import dataclass
 
-from gpe_pl.atomic import replace_text, replacing
+from gpe_pl.atomic import free_bytes, replace_text
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.motion import ROUNDING_SHARE, motion_of, rounding_fault, rounding_of
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, is_intact, shard_moments, with_checksum
@@ -49,6 +45,7 @@ from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.store import StoreError, read_trajectory, trajectory_names, write_shard
 from gpe_pl.trajectory import Metadata, State, Trajectory
+from gpe_pl.workers import pool, results
 
 log = logging.getLogger(__name__)
 
@@ -359,11 +356,10 @@ class Plan:
 def plan(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1)) -> Plan:
     """What ``generate`` does with the same arguments."""
     folder = Path(root) / spec.name / spec.size
-    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
     own = _shards(spec, part)
     missing = tuple((split, k) for split, k in own if not _is_complete(spec, folder, split, k))
     total, num_missing = (sum(len(_shard_indices(spec, split, k)) for split, k in shards) for shards in (own, missing))
-    return Plan(missing, total - num_missing, num_missing, num_missing * _bytes_per_trajectory(spec), shutil.disk_usage(existing).free)
+    return Plan(missing, total - num_missing, num_missing, num_missing * _bytes_per_trajectory(spec), free_bytes(folder))
 
 
 def discard_damaged(root: Path | str, spec: DatasetSpec, num_workers: int = 1, part: tuple[int, int] = (0, 1)) -> None:
@@ -376,8 +372,8 @@ def discard_damaged(root: Path | str, spec: DatasetSpec, num_workers: int = 1, p
     if not paths:
         return
     _claim(folder, spec)
-    with _pool(num_workers) as pool:
-        for path, fault in _run(pool, _fault, [(path,) for path in paths]):
+    with pool(num_workers) as workers:
+        for path, fault in results(workers, _fault, [(path,) for path in paths]):
             if fault:
                 log.warning("generating a shard again: %s", fault)
                 path.unlink(missing_ok=True)
@@ -466,6 +462,7 @@ def generate(
 
     Raises:
         GenerationError: the folder holds a data set of another spec, the disk is too small, or a trajectory failed.
+        WorkerError: a process died.
         FolderError: the folder cannot be made or written.
     """
     if num_workers < 1:
@@ -513,10 +510,10 @@ def _generate(folder: Path, to_do: Plan, spec: DatasetSpec, num_workers: int, on
     draws_sheet = part[0] == 0 and not sheet.is_file()
     if to_do.missing or draws_sheet:
         _compile(spec)  # once, here: the workers load the compiled kernels from disk
-    with _pool(num_workers) as pool:
+    with pool(num_workers) as workers:
         if draws_sheet:  # first, so that hours of wrong data are seen within a minute
-            _draw_contact_sheet(spec, sheet, pool)
-        for count in _run(pool, _write_shard, [(spec, folder, split, k) for split, k in to_do.missing]):
+            _draw_contact_sheet(spec, sheet, workers)
+        for count in results(workers, _write_shard, [(spec, folder, split, k) for split, k in to_do.missing]):
             done += count
             if on_progress is not None:
                 on_progress(done, total)
@@ -525,13 +522,14 @@ def _generate(folder: Path, to_do: Plan, spec: DatasetSpec, num_workers: int, on
             statistics, split_checksum(folder, "train")
         ):
             paths = [shard_path(folder, *shard) for shard in train]
-            moments = {str(path): sums for path, sums in _run(pool, shard_moments, [(path,) for path in paths])}
+            moments = {str(path): sums for path, sums in results(workers, shard_moments, [(path,) for path in paths])}
             _write_json(statistics, with_checksum(combined([moments[str(path)] for path in paths]), split_checksum(folder, "train")))
 
 
-def _draw_contact_sheet(spec: DatasetSpec, path: Path, pool: Executor | None) -> None:
+def _draw_contact_sheet(spec: DatasetSpec, path: Path, workers: Executor | None) -> None:
     """A training scene with as many of the materials as possible, under parameter values from the smallest to the largest."""
     from gpe_pl.viz.contact_sheet import contact_sheet
+    from gpe_pl.viz.saving import save_figure
 
     rows: dict[str, dict[str, float]] = {}
     for share in np.linspace(0.0, 1.0, SHEET_ROWS):
@@ -542,9 +540,8 @@ def _draw_contact_sheet(spec: DatasetSpec, path: Path, pool: Executor | None) ->
         rows[_row_label(values)] = values
     index = _most_varied_scene(spec)
     arguments = [(spec, index, label, values) for label, values in rows.items()]
-    trajectories = dict(_run(pool, _labelled_trajectory, arguments))
-    with replacing(path) as part:
-        contact_sheet({label: trajectories[label] for label in rows}).savefig(part)
+    trajectories = dict(results(workers, _labelled_trajectory, arguments))
+    save_figure(contact_sheet({label: trajectories[label] for label in rows}), path)
 
 
 def _most_varied_scene(spec: DatasetSpec) -> int:
@@ -610,55 +607,3 @@ def _differences(stored: Any, wanted: Any, key: str = "") -> list[str]:
 
 def _write_json(path: Path, values: dict[str, Any]) -> None:
     replace_text(path, json.dumps(values, indent=2, sort_keys=True) + "\n")
-
-
-# --- processes -----------------------------------------------------------------------------------------------------------------------------
-
-
-def _exit_with_parent() -> None:
-    """A worker whose parent was killed must not stay behind."""
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-@contextlib.contextmanager
-def _pool(num_workers: int) -> Iterator[Executor | None]:
-    if num_workers == 1:
-        yield None
-        return
-    before = os.environ.get("NUMBA_NUM_THREADS")
-    os.environ["NUMBA_NUM_THREADS"] = "1"  # inherited by the workers: one process per core, one thread per process
-    pool = ProcessPoolExecutor(num_workers, multiprocessing.get_context("spawn"), _exit_with_parent)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-        if before is None:
-            del os.environ["NUMBA_NUM_THREADS"]
-        else:
-            os.environ["NUMBA_NUM_THREADS"] = before
-
-
-def _run(pool: Executor | None, function: Callable[..., Any], arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
-    """Results of ``function`` as they complete."""
-    if pool is None:
-        for values in arguments:
-            yield function(*values)
-        return
-    futures: list[Future[Any]] = [pool.submit(function, *values) for values in arguments]
-    try:
-        for future in as_completed(futures):
-            yield future.result()
-    except BrokenProcessPool:
-        raise GenerationError(
-            "a worker process died (killed, or out of memory); run simulate again to resume, with fewer workers"
-        ) from None
-    finally:
-        for future in futures:
-            future.cancel()

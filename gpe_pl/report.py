@@ -33,6 +33,7 @@ from gpe_pl.metrics import bootstrap_interval
 from gpe_pl.nn.fused import unfused
 from gpe_pl.parameter_curves import PARAMETER_FIGURE, parameter_curves
 from gpe_pl.timing import paired_ratio, paired_times
+from gpe_pl.viz.saving import save_figure
 
 log = logging.getLogger(__name__)
 
@@ -69,10 +70,10 @@ def _report(folder: Path, runs: list[Run]) -> None:
     if all(curves.values()):
         from gpe_pl.viz.figures import validation_loss_figure
 
-        validation_loss_figure(curves).savefig(folder / "validation_loss.png", dpi=150)
+        save_figure(validation_loss_figure(curves), folder / "validation_loss.png", dpi=150)
     if any(row.parameter_group in UNSEEN_GROUPS and np.isfinite(row.parameter) for row in runs[0].rows):
         by_label = {", ".join(v) or LEARNED: members for v, members in variants.items()}
-        parameter_curves({str(runs[0].config["data.name"]): by_label}).savefig(folder / PARAMETER_FIGURE, dpi=150)
+        save_figure(parameter_curves({str(runs[0].config["data.name"]): by_label}), folder / PARAMETER_FIGURE, dpi=150)
 
 
 def conclusion(folder: Path) -> str:

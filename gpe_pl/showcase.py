@@ -26,6 +26,7 @@ from gpe_pl.machine import environment, peak_resident
 from gpe_pl.rollout import Guard, Simulator, Start, frames, unsound
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.trajectory import Metadata, State, Termination, Trajectory
+from gpe_pl.viz.saving import save_figure
 
 MAX_PICTURES = 60
 """Frames of the animation at most."""
@@ -224,7 +225,7 @@ class _Film:
         )
         columns = evenly_spaced_frames(trajectory.num_frames, 4)
         strip = film_strip([("", trajectory)], columns, Coloring("height", [trajectory], columns))
-        strip.savefig(stem.with_suffix(".png"), dpi=220)
+        save_figure(strip, stem.with_suffix(".png"), dpi=220)
         extension = ".mp4" if find_spec("imageio_ffmpeg") else ".gif"
         write_film(stem.with_suffix(extension), "prediction", trajectory, fps=min(25.0, 1 / self.metadata.frame_dt))
 

@@ -9,11 +9,12 @@ and once to write. The data set appears complete or not at all, and an existing 
     {root}/{name}/imported/contact_sheet.png        some scenes, to look at, from the command
 """
 
-from gpe_pl.data.importers.assemble import FOLDER, draw_contact_sheet, import_dataset, save_dataset
+from gpe_pl.data.importers.assemble import CONTACT_SHEET_FILE, FOLDER, draw_contact_sheet, import_dataset, save_dataset
 from gpe_pl.data.importers.report import PAGE_FILE, Report
 from gpe_pl.data.importers.source import Format, ImportFailure, ImportSettings, Refusal
 
 __all__ = [
+    "CONTACT_SHEET_FILE",
     "FOLDER",
     "PAGE_FILE",
     "Format",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 
 from gpe_pl import integrators
 from gpe_pl.arrays import ArrayError, nearest_distances
-from gpe_pl.atomic import replacing
+from gpe_pl.atomic import free_bytes, replacing
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
@@ -30,12 +30,13 @@ from gpe_pl.periodicity import PeriodicityError
 from gpe_pl.progress import Progress
 from gpe_pl.schema import HISTORY, MATERIALS, NODE_TYPES, SPLITS, ParameterGroup, node_code, param_names
 from gpe_pl.store import iter_trajectories, stored_arrays, write_shard
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory import Metadata, Trajectory
 from gpe_pl.values import faults, size_conflicts
 
 FOLDER = "imported"
 """Folder of imported data in that of a data set, where generated data have their size."""
 
+CONTACT_SHEET_FILE = "contact_sheet.png"
 VERSION = "1"
 TRAJECTORIES_PER_SHARD = 8
 NUM_SAMPLED = 8
@@ -64,16 +65,17 @@ TYPED = ("gns", "lagrangebench", "meshgraphnets")
 """Formats with types of nodes."""
 
 
-def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Progress | None = None) -> Report:
+def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Progress | None = None, contact_sheet: bool = False) -> Report:
     """Convert a source into ``{root}/{name}/imported``.
 
     Args:
         root: folder of all data sets.
         settings: what to read, and what to take instead of what it says.
         on_progress: called after each trajectory that was read, with the number of those and how often one will be.
+        contact_sheet: draw it, as ``draw_contact_sheet`` does, before the data set appears.
 
     Raises:
-        ImportFailure: the source cannot be read, none of its training trajectories can be used, or the data set exists already.
+        ImportFailure: the source cannot be read, none of its training trajectories can be used, the disk is too small, or the data set exists already.
     """
     path = Path(settings.source).expanduser()
     name = settings.name or path.name.partition(".")[0]
@@ -89,7 +91,7 @@ def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Prog
         "source": str(path.absolute()),
         "settings": {k: v for k, v in asdict(settings).items() if v is not None},
     }
-    return _Conversion(name, folder, source, settings.holdout, about, on_progress).run()
+    return _Conversion(name, folder, source, settings.holdout, about, on_progress).run(contact_sheet)
 
 
 def save_dataset(root: Path | str, name: str, holdout: float = 0.1, **splits: Iterable[Trajectory]) -> Report:
@@ -123,14 +125,17 @@ def save_dataset(root: Path | str, name: str, holdout: float = 0.1, **splits: It
 
 def draw_contact_sheet(report: Report) -> Path:
     """Some scenes of an imported data set, to look at; returns the picture's path."""
-    from gpe_pl.viz.contact_sheet import contact_sheet
+    return _draw_contact_sheet(Path(report.folder), next(iter(report.splits)))
 
-    folder, split = Path(report.folder), next(iter(report.splits))
+
+def _draw_contact_sheet(folder: Path, split: str) -> Path:
+    from gpe_pl.viz.contact_sheet import contact_sheet
+    from gpe_pl.viz.saving import save_figure
+
     shown = islice(iter_trajectories(folder, split), NUM_SHOWN)
     figure = contact_sheet({f"{split} {k}": trajectory for k, trajectory in enumerate(shown)})
-    path = folder / "contact_sheet.png"
-    with replacing(path) as part:
-        figure.savefig(part)
+    path = folder / CONTACT_SHEET_FILE
+    save_figure(figure, path)
     return path
 
 
@@ -173,6 +178,7 @@ class _Survey:
     motions: list[tuple[str, str, MotionSummary]] = field(default_factory=list)
     assumes_gravity: list[bool] = field(default_factory=list)
     suspects: list[Event] = field(default_factory=list)
+    num_bytes: int = 0
     flights: list[tuple[bool, FreeFlight]] = field(default_factory=list)
     common: tuple[float, int, tuple[bool, ...]] | None = None
 
@@ -192,12 +198,13 @@ class _Conversion:
         self.origin = np.zeros(0)
         self.on_progress, self.num_read = on_progress, 0
 
-    def run(self) -> Report:
-        """Look, decide, write."""
+    def run(self, contact_sheet: bool = False) -> Report:
+        """Look, decide, write; the folder appears with all that belongs into it."""
         with held(self.folder, "paths.data", makes=False):
             _check_free(self.folder)  # again: the other command may just have ended
             self._look()
             self._decide()
+            self._require_room()
             with replacing(self.folder) as part:
                 for split in SPLITS:  # train first: what is unseen is told by it
                     if split in self.survey.good:
@@ -205,7 +212,17 @@ class _Conversion:
                 self._summarize(part)
                 self.report.warnings += [str(suspect) for suspect in self.survey.suspects]
                 self.report.write(part)
+                if contact_sheet:
+                    _draw_contact_sheet(part, next(iter(self.report.splits)))
         return self.report
+
+    def _require_room(self) -> None:
+        free = free_bytes(self.folder)
+        if self.survey.num_bytes > free:
+            raise ImportFailure(
+                f"{self.folder}: the data need up to {self.survey.num_bytes / 2**30:.3g} GiB, the disk has {free / 2**30:.3g} GiB free; "
+                "choose another folder with paths.data"
+            )
 
     # --- first pass ------------------------------------------------------------------------------------------------------------------------
 
@@ -242,7 +259,8 @@ class _Conversion:
         """Add a trajectory to what is known; raises ``Refusal`` where it does not fit the others."""
         survey, trajectory = self.survey, loaded.trajectory
         m, where = trajectory.metadata, f"{split}, {name}"
-        for fault in _faults(trajectory):
+        arrays = stored_arrays(trajectory)
+        for fault in _faults(m, arrays):
             raise Refusal(fault)
         common = (m.frame_dt, m.dim, m.periodic)
         if survey.common is None:
@@ -267,6 +285,7 @@ class _Conversion:
             what = f"{len(at_one_place)} nodes lie where another one is, the first of them node {at_one_place[0]}: do bodies overlap?"
             survey.suspects.append(Event(split, name, 0, what))
         survey.materials |= set(m.materials)
+        survey.num_bytes += sum(array.nbytes for array in arrays.values())
         survey.bounds.append(m.bounds)
         if len(survey.flights) < NUM_SAMPLED:
             survey.flights.append((loaded.assumes_gravity, _free_flight(trajectory)))
@@ -515,9 +534,8 @@ class _Conversion:
         report.step_in_spacings = report.max_speed * report.frame_dt / report.spacing
 
 
-def _faults(trajectory: Trajectory) -> Iterator[str]:
-    """What the store would not read again."""
-    m, arrays = trajectory.metadata, stored_arrays(trajectory)
+def _faults(m: Metadata, arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
+    """Why the store would not read a trajectory again."""
     yield from (f"{key} {violation}" for key, violation in m.violations())
     yield from size_conflicts(arrays, m.dim, len(m.param_names))
     yield from map(str, faults(arrays, NODE_TYPES, m.materials, m.param_names))

@@ -1,0 +1,16 @@
+"""Figures in files that appear complete or not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from gpe_pl.atomic import replacing
+
+
+def save_figure(figure: Figure, path: Path, **options: Any) -> None:
+    """Write a figure; options are those of ``savefig``. Raises ``FullDiskError``."""
+    with replacing(path) as part:
+        figure.savefig(part, **options)
