@@ -390,10 +390,10 @@ def _has_intact_statistics(path: Path) -> bool:
         return False
 
 
-def _has_statistics_of(path: Path, data: str) -> bool:
-    """Whether a file holds the statistics of the data with this checksum, and not of shards that were there before."""
+def _has_statistics(folder: Path) -> bool:
+    """Whether the statistics in a folder are of the training shards that are there, and not of earlier ones."""
     try:
-        return bool(json.loads(path.read_text())["data_sha256"] == data)
+        return bool(json.loads((folder / STATISTICS_FILE).read_text())["data_sha256"] == split_checksum(folder, "train"))
     except (OSError, ValueError, TypeError, KeyError):
         return False
 
@@ -469,8 +469,8 @@ def generate(
         raise ValueError(f"num_workers must be at least 1, got {num_workers}")
     folder = Path(root) / spec.name / spec.size
     to_do = plan(root, spec, part)
-    needed = [SPEC_FILE, STATISTICS_FILE, *([] if part[0] else [CONTACT_SHEET_FILE])]
-    if not to_do.missing and all((folder / name).is_file() for name in needed):
+    needed = [SPEC_FILE, *([] if part[0] else [CONTACT_SHEET_FILE])]
+    if not to_do.missing and all((folder / name).is_file() for name in needed) and _has_statistics(folder):
         _claim(folder, spec)
         if on_progress is not None:
             on_progress(to_do.num_done, to_do.num_done)
@@ -518,9 +518,7 @@ def _generate(folder: Path, to_do: Plan, spec: DatasetSpec, num_workers: int, on
             if on_progress is not None:
                 on_progress(done, total)
         train = [(split, k) for split, k in _shards(spec) if split == "train"]
-        if all(_is_complete(spec, folder, *shard) for shard in train) and not _has_statistics_of(
-            statistics, split_checksum(folder, "train")
-        ):
+        if all(_is_complete(spec, folder, *shard) for shard in train) and not _has_statistics(folder):
             paths = [shard_path(folder, *shard) for shard in train]
             moments = {str(path): sums for path, sums in results(workers, shard_moments, [(path,) for path in paths])}
             _write_json(statistics, with_checksum(combined([moments[str(path)] for path in paths]), split_checksum(folder, "train")))
