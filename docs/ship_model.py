@@ -18,6 +18,7 @@ from gpe_pl.finished_runs import groups_of
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.pretrained import FOLDER
 from gpe_pl.report import summary
+from gpe_pl.scene_ranges import described
 from gpe_pl.schema import MATERIALS
 
 
@@ -32,6 +33,7 @@ def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows
             f"| {MATERIALS[material].name} of {material} | {a:g} – {b:g} {MATERIALS[material].unit} |"
             for a, b in zip(low, high, strict=True)
         ]
+    ranges += [f"| {kind} | {values} |" for kind, values in described(simulator.trained_scene.numpy())]
     training = settings["training"]
     assert isinstance(training, dict)
     lines = [

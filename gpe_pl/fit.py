@@ -78,7 +78,7 @@ def _fit(cfg: DictConfig, run_dir: Path) -> float:
     def new_module(training: TrainingSettings) -> TrainingModule:
         L.seed_everything(cfg.seed, verbose=False)
         simulator = LearnedSimulator(new_model(spec=data().builder.spec), data().builder)
-        simulator.fit_statistics(data().statistics_sample(), data().parameter_ranges())
+        simulator.fit_statistics(data().statistics_sample(), data().parameter_ranges(), data().trained_scene())
         if start is not None:
             simulator.start_from(start)
         names = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "stress_weight", "compile")

@@ -18,6 +18,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
@@ -33,6 +34,7 @@ from gpe_pl.models.base import Prediction
 from gpe_pl.nn.static_friction import is_held, supported
 from gpe_pl.pretrained import checkpoint_path, names
 from gpe_pl.rollout import SimulationError
+from gpe_pl.scene_ranges import outside, scene_range, united, unlimited
 from gpe_pl.schema import BOUNDARY, MATERIALS, EdgeType, node_code
 from gpe_pl.signatures import checked
 from gpe_pl.skips import Skips
@@ -72,6 +74,7 @@ class LearnedSimulator(nn.Module):
 
     acceleration_std: Tensor
     stress_std: Tensor
+    trained_scene: Tensor
     holds_parameters: bool = True
 
     def __init__(self, model: nn.Module, builder: GraphBuilder) -> None:
@@ -83,6 +86,7 @@ class LearnedSimulator(nn.Module):
         self.standardizer = GraphStandardizer(builder.spec)
         self.register_buffer("acceleration_std", torch.ones((), dtype=torch.float64))
         self.register_buffer("stress_std", torch.ones((), dtype=torch.float64))
+        self.register_buffer("trained_scene", torch.from_numpy(unlimited(builder.spec.dim)))
         for material, count in builder.spec.param_channels.items():
             self.register_buffer(
                 f"trained_{material}", torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).expand(2, count).clone()
@@ -115,7 +119,9 @@ class LearnedSimulator(nn.Module):
         return int(cast(Any, self.model).num_hops)
 
     @torch.no_grad()
-    def fit_statistics(self, graphs: Iterable[HeteroData], parameter_ranges: Mapping[str, Tensor] | None = None) -> None:
+    def fit_statistics(
+        self, graphs: Iterable[HeteroData], parameter_ranges: Mapping[str, Tensor] | None = None, trained_scene: np.ndarray | None = None
+    ) -> None:
         """Set feature statistics, the range of material parameters, and the scales of acceleration and stress from training graphs with ``target``.
 
         Each scale is one scalar for all axes or components and all materials, with mean zero. Materials and relations without statistics are named in a
@@ -124,6 +130,7 @@ class LearnedSimulator(nn.Module):
         Args:
             graphs: a sample of the training data; as a ``StatisticsSample``, it knows more graphs of what is rare.
             parameter_ranges: lowest and highest value [2, param] of each material's parameters in all of them; by default in the sample.
+            trained_scene: what all of their scenes have, as in ``scene_ranges``; by default nothing is known of it.
         """
         sample = graphs if isinstance(graphs, StatisticsSample) else StatisticsSample(list(graphs))
         self._unknown = None
@@ -140,6 +147,8 @@ class LearnedSimulator(nn.Module):
         if stress:
             rms = torch.cat(stress).double().square().mean().sqrt()
             self.stress_std.copy_(torch.where(rms > 0, rms, 1.0))
+        if trained_scene is not None:
+            self.trained_scene.copy_(torch.from_numpy(trained_scene))
         if parameter_ranges is None:
             params = {m: torch.cat([g[m].material_params for g in sample.of(m)]) for m, _ in self.trained_ranges()}
             parameter_ranges = {m: torch.stack([p.amin(dim=0), p.amax(dim=0)]) for m, p in params.items() if len(p)}
@@ -149,8 +158,8 @@ class LearnedSimulator(nn.Module):
 
     @torch.no_grad()
     def start_from(self, trained: LearnedSimulator) -> None:
-        """Take over what another simulator has learned, with the statistics that its weights are made for, as far as it has them; trained ranges of parameters
-        then cover both.
+        """Take over what another simulator has learned, with the statistics that its weights are made for, as far as it has them; trained ranges then
+        cover both.
 
         Raises:
             SceneError: the other one was trained on another frame interval, spacing, dimension or materials.
@@ -163,6 +172,7 @@ class LearnedSimulator(nn.Module):
             raise CheckpointError(f"the model to start from is another one or has other graphs; choose {' '.join(different)}")
         ranges = {material: values.clone() for material, values in self.trained_ranges()}
         statistics = copy.deepcopy(self.standardizer)
+        scene = self.trained_scene.cpu().numpy().copy()
         try:
             self.load_state_dict(trained.state_dict())
         except RuntimeError as error:  # one set of weights per level of a mesh, and meshes of other sizes
@@ -174,6 +184,7 @@ class LearnedSimulator(nn.Module):
             if known:
                 values[0].copy_(torch.stack(known).amin(dim=0)[0])
                 values[1].copy_(torch.stack(known).amax(dim=0)[1])
+        self.trained_scene.copy_(torch.from_numpy(united([scene, self.trained_scene.cpu().numpy()])))
 
     def _choices(self) -> dict[str, str]:
         """Overrides that make such a model and such graphs; the radius in spacings, whether the graph's or the data set's."""
@@ -193,17 +204,27 @@ class LearnedSimulator(nn.Module):
 
     def untrained_parameters(self, state: State) -> list[str]:
         """What in a scene lies outside the range of the training data: one line per material parameter, empty if nothing does."""
-        found = []
+        return [line for _, line in self._outside_parameters(state)]
+
+    def _outside_parameters(self, state: State) -> Iterator[tuple[str, str]]:
         for material, trained in self.trained_ranges():
             column = self.builder.metadata.param_names.index(MATERIALS[material].name)
             values = state.material_params[state.node_type == node_code(material), column]
             margin = RANGE_TOLERANCE * trained.abs()
-            outside = (values < trained[0] - margin[0]) | (values > trained[1] + margin[1])
-            if bool(outside.any()):
-                spec = MATERIALS[material]
-                low, high = trained[0].item(), trained[1].item()
-                found.append(f"{spec.name} of {material} is {values[outside][0].item():g} {spec.unit}, trained were {low:g} to {high:g}")
-        return found
+            is_outside = (values < trained[0] - margin[0]) | (values > trained[1] + margin[1])
+            if bool(is_outside.any()):
+                spec, (low, high) = MATERIALS[material], trained[:, 0].tolist()
+                kind = f"{spec.name} of {material}"
+                yield kind, f"{kind} is {values[is_outside][0].item():g} {spec.unit}, trained were {low:g} to {high:g}"
+
+    def untrained_scene(self, state: State) -> list[str]:
+        """What gravity and boundary nodes of a scene have that training had not: one line per kind of value, empty if there is nothing."""
+        return [line for _, line in self._outside_scene(state)]
+
+    def _outside_scene(self, state: State) -> Iterator[tuple[str, str]]:
+        own = self.builder.metadata
+        here = scene_range(state.gravity.cpu().numpy(), state.boundary.to_numpy(), state.periodicity)
+        yield from outside(self.trained_scene.cpu().numpy(), here, own.spacing / own.frame_dt)
 
     def forward(self, data: HeteroData) -> Prediction:
         """Accelerations without gravity per material, in units of ``acceleration_std``."""
@@ -211,8 +232,8 @@ class LearnedSimulator(nn.Module):
         return self.model(self.standardizer(data, self.skips.absent_types, limits))
 
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
-        """The state at a frame with the velocity history that the graph needs, on this model's device. Material parameters that training did not have are
-        named in a warning, once each.
+        """The state at a frame with the velocity history that the graph needs, on this model's device. What training did not have of material
+        parameters, gravity and boundary nodes is named in a warning, once per kind.
 
         Raises:
             IndexError: too few frames before ``frame``.
@@ -270,11 +291,12 @@ class LearnedSimulator(nn.Module):
                 if wrong.any():
                     node, value = int(rows[wrong][0]), float(column[wrong][0])
                     raise SceneError(f"node {node} ({material}): {spec.name} is {value:g} {spec.unit}, must be {spec.rule}")
-        for line in self.untrained_parameters(state):
-            if line not in self._warned:
-                held = "; taken for the nearest trained value" if self.holds_parameters else ""
-                log.warning("outside the training data: %s%s", line, held)
-                self._warned.add(line)
+        held = "; taken for the nearest trained value" if self.holds_parameters else ""
+        found = [(kind, line + held) for kind, line in self._outside_parameters(state)]
+        for kind, line in (*found, *self._outside_scene(state)):
+            if kind not in self._warned:
+                log.warning("outside the training data: %s", line)
+                self._warned.add(kind)
         return state
 
     @torch.inference_mode()
@@ -405,6 +427,9 @@ class LearnedSimulator(nn.Module):
         for material, trained in self.trained_ranges():
             if not bool((trained[0] <= trained[1]).all()):
                 raise ValueError(f"trained_{material} ends before it begins")
+        low, high = self.trained_scene
+        if not bool(((low <= high) | (low.isposinf() & high.isneginf())).all()):
+            raise ValueError("trained_scene ends before it begins")
 
     # --- checkpoints ----------------------------------------------------------------------------------------------------------------------
 

@@ -16,13 +16,14 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl import ranks
 from gpe_pl.data.checksum import split_checksum
-from gpe_pl.data.dataset import HeldGraphs, WindowDataset, collated, long_enough, open_split, usable
+from gpe_pl.data.dataset import HeldGraphs, StoredTrajectory, WindowDataset, collated, long_enough, open_split, usable
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling, probabilities
 from gpe_pl.data.statistics import acceleration_std, is_intact
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.standardizer import StatisticsSample
+from gpe_pl.scene_ranges import scene_range, united
 from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES, grid, node_code, role
 from gpe_pl.store import StoreError
 from gpe_pl.trajectory import Trajectory
@@ -154,6 +155,10 @@ class TrajectoryDataModule(L.LightningDataModule):
                     found.setdefault(material, []).append(np.array([values.min(), values.max()]))
         return {m: torch.tensor([[np.min(pairs)], [np.max(pairs)]], dtype=torch.float32) for m, pairs in found.items()}
 
+    def trained_scene(self) -> np.ndarray:
+        """What gravity and boundary nodes of all training trajectories have, as in ``scene_ranges``."""
+        return united(map(_scene, self.train_set.trajectories))
+
     def val_trajectories(self, count: int) -> list[Trajectory]:
         """The first ``count`` trajectories of the ``val`` split that are long enough."""
         return list(islice(long_enough(self.root, "val", self.builder.config.history), count))
@@ -188,3 +193,9 @@ def _spread(length: int, count: int) -> np.ndarray:
 def _set_up_worker(_: int) -> None:
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the training needs its workers until it has saved
+
+
+def _scene(stored: StoredTrajectory) -> np.ndarray:
+    first = stored.window(0, 1)
+    whole = first if first.boundary.motion is None else stored.window(0, stored.num_frames)
+    return scene_range(np.asarray(first.metadata.gravity), whole.boundary, first.metadata.periodicity)
