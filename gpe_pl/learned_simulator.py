@@ -36,7 +36,7 @@ from gpe_pl.pretrained import checkpoint_path, names
 from gpe_pl.rollout import SimulationError
 from gpe_pl.scene_ranges import outside, scene_range, united, unlimited
 from gpe_pl.schema import BOUNDARY, MATERIALS, EdgeType, node_code
-from gpe_pl.signatures import checked
+from gpe_pl.signatures import check_plain, checked
 from gpe_pl.skips import Skips
 from gpe_pl.trajectory import Metadata, State, Stress, Trajectory
 
@@ -448,6 +448,7 @@ class LearnedSimulator(nn.Module):
     @classmethod
     def from_description(cls, values: dict[str, Any]) -> LearnedSimulator:
         """Rebuild from ``description``; raises ``ValueError`` for anything else."""
+        check_plain(values)
         if values.get("format") != CHECKPOINT_FORMAT:
             raise ValueError(f"checkpoint format {values.get('format')!r}, this version reads {CHECKPOINT_FORMAT}")
         graph, metadata = GraphConfig(**checked(GraphConfig, values["graph"])), Metadata(**checked(Metadata, values["metadata"]))

@@ -653,3 +653,38 @@ def test_levels_that_share_weights_start_on_meshes_of_any_size() -> None:
     large.start_from(small)
     with pytest.raises(CheckpointError, match="has meshes of other sizes"):
         of_domain(3.0, "separate").start_from(of_domain(0.4, "separate"))
+
+
+def _nested(levels: int, width: int = 1) -> Any:
+    """Lists in lists; with ``width`` 2 each is referred to twice, which is small in a file and 2^levels values to whoever goes through it."""
+    value: Any = "x"
+    for _ in range(levels):
+        value = [value] * width
+    return value
+
+
+UNBOUNDED = {
+    "shared": (_nested(60, 2), "values nested more than 20 levels deep|more than 20000 values"),
+    "shared, flat": (_nested(15, 4), "more than 20000 values"),
+    "deep": (_nested(200), "values nested more than 20 levels deep"),
+    "wide": (list(range(10**5)), "more than 20000 values"),
+    "long": ("x" * 10**7, "a text of 10000000 characters"),
+    "large": (2**1000, "an integer beyond 64 bits"),
+    "tensor": (torch.zeros(10), "a Tensor, where only"),
+}
+
+
+@pytest.mark.parametrize("kind", UNBOUNDED)
+@pytest.mark.parametrize("place", ["settings", "graph", "metadata", "format", "model", "static_friction"])
+def test_what_a_checkpoint_says_is_bounded_before_it_is_looked_at(checkpoint: Path, tmp_path: Path, kind: str, place: str) -> None:
+    value, message = UNBOUNDED[kind]
+    content = torch.load(checkpoint, weights_only=True)
+    known = content["simulator"][place]
+    if isinstance(known, dict):
+        known[min(known)] = value
+    else:
+        content["simulator"][place] = value
+    torch.save(content, tmp_path / "hostile.ckpt")
+    with pytest.raises(CheckpointError, match=message) as caught:
+        LearnedSimulator.from_checkpoint(tmp_path / "hostile.ckpt")
+    assert len(str(caught.value)) < 1000
