@@ -56,10 +56,10 @@ class _Rest:
 class Sleeping(_Batched):
     """Islands at rest stand still and are not computed, until something that is not at rest, a wall included, comes within the graph's radius of them.
 
-    An island (``graphs.islands``, by the radius of the graph) sleeps when all its nodes have been slower and less accelerated than
-    ``Skips.rest_speed`` and ``Skips.rest_acceleration`` in the last ``Skips.sleep_after`` predictions. No pair that pushes each other is thus ever frozen at
-    one end only, and what moves sees its surroundings as before: the model gets all that is within its reach. The momentum that an island still has
-    when it falls asleep is lost; new states report it (``State.lost_impulse``), and how many nodes sleep (``State.num_asleep``).
+    An island (``graphs.islands``, by the radius of the graph) sleeps when the steps of all its nodes have been shorter and more even than
+    ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` in the last ``Skips.sleep_after`` predictions. No pair that pushes each other is
+    thus ever frozen at one end only, and what moves sees its surroundings as before: the model gets all that is within its reach. The momentum that an
+    island still has when it falls asleep is lost; new states report it (``State.lost_impulse``), and how many nodes sleep (``State.num_asleep``).
 
     Args:
         simulator: whose ``skips`` say when to sleep.
@@ -117,8 +117,9 @@ class Sleeping(_Batched):
         pos, vel = state.pos.clone(), torch.zeros_like(state.vel)
         moved = awake[seen]
         pos[awake], vel[awake] = after.pos[moved], after.vel[moved]
-        rest_speed, rest_acceleration = self.simulator.skips.rest_speed, self.simulator.skips.rest_acceleration
-        calm = (vel.norm(dim=1) < rest_speed) & ((vel - state.vel).norm(dim=1) < rest_acceleration * self.dt)
+        skips, unit = self.simulator.skips, self.simulator.builder.scales.velocity
+        is_slow = vel.norm(dim=1) < skips.rest_step_spacings * unit
+        calm = is_slow & ((vel - state.vel).norm(dim=1) < skips.rest_step_change_spacings * unit)
         count = torch.where(awake, torch.where(calm, _rest_of(state) + 1, 0), _rest_of(state))
         return replace(
             state,

@@ -25,8 +25,9 @@ class Skips:
         stress: leaves out the stress that a model decodes beside the motion; the motion stays as it is.
         sleep_after: approximate. Groups of connected nodes that have been at rest for so many frames stand still until something moves in their
             reach; None: never.
-        rest_speed, rest_acceleration: below which a node is at rest [m/s], [m/s²]. Learned models tremble: what lies still in the ground truth moves at
-            0.01 m/s to 0.04 m/s. What turns in flight is as slow for ``2 rest_speed / |g|``, and ``sleep_after`` has to be longer.
+        rest_step_spacings, rest_step_change_spacings: a node is at rest when its step within a frame is shorter than the first, and differs from the step
+            before by less than the second [rest spacings]. Learned models tremble: what lies still in the ground truth makes steps of 0.01 to 0.03
+            spacings. What turns in flight is as slow for some frames, and ``sleep_after`` has to be longer.
         hold: approximate. Frames for which one prediction is held.
     """
 
@@ -37,8 +38,8 @@ class Skips:
     sorted_from: Annotated[int, Field(ge=1)] | None = 5000
     stress: bool = False
     sleep_after: Annotated[int, Field(ge=1)] | None = None
-    rest_speed: Annotated[float, Field(gt=0)] = 0.05
-    rest_acceleration: Annotated[float, Field(gt=0)] = 20.0
+    rest_step_spacings: Annotated[float, Field(gt=0)] = 0.03
+    rest_step_change_spacings: Annotated[float, Field(gt=0)] = 0.06
     hold: Annotated[int, Field(ge=1)] = 1
 
     @property

@@ -53,7 +53,7 @@ class GraphStandardizer(nn.Module):
         super().__init__()
         self.spec = spec
         self.node = nn.ModuleDict({role(t): Standardize(c) for t, c in spec.node_channels.items()})
-        self.params = nn.ModuleDict({m: Standardize(c) for m, c in spec.param_channels.items()})
+        self.params = nn.ModuleDict({m: Standardize(c).to(self._precision(m)) for m, c in spec.param_channels.items()})
         self.odd = nn.ModuleDict({self._key(r): Standardize(spec.odd_channels[r], centered=False) for r in spec.relations})
         self.even = nn.ModuleDict({self._key(r): Standardize(spec.even_channels[r]) for r in spec.relations})
         self.register_buffer("mass", torch.ones(()))
@@ -64,8 +64,13 @@ class GraphStandardizer(nn.Module):
         return f"{role(source)}__{name}__{role(target)}"
 
     @staticmethod
-    def _material_scale(material: str, params: Tensor) -> Tensor:
-        return params.log() if MATERIALS[material].scale == "log" else params
+    def _precision(material: str) -> torch.dtype:
+        """Logarithms are in double precision: another unit shifts them, and single precision would round them to other digits."""
+        return torch.float64 if MATERIALS[material].scale == "log" else torch.float32
+
+    @classmethod
+    def _material_scale(cls, material: str, params: Tensor) -> Tensor:
+        return params.to(cls._precision(material)).log() if MATERIALS[material].scale == "log" else params
 
     def fit(self, graphs: Iterable[HeteroData]) -> list[str]:
         """Set all statistics from graphs of the training split, those of what is rare from further ones if it is a ``StatisticsSample``.
@@ -135,7 +140,8 @@ class GraphStandardizer(nn.Module):
                 params = data[m].material_params
                 if limits is not None:
                     params = params.clamp(*limits[m].to(params.dtype))
-                out[m].material_params = self.params[m](self._material_scale(m, params))
+                standardized = self.params[m](self._material_scale(m, params))
+                out[m].material_params = standardized.to(torch.promote_types(params.dtype, self.mass.dtype))
                 out[m].mass = data[m].mass / self.mass
         for relation in self.spec.relations:
             if wanted(data[relation].odd):

@@ -27,7 +27,7 @@ MAX_CORRECTED = 0.01
 VALID_ERROR = 0.5
 """Of a spacing: root mean square displacement until which a prediction is valid."""
 PERTURBATION = 1e-6
-"""Of the positions [m]."""
+"""Of the domain's longest side."""
 STATIC_FRICTION = 0.5
 """Share of gravity, of the rollout that is only reported."""
 AT_REST = 0.01
@@ -166,24 +166,25 @@ def settle(subject: Subject) -> State | str:
 # --- forgetting the start -------------------------------------------------------------------------------------------------------------------
 
 
-@stress_test(23, "growth of a perturbation", "twin rollouts 1e-6 m apart: growth rate ≤ 1.5 times the solver's own")
+@stress_test(23, "growth of a perturbation", "twin rollouts 1e-6 of the domain apart: growth rate ≤ 1.5 times the solver's own")
 def perturbation(subject: Subject) -> Outcome:
     num_steps = subject.scenes[0].num_frames - 1 - subject.history
-    own = separation(Contained(subject.simulator, subject.dt), subject.state(0, 0.0), num_steps, subject.spacing)
-    solver = separation(subject.spec.solver, initial_state(subject.spec, "test", 0), num_steps, subject.spacing)
+    size = subject.simulator.builder.metadata.longest_side
+    own = separation(Contained(subject.simulator, subject.dt), subject.state(0, 0.0), num_steps, subject.spacing, size)
+    solver = separation(subject.spec.solver, initial_state(subject.spec, "test", 0), num_steps, subject.spacing, size)
     rate, reference = growth_rate(own, subject.spacing), growth_rate(solver, subject.spacing)
     limit = 1.5 * reference if reference > 0 else reference / 1.5
     text = f"{rate:.3g} per frame, solver {reference:.3g}"
     return Outcome(bool(rate <= limit), text, {"model": own.tolist(), "solver": solver.tolist()})
 
 
-def separation(simulator: Simulator, state: State, num_steps: int, spacing: float, seed: int = 0) -> np.ndarray:
-    """Root mean square distance [spacings] of two rollouts whose positions differ by ``PERTURBATION`` at the start, per frame."""
+def separation(simulator: Simulator, state: State, num_steps: int, spacing: float, size: float, seed: int = 0) -> np.ndarray:
+    """Root mean square distance [spacings] of two rollouts whose positions differ by ``PERTURBATION`` times ``size`` [m] at the start, per frame."""
     noise: Any = np.random.default_rng(seed).normal(size=tuple(state.pos.shape))
-    noise *= PERTURBATION / np.sqrt(np.square(noise).sum(axis=-1).mean())
+    noise *= PERTURBATION * size / np.sqrt(np.square(noise).sum(axis=-1).mean())
     is_torch = isinstance(state.pos, torch.Tensor)
     a, b = state, replace(state, pos=state.pos + (torch.from_numpy(noise) if is_torch else noise))
-    found = [PERTURBATION / spacing]
+    found = [PERTURBATION * size / spacing]
     for _ in range(num_steps):
         a, b = simulator.step(a), simulator.step(b)
         distance = np.asarray(a.pos) - np.asarray(b.pos)

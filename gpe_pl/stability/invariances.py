@@ -122,7 +122,7 @@ def galilean_boost(subject: Subject) -> Outcome:
     state = subject.free_state()
     assert state.velocity_history is not None
     boost = torch.zeros(state.dim, dtype=torch.float64)
-    boost[0] = max(1e-3, float(state.vel.square().mean().sqrt()))
+    boost[0] = float(state.vel.square().mean().sqrt()) or 1e-3 * subject.simulator.builder.scales.velocity
     moved = with_velocities(state, state.velocity_history + boost)
     change = (acceleration(subject.simulator, moved) - acceleration(subject.simulator, state)).square().mean().sqrt().item()
     text = f"{change / subject.one_step_rmse:.2g} one-step RMSE for a boost by the rms velocity"

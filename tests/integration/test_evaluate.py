@@ -181,7 +181,7 @@ def test_levels_of_skipping_change_nothing_or_are_reported_with_what_they_cost(t
         "all", "absent_types=false", "static_boundary=false", "isolated_nodes=false", "edges_at_once=null", "sorted_from=null"
     )
     assert of_rollouts(everything) == pytest.approx(usual, rel=1e-3, abs=1e-9)
-    approximate = rows("approximate", "hold=2", "sleep_after=1", "rest_speed=100", "rest_acceleration=1e6")
+    approximate = rows("approximate", "hold=2", "sleep_after=1", "rest_step_spacings=100", "rest_step_change_spacings=100")
     shared = of_rollouts(approximate, "learned, exact")
     assert shared == pytest.approx({k: usual[k] for k in shared}, rel=1e-6, abs=1e-12) and len(shared) > 10
     costs = {k: v for k, v in of_rollouts(approximate).items() if k[1] in ("skipping_mse", "share_asleep", "lost_impulse")}

@@ -133,7 +133,7 @@ def test_a_single_restless_node_keeps_its_island_awake() -> None:
 
 
 def test_momentum_is_lost_once_and_counted() -> None:
-    simulated = silenced(simulator(scenes.builder(), rest_speed=0.1))
+    simulated = silenced(simulator(scenes.builder(), rest_step_spacings=0.01))
     state = two_heaps(gap=1.0).to_torch()
     vel = state.vel.clone()
     vel[:20] = 0.05 * torch.nn.functional.normalize(torch.randn(20, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
@@ -144,8 +144,31 @@ def test_momentum_is_lost_once_and_counted() -> None:
     assert lost == [0, 0, pytest.approx(0.05 * float(state.mass[:20].sum())), 0, 0]
 
 
+@pytest.mark.parametrize(("length", "time"), [(1.0, 1.0), (2.0**10, 1.0), (2.0**-20, 2.0**-12)])
+def test_what_is_at_rest_sleeps_in_any_unit(length: float, time: float) -> None:
+    """The left heap creeps by 0.01 spacings within a frame, the right one moves."""
+    usual = scenes.metadata()
+    scaled = replace(
+        usual,
+        spacing=length * usual.spacing,
+        connectivity_radius=length * usual.connectivity_radius,
+        frame_dt=time * usual.frame_dt,
+        bounds=((0.0, length),) * 2,
+    )
+    simulated = silenced(simulator(GraphBuilder(scenes.builder().config, scaled)))
+    state = two_heaps(gap=1.0)
+    vel = np.where(np.arange(40)[:, None] < 20, [0.1, 0.0], [2.0, 0.0]) * length / time
+    boundary = replace(state.boundary, pos=length * state.boundary.pos)
+    state = replace(state, pos=length * state.pos, vel=vel, velocity_history=vel[:, None], boundary=boundary).to_torch()
+    sleeping, asleep = Sleeping(simulated), []
+    for _ in range(4):
+        state = sleeping.step(state)
+        asleep.append(state.num_asleep)
+    assert asleep == [0, 0, 20, 20]
+
+
 def test_a_rollout_that_is_taken_up_again_is_the_same() -> None:
-    simulated = simulator(scenes.builder(), hold=2, rest_speed=0.5, rest_acceleration=1e4)
+    simulated = simulator(scenes.builder(), hold=2, rest_step_spacings=0.05, rest_step_change_spacings=5.0)
     runner, state = approximate(simulated), two_heaps(speed=0.3).to_torch()
     assert isinstance(runner, Holding)
     through = state
@@ -195,7 +218,7 @@ def test_without_approximate_levels_the_simulator_is_itself() -> None:
 
 def test_scenes_side_by_side_are_as_alone_and_containment_works_around() -> None:
     build = scenes.builder()
-    simulated = simulator(build, hold=2, rest_speed=0.5, rest_acceleration=1e4)
+    simulated = simulator(build, hold=2, rest_step_spacings=0.05, rest_step_change_spacings=5.0)
     runner = Contained(approximate(simulated), build.metadata.frame_dt)
     states = [two_heaps(gap, speed=0.3).to_torch() for gap in (0.2, 0.6)]
     together = rollouts(runner, [Start(s, 5, build.metadata, Guard(bounds=build.metadata.bounds, margin=1.0)) for s in states])

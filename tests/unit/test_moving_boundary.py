@@ -197,7 +197,7 @@ def test_every_simulator_takes_the_wall_along(truth: Trajectory, simulator: Lear
 
 
 def test_a_wall_that_comes_wakes_what_sleeps(truth: Trajectory, simulator: LearnedSimulator) -> None:
-    simulator.skips = Skips(sleep_after=1, rest_speed=1e3, rest_acceleration=1e6)
+    simulator.skips = Skips(sleep_after=1, rest_step_spacings=1e3, rest_step_change_spacings=1e3)
     state = simulator.initial_state(truth, 2)
     calm = replace(state, internal=_Rest(torch.full((state.num_nodes,), 5)))
     assert Sleeping(simulator).step(calm).num_asleep == 0

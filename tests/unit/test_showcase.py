@@ -114,6 +114,6 @@ def test_a_material_that_cannot_be_is_refused_before_anything_runs(values: dict[
 
 def test_what_approximate_levels_leave_out_is_counted(tmp_path: Path) -> None:
     simulated = simulator()
-    simulated.skips = Skips(sleep_after=1, rest_speed=1e3, rest_acceleration=1e6)
+    simulated.skips = Skips(sleep_after=1, rest_step_spacings=1e3, rest_step_change_spacings=1e3)
     found = values(run(simulated, CANYON, SETTINGS, tmp_path))
     assert found["share_asleep"] > 0 and found["lost_impulse"] > 0

@@ -27,6 +27,7 @@ import numpy as np
 from gpe_pl.data.importers import hdf5, npz, tfrecord
 from gpe_pl.data.importers.source import (
     ASSUMED_FRICTION,
+    SMALLEST,
     Facts,
     ImportFailure,
     ImportSettings,
@@ -65,9 +66,9 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     if "context_mean" in values:
         notes.append("step_context, a global input per frame, has no place in the store and was left out")
     facts = Facts(
-        number(values, "dt", described, low=1e-12),
+        number(values, "dt", described, low=SMALLEST),
         bounds,
-        connectivity_radius=number(values, "default_connectivity_radius", described, low=1e-12),
+        connectivity_radius=number(values, "default_connectivity_radius", described, low=SMALLEST),
         walls=walls,
         notes=tuple(notes),
     ).overridden(settings)

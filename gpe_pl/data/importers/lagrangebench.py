@@ -17,6 +17,7 @@ from pathlib import Path
 
 from gpe_pl.data.importers import hdf5
 from gpe_pl.data.importers.source import (
+    SMALLEST,
     Facts,
     ImportFailure,
     ImportSettings,
@@ -72,12 +73,12 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
     if "write_every" not in values:
         notes.append("write_every is not in the source; every step of dt is taken for a frame (frame_dt=…)")
     facts = Facts(
-        number(values, "dt", described, low=1e-12) * number({"write_every": 1, **values}, "write_every", described, low=1.0),
+        number(values, "dt", described, low=SMALLEST) * number({"write_every": 1, **values}, "write_every", described, low=1.0),
         bounds,
         tuple(periodic[:dim]),
         gravity,
-        number(values, "dx", described, low=1e-12) if "dx" in values else None,
-        number(values, "default_connectivity_radius", described, low=1e-12),
+        number(values, "dx", described, low=SMALLEST) if "dx" in values else None,
+        number(values, "default_connectivity_radius", described, low=SMALLEST),
         parameters=parameters,
         notes=tuple(notes),
     ).overridden(settings)

@@ -31,6 +31,9 @@ ASSUMED_PARAMETERS = {"sand": 30.0, "snow": 8.0, "fluid": 1e-3, "elastomer": 1e5
 
 ASSUMED_FRICTION = 0.5
 
+SMALLEST = float(np.finfo(np.float32).tiny)
+"""Lengths and times of a source are at least this: what is positive in the precision that is stored."""
+
 STILL = 1e-2
 """Boundary nodes that never get farther than this share of the spacing from where they should be are still, or slide steadily."""
 

@@ -165,7 +165,7 @@ def test_twins_of_free_fall_keep_their_distance(spec: DatasetSpec, scenes: list[
     from gpe_pl.baselines import Ballistic
 
     own = subject(spec, scenes)
-    apart = separation(Ballistic(own.dt), own.state(0, 0.0), 5, own.spacing)
+    apart = separation(Ballistic(own.dt), own.state(0, 0.0), 5, own.spacing, 1.0)
     assert apart == pytest.approx(np.full(6, 1e-6 / own.spacing), rel=1e-6)
 
 
