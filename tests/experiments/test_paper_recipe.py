@@ -58,7 +58,7 @@ def test_the_recipe_wins_for_every_model_and_data_set(experiment: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("comparison", sorted(p.stem for p in (CONF / "comparison").glob("*.yaml")))
 def test_the_recipe_wins_over_a_comparison(comparison: str) -> None:
-    assert_is_the_papers(compose("fit", f"+comparison={comparison}", "recipe=paper", "size=small", "model=gpe_tuned"))
+    assert_is_the_papers(compose("fit", f"comparison={comparison}", "recipe=paper", "size=small", "model=gpe_tuned"))
 
 
 @pytest.mark.parametrize("domain", DOMAINS)

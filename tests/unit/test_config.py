@@ -364,7 +364,7 @@ def test_commands_fail_in_one_line(tmp_path: Path, command: str, arguments: list
 
 
 def test_a_table_by_model_has_a_default() -> None:
-    table = ["data=mixed", "+comparison=equal_steps", "data.comparison.velocity_noise_of_change.default=0.5"]
+    table = ["data=mixed", "comparison=equal_steps", "data.comparison.velocity_noise_of_change.default=0.5"]
     table += ["++data.comparison.velocity_noise_of_change.GNS=2.0"]
     assert compose("fit", *table).training.velocity_noise_of_change == 0.5
     assert compose("fit", *table, "model=gns").training.velocity_noise_of_change == 2.0
