@@ -9,7 +9,7 @@ from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, create_model
 
-MOST_VALUES, MOST_LEVELS, LONGEST_TEXT, LARGEST_NUMBER = 20_000, 20, 10_000, 2**63
+MOST_VALUES, MOST_LEVELS, LONGEST_TEXT, LARGEST_NUMBER = 20_000, 20, 10_000, 2**64
 """Of plain values from a file; the largest description of a model has some hundreds."""
 
 
