@@ -29,10 +29,11 @@ import numpy as np
 from pydantic import Field, InstanceOf
 from pydantic.dataclasses import dataclass
 
+from gpe_pl import sealed
 from gpe_pl.atomic import free_bytes, replace_text
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.motion import ROUNDING_SHARE, motion_of, rounding_fault, rounding_of
-from gpe_pl.data.statistics import STATISTICS_FILE, combined, is_intact, shard_moments, with_checksum
+from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import ON_SURFACE
 from gpe_pl.locks import held
@@ -385,16 +386,17 @@ def discard_damaged(root: Path | str, spec: DatasetSpec, num_workers: int = 1, p
 
 def _has_intact_statistics(path: Path) -> bool:
     try:
-        return is_intact(json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError):
+        sealed.read(path, "")
+    except sealed.SealError:
         return False
+    return True
 
 
 def _has_statistics(folder: Path) -> bool:
     """Whether the statistics in a folder are of the training shards that are there, and not of earlier ones."""
     try:
-        return bool(json.loads((folder / STATISTICS_FILE).read_text())["data_sha256"] == split_checksum(folder, "train"))
-    except (OSError, ValueError, TypeError, KeyError):
+        return bool(sealed.read(folder / STATISTICS_FILE, "")["data_sha256"] == split_checksum(folder, "train"))
+    except (OSError, ValueError, KeyError):
         return False
 
 
@@ -521,7 +523,7 @@ def _generate(folder: Path, to_do: Plan, spec: DatasetSpec, num_workers: int, on
         if all(_is_complete(spec, folder, *shard) for shard in train) and not _has_statistics(folder):
             paths = [shard_path(folder, *shard) for shard in train]
             moments = {str(path): sums for path, sums in results(workers, shard_moments, [(path,) for path in paths])}
-            _write_json(statistics, with_checksum(combined([moments[str(path)] for path in paths]), split_checksum(folder, "train")))
+            sealed.write(statistics, {**combined([moments[str(path)] for path in paths]), "data_sha256": split_checksum(folder, "train")})
 
 
 def _draw_contact_sheet(spec: DatasetSpec, path: Path, workers: Executor | None) -> None:
@@ -571,21 +573,25 @@ def _labelled_trajectory(spec: DatasetSpec, index: int, label: str, values: dict
 def _claim(folder: Path, spec: DatasetSpec) -> None:
     """Write the spec into the folder, or check that the one there is the same."""
     path, values = folder / SPEC_FILE, spec.as_dict()
-    sha256 = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
     if not path.is_file():
         if any(folder.glob("*/shard-*.h5")):
             raise GenerationError(f"{folder}: holds shards but no {SPEC_FILE}; delete the folder, or choose another name or size")
-        _write_json(path, {"spec": values, "sha256": sha256})
+        _write_json(path, {"spec": values, "sha256": sealed.checksum(values)})
         return
+    advice = f"delete the folder {folder} and run simulate again"
     try:
-        stored = json.loads(path.read_text(encoding="utf-8"))["spec"]
-    except (ValueError, KeyError, TypeError):
-        raise GenerationError(f"{path}: unreadable; delete the folder {folder} and run simulate again") from None
-    differing = _differences(stored, values)
-    made_by, now = ({key: spec.get("solver", {}).get(key) for key in ("name", "version")} for spec in (stored, values))
-    if made_by["name"] == now["name"] and made_by["version"] != now["version"]:
+        stored = sealed.parsed(path, advice)
+    except sealed.SealError as error:
+        raise GenerationError(str(error)) from None
+    if not (isinstance(stored, dict) and isinstance(stored.get("spec"), dict)):
+        raise GenerationError(f"{path}: unreadable, as it describes no data set; {advice}")
+    differing = _differences(stored["spec"], values)
+    if not differing and stored.get("sha256") != sealed.checksum(values):
+        raise GenerationError(f"{path}: was changed or damaged since it was written (checksum mismatch); {advice}")
+    made_by, now = (spec["solver"] if isinstance(spec.get("solver"), dict) else {} for spec in (stored["spec"], values))
+    if made_by.get("name") == now.get("name") and made_by.get("version") != now.get("version"):
         raise GenerationError(
-            f"{folder}: holds data of version {made_by['version']} of the solver {now['name']}; this is version {now['version']}, whose trajectories are "
+            f"{folder}: holds data of version {made_by.get('version')} of the solver {now['name']}; this is version {now['version']}, whose trajectories are "
             "others. Delete the folder to generate the data again, or choose another data set name"
         )
     if differing:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gpe_pl.atomic import replace_text
+from gpe_pl import sealed
 from gpe_pl.errors import GpeError
 
 CONFIG = "config.json"
@@ -38,7 +37,7 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
                 f"{run_dir} holds a run with another configuration ({'; '.join(different[:3])}); choose another name=… or delete the folder"
             )
         return
-    replace_text(path, json.dumps(config, indent=1, sort_keys=True))
+    sealed.write(path, config)
 
 
 def refuse_links(run_dir: Path) -> None:
@@ -72,12 +71,11 @@ def without_tables(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def config_in(path: Path) -> dict[str, Any]:
-    """The configuration that a run has left in a file; raises ``RunError`` if that is damaged."""
+    """The configuration that a run has left in a file; raises ``RunError`` if that is damaged, or was changed since."""
     try:
-        values = dict(json.loads(path.read_text(encoding="utf-8")))
-        return without_tables(values)  # which older runs wrote down
-    except (ValueError, TypeError, AttributeError):
-        raise RunError(f"{path} is damaged; delete the folder {path.parent} or choose another name=…") from None
+        return sealed.read(path, f"the run was made with other settings; delete the folder {path.parent} or choose another name=…")
+    except sealed.SealError as error:
+        raise RunError(str(error)) from None
 
 
 def differences(a: Any, b: Any, path: str = "") -> list[str]:

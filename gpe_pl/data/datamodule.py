@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 from functools import cached_property
 from itertools import islice
@@ -14,12 +13,12 @@ import torch
 from torch.utils.data import DataLoader
 from torch_geometric.data import HeteroData
 
-from gpe_pl import ranks
+from gpe_pl import ranks, sealed
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.dataset import HeldGraphs, StoredTrajectory, WindowDataset, collated, long_enough, open_split, usable
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling, probabilities
-from gpe_pl.data.statistics import acceleration_std, is_intact
+from gpe_pl.data.statistics import acceleration_std
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.standardizer import StatisticsSample
@@ -40,16 +39,18 @@ def data_statistics(root: Path | str) -> dict[str, float]:
     """Statistics of the train split, as written beside it by ``simulate``."""
     path = Path(root) / "statistics.json"
     try:
-        statistics = json.loads(path.read_text(encoding="utf-8"))
-        if not is_intact(statistics):
-            raise ValueError("checksum mismatch")
+        statistics = sealed.read(path, "generate or import the data again")
         if statistics["data_sha256"] != split_checksum(root, "train"):
-            raise ValueError("it is of other data than those in train")
+            raise StoreError(f"{path}: is of other data than those in train; generate or import the data again")
         return {"acceleration_std": float(statistics["acceleration_std"])}
     except StoreError:
         raise
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{path}: cannot be used ({error}); generate or import the data again") from None
+    except sealed.SealError as error:
+        raise StoreError(str(error)) from None
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be used ({error.strerror}); generate or import the data again") from None
+    except (ValueError, KeyError, TypeError, OverflowError):
+        raise StoreError(f"{path}: holds no statistics; generate or import the data again") from None
 
 
 class TrajectoryDataModule(L.LightningDataModule):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -84,18 +82,3 @@ def combined(moments: list[dict[str, Any]]) -> dict[str, Any]:
         },
         **{f"num_{key}": sum(m[key] for m in moments) for key in ("trajectories", "frames", "nodes")},
     }
-
-
-def with_checksum(statistics: dict[str, Any], data: str) -> dict[str, Any]:
-    """Statistics as they are stored: with the checksum of the data that they are of (``split_checksum``), and a SHA-256 digest of all values."""
-    values = {**statistics, "data_sha256": data}
-    return {**values, "sha256": _checksum(values)}
-
-
-def is_intact(stored: dict[str, Any]) -> bool:
-    """Whether stored statistics agree with their digest; those of earlier versions have none."""
-    return "sha256" not in stored or stored["sha256"] == _checksum({k: v for k, v in stored.items() if k != "sha256"})
-
-
-def _checksum(statistics: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(statistics, sort_keys=True).encode()).hexdigest()

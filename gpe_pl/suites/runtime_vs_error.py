@@ -8,7 +8,6 @@ and Hakim 2024 (arXiv 2407.07218): a solver always has a resolution to turn down
 from __future__ import annotations
 
 import copy
-import json
 import logging
 import math
 import time
@@ -33,6 +32,7 @@ from gpe_pl.rollout import SimulationError, Simulator
 from gpe_pl.schema import Split
 from gpe_pl.solvers.resolution import Resolved, coarser, finer
 from gpe_pl.suites.trained import Case, runs_in, trained_on
+from gpe_pl.training.budget import read_times
 from gpe_pl.trajectory import State, Trajectory
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ def training_seconds(run: Run) -> float:
     model = str(run.config["model._target_"]).rpartition(".")[2]
     about = f"{run.config['data.name']} {run.config['size.name']} {model} "
     steps, budget = float(run.config["training.num_steps"]), 60 * float(run.config.get("size.comparison.budget_minutes") or math.inf)
-    times = {} if path is None else json.loads(path.read_text(encoding="utf-8"))
+    times = {} if path is None else read_times(path)
     return max((steps * t for key, t in times.items() if key.startswith(about) and steps * t <= budget), default=math.nan)
 
 

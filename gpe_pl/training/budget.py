@@ -14,13 +14,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import lightning as L
 import torch
 from filelock import FileLock
+from pydantic import Field, TypeAdapter, ValidationError
 
-from gpe_pl.atomic import replace_text
+from gpe_pl import sealed
 from gpe_pl.data.dataset import Samples, WindowDataset, collated
 from gpe_pl.data.sampling import NUM_LANES, BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
@@ -35,6 +36,7 @@ MEASURED_STEPS = 25
 ROUNDS = 5
 SHARE_TO_MEASURE = 0.5
 """Of a budget: no further round begins once measuring has taken as long."""
+TIMES = TypeAdapter(dict[str, Annotated[float, Field(gt=0, strict=True)]])
 RATE = "FLOP/s in products"
 """In a file of step times: what the machine did when the first of them was measured."""
 PRODUCTS = (4096, 128)
@@ -138,13 +140,13 @@ def within_budget(
     assert settings.budget_minutes is not None
     path.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(_lock(path)):
-        times = _read(path)
+        times = read_times(path)
         if key not in times:
             with _announced(path):
                 _check_machine(times, path, key, device)
                 times[key] = _measured(settings, measure)
             log.info("%s: %.1f ms per training step", key, 1e3 * times[key])
-            replace_text(path, json.dumps(times, indent=1))
+            sealed.write(path, times)
     validations = max(1, settings.num_steps // settings.val_interval)
     interval = max(1, int(60 * settings.budget_minutes / times[key] / validations))
     return replace(settings, num_steps=interval * validations, val_interval=interval, budget_minutes=None)
@@ -206,11 +208,13 @@ def _announcement(path: Path) -> Path:
     return path.with_suffix(".measuring")
 
 
-def _read(path: Path) -> dict[str, float]:
+def read_times(path: Path) -> dict[str, float]:
+    """Step times [s] by what they depend on, and the machine's rate; none where there is no file. Raises ``BudgetError`` where it is damaged."""
     if not path.exists():
         return {}
     try:
-        times = json.loads(path.read_text(encoding="utf-8"))
-        return {str(key): float(value) for key, value in times.items()}
-    except (OSError, ValueError, AttributeError, TypeError) as error:
-        raise BudgetError(f"{path}: not a file of step times ({error}); delete it to measure again") from None
+        return TIMES.validate_python(sealed.read(path, "delete it to measure again"))
+    except ValidationError:
+        raise BudgetError(f"{path}: not a file of step times, which are positive numbers; delete it to measure again") from None
+    except sealed.SealError as error:
+        raise BudgetError(str(error)) from None

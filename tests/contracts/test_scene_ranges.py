@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from gpe_pl import sealed
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
-from gpe_pl.data.statistics import with_checksum
 from gpe_pl.geometry import domain_walls
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator
@@ -158,7 +157,7 @@ def test_the_range_is_that_of_all_training_trajectories(store: Path) -> None:
     calm = replace(held[0], pos=pos)
     shard.unlink()
     write_shard(shard, [calm, replace(calm, boundary=still), replace(calm, boundary=replace(still, motion=way).at(0))])
-    (store / "statistics.json").write_text(json.dumps(with_checksum({"acceleration_std": 50.0}, split_checksum(store, "train"))))
+    sealed.write(store / "statistics.json", {"acceleration_std": 50.0, "data_sha256": split_checksum(store, "train")})
     module = TrajectoryDataModule(store, GraphConfig(history=2), Noise(0.0, 0.5), batch_size=BatchSize(2), seed=1)
     low, high = module.trained_scene()
     assert (low[:2] == high[:2]).all() and tuple(low[:2]) == calm.metadata.gravity

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from omegaconf import DictConfig
 
+from gpe_pl import sealed
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import data_statistics
 from gpe_pl.data.importers.assemble import save_dataset
@@ -150,7 +151,7 @@ def test_a_report_says_which_runs_used_other_data(tmp_path: Path, caplog: pytest
         folder = tmp_path / name
         folder.mkdir()
         said["data"]["name"] = data
-        (folder / "config.json").write_text(json.dumps(said | {"seed": name, "data_sha256": {"train": checksum}}))
+        sealed.write(folder / "config.json", said | {"seed": name, "data_sha256": {"train": checksum}})
         (folder / "metrics.csv").write_text("model,split,trajectory,parameter,parameter_group,metric,horizon,value\n")
     runs = finished_runs(tmp_path)
     assert [r.message for r in caplog.records] == [

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from gpe_pl import domain_table
+from gpe_pl import domain_table, sealed
 from gpe_pl.config import Report
 from gpe_pl.domain_table import TableError, compares_models, report_domains
 from gpe_pl.evaluation import LEARNED, Row, read_rows, write_rows
@@ -36,7 +36,7 @@ def write_run(folder: Path, domain: str, model: str, seed: int, errors: list[flo
         "model": {"_target_": f"gpe_pl.models.x.{model}"},
         "training": {"num_steps": 1000},
     }
-    (folder / "config.json").write_text(json.dumps(config))
+    sealed.write(folder / "config.json", config)
     rows = []
     for name, values in {LEARNED: errors, "ballistic": [BALLISTIC[domain]] * len(errors), **trivial}.items():
         for k, value in enumerate(values):
@@ -143,7 +143,7 @@ def test_on_other_scenes_the_papers_ratios_are_left_out(sweep: Path) -> None:
     assert "paper" in cells((sweep / "table1.md").read_text(), "sand")
     for path in sweep.rglob("config.json"):
         config = json.loads(path.read_text())
-        path.write_text(json.dumps(config | {"evaluation": {"data": {"name": "larger", "scene": {"num_particles": 9}}}}))
+        sealed.write(path, config | {"evaluation": {"data": {"name": "larger", "scene": {"num_particles": 9}}}})
     report_domains(sweep)
     text = (sweep / "table1.md").read_text()
     assert "paper" not in text
@@ -184,7 +184,7 @@ def test_what_is_no_training_run_and_what_is_there_twice_is_left_out(sweep: Path
     before = (sweep / "table1.md").read_text()
     shutil.copytree(sweep / "sand" / "GPE" / "0", sweep / "sand" / "GPE" / "0 copy")
     evaluation = shutil.copytree(sweep / "sand" / "GPE" / "0", sweep / "evaluated")
-    (evaluation / "config.json").write_text('{"checkpoint": "best.ckpt"}')
+    sealed.write(evaluation / "config.json", {"checkpoint": "best.ckpt"})
     report_domains(sweep)
     assert (sweep / "table1.md").read_text() == before
     assert "0 copy repeats" in caplog.text and "evaluated is not of a training run (data.name, model._target_" in caplog.text
@@ -209,7 +209,7 @@ def test_a_run_without_the_judged_split_does_not_hide_the_others(tmp_path: Path)
 def change(folder: Path, part: str, **values: Any) -> None:
     path = folder / "config.json"
     config = json.loads(path.read_text())
-    path.write_text(json.dumps(config | {part: config.get(part, {}) | values}))
+    sealed.write(path, config | {part: config.get(part, {}) | values})
 
 
 @pytest.mark.parametrize(("part", "key"), [("training", "num_steps"), ("model", "decoder"), ("evaluation", "hold_parameters")])

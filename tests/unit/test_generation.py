@@ -464,7 +464,19 @@ def test_a_damaged_description_is_named(folder, tmp_path, content):
     again = tmp_path / "sand" / "smoke"
     shutil.copytree(folder, again)
     (again / "dataset.json").write_bytes(content)
-    with pytest.raises(GenerationError, match=r"dataset.json: unreadable; delete the folder"):
+    with pytest.raises(GenerationError, match=r"dataset.json: unreadable.*; delete the folder"):
+        generate(tmp_path, SPEC, 1)
+
+
+def test_a_description_whose_checksum_is_another_is_named(folder, tmp_path):
+    again = tmp_path / "sand" / "smoke"
+    shutil.copytree(folder, again)
+    path = again / "dataset.json"
+    stored = json.loads(path.read_text(encoding="utf-8"))
+    path.write_text(json.dumps({**stored, "sha256": "0" * 64}), encoding="utf-8")
+    with pytest.raises(
+        GenerationError, match=r"dataset.json: was changed or damaged since it was written \(checksum mismatch\); delete the folder"
+    ):
         generate(tmp_path, SPEC, 1)
 
 

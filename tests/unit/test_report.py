@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import csv
-import json
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from gpe_pl import report
+from gpe_pl import report, sealed
 from gpe_pl.evaluation import LEARNED, Row, read_rows, write_rows
 from gpe_pl.run_folder import RunError
 
@@ -25,7 +24,7 @@ ERRORS = {  # of two test scenes; free flight has 2e-3 and 6e-3
 def write_run(folder: Path, interaction: str, seed: int) -> None:
     folder.mkdir(parents=True)
     model = {"_target_": "gpe_pl.models.gpe.GPE", "interaction": interaction}
-    (folder / "config.json").write_text(json.dumps({"seed": seed, "data": {"name": "sand"}, "model": model, "training": {"num_steps": 10}}))
+    sealed.write(folder / "config.json", {"seed": seed, "data": {"name": "sand"}, "model": model, "training": {"num_steps": 10}})
     groups = ("interpolated", "extrapolated")
     rows = [Row(LEARNED, "test_unseen", k, groups[k], 20.0, "rollout_mse", "full", v) for k, v in enumerate(ERRORS[interaction, seed])]
     rows += [Row("ballistic", "test_unseen", k, groups[k], 20.0, "rollout_mse", "full", v) for k, v in enumerate((2e-3, 6e-3))]
@@ -85,11 +84,13 @@ def test_a_repeated_run_counts_once(runs: Path, caplog: pytest.LogCaptureFixture
     assert "repeats" in caplog.text
 
 
-@pytest.mark.parametrize("content", [b"{", b"5", b"\xa1\xff"])
+@pytest.mark.parametrize(
+    "content", [b"{", b"5", b"\xa1\xff", b"[" * 10**6, b'{"a":' * 70 + b"1" + b"}" * 70, b'{"a": 1' + b"0" * 10**5 + b"}", b'{"seed": 0}']
+)
 def test_a_damaged_configuration_is_named(runs: Path, content: bytes) -> None:
     path = runs / "negated" / "0" / "config.json"
     path.write_bytes(content)
-    with pytest.raises(RunError, match=r"negated/0/config.json is damaged; delete the folder"):
+    with pytest.raises(RunError, match=r"negated/0/config.json: .*; delete the folder"):
         report.report_sweep(runs)
 
 

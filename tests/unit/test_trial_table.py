@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from gpe_pl import sealed
 from gpe_pl.evaluation import LEARNED, Row, write_rows
 from gpe_pl.trial_table import compares_settings, report_trials
 
@@ -23,7 +24,7 @@ def write_run(folder: Path, domain: str, model: str, noise: float, seed: int, er
     folder.mkdir(parents=True)
     training = {"velocity_noise_of_change": noise, "num_steps": 1000 + int(noise), "val_interval": 10 + int(noise)}
     config = {"seed": seed, "data": {"name": domain}, "model": {"_target_": f"gpe_pl.models.x.{model}"}, "training": training}
-    (folder / "config.json").write_text(json.dumps(config))
+    sealed.write(folder / "config.json", config)
     rows = [Row(LEARNED, "val", k, "seen", 20.0, "rollout_mse", "full", value) for k, value in enumerate(errors)]
     flight = [Row("ballistic", "val", k, "seen", 20.0, "rollout_mse", "full", 20e-3) for k in range(len(errors))]
     write_rows(folder / "metrics.csv", [*rows, *flight])
@@ -80,7 +81,7 @@ def test_another_budget_alone_is_a_setting(tmp_path: Path) -> None:
     write_run(longer, "sand", "GPE", 0.3, 0, [1e-3])
     config = json.loads((longer / "config.json").read_text())
     config["training"]["num_steps"] = 9000
-    (longer / "config.json").write_text(json.dumps(config))
+    sealed.write(longer / "config.json", config)
     assert compares_settings(tmp_path)
     report_trials(tmp_path)
     assert "| sand | GPE | 9000 |" in (tmp_path / "trials.md").read_text()

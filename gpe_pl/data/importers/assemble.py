@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl import integrators
+from gpe_pl import integrators, sealed
 from gpe_pl.arrays import ArrayError, nearest_distances
 from gpe_pl.atomic import free_bytes, replacing
 from gpe_pl.data.checksum import split_checksum
@@ -21,7 +21,7 @@ from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
 from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
 from gpe_pl.data.motion import ROUNDING_SHARE, MotionSummary, better_origin, motion_of, rounding_fault
-from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments, with_checksum
+from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.locks import held
@@ -499,8 +499,7 @@ class _Conversion:
         split = "train" if "train" in self.survey.good else next(iter(self.survey.good))
         shards = sorted((folder / split).glob("shard-*.h5"))
         statistics = combined([shard_moments(path)[1] for path in shards])
-        stored = with_checksum(statistics, split_checksum(folder, split))
-        (folder / STATISTICS_FILE).write_text(json.dumps(stored, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+        sealed.write(folder / STATISTICS_FILE, {**statistics, "data_sha256": split_checksum(folder, split)})
         report = self.report
         report.velocity_std, report.acceleration_std = statistics["velocity_std"], statistics["acceleration_std"]
         if report.acceleration_std == 0:

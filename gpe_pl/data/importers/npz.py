@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import pickle
+import struct
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -18,7 +20,8 @@ from gpe_pl.hdf5_arrays import LARGEST_DEFLATE_RATIO
 HEADERS: dict[tuple[int, int], Any] = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 DAMAGE = (
-    *(OSError, EOFError, KeyError, ValueError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error),
+    *(OSError, EOFError, KeyError, ValueError, TypeError, ArithmeticError, SyntaxError),  # the last ones of a header's text
+    *(MemoryError, RuntimeError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
     *(pickle.UnpicklingError, AttributeError, ImportError),
 )
 """What reading a damaged archive, or a pickle that was asked for, can raise."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,13 +14,14 @@ import numpy as np
 import pytest
 import torch
 
+from gpe_pl import sealed
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.dataset import HeldGraphs, WindowDataset
 from gpe_pl.data.importers import save_dataset
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
-from gpe_pl.data.statistics import motion, with_checksum
+from gpe_pl.data.statistics import motion
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
@@ -42,7 +42,7 @@ def root(store: Path) -> Path:
 
 def described(root: Path) -> Path:
     """The data set, with statistics of its training trajectories as they are now."""
-    (root / "statistics.json").write_text(json.dumps(with_checksum({"acceleration_std": 50.0}, split_checksum(root, "train"))))
+    sealed.write(root / "statistics.json", {"acceleration_std": 50.0, "data_sha256": split_checksum(root, "train")})
     return root
 
 
@@ -212,7 +212,7 @@ def test_missing_statistics_are_a_readable_error(root: Path, content: str | None
     path.unlink()
     if content is not None:
         path.write_text(content)
-    with pytest.raises(StoreError, match=r"statistics.json: cannot be used .* generate or import the data again"):
+    with pytest.raises(StoreError, match=r"statistics.json: .*; generate or import the data again"):
         datamodule(root)
 
 

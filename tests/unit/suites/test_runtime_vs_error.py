@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from gpe_pl import sealed
 from gpe_pl.baselines import ConstantVelocity
 from gpe_pl.finished_runs import Run
 from gpe_pl.generation import generate_trajectory, initial_state, trajectory_metadata
@@ -130,7 +130,7 @@ def test_training_took_its_steps_at_the_step_time_of_its_sweep(tmp_path: Path) -
     trained = Run(sweep / "seed=0", config, [])
     assert math.isnan(training_seconds(trained))
     times = {"sand tiny GPE 1": 0.5, "sand tiny GPE 2": 0.1, "sand tiny GPE 3": 0.7, "sand small GPE 1": 0.55, "sand tiny GNS 1": 0.58}
-    (sweep / "step_times.json").write_text(json.dumps(times))
+    sealed.write(sweep / "step_times.json", times)
     assert training_seconds(trained) == 50.0  # 70 s were more than it had
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import threading
 from dataclasses import replace
@@ -13,6 +12,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from gpe_pl import sealed
 from gpe_pl.config import construct
 from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.data.sampling import BatchSize, PushForward
@@ -112,22 +112,40 @@ def test_times_of_another_machine_are_not_mixed_without_a_word(
     within_budget(SETTINGS, path, "sand GNS", lambda _: 0.1)
     said = f"step_times.json: its step times were measured where products ran at 100 GFLOP/s, and here it is {rate / 1e9:.0f}; sand GNS"
     assert (said in caplog.text) == is_another
-    assert json.loads(path.read_text()) == {budget.RATE: 1e11, "sand GPE": 0.1, "sand GNS": 0.1}
+    assert budget.read_times(path) == {budget.RATE: 1e11, "sand GPE": 0.1, "sand GNS": 0.1}
 
 
 def test_a_file_without_a_rate_stays_without(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "step_times.json"
-    path.write_text('{"sand GPE": 0.1}')
+    sealed.write(path, {"sand GPE": 0.1})
     within_budget(SETTINGS, path, "sand GNS", lambda _: 0.1)
-    assert json.loads(path.read_text()) == {"sand GPE": 0.1, "sand GNS": 0.1}
+    assert budget.read_times(path) == {"sand GPE": 0.1, "sand GNS": 0.1}
     assert "products" not in caplog.text
 
 
-@pytest.mark.parametrize("content", ["", "[1]", '{"a": "fast"}', "\x00"])
+@pytest.mark.parametrize(
+    "content", ["", "[1]", '{"sand": 0.1}', '{"sand": NaN}', '{"sand": 1e999}', "[" * 10**5, "\x00", '{"sand": 1' + 5000 * "0" + "}"]
+)
 def test_a_damaged_file_is_named(tmp_path: Path, content: str) -> None:
     path = tmp_path / "step_times.json"
-    path.write_text(content)
-    with pytest.raises(BudgetError, match=r"step_times\.json: not a file of step times .*delete it"):
+    path.write_text(content, encoding="utf-8")
+    with pytest.raises(BudgetError, match=r"step_times\.json: .*; delete it to measure again"):
+        within_budget(SETTINGS, path, "sand", lambda _: 1.0)
+
+
+@pytest.mark.parametrize("value", [0, -0.1, "fast", None, True, [0.1]])
+def test_a_step_time_is_a_positive_number(tmp_path: Path, value: Any) -> None:
+    path = tmp_path / "step_times.json"
+    sealed.write(path, {"sand": value})
+    with pytest.raises(BudgetError, match=r"step_times\.json: not a file of step times, which are positive numbers; delete it"):
+        within_budget(SETTINGS, path, "sand", lambda _: 1.0)
+
+
+def test_a_changed_digit_does_not_change_the_number_of_steps(tmp_path: Path) -> None:
+    path = tmp_path / "step_times.json"
+    within_budget(SETTINGS, path, "sand", lambda _: 0.0301)
+    path.write_text(path.read_text(encoding="utf-8").replace("0.0301", "9.0301"), encoding="utf-8")
+    with pytest.raises(BudgetError, match=r"was changed or damaged since it was written \(checksum mismatch\); delete it to measure again"):
         within_budget(SETTINGS, path, "sand", lambda _: 1.0)
 
 

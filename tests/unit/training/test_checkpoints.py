@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shutil
@@ -19,12 +18,12 @@ import pytest
 import torch
 from lightning.pytorch.loggers import CSVLogger
 
+from gpe_pl import sealed
 from gpe_pl.data import sampling
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
-from gpe_pl.data.statistics import with_checksum
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator
 from gpe_pl.models.gpe import GPE
@@ -63,7 +62,7 @@ def data(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> Path:
         steps = [np.random.default_rng(t.metadata.seed).normal(scale=3e-3, size=t.pos.shape) for t in made]
         moved = [replace(t, pos=(t.pos[0] + np.cumsum(s, axis=0)).astype(np.float32)) for t, s in zip(made, steps, strict=True)]
         write_shard(root / split / "shard-00000.h5", moved)
-    (root / "statistics.json").write_text(json.dumps(with_checksum({"acceleration_std": 50.0}, split_checksum(root, "train"))))
+    sealed.write(root / "statistics.json", {"acceleration_std": 50.0, "data_sha256": split_checksum(root, "train")})
     return root
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pickle
 import signal
@@ -19,14 +18,13 @@ from lightning.pytorch.loggers import CSVLogger
 from torch import nn
 from torch_geometric.data import Batch, HeteroData
 
-from gpe_pl import ranks
+from gpe_pl import ranks, sealed
 from gpe_pl.data import sampling
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.dataset import Samples
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize, Sampling
-from gpe_pl.data.statistics import with_checksum
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
@@ -127,7 +125,7 @@ def mixed(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> Path:
     sizes = [(8, False), (30, True), (14, False), (21, True)]
     write_shard(root / "train" / "shard-00000.h5", [trajectory(k, n, snow, "train") for k, (n, snow) in enumerate(sizes)])
     write_shard(root / "val" / "shard-00000.h5", [trajectory(10 + k, n, snow, "val") for k, (n, snow) in enumerate(sizes[:3])])
-    (root / "statistics.json").write_text(json.dumps(with_checksum({"acceleration_std": 50.0}, split_checksum(root, "train"))))
+    sealed.write(root / "statistics.json", {"acceleration_std": 50.0, "data_sha256": split_checksum(root, "train")})
     return root
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import pytest
 import torch
 from lightning.pytorch.utilities import rank_zero_only
 
+from gpe_pl import sealed
 from gpe_pl.run_folder import RunError, claim, without_tables
 from gpe_pl.training.run import TrainerSettings, adopt, set_up
 
@@ -21,7 +21,7 @@ def finished(folder: Path, config: dict[str, Any]) -> Path:
     (folder / "checkpoints").mkdir(parents=True)
     (folder / "checkpoints" / "best.ckpt").write_bytes(b"weights")
     (folder / "metrics.csv").touch()
-    (folder / "config.json").write_text(json.dumps({**config, "evaluation": {"splits": ["test"]}}))
+    sealed.write(folder / "config.json", {**config, "evaluation": {"splits": ["test"]}})
     return folder
 
 
@@ -42,14 +42,14 @@ def test_the_same_configuration_is_the_same_run(tmp_path: Path, config: dict[str
 
 
 def test_what_data_and_sizes_offer_is_no_part_of_a_run(tmp_path: Path) -> None:
-    """Older runs wrote it down; new settings there must not make other runs of them."""
+    """New settings there must not make other runs of those that are finished."""
     offered = {
         "data": {"name": "sand", "comparison": {"velocity_noise_of_change": 1.0}, "larger": {"scene": {"max_bodies": 6}}},
         "size": {"name": "tiny", "comparison": {"budget_minutes": 1.0, "seeds": "0,1"}},
     }
     now = without_tables({**CONFIG, **offered})
     assert now == {**CONFIG, "data": {"name": "sand"}, "size": {"name": "tiny", "comparison": {"budget_minutes": 1.0}}}
-    folder = finished(tmp_path / "there", {**CONFIG, **offered})
+    folder = finished(tmp_path / "there", now)
     for config in (now, {**CONFIG, **offered}):
         claim(folder, {**config, "evaluation": {"splits": ["test"]}})
     assert adopt(tmp_path / "there", now, tmp_path / "now") is not None
