@@ -40,9 +40,9 @@ from gpe_pl.locks import held
 from gpe_pl.names import DataName
 from gpe_pl.progress import Progress
 from gpe_pl.rollout import Guard, SimulationError, Simulator, rollout
-from gpe_pl.schema import MATERIALS, SPLITS, ParameterGroup
+from gpe_pl.schema import SPLITS, ParameterGroup
 from gpe_pl.solvers.caution import unresolved
-from gpe_pl.solvers.materials import LIMITS
+from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.store import StoreError, read_trajectory, trajectory_names, write_shard
 from gpe_pl.trajectory import Metadata, State, Trajectory
@@ -160,13 +160,10 @@ class DatasetSpec:
                 "leave out others with ~data.parameters.MATERIAL"
             )
         for material, values in self.parameters.items():
-            parameter, limits = MATERIALS[material], LIMITS[material]
             for key, group in asdict(cast(Any, values)).items():
                 for value in group:
-                    if not limits.low <= value <= limits.high:
-                        raise ValueError(
-                            f"parameters.{material}.{key}: {parameter.name} = {value} {parameter.unit} is outside {limits}, the solvers' limits"
-                        )
+                    if fault := limits_fault(material, value):
+                        raise ValueError(f"parameters.{material}.{key}: {fault}")
             if self.num_test_unseen and not (values.interpolated and values.extrapolated):
                 raise ValueError(f"num_test_unseen > 0 needs parameters.{material}.interpolated and .extrapolated")
         for key, path in self.scene.input_files.items():
@@ -528,6 +525,7 @@ def _generate(folder: Path, to_do: Plan, spec: DatasetSpec, num_workers: int, on
 
 def _draw_contact_sheet(spec: DatasetSpec, path: Path, workers: Executor | None) -> None:
     """A training scene with as many of the materials as possible, under parameter values from the smallest to the largest."""
+    from gpe_pl.viz.captions import row_label
     from gpe_pl.viz.contact_sheet import contact_sheet
     from gpe_pl.viz.saving import save_figure
 
@@ -537,7 +535,7 @@ def _draw_contact_sheet(spec: DatasetSpec, path: Path, workers: Executor | None)
         for material, choices in spec.parameters.items():
             every = sorted({*choices.seen, *choices.interpolated, *choices.extrapolated})
             values[material] = every[round(share * (len(every) - 1))]
-        rows[_row_label(values)] = values
+        rows[row_label(values)] = values
     index = _most_varied_scene(spec)
     arguments = [(spec, index, label, values) for label, values in rows.items()]
     trajectories = dict(results(workers, _labelled_trajectory, arguments))
@@ -554,16 +552,6 @@ def _most_varied_scene(spec: DatasetSpec) -> int:
         if number > most:
             best, most = index, number
     return best
-
-
-def _row_label(values: Mapping[str, float]) -> str:
-    lines = []
-    for material, value in values.items():
-        parameter = MATERIALS[material]
-        name = material if len(values) > 1 else f"{parameter.name.replace('_', ' ').replace('youngs', 'Young’s')}\n"
-        prefix, scale = next(((p, s) for p, s in (("M", 1e6), ("k", 1e3)) if parameter.unit == "Pa" and value >= s), ("", 1.0))
-        lines.append(f"{name} {value / scale:g} {prefix}{'' if parameter.unit == '1' else parameter.unit.replace('^2', '²')}".strip())
-    return "\n".join(lines)
 
 
 def _labelled_trajectory(spec: DatasetSpec, index: int, label: str, values: dict[str, float]) -> tuple[str, Trajectory]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
 from array_api_compat import array_namespace
@@ -222,6 +222,14 @@ def _step(simulator: Simulator, state: State) -> State | SimulationError:
         return error
 
 
+@runtime_checkable
+class GroundTruth(Protocol):
+    """What tells a ground-truth solver from other simulators: the name and version under which its results are stored."""
+
+    name: ClassVar[str]
+    version: ClassVar[str]
+
+
 @dataclass(frozen=True)
 class Start:
     """Where a rollout begins and ends.
@@ -282,7 +290,8 @@ def rollouts(simulator: Simulator, starts: Sequence[Start], on_frame: Callable[[
     Returns:
         One trajectory per start.
     """
-    recordings = [_Recording(start) for start in starts]
+    is_prediction = not isinstance(simulator, GroundTruth)
+    recordings = [_Recording(start, is_prediction) for start in starts]
     for scene, frame, item in frames(simulator, starts):
         recordings[scene].add(item)
         if on_frame is not None and isinstance(item, State):
@@ -293,8 +302,8 @@ def rollouts(simulator: Simulator, starts: Sequence[Start], on_frame: Callable[[
 class _Recording:
     """The frames of one scene so far, as arrays of its own."""
 
-    def __init__(self, start: Start) -> None:
-        self.start = start
+    def __init__(self, start: Start, is_prediction: bool) -> None:
+        self.start, self.is_prediction = start, is_prediction
         self.pos: list[np.ndarray] = []
         self.vel: list[np.ndarray] = []
         self.stress: list[Stress | None] = []
@@ -332,6 +341,7 @@ class _Recording:
             stress=Stress(np.stack([s.node for s in known]), np.stack([s.cell for s in known])) if has_stress else None,
             termination=self.termination,
             start_time=state.time,
+            is_prediction=self.is_prediction,
         )
 
 

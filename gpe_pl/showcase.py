@@ -24,6 +24,7 @@ from gpe_pl.geometry import signed_distance, surface_tolerance
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.machine import environment, peak_resident
 from gpe_pl.rollout import Guard, Simulator, Start, frames, unsound
+from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.trajectory import Metadata, State, Termination, Trajectory
 from gpe_pl.viz.saving import save_figure
@@ -67,12 +68,15 @@ def start(simulator: LearnedSimulator, scene: Scene, settings: ShowcaseSettings)
 
     Raises:
         SceneError: the scene does not fit the simulator.
-        ValueError: there is no such scene, or no such material in it.
+        ValueError: there is no such scene, no such material in it, or a value outside the limits of the solvers.
     """
     metadata = replace(describe(scene, simulator.builder.metadata.frame_dt, seed=settings.seed), dataset="showcase")
     unknown = settings.values.keys() - set(metadata.materials)
     if unknown:
         raise ValueError(f"values.{min(unknown)}: no material of this scene, which has {', '.join(metadata.materials)}")
+    for material, value in settings.values.items():
+        if fault := limits_fault(material, value):
+            raise ValueError(f"values.{material}: {fault}")
     state = simulator.standing(scene.sample(settings.values, settings.seed), metadata)
     impossible = unsound(state, metadata)
     if impossible is not None:
@@ -222,6 +226,7 @@ class _Film:
             self.state.mass.cpu().numpy(),
             self.state.material_params.cpu().numpy(),
             self.state.boundary.to_numpy(),
+            is_prediction=True,
         )
         columns = evenly_spaced_frames(trajectory.num_frames, 4)
         strip = film_strip([("", trajectory)], columns, Coloring("height", [trajectory], columns))

@@ -464,6 +464,7 @@ class Trajectory:
         stress: of the mesh in every frame.
         termination: set when a rollout stopped before its last frame.
         start_time: of the first frame, in s since the start of the scene; not stored.
+        is_prediction: whether a rollout of anything but a ground-truth solver made it; not stored.
     """
 
     metadata: Metadata
@@ -479,6 +480,7 @@ class Trajectory:
     cell_dim: int | None = None
     termination: Termination | None = field(default=None, compare=False)
     start_time: float = field(default=0.0, compare=False)
+    is_prediction: bool = field(default=False, compare=False)
 
     @classmethod
     def from_numpy(

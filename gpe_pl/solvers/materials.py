@@ -45,6 +45,14 @@ LIMITS: dict[str, Limits] = {
 """By material. Imported data need not keep to them: ``schema.MaterialParameter.rule`` says what can be stored."""
 
 
+def limits_fault(material: str, value: float) -> str:
+    """What to say of a parameter that no solver computes; empty where one does."""
+    parameter, limits = MATERIALS[material], LIMITS[material]
+    if limits.low <= value <= limits.high:
+        return ""
+    return f"{parameter.name} = {value} {parameter.unit} is outside {limits}, the solvers' limits"
+
+
 def check_limits(material: str, values: np.ndarray, nodes: np.ndarray) -> None:
     """Refuse parameters that no solver computes.
 

@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from gpe_pl.trajectory import Trajectory
+from gpe_pl.viz.captions import with_heading
 from gpe_pl.viz.coloring import PALETTE, ColorBy, Coloring
 from gpe_pl.viz.film_strip import evenly_spaced_frames, film_strip, new_figure
 
@@ -29,21 +30,21 @@ COLUMN_WIDTH = 3.4
 def rollout_figure(
     ground_truth: Trajectory, predictions: Mapping[str, Trajectory], num_columns: int = 6, color: ColorBy = "error"
 ) -> Figure:
-    """Film strip of a rollout: time runs to the right, the ground truth is the top row, each prediction has a row below.
+    """Film strip of a rollout: time runs to the right, the ground truth is the top row, each prediction has a row below, and materials stand under them.
 
     Args:
-        ground_truth: sets the times, evenly spaced from its first to its last frame.
+        ground_truth: sets the times, evenly spaced from its first to its last frame; a prediction in its place is called so.
         predictions: rollouts from frame 0 of the ground truth, by the name of their row. One that stopped early says so in
             place of its missing frames.
         num_columns: number of times; fewer if there are fewer frames.
         color: ``error`` is the distance of predicted particles from the ground truth; others as in ``Coloring``.
 
     Raises:
-        ValueError: ``num_columns`` is not positive, or no trajectory has what ``color`` needs.
+        ValueError: ``num_columns`` is not positive, no trajectory has what ``color`` needs, or a prediction has the name of the first row.
     """
-    rows = {name: trajectory.with_moving_boundary() for name, trajectory in {"ground truth": ground_truth, **predictions}.items()}
+    rows = {name: trajectory.with_moving_boundary() for name, trajectory in with_heading(ground_truth, predictions).items()}
     frames = evenly_spaced_frames(ground_truth.num_frames, num_columns)
-    coloring = Coloring(color, list(rows.values()), frames, rows["ground truth"])
+    coloring = Coloring(color, list(rows.values()), frames, next(iter(rows.values())))
     # A row may be lower than its name is long.
     return film_strip([(name.replace(" ", "\n"), trajectory) for name, trajectory in rows.items()], frames, coloring)
 

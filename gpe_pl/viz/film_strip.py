@@ -13,6 +13,7 @@ from matplotlib.ticker import EngFormatter
 
 from gpe_pl.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
+from gpe_pl.viz.captions import in_common
 from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.panel import Panel
 from gpe_pl.viz.scenery import INK
@@ -43,7 +44,7 @@ def evenly_spaced_frames(num_frames: int, num_columns: int) -> list[int]:
 
 
 def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], coloring: Coloring, dpi: int = 150) -> Figure:
-    """A panel per trajectory and frame, times above the columns, and a colour bar, legend or line below that explains the colours.
+    """A panel per trajectory and frame, times above the columns, and below materials with what the colours mean; other colours have a bar or legend.
 
     Args:
         rows: label and trajectory, from top to bottom, of scenes in the same domain.
@@ -58,8 +59,11 @@ def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], co
     legend = coloring.legend(trajectories)
     aspect = Camera(trajectories[0]).aspect
     right = 0.04 if not has_bar else 0.62 if coloring.by == "error" else 0.9  # inch; a stress comes with its unit
-    caption = f"{', '.join(trajectories[0].metadata.materials)}; colour: height at the start" if coloring.by == "height" else ""
-    top, bottom, gap = 0.22, (0.24 if legend or caption else 0.0), 0.05
+    caption = textwrap.fill(
+        "; ".join([in_common(trajectories), *["colour: height at the start"] * (coloring.by == "height")]), int(TEXT_WIDTH / CHARACTER)
+    )
+    below = 0.24 if legend else 0.06
+    top, bottom, gap = 0.22, below + LINE * (caption.count("\n") + 1) + 0.04, 0.05
 
     def panel_width(left: float) -> float:
         return (TEXT_WIDTH - left - right - gap * (len(frames) - 1)) / len(frames)
@@ -86,8 +90,7 @@ def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], co
     for j, text in enumerate(_times(frames, trajectories[0].metadata.frame_dt)):
         x, y, w, h = rectangle(0, j)
         figure.text(x + w / 2, y + h + 0.05 / height, text, va="bottom", **style)
-    if caption:
-        figure.text(0.5, 0.06 / height, caption, va="bottom", **style)
+    figure.text(0.5, below / height, caption, va="bottom", linespacing=1.1, **style)
     if has_bar:
         low, high = rectangle(len(rows) - 1, 0)[1], rectangle(first_with_bar, 0)
         _draw_bar(figure, coloring, (1 - (right - 0.1) / TEXT_WIDTH, low, 0.08 / TEXT_WIDTH, high[1] + high[3] - low))

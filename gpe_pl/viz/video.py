@@ -1,5 +1,6 @@
 """Animations of a rollout beside the ground truth: GIF always, MP4 where imageio-ffmpeg is installed."""
 
+import textwrap
 from collections.abc import Iterator, Mapping
 from itertools import chain
 from pathlib import Path
@@ -13,11 +14,14 @@ from PIL import Image
 from gpe_pl.atomic import replacing
 from gpe_pl.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
+from gpe_pl.viz.captions import in_common, with_heading
 from gpe_pl.viz.coloring import COLOR_MAPS, REFERENCE, ColorBy, Coloring
 from gpe_pl.viz.panel import Panel
 from gpe_pl.viz.scenery import INK
 
 PANEL_PIXELS, FILM_PIXELS = 360, 960
+CHARACTER_PIXELS = 7
+"""About the width of a character of the line that names materials."""
 DPI = 100
 
 
@@ -33,7 +37,7 @@ def write_animation(
 
     Args:
         path: ends in ``.gif`` or ``.mp4``.
-        ground_truth: sets the length.
+        ground_truth: sets the length; a prediction in its place is called so.
         predictions: rollouts from frame 0 of the ground truth, by the name of their panel.
         fps: frames per second of the animation; a GIF rounds the time of a frame to 10 ms.
         stride: show every so many frames of the trajectory.
@@ -42,12 +46,12 @@ def write_animation(
 
     Raises:
         ValueError: another file type, a stride or frame rate that is not positive, or a GIF with more than 50 frames per
-            second, or no trajectory has what ``color`` needs.
+            second, no trajectory has what ``color`` needs, or a prediction has the name of the first panel.
         ModuleNotFoundError: MP4 without imageio-ffmpeg.
     """
     frames = range(0, ground_truth.num_frames, stride) if stride >= 1 else range(0)
-    rows = {name: trajectory.with_moving_boundary() for name, trajectory in {"ground truth": ground_truth, **predictions}.items()}
-    _write(Path(path), rows, frames, fps, color, rows["ground truth"], PANEL_PIXELS)
+    rows = {name: trajectory.with_moving_boundary() for name, trajectory in with_heading(ground_truth, predictions).items()}
+    _write(Path(path), rows, frames, fps, color, next(iter(rows.values())), PANEL_PIXELS)
 
 
 def write_film(path: Path | str, name: str, trajectory: Trajectory, fps: int | float = 25, color: ColorBy = "height") -> None:
@@ -75,7 +79,9 @@ def _images(rows: dict[str, Trajectory], frames: range, coloring: Coloring, pane
     first = next(iter(rows.values()))
     aspect = Camera(first).aspect
 
-    title, gap = 28, 8
+    line, gap = 24, 8
+    caption = textwrap.wrap(in_common(list(rows.values())), int((len(rows) * panel_pixels) / CHARACTER_PIXELS))
+    title = line * (1 + len(caption))
     width = len(rows) * panel_pixels + (len(rows) + 1) * gap
     height = round(panel_pixels * aspect) + title + gap
     width, height = width + width % 2, height + height % 2  # H.264 wants even sizes
@@ -86,8 +92,10 @@ def _images(rows: dict[str, Trajectory], frames: range, coloring: Coloring, pane
         left = gap + k * (panel_pixels + gap)
         box = (left / width, gap / height, panel_pixels / width, panel_pixels * aspect / height)
         panels.append(Panel(figure, box, trajectory, coloring))
-        figure.text((left + panel_pixels / 2) / width, 1 - title / 2 / height, name, ha="center", va="center", fontsize=10, color=INK)
-    clock = figure.text(gap / width, 1 - title / 2 / height, "", ha="left", va="center", fontsize=9, color=INK)
+        figure.text((left + panel_pixels / 2) / width, 1 - line / 2 / height, name, ha="center", va="center", fontsize=10, color=INK)
+    for k, text in enumerate(caption):
+        figure.text(0.5, 1 - line * (1.5 + k) / height, text, ha="center", va="center", fontsize=9, color=INK)
+    clock = figure.text(gap / width, 1 - line / 2 / height, "", ha="left", va="center", fontsize=9, color=INK)
 
     moving = [*(artist for panel in panels for artist in panel.artists), clock]
     for artist in moving:

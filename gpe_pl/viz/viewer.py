@@ -30,6 +30,7 @@ from gpe_pl.geometry import Bowl, signed_distance
 from gpe_pl.schema import BOUNDARY, NODE_TYPES, node_code
 from gpe_pl.trajectory import Trajectory
 from gpe_pl.viz.camera import AZIMUTH, ELEVATION, vertical_axis
+from gpe_pl.viz.captions import describe, heading, with_heading
 from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, ColorBy, Coloring, position_error
 from gpe_pl.viz.contact_sheet import telling_color
 from gpe_pl.viz.panel import DOT, drawn_faces, outline, polygon_edges
@@ -73,7 +74,7 @@ def write_viewer(
 
     Args:
         path: ends in ``.html``.
-        ground_truth: sets the length.
+        ground_truth: sets the length; a prediction in its place is called so.
         predictions: of the same frames, by name; one of them is shown at a time. Without any, the ground truth stands alone.
         stride: every so many frames.
         title: of the page; by default data set and split.
@@ -83,24 +84,26 @@ def write_viewer(
 
     Raises:
         ViewerError: a prediction has other nodes than the ground truth.
-        ValueError: another file type, or a stride that is not positive.
+        ValueError: another file type, a stride that is not positive, or a prediction with the name of the first panel.
     """
     path = Path(path)
     if path.suffix != ".html":
         raise ValueError(f"{path}: a viewer ends in .html")
     if stride < 1:
         raise ValueError(f"stride must be positive, got {stride}")
-    trajectories = {"ground truth": ground_truth, **(predictions or {})}
+    trajectories = with_heading(ground_truth, predictions or {})
     for name, trajectory in trajectories.items():
         if not np.array_equal(trajectory.node_type, ground_truth.node_type):
             raise ViewerError(
-                f"{name!r} has {trajectory.num_nodes} nodes, or their materials, unlike the ground truth's {ground_truth.num_nodes}"
+                f"{name!r} has {trajectory.num_nodes} nodes, or their materials, unlike the {heading(ground_truth)}'s {ground_truth.num_nodes}"
             )
     about = ground_truth.metadata
     title = title or " ".join(word for word in (about.dataset, about.split) if word)
     scene, arrays = _scene({name: trajectory.with_moving_boundary() for name, trajectory in trajectories.items()}, stride)
     parts = {
         "title": html.escape(title),
+        "contents": html.escape(", ".join(trajectories)),
+        "materials": html.escape(describe(ground_truth)),
         "style": (PAGE / "viewer.css").read_text(encoding="utf-8"),
         "arrays": "\n".join(_element(name, *value) for name, value in arrays.items()),
         "scene": json.dumps(scene, allow_nan=False).replace("<", "\\u003c"),
@@ -117,11 +120,12 @@ Arrays = dict[str, tuple[str, np.ndarray]]
 
 def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, Any], Arrays]:
     """What the page knows, as plain values and arrays."""
-    truth, about = trajectories["ground truth"], trajectories["ground truth"].metadata
+    first, truth = next(iter(trajectories.items()))
+    about = truth.metadata
     frames = range(0, truth.num_frames, stride)
     shown = {name: _inside(t.frames(0, truth.num_frames)) for name, t in trajectories.items()}
     raster = Raster.of([t.pos[::stride] for t in shown.values()], np.asarray(about.bounds, float))
-    colorings = {by: Coloring(by, [*shown.values()], frames, shown["ground truth"]) for by in _colors(shown)}
+    colorings = {by: Coloring(by, [*shown.values()], frames, shown[first]) for by in _colors(shown)}
     steps = {by: _step(by, colorings[by], shown, frames) for by in ("speed", "von_mises") if by in colorings}
     codes = np.unique(truth.node_type).tolist()
     vertical = vertical_axis(truth)
@@ -149,7 +153,7 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
     }
     arrays: Arrays = {f"map_{by}": ("uint8", _color_map(coloring)) for by, coloring in colorings.items()}
     for by in ("height", "material"):
-        arrays[f"all_{by}"] = ("float32", colorings[by].values(shown["ground truth"], 0)[0])  # type: ignore[index]
+        arrays[f"all_{by}"] = ("float32", colorings[by].values(shown[first], 0)[0])  # type: ignore[index]
     for number, (name, trajectory) in enumerate(shown.items()):
         kept = [frame for frame in frames if frame < trajectory.num_frames]
         fields = {"pos": raster(trajectory.pos[kept])}
@@ -165,7 +169,7 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
                 "frames": len(kept),
                 "fields": [*fields],
                 "stopped": "not simulated" if stop is None else f"stopped at {stop.frame * about.frame_dt:.2f} s ({stop.reason})",
-                "rmse": None if number == 0 else _rmse(trajectory, shown["ground truth"], frames),
+                "rmse": None if number == 0 else _rmse(trajectory, shown[first], frames),
             }
         )
     arrays |= {name: ("uint32", values) for name, values in _mesh(truth).items()}

@@ -129,11 +129,16 @@ def draw_contact_sheet(report: Report) -> Path:
 
 
 def _draw_contact_sheet(folder: Path, split: str) -> Path:
+    from gpe_pl.viz.captions import describe
     from gpe_pl.viz.contact_sheet import contact_sheet
     from gpe_pl.viz.saving import save_figure
 
-    shown = islice(iter_trajectories(folder, split), NUM_SHOWN)
-    figure = contact_sheet({f"{split} {k}": trajectory for k, trajectory in enumerate(shown)})
+    shown = list(islice(iter_trajectories(folder, split), NUM_SHOWN))
+    values = [describe(trajectory) for trajectory in shown]
+    differ = len(set(values)) > 1
+    figure = contact_sheet(
+        {f"{split} {k}{f': {text}' if differ else ''}": t for k, (t, text) in enumerate(zip(shown, values, strict=True))}
+    )
     path = folder / CONTACT_SHEET_FILE
     save_figure(figure, path)
     return path

@@ -86,7 +86,7 @@ def test_names_cannot_break_out_of_the_page(tmp_path, ground_truth, prediction):
     write_viewer(tmp_path / "a.html", ground_truth, {"</script><b>": prediction}, title="<i>&")
     page = Page(tmp_path / "a.html")
     assert page.scene["trajectories"][1]["name"] == "</script><b>" and "<b>" not in page.text
-    assert "<title>&lt;i&gt;&amp;</title>" in page.text
+    assert "<title>&lt;i&gt;&amp;: ground truth, " in page.text
 
 
 def test_the_page_refers_to_nothing_outside_of_it(tmp_path, mesh):

@@ -1,0 +1,133 @@
+"""Pictures say whether they show ground truth or a prediction, and of which material with which parameter."""
+
+import html
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from gpe_pl.baselines import Ballistic
+from gpe_pl.data.importers import draw_contact_sheet, save_dataset
+from gpe_pl.rollout import rollout
+from gpe_pl.schema import node_code
+from gpe_pl.trajectory import Trajectory
+from gpe_pl.viz import contact_sheet as sheets
+from gpe_pl.viz import video
+from gpe_pl.viz.captions import describe, parameter_value, row_label
+from gpe_pl.viz.contact_sheet import contact_sheet
+from gpe_pl.viz.figures import rollout_figure
+from gpe_pl.viz.video import write_animation, write_film
+from gpe_pl.viz.viewer import write_viewer
+from tests.contracts.test_solvers import flip
+from tests.scenes import metadata
+from tests.unit.viz.conftest import falling
+
+SAND = "sand, friction angle 27.5°"
+
+
+def truth(angle: float = 27.5) -> Trajectory:
+    trajectory = falling(2)
+    return replace(trajectory, material_params=np.full_like(trajectory.material_params, angle))
+
+
+def predicted() -> Trajectory:
+    t = truth()
+    return rollout(Ballistic(t.metadata.frame_dt), t.state(0), 6, t.metadata)
+
+
+def mixed() -> Trajectory:
+    """Half of it sand, half an elastomer whose stiffness varies."""
+    t = truth()
+    types, params = t.node_type.copy(), np.full((t.num_nodes, 2), np.nan, np.float32)
+    types[::2] = node_code("elastomer")
+    params[1::2, 0], params[::2, 1] = 27.5, np.linspace(6e5, 1e6, len(params[::2]))
+    about = replace(t.metadata, materials=("sand", "elastomer"), param_names=("friction_angle", "youngs_modulus"))
+    return replace(t, node_type=types, material_params=params, metadata=about)
+
+
+def texts(figure: Figure) -> list[str]:
+    return [t.get_text().replace("\n", " ") for t in figure.texts]
+
+
+def page(path: Path) -> tuple[str, str, list[str]]:
+    """Title and heading of a viewer, and the names of what it shows."""
+    text = path.read_text(encoding="utf-8")
+    title, heading = (html.unescape(re.sub("<[^>]*>", "", re.findall(f"<{tag}>(.*?)</{tag}>", text)[0])) for tag in ("title", "h1"))
+    scene = json.loads(re.findall(r'id="scene">(.*?)</script>', text)[0])
+    return title, heading, [trajectory["name"] for trajectory in scene["trajectories"]]
+
+
+def test_a_rollout_knows_whether_a_solver_made_it() -> None:
+    assert predicted().is_prediction and predicted().frames(2).is_prediction
+    assert not truth().is_prediction
+    solver, state = flip(2)
+    assert not rollout(solver, state, 1, metadata(("fluid",), 2)).is_prediction
+
+
+def test_a_prediction_alone_is_called_so(tmp_path: Path) -> None:
+    figure = rollout_figure(predicted(), {})
+    assert {"prediction", SAND} <= set(texts(figure)) and "ground truth" not in texts(figure)
+    write_viewer(tmp_path / "a.html", predicted())
+    assert page(tmp_path / "a.html") == ("test: prediction", f"test {SAND}", ["prediction"])
+    for name, value in (("ground truth", truth()), ("prediction", predicted())):
+        with pytest.raises(ValueError, match=f"'{name}' is what the first trajectory is called"):
+            rollout_figure(value, {name: predicted()})
+
+
+def test_ground_truth_is_called_so(tmp_path: Path) -> None:
+    assert {"ground truth", "GPE", SAND} <= set(texts(rollout_figure(truth(), {"GPE": predicted()})))
+    write_viewer(tmp_path / "a.html", truth(), {"GPE": predicted()}, title="A <test>")
+    assert page(tmp_path / "a.html") == ("A <test>: ground truth, GPE", f"A <test> {SAND}", ["ground truth", "GPE"])
+
+
+def test_films_say_what_they_show(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[str] = []
+
+    class Watched(video.Figure):  # type: ignore[misc, name-defined]
+        def text(self, x: float, y: float, s: str, **style: object) -> object:
+            drawn.append(s)
+            return super().text(x, y, s, **style)
+
+    monkeypatch.setattr(video, "Figure", Watched)
+    write_animation(tmp_path / "a.gif", predicted(), {}, stride=6)
+    assert drawn == ["prediction", SAND, ""]  # the last becomes the time
+    drawn.clear()
+    write_film(tmp_path / "b.gif", "GPE", predicted())
+    assert drawn == ["GPE", SAND, ""]
+
+
+def test_contact_sheets_name_values_where_they_differ(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "sand, friction angle 27.5°; colour: height at the start" in texts(contact_sheet({"a": truth(), "b": truth()}))
+    assert "sand; colour: height at the start" in texts(contact_sheet({"20°": truth(20.0), "30°": truth(30.0)}))
+    labels: list[str] = []
+
+    def watched(rows: dict[str, Trajectory]) -> Figure:
+        labels.extend(rows)
+        return contact_sheet(rows)
+
+    monkeypatch.setattr(sheets, "contact_sheet", watched)
+    for name, angles in (("same", (20.0, 20.0)), ("other", (20.0, 30.0))):
+        shown = [replace(truth(angle), pos=truth().pos + 0.001 * k) for k, angle in enumerate(angles)]
+        draw_contact_sheet(save_dataset(tmp_path, name, holdout=0.0, train=shown))
+    assert labels == ["train 0", "train 1", "train 0: sand, friction angle 20°", "train 1: sand, friction angle 30°"]
+
+
+def test_several_materials_are_named_above_their_legend() -> None:
+    figure = contact_sheet({"a": mixed()}, 2)
+    (legend,) = figure.legends
+    (caption,) = (t for t in figure.texts if t.get_text() == "sand, friction angle 27.5°; elastomer, Young’s modulus 0.6 … 1 MPa")
+    figure.canvas.draw()
+    assert legend.get_window_extent().y1 <= caption.get_window_extent().y0 + 1
+    assert caption.get_window_extent().y1 <= figure.axes[-1].get_window_extent().y0
+
+
+def test_values_have_their_unit() -> None:
+    assert [parameter_value("solid", x) for x in (2.1e11, 6e5, 500.0)] == ["210 GPa", "600 kPa", "500 Pa"]
+    assert parameter_value("fluid", 8.93e-7) == "8.93e-07 m²/s"
+    assert (parameter_value("snow", 8.0), parameter_value("sand", 20.0, 30.0)) == ("8", "20 … 30°")
+    assert row_label({"sand": 20.0}) == "friction angle\n20°" and row_label({"sand": 20.0, "snow": 8.0}) == "sand 20°\nsnow 8"
+    assert describe(replace(truth(), material_params=np.full((truth().num_nodes, 1), np.nan))) == "sand"
