@@ -34,7 +34,7 @@ class WarmAverage(WeightAveraging):
             else:
                 torch._foreach_copy_(averaged, current)
 
-        super().__init__(multi_avg_fn=average)
+        super().__init__(use_buffers=False, multi_avg_fn=average)  # copied: they do not learn, and may be infinite, which has no mean
 
 
 class RolloutValidation(Callback):
