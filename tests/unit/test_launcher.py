@@ -9,10 +9,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from hydra.core.utils import JobStatus
+from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
 
-from gpe_pl.launcher import CommandLauncher, Job, ProcessLauncher, RayLauncher, SlurmLauncher, UsageError
+from gpe_pl.launcher import CommandLauncher, Job, ProcessLauncher, RayLauncher, SlurmLauncher, SweepError, UsageError
 
 COMMAND = """
 import json, os, sys
@@ -138,3 +138,18 @@ def test_wrong_settings_are_named(folder: Path) -> None:
     pytest.importorskip("submitit")
     with pytest.raises(UsageError, match="hydra.launcher.parameters: .*hours"):
         outcomes(SlurmLauncher("debug", {"hours": 3}), folder, "1")
+
+
+def test_an_interrupted_sweep_says_how_far_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Interrupted(ProcessLauncher):
+        def run(self, jobs: Any, module: str) -> Iterator[tuple[int, JobReturn]]:
+            yield 1, JobReturn(jobs[1].overrides, status=JobStatus.COMPLETED, _return_value=0.5)
+            raise KeyboardInterrupt
+
+    launcher = Interrupted(1)
+    launcher.config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}})
+    monkeypatch.setattr(launcher, "_job", lambda number, overrides: Job([*overrides], Path("sweep"), f"x={number}", tmp_path))
+    with pytest.raises(
+        SweepError, match=r"^interrupted with 1 of 3 runs done; the same command goes on with the others, each output.log says"
+    ):
+        launcher.launch([["x=0"], ["x=1"], ["x=2"]], 0)
