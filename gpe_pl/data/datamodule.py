@@ -41,7 +41,7 @@ def data_statistics(root: Path | str) -> dict[str, float]:
     try:
         statistics = sealed.read(path, "generate or import the data again")
         if statistics["data_sha256"] != split_checksum(root, "train"):
-            raise StoreError(f"{path}: is of other data than those in train; generate or import the data again")
+            raise StoreError(f"{path}: cannot be used (it is of other data than those in train); generate or import the data again")
         return {"acceleration_std": float(statistics["acceleration_std"])}
     except StoreError:
         raise
