@@ -345,7 +345,7 @@ def test_snow_deposit_rises_with_hardening(physics):
 L0 = 0.2
 
 
-def collapse(aspect, angle, cells_per_width=10, duration=1.6):
+def collapse(aspect, angle, cells_per_width=10, duration=1.6, cfl=0.5):
     """A column of width L0 and height a L0 against a slip wall, on a sticky floor; returns the final state."""
     dx = L0 / cells_per_width
     height = math.ceil((aspect * L0 + 0.1) / dx) * dx
@@ -354,7 +354,7 @@ def collapse(aspect, angle, cells_per_width=10, duration=1.6):
     walls = domain_walls(bounds, {"x_low": 0.0, "x_high": STICKY, "y_low": STICKY, "y_high": 0.0})
     boundary = Boundary.sample(walls, dx / 2, 2)
     state = block((0.0, 0.0), (L0, aspect * L0), dx / 2, value=angle, boundary=boundary, gravity=GRAVITY * down(2))
-    solver = MPM(bounds=bounds, grid_spacing=dx)
+    solver = MPM(bounds=bounds, grid_spacing=dx, cfl=cfl)
     return run(solver, state, round(duration / solver.frame_dt))
 
 

@@ -88,7 +88,7 @@ class MPM:
     max_substeps: Annotated[int, Field(ge=1)] = 1000
 
     name: ClassVar[str] = "mpm"
-    version: ClassVar[str] = "4"
+    version: ClassVar[str] = "5"
     stores_stress: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
