@@ -1,27 +1,83 @@
-"""Where libraries keep what they compile and look up, on systems on which neither the package nor the home can be written."""
+"""Where libraries keep what they compile: apart for each version of the sources, and also where package and home cannot be written."""
 
 from __future__ import annotations
 
+import hashlib
 import os
+import shutil
 import stat
+import sys
+import time
 from pathlib import Path
 
 PACKAGE = Path(__file__).parent
 
+COMPILED = ("schema.py", "graphs/islands.py", "grid_distance.py", "data/importers/tfrecord.py", "nn/fused*.py", "solvers/**/*.py")
+"""Sources of compiled functions, and of the types and constants in them."""
+NAME = "gpe_pl-compiled-"
+"""Begins the names of folders of compiled functions; a digest of ``COMPILED`` follows."""
+SECONDS_UNUSED = 30 * 24 * 3600
+"""After so long, compiled functions of other sources are removed."""
+
 
 def prepare() -> None:
-    """Give libraries a folder of the user below the system's temporary one, where those that they would take cannot be written.
+    """Choose folders for what Numba compiles, and for Matplotlib and Triton where those that they would take cannot be written.
 
-    Numba fails without a folder; Matplotlib and Triton warn, and work anew in each process. What the user has set stays. Takes effect on what is imported
-    afterwards.
+    Numba compiles a function again when its own file has changed, but not when another file has that defines a type, a constant or a function in it. So each
+    version of ``COMPILED`` has a folder of its own: in ``NUMBA_CACHE_DIR`` if that is set, else in the package, else in the user's folder for caches, else in
+    one below the system's temporary folder. Matplotlib and Triton warn where they have no folder, and work anew in each process; what the user has set stays.
+    Takes effect on what is imported afterwards.
     """
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
-    if not (_is_writable(PACKAGE) or _is_writable(home / "numba")):
-        _set("NUMBA_CACHE_DIR", "numba")
+    _prepare_numba()
     if not _is_writable(Path("~/.config/matplotlib").expanduser()):
         _set("MPLCONFIGDIR", "matplotlib")
     if not _is_writable(Path("~/.triton").expanduser()):
         _set("TRITON_CACHE_DIR", "triton")
+
+
+def _prepare_numba() -> None:
+    parent = _parent_of_compiled()
+    if parent is None:
+        return
+    folder = parent / (NAME + _digest())
+    try:
+        is_new = not folder.exists()
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+        if is_new:
+            _remove_unused(parent)
+    except OSError:  # Numba looks for another place itself
+        return
+    os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    if "numba" in sys.modules:
+        sys.modules["numba"].config.CACHE_DIR = str(folder)  # read at its import
+
+
+def _parent_of_compiled() -> Path | None:
+    """Where folders of compiled functions lie."""
+    if given := os.environ.get("NUMBA_CACHE_DIR"):
+        chosen = Path(given)
+        return chosen.parent if chosen.name.startswith(NAME) else chosen  # that of the process that started this one
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+    if own := next((place for place in (PACKAGE / "__pycache__", home / "numba") if _is_writable(place)), None):
+        return own
+    temporary = _own_folder()
+    return None if temporary is None else temporary / "numba"
+
+
+def _digest() -> str:
+    """Of the names and contents of ``COMPILED``."""
+    digest = hashlib.blake2b(digest_size=8)
+    for path in sorted(path for pattern in COMPILED for path in PACKAGE.glob(pattern)):
+        digest.update(f"{path.relative_to(PACKAGE).as_posix()}\n".encode())
+        digest.update(hashlib.blake2b(path.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def _remove_unused(parent: Path) -> None:
+    for folder in parent.glob(f"{NAME}*"):
+        if folder.stat().st_mtime < time.time() - SECONDS_UNUSED:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def _is_writable(folder: Path) -> bool:
