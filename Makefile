@@ -33,7 +33,7 @@ test-all: install ## all tests, analytic physics and notebooks included
 fuzz: install ## random states, scenes, graphs and files, thousands of each and others every time
 	$(BIN)/python -m pytest tests/fuzz tests/unit/test_integrators.py --hypothesis-profile=fuzz $(ARGS) $(PYTEST_ARGS)
 
-physics: install ## solvers against formulas and experiments; writes docs/results/physics.md
+physics: install ## solvers against formulas and experiments; writes docs/results/physics.md and convergence.md
 	$(BIN)/python -m pytest tests/physics -m "not notebook" --physics-page docs/results/physics.md $(PYTEST_ARGS) -n 0
 
 check: lint types contracts format-page ## everything that needs no run: style, types, import contracts, generated pages
