@@ -233,13 +233,17 @@ class LearnedSimulator(nn.Module):
 
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
         """The state at a frame with the velocity history that the graph needs, on this model's device. What training did not have of material
-        parameters, gravity and boundary nodes is named in a warning, once per kind.
+        parameters, gravity and boundary nodes, and another version of the solver, is named in a warning, once per kind.
 
         Raises:
             IndexError: too few frames before ``frame``.
             SceneError: another frame interval, dimension or material than in training, or a value that is not finite; names the node.
         """
         self.check_scene(trajectory.metadata)
+        own, scene = self.builder.metadata, trajectory.metadata
+        if scene.solver == own.solver and scene.solver_version != own.solver_version:
+            version = f"version {scene.solver_version} of the solver {scene.solver}, in training version {own.solver_version}"
+            self._warn_once("solver", f"the ground truth is of {version}, whose trajectories differ")
         state = trajectory.state(frame, history=self.builder.config.history).to_torch(self.acceleration_std.device)
         return self._checked(state, f"frame {frame}")
 
@@ -294,10 +298,13 @@ class LearnedSimulator(nn.Module):
         held = "; taken for the nearest trained value" if self.holds_parameters else ""
         found = [(kind, line + held) for kind, line in self._outside_parameters(state)]
         for kind, line in (*found, *self._outside_scene(state)):
-            if kind not in self._warned:
-                log.warning("outside the training data: %s", line)
-                self._warned.add(kind)
+            self._warn_once(kind, line)
         return state
+
+    def _warn_once(self, kind: str, line: str) -> None:
+        if kind not in self._warned:
+            log.warning("outside the training data: %s", line)
+            self._warned.add(kind)
 
     @torch.inference_mode()
     def step(self, state: State) -> State:

@@ -16,6 +16,7 @@ from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
 from gpe_pl.geometry import domain_walls
+from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator
 from gpe_pl.models.gpe import GPE
@@ -24,7 +25,7 @@ from gpe_pl.pretrained import names
 from gpe_pl.scene_ranges import described, scene_range, united
 from gpe_pl.schema import STICKY
 from gpe_pl.store import read_trajectory, trajectory_names, write_shard
-from gpe_pl.trajectory import Boundary, Motion, State
+from gpe_pl.trajectory import Boundary, Motion, State, Trajectory
 from tests import scenes
 
 GRAVITY = (0.0, -9.81)
@@ -172,3 +173,14 @@ def test_shipped_models_know_their_gravity(name: str) -> None:
     low, high = simulator.trained_scene.numpy()
     assert tuple(low[: metadata.dim]) == tuple(high[: metadata.dim]) == metadata.gravity
     assert np.isfinite(simulator.trained_scene).all()
+
+
+def test_another_version_of_the_solver_is_warned_of(new_trajectory: Callable[..., Trajectory], caplog: pytest.LogCaptureFixture) -> None:
+    for version in ("1", "2"):  # in this order: the model's own version has nothing to warn of
+        trajectory = new_trajectory(solver_version=version)
+        build = GraphBuilder(GraphConfig(history=2), new_trajectory().metadata)
+        simulator = LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=4), build)
+        for frame in (3, 4):
+            simulator.initial_state(trajectory, frame)
+    (line,) = [r.getMessage() for r in caplog.records if "solver" in r.getMessage()]
+    assert line.startswith("outside the training data: the ground truth is of version 2 of the solver random, in training version 1")
