@@ -77,6 +77,10 @@ def array_bytes(trajectory: Trajectory) -> int:
     return sum(array.nbytes for array in stored_arrays(trajectory).values())
 
 
+ATTRIBUTES = ("metadata", "shapes", "node_types")
+"""Of a trajectory's group, beside the digest."""
+
+
 def stored_attributes(trajectory: Trajectory) -> dict[str, str]:
     """What else is stored of a trajectory, as JSON: its metadata, the shapes of its boundary, and the names behind ``node_type``."""
     m = trajectory.metadata
@@ -92,7 +96,7 @@ def digest(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
         sha.update(f"{name}={text};".encode())
     for name, array in sorted(arrays.items()):
         sha.update(f"{name}:{array.dtype.str}:{array.shape};".encode())
-        sha.update(np.ascontiguousarray(array).tobytes())
+        sha.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return sha.hexdigest()
 
 
@@ -303,7 +307,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         metadata = metadata_of(group)
         arrays = {key: read_field(group, key, frames) for key, spec in FIELDS.items() if spec.required or is_named(group, key)}
         if verify:
-            attributes = {key: read_text(group, key) for key in ("metadata", "shapes", "node_types")}
+            attributes = {key: read_text(group, key) for key in ATTRIBUTES}
             if digest(arrays, attributes) != read_text(group, "sha256"):
                 raise StoreError(
                     f"{path}:{name}: SHA-256 digest does not match the content; delete the shard and generate or import the data again"

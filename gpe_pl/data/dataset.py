@@ -71,6 +71,10 @@ class StoredTrajectory:
             return self.held.frames(start, stop)
         return read_trajectory(self.path, self.name, frames=slice(start, stop))
 
+    def whole(self) -> Trajectory:
+        """All frames, compared with the digest that they were stored with; raises ``StoreError`` as ``window`` does."""
+        return read_trajectory(self.path, self.name, verify=True) if self.held is None else self.held
+
 
 def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> list[StoredTrajectory]:
     """Index all trajectories of a split, holding them in memory if they are small enough."""
@@ -84,7 +88,7 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
             held = None
             if hold:
                 with suppress(UnsoundError):  # which ``usable`` will meet again
-                    held = _read_only(read_trajectory(path, name))
+                    held = _read_only(read_trajectory(path, name, verify=True))
             stored.append(StoredTrajectory(path, name, num_frames, num_nodes, held))
     return stored
 
@@ -94,7 +98,7 @@ def long_enough(root: Path | str, split: str, history: int) -> Iterator[Trajecto
     for path in shards(root, split):
         for name in trajectory_names(path):
             try:
-                trajectory = read_trajectory(path, name)
+                trajectory = read_trajectory(path, name, verify=True)
             except UnsoundError as error:
                 _warn(path, name, error.fault)
                 continue
@@ -120,7 +124,7 @@ def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
     found = []
     for stored in trajectories:
         try:
-            fault = damage(stored.window(0, stored.num_frames))
+            fault = damage(stored.whole())
         except UnsoundError as error:
             fault = error.fault
         if fault is None:

@@ -29,7 +29,7 @@ from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.progress import Progress
 from gpe_pl.report import report_sweep
 from gpe_pl.run_folder import RunError, claim
-from gpe_pl.store import StoreError
+from gpe_pl.store import StoreError, write_shard
 from gpe_pl.training import callbacks
 from gpe_pl.training.module import TrainingError, TrainingModule
 from tests.runs import tiny
@@ -349,18 +349,20 @@ def test_one_corrupted_batch_does_not_end_a_run(
 
 
 def test_a_position_that_is_not_finite_stops_the_run_and_is_named(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = TrajectoryDataModule.train_dataloader
+    """Of a trajectory that is not held in memory, and went wrong after training had looked at all of them."""
+    plain, spoiled = TrajectoryDataModule.train_dataloader, tmp_path / "shard-00000.h5"
 
     def train_dataloader(self: TrajectoryDataModule) -> Any:
         stored = self.train_set.trajectories[1]
         assert stored.held is not None
         pos = stored.held.pos.copy()
         pos[8, 7] = np.nan
-        self.train_set.trajectories[1] = replace(stored, held=replace(stored.held, pos=pos))
+        write_shard(spoiled, [replace(stored.held, pos=pos)], ["00001"])
+        self.train_set.trajectories[1] = replace(stored, path=spoiled, held=None)
         return plain(self)
 
     monkeypatch.setattr(TrajectoryDataModule, "train_dataloader", train_dataloader)
-    with pytest.raises(StoreError, match="shard-00000.h5:00001: frame 8, node 7: the position is not finite"):
+    with pytest.raises(StoreError, match="shard-00000.h5:00001: field 'pos': frame 8, node 7, dim 0 and 1 more: not finite"):
         fit(tiny(tiny_data, tmp_path, "training.num_steps=40", "training.val_interval=40"))
 
 

@@ -7,18 +7,21 @@ import copy
 import functools
 import hashlib
 import itertools
+import json
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
+import h5py
 import numpy as np
 import pytest
 import torch
 
 from gpe_pl import integrators
-from gpe_pl.data.dataset import StartKey, StoredTrajectory, WindowDataset, collated, open_split
+from gpe_pl.data.checksum import split_checksum
+from gpe_pl.data.dataset import CACHE_BYTES, StartKey, StoredTrajectory, WindowDataset, collated, long_enough, open_split, usable
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import NUM_LANES, UNIFORM_SHARE, BatchSampler, BatchSize, PushForward, StepSampler, probabilities
 from gpe_pl.graphs.builder import GraphBuilder
@@ -293,3 +296,30 @@ def test_late_batches_ask_for_own_steps(store: Path) -> None:
         assert list(itertools.islice(resumed, 10)) == keys[first : first + 10]
     starts = collated([data[key] for key in keys[5]])
     assert isinstance(starts, list) and len(starts) == 2
+
+
+def edited(store: Path, key: str) -> None:
+    """The first training trajectory changed in place, with its old digest."""
+    with h5py.File(next((store / "train").iterdir()), "r+") as file:
+        group = file["00000"]
+        if key == "metadata":
+            text = json.dumps(json.loads(group.attrs[key]) | {"gravity": [0.0, -1.62]}, sort_keys=True)
+            group.attrs[key] = np.bytes_(text.encode())
+        else:
+            group[key][...] = group[key][...] + np.float32(0.01)
+
+
+@pytest.mark.parametrize("key", ["pos", "mass", "metadata"])
+@pytest.mark.parametrize("cache_bytes", [0, CACHE_BYTES])
+def test_what_was_changed_without_its_digest_is_not_learned_from(store: Path, key: str, cache_bytes: int) -> None:
+    edited(store, key)
+    with pytest.raises(StoreError, match=r"shard-00000.h5:00000: SHA-256 digest does not match the content"):
+        usable(open_split(store, "train", cache_bytes))
+    with pytest.raises(StoreError, match=r"shard-00000.h5:00000: SHA-256 digest does not match the content"):
+        list(long_enough(store, "train", 2))
+
+
+def test_changed_metadata_are_other_data_though_no_array_is_read(store: Path) -> None:
+    before = split_checksum(store, "train")
+    edited(store, "metadata")
+    assert split_checksum(store, "train") != before
