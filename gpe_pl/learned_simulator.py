@@ -176,7 +176,7 @@ class LearnedSimulator(nn.Module):
         try:
             self.load_state_dict(trained.state_dict())
         except RuntimeError as error:  # one set of weights per level of a mesh, and meshes of other sizes
-            raise CheckpointError(f"the model to start from has meshes of other sizes ({_reason(error)})") from None
+            raise CheckpointError(f"the model to start from has meshes of other sizes ({reason(error)})") from None
         statistics.take_over(self.standardizer)
         self.standardizer, self._unknown = statistics, None
         for material, values in self.trained_ranges():
@@ -495,7 +495,7 @@ class LearnedSimulator(nn.Module):
             simulator.load_state_dict(weights)
             simulator._check_values()
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-            raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model ({_reason(error)})") from None
+            raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model ({reason(error)})") from None
         return simulator.to(device).eval()
 
 
@@ -516,7 +516,7 @@ def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:
         return torch.load(path, map_location=device, weights_only=True)
     except Exception as error:  # zipfile and torch raise many types for damaged or unsafe files
         raise CheckpointError(
-            f"{path}: not a safe, complete checkpoint ({_reason(error)}); if it was copied, copy it again, or take another of the run, such as last.ckpt"
+            f"{path}: not a safe, complete checkpoint ({reason(error)}); if it was copied, copy it again, or take another of the run, such as last.ckpt"
         ) from None
 
 
@@ -528,7 +528,8 @@ def _per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterat
             yield scene, rows[scene], part
 
 
-def _reason(error: Exception) -> str:
+def reason(error: Exception) -> str:
+    """What went wrong, in one line of bounded length."""
     return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
 
 

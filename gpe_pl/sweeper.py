@@ -1,7 +1,8 @@
 """A Hydra sweeper that lets Optuna choose what to try next: ``hydra/sweeper=optuna``.
 
 A sweep is an Optuna study that minimises what the command returns. It is kept in a journal in the sweep's folder: the same command resumes it, runs that were
-interrupted first. Any launcher runs its trials.
+interrupted first. The best trial so far is run again before: its folder gives the same number at once, or says what has changed since. Any launcher runs the
+trials.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class OptunaSweeper(Sweeper):
             ``a,b``, ``range(1, 5)``; a key given on the command line takes the place of the one here.
 
     Raises:
-        SweepError: no trial returned a finite number.
+        SweepError: no trial returned a finite number, or those of an earlier start were of other settings or data.
     """
 
     def __init__(self, num_trials: int = 20, num_at_once: int = 1, seed: int = 0, params: Mapping[str, Any] | None = None) -> None:
@@ -68,6 +69,8 @@ class OptunaSweeper(Sweeper):
         study = optuna.create_study(
             storage=JournalStorage(JournalFileBackend(str(folder / JOURNAL))), study_name="sweep", load_if_exists=True
         )
+        if study.get_trials(states=[State.COMPLETE]):
+            self._require_same(study.best_trial, fixed, folder)
         for left_over in study.get_trials(states=[State.RUNNING]):  # of a sweep that was killed: their folders know how far they are
             study.enqueue_trial(left_over.params)
             study.tell(left_over.number, state=State.FAIL)
@@ -75,7 +78,7 @@ class OptunaSweeper(Sweeper):
         while (left := self.num_trials - len(study.get_trials(states=[State.COMPLETE, State.PRUNED]))) > 0:
             study.sampler = optuna.samplers.TPESampler(seed=self.seed + len(study.trials))
             trials = [study.ask(space) for _ in range(min(left, self.num_at_once))]
-            overrides = [[*fixed, *(f"{key}={_text(value)}" for key, value in trial.params.items())] for trial in trials]
+            overrides = [_overrides(fixed, trial) for trial in trials]
             for trial, outcome in zip(trials, self.launcher.launch(overrides, initial_job_idx=trials[0].number), strict=True):
                 value = outcome._return_value
                 if outcome.status is JobStatus.COMPLETED and value is not None and math.isfinite(value):
@@ -90,6 +93,19 @@ class OptunaSweeper(Sweeper):
         replace_text(folder / BEST, json.dumps({"value": best.value, "trial": best.number, "values": best.params}, indent=1) + "\n")
         print(f"best of {self.num_trials} trials: {best.value:.6g} with {', '.join(f'{k}={_text(v)}' for k, v in best.params.items())}")
 
+    def _require_same(self, trial: Any, fixed: list[str], folder: Path) -> None:
+        """Refuse to go on with numbers that the same trial would not have now."""
+        assert self.launcher is not None
+        (outcome,) = self.launcher.launch([_overrides(fixed, trial)], initial_job_idx=trial.number)
+        value = outcome._return_value
+        if outcome.status is JobStatus.FAILED:
+            raise SweepError(f"{folder}: trial {trial.number} of an earlier start cannot be repeated: {value}")
+        if value != trial.value:
+            raise SweepError(
+                f"{folder}: trial {trial.number} of an earlier start had {trial.value:.6g} and has {value} now, so settings or data have changed; "
+                "choose another name=… or delete the folder"
+            )
+
     def _split(self, arguments: list[str]) -> tuple[list[str], dict[str, Any]]:
         """Overrides that hold for all trials, and the distributions of the others' values by key."""
         given = OverridesParser.create().parse_overrides([f"{key}={value}" for key, value in self.params.items()] + arguments)
@@ -100,6 +116,10 @@ class OptunaSweeper(Sweeper):
                 "hydra/sweeper=optuna: no key has several values; give some, such as training.learning_rate='interval(1e-4,1e-2)'"
             )
         return [str(o.input_line) for o in latest.values() if not o.is_sweep_override()], space
+
+
+def _overrides(fixed: list[str], trial: Any) -> list[str]:
+    return [*fixed, *(f"{key}={_text(value)}" for key, value in trial.params.items())]
 
 
 def _distribution(override: Override) -> Any:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,8 @@ from lightning.pytorch.callbacks import Checkpoint
 
 from gpe_pl import ranks
 from gpe_pl.atomic import replace_bytes
-from gpe_pl.learned_simulator import CheckpointError, load_checkpoint
+from gpe_pl.errors import GpeError
+from gpe_pl.learned_simulator import CheckpointError, load_checkpoint, reason
 from gpe_pl.training.interruption import Interruption
 
 SCORE = "val/rollout_mse"
@@ -35,6 +38,7 @@ class Checkpoints(Checkpoint):
     Attributes:
         best_score, best_step: of ``best.ckpt``; None: there is none.
         saved_step: of ``last.ckpt``; None: this training has neither loaded nor saved it.
+        has_begun: whether training steps are made, so that all of ``last.ckpt`` has been taken up.
     """
 
     def __init__(self, folder: Path, seconds: float = math.inf, interruption: Interruption | None = None) -> None:
@@ -43,6 +47,7 @@ class Checkpoints(Checkpoint):
         self.best_score: float | None = None
         self.best_step: int | None = None
         self.saved_step: int | None = None
+        self.has_begun = False
         self._saved_at = time.monotonic()
 
     def where_saved(self) -> str | None:
@@ -54,7 +59,7 @@ class Checkpoints(Checkpoint):
     # --- when ----------------------------------------------------------------------------------------------------------------------------
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        self._saved_at = time.monotonic()
+        self.has_begun, self._saved_at = True, time.monotonic()
         self.interruption.listen()
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int) -> None:
@@ -88,6 +93,18 @@ class Checkpoints(Checkpoint):
         if ranks.num_ranks() == 1:
             return list(wishes)
         return [bool(count) for count in ranks.summed(torch.tensor(wishes, dtype=torch.int64, device=module.device)).tolist()]
+
+    @contextmanager
+    def taken_up(self) -> Iterator[None]:
+        """Inside, whatever Lightning raises because ``last.ckpt`` holds something else than a training becomes a ``CheckpointError``."""
+        try:
+            yield
+        except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+            if self.has_begun or not self.last.exists() or isinstance(error, GpeError | torch.OutOfMemoryError):
+                raise
+            raise CheckpointError(
+                f"{self.last}: is none to resume from ({reason(error)}); delete the file, and the same command trains from the start"
+            ) from None
 
     # --- what is remembered ---------------------------------------------------------------------------------------------------------------
 

@@ -206,7 +206,7 @@ def train(
     for known in (r"`isinstance\(treespec, LeafSpec\)` is deprecated", r"Checkpoint directory .* exists and is not empty"):
         warnings.filterwarnings("ignore", known)  # the first is between Lightning and PyTorch, the second what resuming is
     try:
-        with interruption:
+        with interruption, checkpoints.taken_up():
             trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
     except SystemExit:  # Lightning's answer to an interruption
         if trainer.global_rank > 0:

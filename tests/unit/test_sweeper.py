@@ -73,12 +73,31 @@ def test_a_sweep_that_was_killed_goes_on(tmp_path: Path) -> None:
         sweeper(tmp_path, first).sweep([])
     second = Launcher()
     sweeper(tmp_path, second).sweep([])
-    assert second.jobs[0] == first.jobs[3]  # whose folder knows how far it is
-    assert len(second.jobs) == 3
-    assert not [job for job in second.jobs if job in first.jobs[:3]]
+    assert second.jobs[0] in first.jobs[:3]  # the best so far, whose folder knows that it is finished
+    assert second.jobs[1] == first.jobs[3]  # whose folder knows how far it is
+    assert len(second.jobs) == 4
+    assert not [job for job in second.jobs[1:] if job in first.jobs[:3]]
     finished = Launcher()
     sweeper(tmp_path, finished).sweep([])
-    assert not finished.jobs
+    assert len(finished.jobs) == 1
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (
+            Launcher(other={"gpe": 0.25}),
+            r"trial \d of an earlier start had [\d.]+ and has 0.25 now, so settings or data have changed; choose",
+        ),
+        (Launcher(failing="gpe"), r"trial \d of an earlier start cannot be repeated: no$"),
+    ],
+)
+def test_numbers_of_other_settings_or_data_are_not_compared(tmp_path: Path, changed: Launcher, message: str) -> None:
+    sweeper(tmp_path, Launcher(), num_trials=2).sweep(["model=gpe"])
+    best = (tmp_path / "best.json").read_bytes()
+    with pytest.raises(SweepError, match=message):
+        sweeper(tmp_path, changed, num_trials=4).sweep(["model=gpe"])
+    assert len(changed.jobs) == 1 and (tmp_path / "best.json").read_bytes() == best
 
 
 def test_a_key_on_the_command_line_takes_the_place_of_the_space(tmp_path: Path) -> None:

@@ -332,3 +332,25 @@ def test_checkpoints_that_are_links_are_replaced_not_followed(data: Path, tmp_pa
 def test_what_is_no_score_is_refused(tmp_path: Path, state: dict[str, Any]) -> None:
     with pytest.raises(CheckpointError, match="last.ckpt: does not hold the score and step of the best checkpoint"):
         Checkpoints(tmp_path).load_state_dict(state)
+
+
+CONTENTS: dict[str, Any] = {
+    "loops": {"fit_loop": 5},
+    "optimizer_states": [{"state": {}, "param_groups": []}],
+    "lr_schedulers": [{}],
+    "callbacks": 5,
+    "averaging_state": {"n_averaged": "many"},
+    "state_dict": {},
+    "skipped": 5,
+    "excursions": [1],
+}
+
+
+@pytest.mark.parametrize("key", [pytest.param(key, marks=[] if key == "loops" else pytest.mark.slow) for key in CONTENTS])
+def test_wrong_contents_of_a_checkpoint_are_named_in_one_line(data: Path, tmp_path: Path, key: str) -> None:
+    with pytest.raises(Killed):
+        trained(data, tmp_path / "run", at={4: stop(Killed)})
+    last = tmp_path / "run" / "checkpoints" / "last.ckpt"
+    torch.save(stored(tmp_path / "run") | {key: CONTENTS[key]}, last)
+    with pytest.raises(CheckpointError, match=rf"^{last}: .*; delete the file, and the same command trains from the start$"):
+        trained(data, tmp_path / "run")
