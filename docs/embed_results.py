@@ -1,7 +1,7 @@
 """Copy results of runs into ``docs/results`` and the tables there into the README, so that no number is typed by hand.
 
 ``python docs/embed_results.py RUN_FOLDER NAME`` takes the table, the figures and the first animation of a finished run or sweep, and of a table 1 what its
-finished runs are known by and were evaluated to; copied back into a folder of runs, these are not run again.
+finished runs are known by and were evaluated to, from which ``python -m gpe_pl.tables docs/results/NAME`` makes the table again.
 ``python docs/embed_results.py`` only renews the README; ``--check`` fails if the README differs from ``docs/results``.
 """
 
@@ -39,7 +39,7 @@ def collect(run: Path, name: str) -> None:
         for path in sorted(run.glob(pattern)):
             if not (is_table1 and path.stem == "table"):  # of all its runs at once, which says nothing
                 shutil.copy(path, target / path.name)
-    if is_table1:  # takes many hours: whoever has these files goes on from them
+    if is_table1:  # takes many hours; its rules may change
         for metrics in sorted(run.glob("*/**/metrics.csv")):
             if (metrics.parent / "config.json").exists():
                 kept = target / "runs" / metrics.parent.relative_to(run)

@@ -366,7 +366,11 @@ class Report(Callback):
         """Ends the process on failure: Hydra turns an exception of a callback into a warning, and the command would seem to have succeeded."""
         try:
             if is_sweep:
-                self._report_sweep(folder)
+                from gpe_pl.tables import write_tables
+
+                table = write_tables(folder)
+                if table.exists():  # not where no run has finished
+                    print(table.read_text(encoding="utf-8"))
             else:
                 from gpe_pl.report import conclusion, report
 
@@ -379,22 +383,3 @@ class Report(Callback):
         except Exception:
             traceback.print_exc()
             sys.exit(1)
-
-    @staticmethod
-    def _report_sweep(folder: Path) -> None:
-        """Write and print the table that suits what the runs differ in."""
-        from gpe_pl.domain_table import TABLE_MD, compares_models, report_domains
-        from gpe_pl.report import SWEEP_MD, report_sweep
-        from gpe_pl.trial_table import TRIALS_MD, compares_settings, report_trials
-
-        if compares_settings(folder):
-            report_trials(folder)
-            table = folder / TRIALS_MD
-        elif compares_models(folder):
-            report_domains(folder)
-            table = folder / TABLE_MD
-        else:
-            report_sweep(folder)
-            table = folder / SWEEP_MD
-        if table.exists():  # not where no run has finished
-            print(table.read_text(encoding="utf-8"))

@@ -28,6 +28,7 @@ from gpe_pl.finished_runs import (
     distinct_runs,
     finished_runs,
     groups_of,
+    replaced_data,
     rollout_errors,
     shared_table,
     shared_trajectories,
@@ -158,7 +159,7 @@ def _check(folder: Path, domains: list[str], by_cell: dict[tuple[str, str], list
             )
     for domain in domains:
         runs = [run for (d, _), members in by_cell.items() if d == domain for run in members]
-        keys = [key for key in axes_of(runs) if key.startswith(SAME_IN_A_ROW)]
+        keys = [key for key in axes_of(runs) if key.startswith(SAME_IN_A_ROW)] + replaced_data(runs)
         if keys:
             raise TableError(
                 f"{folder}: models on {domain} were trained or judged on different data ({', '.join(keys[:3])}) and do not compare; "

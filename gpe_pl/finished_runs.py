@@ -75,6 +75,12 @@ def _warn_of_replaced_data(runs: list[Run]) -> None:
             log.warning("%s and %s used different data of the same name; their errors do not compare", before.folder, run.folder)
 
 
+def replaced_data(runs: list[Run]) -> list[str]:
+    """Keys of the data of which runs have different checksums. Runs of earlier versions have none, and differ in nothing."""
+    keys = sorted({key for run in runs for key in run.data})
+    return [key for key in keys if len({run.data[key] for run in runs if key in run.data}) > 1]
+
+
 def distinct_runs(runs: list[Run]) -> list[Run]:
     """Runs of the same configuration count once."""
     first: dict[str, Run] = {}

@@ -27,7 +27,9 @@ ERRORS = {
 BALLISTIC = {"sand": 30e-3, "fem": 8e-3, "fluid": 1.0, "fluid_2d": 1.0, "fem_3d": 1.0}
 
 
-def write_run(folder: Path, domain: str, model: str, seed: int, errors: list[float], **trivial: list[float]) -> None:
+def write_run(
+    folder: Path, domain: str, model: str, seed: int, errors: list[float], checksum: str | None = None, **trivial: list[float]
+) -> None:
     """Scenes are in turn between trained values and outside; trivial models are given as lists, or ballistic flight is the same in all scenes."""
     folder.mkdir(parents=True)
     config = {
@@ -36,7 +38,7 @@ def write_run(folder: Path, domain: str, model: str, seed: int, errors: list[flo
         "model": {"_target_": f"gpe_pl.models.x.{model}"},
         "training": {"num_steps": 1000},
     }
-    sealed.write(folder / "config.json", config)
+    sealed.write(folder / "config.json", config if checksum is None else {**config, "data_sha256": {"train": checksum}})
     rows = []
     for name, values in {LEARNED: errors, "ballistic": [BALLISTIC[domain]] * len(errors), **trivial}.items():
         for k, value in enumerate(values):
