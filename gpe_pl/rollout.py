@@ -16,6 +16,7 @@ from array_api_compat import array_namespace
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import signed_distance
 from gpe_pl.schema import NODE_TYPES
+from gpe_pl.shape_values import shapes_fault
 from gpe_pl.trajectory import Metadata, Motion, State, Stress, Termination, Trajectory
 from gpe_pl.values import faults, size_conflicts
 
@@ -179,7 +180,10 @@ def crowding(pos: np.ndarray, width: float) -> np.ndarray:
 
 
 def unsound(state: State, metadata: Metadata) -> Termination | None:
-    """The first array of a state whose size or values break the rules of ``schema.FIELDS``, or None; nothing could be told from what follows it."""
+    """The first array or shape of a state that breaks its rule (``schema.FIELDS``, ``shape_values.shapes_fault``), or None.
+
+    Nothing could be told from what follows it.
+    """
     b, has_mesh = state.boundary, state.cells is not None and state.rest_pos is not None
     nodes = {
         "node_type": state.node_type,
@@ -203,6 +207,8 @@ def unsound(state: State, metadata: Metadata) -> Termination | None:
     for name, values in (("gravity", state.gravity), ("velocity_history", state.velocity_history)):
         if values is not None and not np.isfinite(_numpy(values)).all():
             return Termination("nan", 0, -1, f"{name} is not finite")
+    if (wrong := shapes_fault(b.shapes, metadata.periodicity)) is not None:
+        return Termination("input", 0, -1, wrong)
     return None
 
 

@@ -26,7 +26,7 @@ from gpe_pl.hdf5_arrays import attribute, dataset_in, is_named, is_own, obstacle
 from gpe_pl.json_text import parsed
 from gpe_pl.late_failure import LateFailure
 from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, SCHEMA_VERSION, node_code
-from gpe_pl.shape_values import shape_from_dict, shape_to_dict
+from gpe_pl.shape_values import shape_from_dict, shape_to_dict, shapes_fault
 from gpe_pl.trajectory import Boundary, Metadata, Motion, Stress, Trajectory
 from gpe_pl.values import faults, size_conflicts
 
@@ -263,10 +263,17 @@ def metadata_of(group: h5py.Group) -> Metadata:
         raise StoreError(f"{_where(group)}: metadata unreadable: {error}") from None
 
 
+def _parsed_list(group: h5py.Group, key: str) -> list[Any]:
+    values = parsed(read_text(group, key))
+    if not isinstance(values, list):
+        raise ValueError(f"is a {type(values).__name__}, must be a list")
+    return values
+
+
 def shapes_of(group: h5py.Group) -> tuple[Shape, ...]:
     """The obstacle and wall geometry of a trajectory's group."""
     try:
-        return tuple(shape_from_dict(s) for s in parsed(read_text(group, "shapes")))
+        return tuple(shape_from_dict(values) for values in _parsed_list(group, "shapes"))
     except StoreError:
         raise
     except (ValueError, TypeError, AttributeError, ArithmeticError, LookupError) as error:
@@ -276,7 +283,7 @@ def shapes_of(group: h5py.Group) -> tuple[Shape, ...]:
 def node_types_of(group: h5py.Group) -> tuple[str, ...]:
     """The names behind the integers of ``node_type`` in a trajectory's group; all of them are in ``schema.NODE_TYPES``."""
     try:
-        names = tuple(parsed(read_text(group, "node_types")))
+        names = tuple(_parsed_list(group, "node_types"))
     except StoreError:
         raise
     except (ValueError, TypeError) as error:
@@ -298,7 +305,8 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
 
     Raises:
         StoreError: file, group or field missing, wrong shape or type, or a checksum that does not match.
-        UnsoundError: metadata or values that break the rules of ``Metadata.violations`` and ``schema.FIELDS``; names field, frame and node.
+        UnsoundError: metadata, shapes or values that break their rules (``Metadata.violations``, ``shape_values.shapes_fault``, ``schema.FIELDS``);
+            names field, frame and node.
     """
     if verify and frames is not None:
         raise ValueError("the digest covers all frames: pass verify or frames, not both")
@@ -319,6 +327,8 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         shapes, names = shapes_of(group), node_types_of(group)
     for key, violation in metadata.violations():
         raise UnsoundError(f"{path}:{name}", f"{key} {violation}")
+    if (wrong := shapes_fault(shapes, metadata.periodicity)) is not None:
+        raise UnsoundError(f"{path}:{name}", wrong)
     first_frame = 0 if frames is None else frames.start or 0
     for fault in faults(arrays, names, metadata.materials, metadata.param_names, first_frame):
         raise UnsoundError(f"{path}:{name}", str(fault))

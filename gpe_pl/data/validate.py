@@ -11,18 +11,16 @@ from __future__ import annotations
 
 import argparse
 import inspect
-import json
 import math
 import re
 import sys
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import h5py
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.motion import motion_of, rounding_fault, rounding_of
@@ -30,8 +28,8 @@ from gpe_pl.geometry import Shape
 from gpe_pl.hdf5_arrays import attribute, is_named
 from gpe_pl.json_text import parsed
 from gpe_pl.printable import printable, speak_utf8
-from gpe_pl.repeated_shapes import Repeated
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup
+from gpe_pl.shape_values import shapes_fault
 from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.store import (
     StoreError,
@@ -306,31 +304,13 @@ def _check_motion(m: Metadata, arrays: dict[str, np.ndarray]) -> Iterator[Findin
 def _check_shapes(m: Metadata, arrays: dict[str, np.ndarray], shapes: tuple[Shape, ...], sound: bool) -> Iterator[Finding]:
     """Shapes, and whether boundary nodes lie on them where their positions are ``sound``."""
     pos = arrays["boundary_pos"]
-    for k, shape in enumerate(shapes):
-        if isinstance(shape, Repeated) and shape.periodicity != m.periodicity:
-            yield "shapes", f"shape {k} repeats along {shape.periodicity}, the domain along {m.periodicity}"
-        elif message := _bad_shape(shape, m.dim):
-            sound = False
-            yield "shapes", f"shape {k} ({shape.kind}): {message}"
+    if (wrong := shapes_fault(shapes, m.periodicity)) is not None:
+        yield "shapes", wrong
+        return
     if shapes and sound and m.spacing > 0 and not m.solver.startswith("import/"):  # of imported boundaries some may be known by points only
         distance = np.min([np.abs(shape.signed_distance(pos.astype(np.float64))) for shape in shapes], axis=0)
         if where := _offenders("boundary_pos", distance > 0.1 * m.spacing):
             yield "boundary_pos", f"{where}: {distance[distance > 0.1 * m.spacing][0]:.4g} m away from every shape that it could belong to"
-
-
-def _bad_shape(shape: Shape, dim: int) -> str | None:
-    if isinstance(shape, Repeated):
-        return _bad_shape(shape.shape, dim)
-    values: dict[str, Any] = asdict(shape)  # type: ignore[call-overload]
-    try:
-        TypeAdapter(type(shape)).validate_json(json.dumps(values), strict=True)
-    except ValidationError as error:
-        return "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-    numbers = [np.ravel(np.asarray(v, np.float64)) for v in values.values() if not isinstance(v, str)]
-    if not np.isfinite(np.concatenate(numbers)).all():
-        return "not finite"
-    wrong = [key for key, v in values.items() if isinstance(v, tuple) and (len(v[0]) if key == "vertices" else len(v)) != dim]
-    return f"{', '.join(wrong)} must have {dim} components" if wrong else None
 
 
 # --- the page that describes the format ---------------------------------------------------------------------------------------------------

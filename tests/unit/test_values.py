@@ -13,6 +13,9 @@ import torch
 
 from gpe_pl.data.dataset import long_enough, open_split, usable
 from gpe_pl.data.importers import ImportFailure, save_dataset
+from gpe_pl.geometry import Box, Polygon, Shape, Sphere, Wall
+from gpe_pl.periodicity import Periodicity
+from gpe_pl.repeated_shapes import Repeated
 from gpe_pl.rollout import rollout
 from gpe_pl.schema import FIELDS, LARGEST, node_code, param_names
 from gpe_pl.store import StoreError, UnsoundError, read_trajectory, stored_arrays, write_shard
@@ -96,6 +99,40 @@ def test_a_boundary_of_another_length_starts_no_rollout(trajectory: Trajectory, 
         Steps(lambda _: pytest.fail("a step was made")), replace(trajectory.state(0), boundary=boundary), 3, trajectory.metadata
     )
     assert result.termination is not None and result.termination.message.startswith("field 'boundary_")
+
+
+LOW, HIGH = (0.0, 0.0), (1.0, 1.0)
+BALL = Sphere((0.5, 0.5), 0.1, 0.3)
+BROKEN_SHAPES: list[tuple[Shape, str]] = [
+    *[(replace(BALL, radius=value), r"\(sphere\): not finite: radius") for value in (NAN, INF, -1e30)],
+    *[(replace(BALL, radius=value), r"\(sphere\): radius is .* must be positive") for value in (0.0, -0.1)],
+    *[(replace(BALL, friction=value), "not finite: friction") for value in (NAN, INF)],
+    (replace(BALL, friction=-0.1), "friction is -0.1, must be at least 0"),
+    *[(replace(BALL, restitution=value), "restitution is .* must lie between 0 and 1") for value in (-0.1, 1.5)],
+    (replace(BALL, center=(0.5, NAN)), "not finite: center"),
+    (replace(BALL, center=(0.5, 0.5, 0.5)), "center must have 2 components"),
+    (Box((0.2, 0.2), (0.4, 0.2), 0.0), "low must be below high"),
+    (Polygon(((0.0, 0.0), (1.0, 0.0), (0.0, NAN)), 0.0), "not finite: vertices"),
+    *[
+        (Wall(normal, 0.0, LOW, HIGH, 0.3), "normal must be a unit vector along one axis")
+        for normal in ((0.0, 0.0), (0.6, 0.8), (0.0, 2.0))
+    ],
+    (Wall((0.0, 1.0), NAN, LOW, HIGH, 0.3), "not finite: offset"),
+    (Repeated(BALL, Periodicity((LOW, HIGH), (True, False))), "repeats along"),
+]
+
+
+@pytest.mark.parametrize(("shape", "message"), BROKEN_SHAPES)
+def test_shapes_that_break_a_rule_are_refused_by_the_reader_and_by_rollouts(
+    tmp_path: Path, trajectory: Trajectory, shape: Shape, message: str
+) -> None:
+    """The distance to one that is not a number is none, and containment would let everything through."""
+    broken = replace(trajectory, boundary=replace(trajectory.boundary, shapes=(BALL, shape)))
+    write_shard(tmp_path / "a.h5", [broken])
+    with pytest.raises(UnsoundError, match=rf"a\.h5:00000: shape 1 .*{message}"):
+        read_trajectory(tmp_path / "a.h5", "00000")
+    result = rollout(Steps(lambda _: pytest.fail("a step was made")), broken.state(2, history=2), 3, trajectory.metadata)
+    assert result.termination is not None and result.termination.reason == "input" and "shape 1" in result.termination.message
 
 
 @pytest.mark.parametrize("name", ["gravity", "velocity_history"])
