@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -29,7 +29,7 @@ from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
 from gpe_pl.portable import export_model
 from gpe_pl.rollout import Guard, Simulator, Start, rollout, rollouts, share_outside
-from gpe_pl.schema import Split
+from gpe_pl.schema import SPLITS, ParameterGroup, Split
 from gpe_pl.trajectory import State, Trajectory
 from gpe_pl.viz.saving import save_figure
 
@@ -258,6 +258,10 @@ def write_rows(path: Path, rows: list[Row]) -> None:
         part.write_bytes(content)
 
 
+GROUPS = ("", *get_args(ParameterGroup))
+"""Of the material parameter; none where a value is of a whole split."""
+
+
 class MetricsError(GpeError, ValueError):
     """A ``metrics.csv`` is damaged; the message names the file, and the line if it is one that cannot be read."""
 
@@ -285,6 +289,10 @@ def read_rows(path: Path) -> Iterator[Row]:
                 "parameter": float(r["parameter"]),
                 "value": float(r["value"]),
             }
+            if r["split"] not in SPLITS or r["parameter_group"] not in GROUPS or not (r["horizon"] == "full" or r["horizon"].isdecimal()):
+                raise ValueError(f"split, parameter group or horizon is {r['split']}, {r['parameter_group']}, {r['horizon']}")
+            if not (r["model"].isprintable() and r["metric"].isprintable()):
+                raise ValueError("model or metric holds characters that are not shown")
             yield Row(**known)
     except (ValueError, csv.Error) as error:  # also what is not text
         raise MetricsError(f"{path}, line {reader.line_num}: damaged ({error}); delete the file to evaluate again") from None

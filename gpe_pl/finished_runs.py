@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl.evaluation import LEARNED, Row, read_rows
-from gpe_pl.run_folder import DATA_CHECKSUMS, config_in
+from gpe_pl.evaluation import LEARNED, MetricsError, Row, read_rows
+from gpe_pl.run_folder import DATA_CHECKSUMS, RunError, config_in
 
 log = logging.getLogger(__name__)
 
@@ -38,8 +38,8 @@ UNSAID: dict[str, Any] = {"training.sampling": "uniform", "training.push_share":
 WITHOUT_CONSEQUENCE = {"evaluation.num_pictures", "evaluation.export"}
 """What runs may differ in without having been done otherwise."""
 
-TRAINED = {"data.name", "model._target_", "training.num_steps"}
-"""What the configuration of every training run says."""
+TRAINED = {"data.name": str, "model._target_": str, "training.num_steps": int}
+"""What the configuration of every training run says, by type."""
 
 
 def finished_runs(folder: Path) -> list[Run]:
@@ -51,13 +51,18 @@ def finished_runs(folder: Path) -> list[Run]:
             said = {key: value for key, value in _flatten(config_in(config)) if key not in WITHOUT_CONSEQUENCE}
             data = {key: str(said.pop(key)) for key in list(said) if DATA_CHECKSUMS in key.split(".")}
             values = UNSAID | said
-            if values.keys() >= TRAINED:
+            if values.keys() >= TRAINED.keys():
+                for key, kind in TRAINED.items():
+                    if type(values[key]) is not kind:
+                        raise RunError(
+                            f"{config}: {key} is {values[key]!r}; delete the folder {path.parent}, which this package has not written"
+                        )
                 runs.append(Run(path.parent, values, list(read_rows(path)), data))
             else:
                 log.warning(
                     "%s is not of a training run (%s) and is left out of the report",
                     path.parent,
-                    ", ".join(sorted(TRAINED - values.keys())),
+                    ", ".join(sorted(TRAINED.keys() - values.keys())),
                 )
     _warn_of_replaced_data(runs)
     return runs
@@ -112,13 +117,20 @@ def groups_of(row: Row) -> list[str]:
 
 
 def validation_curve(run_dir: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Steps and one-step validation loss of a run, over all its starts."""
+    """Steps and one-step validation loss of a run, over all its starts; raises ``MetricsError`` where a log is damaged."""
     points: dict[int, float] = {}
-    for path in sorted(run_dir.glob("log/version_*/metrics.csv"), key=lambda p: int(p.parent.name.partition("_")[2])):
+    logs = {path: path.parent.name.removeprefix("version_") for path in run_dir.glob("log/version_*/metrics.csv")}
+    for path in sorted((path for path, version in logs.items() if version.isdecimal()), key=lambda path: int(logs[path])):
         with open(path, newline="", encoding="utf-8") as handle:
-            for line in csv.DictReader(handle):
-                if line.get("val/one_step_nmse"):
-                    points[int(line["step"]) + 1] = float(line["val/one_step_nmse"])
+            reader = csv.DictReader(handle)
+            try:
+                for line in reader:
+                    if line.get("val/one_step_nmse"):
+                        points[int(line["step"]) + 1] = float(line["val/one_step_nmse"])
+            except (ValueError, KeyError, TypeError, csv.Error) as error:  # also what is not text
+                raise MetricsError(
+                    f"{path}, line {reader.line_num}: damaged ({error}); delete the file, which only the curve of the validation loss needs"
+                ) from None
     steps = sorted(points)
     return np.array(steps), np.array([points[s] for s in steps])
 

@@ -32,6 +32,7 @@ from gpe_pl.markdown import table_row
 from gpe_pl.metrics import bootstrap_interval
 from gpe_pl.nn.fused import unfused
 from gpe_pl.parameter_curves import PARAMETER_FIGURE, parameter_curves
+from gpe_pl.printable import printable
 from gpe_pl.timing import paired_ratio, paired_times
 from gpe_pl.viz.saving import save_figure
 
@@ -79,7 +80,7 @@ def _report(folder: Path, runs: list[Run]) -> None:
 def conclusion(folder: Path) -> str:
     """What a command ends with: the numbers of the run or evaluation in a folder, and what to look at next."""
     viewers = sorted(folder.glob("rollout_*_00.html"))
-    return "\n".join([summary(list(read_rows(folder / "metrics.csv"))), *(f"look at {viewer}" for viewer in viewers)])
+    return "\n".join([summary(list(read_rows(folder / "metrics.csv"))), *(printable(f"look at {viewer}") for viewer in viewers)])
 
 
 def summary(rows: list[Row]) -> str:

@@ -66,12 +66,19 @@ class OptunaSweeper(Sweeper):
         fixed, space = self._split(arguments)
         folder = Path(str(self.config.hydra.sweep.dir))
         folder.mkdir(parents=True, exist_ok=True)
-        study = optuna.create_study(
-            storage=JournalStorage(JournalFileBackend(str(folder / JOURNAL))), study_name="sweep", load_if_exists=True
-        )
-        if study.get_trials(states=[State.COMPLETE]):
+        try:
+            storage = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
+            study = optuna.create_study(storage=storage, study_name="sweep", load_if_exists=True)
+            finished, left_over_trials = (study.get_trials(states=[state]) for state in (State.COMPLETE, State.RUNNING))
+        except OSError:
+            raise
+        except Exception as fault:  # Optuna says nothing of its own about a damaged journal
+            raise SweepError(
+                f"{folder / JOURNAL}: damaged ({type(fault).__name__}: {fault}); delete the file to begin the search again"
+            ) from None
+        if finished:
             self._require_same(study.best_trial, fixed, folder)
-        for left_over in study.get_trials(states=[State.RUNNING]):  # of a sweep that was killed: their folders know how far they are
+        for left_over in left_over_trials:  # of a sweep that was killed: their folders know how far they are
             study.enqueue_trial(left_over.params)
             study.tell(left_over.number, state=State.FAIL)
         error = "no trial has returned a finite number"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import netrc
 import os
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -81,11 +82,14 @@ def has_key() -> bool:
 
 
 def run_id(run_dir: Path) -> str:
-    """An identifier that a resumed run finds again; written once."""
+    """An identifier that a resumed run finds again; written once. Raises ``TrackingError`` for another text: W&B makes paths of it."""
     path = run_dir / RUN_ID
     if not path.exists():
         replace_text(path, os.urandom(6).hex())
-    return path.read_text(encoding="utf-8").strip()
+    text = path.read_bytes()[:100].decode(errors="replace").strip()
+    if not re.fullmatch("[0-9a-z]{1,32}", text):
+        raise TrackingError(f"{path}: holds {text!r}, which is no identifier of a run; delete the file, then W&B begins a new run")
+    return text
 
 
 def publish(loggers: Iterable[Logger], run_dir: Path, results: Mapping[str, float]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 from collections.abc import Callable
 from dataclasses import replace
@@ -52,6 +53,39 @@ def test_changed_rows_are_refused(tmp_path: Path, change: Callable[[bytes], byte
         list(read_rows(path))
     (tmp_path / "metrics.csv.sha256").unlink()
     assert len(list(read_rows(path))) < 3  # as in runs of earlier versions
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"horizon": "many"},
+        {"horizon": "-5"},
+        {"horizon": ""},
+        {"split": "exam"},
+        {"parameter_group": "new"},
+        {"model": "\x1b[2Kerror: forged"},
+        {"metric": "a\u202eb"},
+        {"trajectory": "one"},
+        {"value": "x"},
+    ],
+)
+def test_rows_without_a_digest_have_to_mean_something(tmp_path: Path, change: dict[str, str]) -> None:
+    row = {
+        "model": "learned",
+        "split": "test",
+        "trajectory": 3,
+        "parameter_group": "seen",
+        "parameter": 30.0,
+        "metric": "x",
+        "horizon": "full",
+    }
+    with open(tmp_path / "metrics.csv", "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [*row, "value"])
+        writer.writeheader()
+        writer.writerow({**row, "value": 1.0, **change})
+    with pytest.raises(MetricsError, match="metrics.csv, line 2: damaged") as refused:
+        list(read_rows(tmp_path / "metrics.csv"))
+    assert str(refused.value).isprintable()
 
 
 def test_rollouts_start_where_asked_or_as_early_as_they_can() -> None:

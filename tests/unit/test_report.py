@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from gpe_pl import report, sealed
-from gpe_pl.evaluation import LEARNED, Row, read_rows, write_rows
+from gpe_pl.evaluation import LEARNED, MetricsError, Row, read_rows, write_rows
 from gpe_pl.run_folder import RunError
 
 ERRORS = {  # of two test scenes; free flight has 2e-3 and 6e-3
@@ -92,6 +93,35 @@ def test_a_damaged_configuration_is_named(runs: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(RunError, match=r"negated/0/config.json: .*; delete the folder"):
         report.report_sweep(runs)
+
+
+@pytest.mark.parametrize(
+    "change", [{"training": {"num_steps": "many"}}, {"data": {"name": 3}}, {"model": {"_target_": None}}, {"training": {"num_steps": True}}]
+)
+def test_a_configuration_of_other_types_is_named(runs: Path, change: dict[str, Any]) -> None:
+    path = runs / "negated" / "0" / "config.json"
+    values = sealed.read(path, "")
+    sealed.write(path, values | change)
+    with pytest.raises(RunError, match=r"negated/0/config.json: [a-z_.]+ is .*; delete the folder"):
+        report.report_sweep(runs)
+
+
+@pytest.mark.parametrize(
+    "content", [b"step,val/one_step_nmse\n9,x\n", b"step,val/one_step_nmse\nlast,0.5\n", b"val/one_step_nmse\n0.5\n", b"\xff\n"]
+)
+def test_a_damaged_log_of_the_training_is_named(runs: Path, content: bytes) -> None:
+    (runs / "odd" / "0" / "log" / "version_mine").mkdir()
+    (runs / "odd" / "0" / "log" / "version_mine" / "metrics.csv").touch()  # of somebody else
+    report.report_sweep(runs)
+    (runs / "odd" / "0" / "log" / "version_0" / "metrics.csv").write_bytes(content)
+    with pytest.raises(MetricsError, match=r"odd/0/log/version_0/metrics.csv, line \d: damaged \(.*; delete the file"):
+        report.report_sweep(runs)
+
+
+def test_names_of_files_that_are_shown_are_printable(runs: Path) -> None:
+    folder = runs / "odd" / "0"
+    (folder / "rollout_\x1b[2K_00.html").touch()
+    assert "look at" in report.conclusion(folder) and "\x1b" not in report.conclusion(folder)
 
 
 def test_a_parameter_that_training_did_not_have_makes_a_figure(runs: Path) -> None:

@@ -134,3 +134,14 @@ def test_wrong_settings_are_named(tmp_path: Path) -> None:
         sweeper(tmp_path, Launcher(), params={}).sweep(["seed=1"])
     with pytest.raises(UsageError, match=r"rate=tag\(log, interval\(0, 1\)\): "):
         sweeper(tmp_path, Launcher(), params={"rate": "tag(log, interval(0, 1))"}).sweep([])
+
+
+@pytest.mark.parametrize(
+    "damage", ["{\n", "[1]\n", '{"op_code": 99}\n', '{"op_code": 4, "worker_id": "x"}\n', "\x00\n", "[" * 100_000 + "\n"]
+)
+def test_a_damaged_journal_is_named(tmp_path: Path, damage: str) -> None:
+    sweeper(tmp_path, Launcher(), num_trials=2).sweep([])
+    path = tmp_path / "optuna.log"
+    path.write_text(damage + path.read_text(encoding="utf-8"), encoding="utf-8")
+    with pytest.raises(SweepError, match=r"optuna.log: damaged \(.*\); delete the file to begin the search again"):
+        sweeper(tmp_path, Launcher(), num_trials=4).sweep([])

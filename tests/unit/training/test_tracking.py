@@ -80,6 +80,13 @@ def test_what_wandb_refuses_is_one_line(tmp_path: Path, recorder: type[Recorder]
         LoggerSettings("wandb").loggers(tmp_path, "run", {})
 
 
+@pytest.mark.parametrize("content", [b"../../x", b"", b"\xff\xfe", b"a" * 10**6, b"a b", b"\x1b[2K"])
+def test_an_identifier_that_could_be_a_path_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "run_id").write_bytes(content)
+    with pytest.raises(TrackingError, match=r"run_id: holds .*, which is no identifier of a run; delete the file"):
+        run_id(tmp_path)
+
+
 def test_every_start_of_a_run_is_to_be_uploaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     class Run:
         settings: ClassVar = wandb.Settings(mode="offline")
