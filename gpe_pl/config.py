@@ -13,7 +13,6 @@ import json
 import os
 import re
 import sys
-import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +33,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.launcher import RESULT, USAGE_ERROR, SweepError, end_with_sweep
 from gpe_pl.names import NameRefused, run_name, sweep_name
 from gpe_pl.pretrained import model_name
-from gpe_pl.printable import clean_logs, one_line, speak_utf8
+from gpe_pl.printable import clean_messages, one_line, speak_utf8
 from gpe_pl.run_folder import refuse_links
 from gpe_pl.signatures import checked, parameters
 
@@ -207,7 +206,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             if not CONF.is_dir():
                 _fail(ConfigError(f"{CONF} not found: install gpe_pl from a clone with `pip install -e .`"))
             speak_utf8()
-            clean_logs()
+            clean_messages()
             sys.argv[1:] = [quoted(argument) for argument in sys.argv[1:]]
             os.environ["HYDRA_FULL_ERROR"] = "1"  # let exceptions reach us instead of Hydra's own report
             try:
@@ -335,25 +334,25 @@ class Report(Callback):
     """
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        folder = Path(config.hydra.run.dir)
-        try:
-            refuse_links(folder)
-        except GpeError as error:
-            _fail(error)
-        self._hold(folder)
+        with contextlib.suppress(OmegaConfBaseException):  # of a name that is refused; Hydra meets it again, and ends
+            self._hold(Path(config.hydra.run.dir))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        self._hold(Path(config.hydra.sweep.dir))
+        with contextlib.suppress(OmegaConfBaseException):
+            self._hold(Path(config.hydra.sweep.dir))
 
     def _hold(self, folder: Path) -> None:
-        """Until the process ends. Ends it if another command writes to the folder."""
+        """Until the process ends. Ends it where the folder cannot be used: Hydra turns an exception of a callback into a warning, and goes on."""
         from gpe_pl.locks import held
 
         stack = contextlib.ExitStack()
         try:
+            refuse_links(folder)
             stack.enter_context(held(folder))
-        except (GpeError, OSError) as error:
+        except GpeError as error:
             _fail(error)
+        except OSError as error:
+            _fail(ConfigError(f"{folder}: cannot be read or written ({error.strerror}); choose another folder with paths.runs=…"))
         atexit.register(stack.close)
 
     def on_run_end(self, config: DictConfig, **_: Any) -> None:
@@ -380,6 +379,6 @@ class Report(Callback):
             print(folder)
         except GpeError as error:
             _fail(error)
-        except Exception:
-            traceback.print_exc()
+        except Exception as error:
+            sys.excepthook(type(error), error, error.__traceback__)
             sys.exit(1)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import io
 import logging
 import sys
+import traceback
+import warnings
+from types import TracebackType
 
 LONGEST = 4000
 """Characters of a message. Names can have tens of thousands."""
@@ -45,6 +48,17 @@ def speak_utf8() -> None:
             stream.reconfigure(encoding="utf-8", errors="backslashreplace")
 
 
-def clean_logs() -> None:
-    """Every message that this process logs from now on is one line, whatever handler writes it."""
+def clean_messages() -> None:
+    """From now on what this process logs and warns of is one line, whatever handler writes it, and the lines of its tracebacks are printable."""
     logging.setLogRecordFactory(LogRecord)
+    warnings.formatwarning = _one_line_warning
+    sys.excepthook = _print_traceback
+
+
+def _one_line_warning(message: Warning | str, category: type[Warning], filename: str, lineno: int, line: str | None = None) -> str:
+    return one_line(f"{filename}:{lineno}: {category.__name__}: {message}") + "\n"
+
+
+def _print_traceback(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    for line in "".join(traceback.format_exception(kind, error, trace)).split("\n"):
+        print(printable(line), file=sys.stderr)

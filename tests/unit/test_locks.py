@@ -198,6 +198,31 @@ def test_hydra_starts_nothing_in_a_folder_that_another_writes_to(tmp_path: Path,
     assert capsys.readouterr().err.startswith(f"error: {tmp_path}/a: another command writes to it (process ")
 
 
+@pytest.mark.parametrize("kind", ["run", "sweep"])
+def test_hydra_starts_nothing_in_a_folder_that_cannot_be_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], kind: str
+) -> None:
+    """In one line: an exception of a callback would be a warning, and the command would go on."""
+    config = OmegaConf.create({"hydra": {kind: {"dir": str(tmp_path / "a")}}})
+    start = Report().on_run_start if kind == "run" else Report().on_multirun_start
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "multirun.yaml").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(SystemExit, match="2"):
+        start(config)
+    assert "multirun.yaml: a link that leads out of the run folder" in capsys.readouterr().err
+
+    def refused(_: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", "a")
+
+    monkeypatch.setattr("gpe_pl.config.refuse_links", refused)
+    with pytest.raises(SystemExit, match="2"):
+        start(config)
+    assert (
+        capsys.readouterr().err
+        == f"error: {tmp_path}/a: cannot be read or written (Permission denied); choose another folder with paths.runs=…\n"
+    )
+
+
 def test_complete_data_are_read_where_nothing_can_be_written(tiny_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(locks, "_acquired", lambda *_: pytest.fail("reading needs no lock"))
     generate_tiny(tiny_data)

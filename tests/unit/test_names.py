@@ -74,7 +74,7 @@ def test_commands_refuse_names_before_they_make_folders(tmp_path: Path) -> None:
 
 
 def test_hydra_makes_no_folder_outside_the_results(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], recwarn: pytest.WarningsRecorder
 ) -> None:
     import sys
 
@@ -83,7 +83,7 @@ def test_hydra_makes_no_folder_outside_the_results(
 
     from gpe_pl import config
 
-    monkeypatch.setattr(config, "clean_logs", lambda: None)  # for the whole process
+    monkeypatch.setattr(config, "clean_messages", lambda: None)  # for the whole process
     monkeypatch.setattr(HydraConfig.instance(), "cfg", None)  # restored
     monkeypatch.chdir(tmp_path)
     for command, override, said in (
@@ -97,6 +97,7 @@ def test_hydra_makes_no_folder_outside_the_results(
             config.entry_point(command)(lambda cfg: None)()
         line, *more = capsys.readouterr().err.splitlines()
         assert line.startswith(said) and "\n" not in line and not more
+        assert not [warning for warning in recwarn if "Callback" in str(warning.message)]
     assert not [*tmp_path.iterdir()]
 
 

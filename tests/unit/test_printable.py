@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import logging
+import sys
+import warnings
 
 import pytest
 
 from gpe_pl.errors import GpeError
 from gpe_pl.markdown import table_row
-from gpe_pl.printable import LONGEST, LogRecord, clean_logs, one_line, printable
+from gpe_pl.printable import LONGEST, LogRecord, clean_messages, one_line, printable
 from gpe_pl.store import StoreError
 
 HOSTILE = "sand\x1b[2K\rerror: forged\nerror: forged\u202e\u2028\x9b31m"
@@ -39,16 +41,32 @@ def test_errors_are_printable_wherever_they_are_shown(error: type[Exception]) ->
 
 def test_log_lines_are_printable_whatever_handler_writes_them(monkeypatch: pytest.MonkeyPatch) -> None:
     before, stream = logging.getLogRecordFactory(), io.StringIO()
+    for module, name in ((warnings, "formatwarning"), (sys, "excepthook")):
+        monkeypatch.setattr(module, name, getattr(module, name))  # restored
     logger, handler = logging.getLogger("gpe_pl.shown"), logging.StreamHandler(stream)
     logger.addHandler(handler)
     try:
-        clean_logs()
+        clean_messages()
         assert logging.getLogRecordFactory() is LogRecord
         logger.warning("name: %s", HOSTILE)
     finally:
         logging.setLogRecordFactory(before)
         logger.removeHandler(handler)
     assert stream.getvalue() == f"name: {one_line(HOSTILE)}\n"
+
+
+def test_warnings_and_tracebacks_of_others_are_printable(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    before = logging.getLogRecordFactory()
+    for module, name in ((warnings, "formatwarning"), (sys, "excepthook")):
+        monkeypatch.setattr(module, name, getattr(module, name))  # restored
+    clean_messages()
+    logging.setLogRecordFactory(before)
+    assert warnings.formatwarning(HOSTILE, UserWarning, "a.py", 3) == f"a.py:3: UserWarning: {one_line(HOSTILE)}\n"
+    try:
+        raise RuntimeError("name\x1b[2K\u202e")
+    except RuntimeError as error:
+        sys.excepthook(type(error), error, error.__traceback__)
+    assert capsys.readouterr().err.rstrip().endswith("RuntimeError: name\\x1b[2K\\u202e")
 
 
 def test_cells_of_tables_are_printable() -> None:
