@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -27,6 +28,8 @@ STRETCH = 0.25
 
 PARTNERS = 8
 NEIGHBOURS = 16
+FEW_FRAMES = 8
+"""Frames, evenly spread, that are looked at first: they exclude most of what does not move alike."""
 
 
 @dataclass(frozen=True)
@@ -49,10 +52,19 @@ class _Paths:
         """From a place [dim] to the nearest images of nodes in the first frame [node, dim]."""
         return np.asarray(self.periodicity.shortest(self.first[nodes] - centre))
 
+    @cached_property
+    def few(self) -> _Paths:
+        """The same nodes in few frames."""
+        return replace(self, moved=self.moved[self._stages[0]])
+
+    @cached_property
+    def _stages(self) -> tuple[np.ndarray, slice]:
+        """Frames in the order in which they are looked at."""
+        return np.linspace(0, len(self.moved) - 1, FEW_FRAMES).astype(int), slice(None)
+
     def keep_distance(self, nodes: np.ndarray, node: int) -> np.ndarray:
         """Those of ``nodes`` that are as far from ``node`` in every frame as in the first."""
-        num_frames = len(self.moved)
-        for frames in (np.linspace(0, num_frames - 1, 8).astype(int), slice(None)):  # few frames first: they exclude most nodes
+        for frames in self._stages:
             arm = self.arms(nodes, self.first[node])
             length = np.linalg.norm(arm + self.moved[frames][:, nodes] - self.moved[frames][:, node, None], axis=-1)
             nodes = nodes[(np.abs(length - np.linalg.norm(arm, axis=-1)) <= 2 * self.tolerance).all(axis=0)]
@@ -68,11 +80,14 @@ class _Paths:
 
     def described(self, nodes: np.ndarray, part: _Part) -> np.ndarray:
         """Which of ``nodes`` a motion describes in every frame [node]."""
-        predicted = part.path[:, None]
-        if part.turn is not None:
-            arms = self.arms(nodes, part.centre)
-            predicted = predicted + np.einsum("fde,ne->fnd", part.turn, arms) - arms
-        return np.asarray((np.abs(self.moved[:, nodes] - predicted) <= 2 * self.tolerance).all(axis=(0, 2)))
+        fits = np.ones(len(nodes), dtype=bool)
+        for frames in self._stages:
+            rows, predicted = nodes[fits], part.path[frames][:, None]
+            if part.turn is not None:
+                arms = self.arms(rows, part.centre)
+                predicted = predicted + np.einsum("fde,ne->fnd", part.turn[frames], arms) - arms
+            fits[fits] = (np.abs(self.moved[frames][:, rows] - predicted) <= 2 * self.tolerance).all(axis=(0, 2))
+        return fits
 
 
 @dataclass(frozen=True)
@@ -133,6 +148,8 @@ def _parts(paths: _Paths) -> tuple[np.ndarray, list[_Part]]:
         seed, nodes = int(left[0]), paths.keep_distance(left, int(left[0]))
         found, part = np.array([seed]), None
         for some in _hypotheses(paths, nodes, seed):
+            if len(_grown(paths.few, nodes, some, seed)[0]) <= len(found):
+                continue
             members, motion = _grown(paths, nodes, some, seed)
             if len(members) > len(found):
                 found, part = members, motion
@@ -142,7 +159,7 @@ def _parts(paths: _Paths) -> tuple[np.ndarray, list[_Part]]:
             label[found] = len(parts)
             parts.append(part)
         left = np.setdiff1d(left, np.append(found, seed))
-    if len(parts) > 1:
+    if parts:
         _settle(paths, label, parts)
     label[~_hold_together(paths, label)] = -1
     return label, parts
@@ -199,11 +216,14 @@ def _grown(paths: _Paths, nodes: np.ndarray, some: np.ndarray, seed: int) -> tup
 
 
 def _settle(paths: _Paths, label: np.ndarray, parts: list[_Part]) -> None:
-    """Give nodes that several motions describe, as one on the axis of a wheel, to the part that lies nearest; changes ``label``."""
+    """Give nodes to the nearest part whose motion describes them where there are several, as on the axis of a wheel, or where the node has no part yet.
+
+    Changes ``label``.
+    """
     fits = np.stack([paths.described(np.arange(len(label)), part) for part in parts])
-    several = np.flatnonzero((fits.sum(axis=0) > 1) & (label >= 0))
-    for node in several:
-        others = np.setdiff1d(np.flatnonzero(np.isin(label, np.flatnonzero(fits[:, node]))), several)
+    open_ones = np.flatnonzero(fits.sum(axis=0) > (label >= 0))
+    for node in open_ones:
+        others = np.setdiff1d(np.flatnonzero(np.isin(label, np.flatnonzero(fits[:, node]))), open_ones)
         if len(others):
             label[node] = label[others[np.linalg.norm(paths.arms(others, paths.first[node]), axis=1).argmin()]]
 

@@ -66,6 +66,19 @@ def test_a_disc_that_turns_above_a_floor_turns_its_own_normals_alone() -> None:
     np.testing.assert_allclose(result[:, len(FLOOR) :], np.einsum("fde,ne->fnd", turn, normal.astype(np.float32)), atol=1e-12)
 
 
+@pytest.mark.parametrize("radius", [0.05, 0.08])
+def test_a_small_wheel_with_a_hub_turns_as_a_whole_in_a_wide_domain(radius: float) -> None:
+    """Rounding that a wide domain allows hides how the hub and its neighbours lie to each other, but not that the wheel takes them along."""
+    floor = np.stack([np.linspace(0, 100, 301), np.zeros(301)], axis=1)
+    body, normal = disc((50.0, 0.3), radius)
+    body, normal = np.concatenate([body[:1] * 0 + [50.0, 0.3], body]), np.concatenate([normal[:1], normal])
+    turn = rotation(1.5 * TIME)
+    path = np.concatenate([still(floor), turned(body, turn, np.array([50.0, 0.3]))], axis=1)
+    result = normals(path, np.concatenate([np.tile([0.0, 1.0], (301, 1)), normal]))
+    assert (result[:, :301] == [0.0, 1.0]).all()
+    np.testing.assert_allclose(result[:, 301:], np.einsum("fde,ne->fnd", turn, normal.astype(np.float32)), atol=1e-4)
+
+
 def test_bodies_that_part_later_are_two() -> None:
     """They leave together; after half of the time one of them begins to turn. They also lie within each other, so that nearness tells nothing."""
     body, normal = disc((0.3, 0.3), 0.1)
