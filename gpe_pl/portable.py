@@ -245,7 +245,7 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
     """The tensors that a program of this simulator takes, for a state with velocity history."""
     builder, spec = simulator.builder, simulator.builder.spec
     graph = GraphBuilder(replace(builder.config, trim_boundary=False), builder.metadata)(state)
-    pos, rest_pos = _kept_together(state, graph, spec), state.pos if state.rest_pos is None else state.rest_pos
+    pos, rest_pos = (_kept_together(x, state, graph, spec) for x in (state.pos, state.pos if state.rest_pos is None else state.rest_pos))
     scene: Scene = {"gravity": state.gravity} | {f"boundary.{name}": getattr(state.boundary, name) for name in BOUNDARY_FIELDS}
     for m in spec.materials:
         rows, column = graph[m].node_id, builder.metadata.param_names.index(MATERIALS[m].name)
@@ -268,14 +268,14 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
     return {name: scene[name] for name in describe(simulator)}
 
 
-def _kept_together(state: State, graph: HeteroData, spec: FeatureSpec) -> Tensor:
-    """Positions that do not tear meshes apart at the seams of a periodic domain."""
+def _kept_together(pos: Tensor, state: State, graph: HeteroData, spec: FeatureSpec) -> Tensor:
+    """Images of positions that do not tear meshes apart at the seams of a periodic domain."""
     if not state.periodicity:
-        return state.pos
+        return pos
     along_cells = [graph[r[2]].node_id[graph[r].edge_index] for r in spec.relations if r[1] == CELL]
-    edges = torch.cat([torch.empty(2, 0, dtype=torch.int64, device=state.pos.device), *along_cells], dim=1)
-    images, _ = unwrapped(np.ascontiguousarray(state.pos.cpu().numpy()), edges.cpu().numpy(), state.periodicity)
-    return torch.from_numpy(images).to(state.pos.device)
+    edges = torch.cat([torch.empty(2, 0, dtype=torch.int64, device=pos.device), *along_cells], dim=1)
+    images, _ = unwrapped(np.ascontiguousarray(pos.cpu().numpy()), edges.cpu().numpy(), state.periodicity)
+    return torch.from_numpy(images).to(pos.device)
 
 
 def export_model(simulator: LearnedSimulator, path: Path | str) -> None:

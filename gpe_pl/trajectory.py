@@ -27,7 +27,7 @@ from gpe_pl.arrays import (
 )
 from gpe_pl.geometry import Shape, surface_tolerance
 from gpe_pl.periodicity import NOWHERE, Periodicity, PeriodicityError
-from gpe_pl.repeated_shapes import repeated
+from gpe_pl.repeated_shapes import is_covered, repeated
 from gpe_pl.rigid_parts import carried_along
 from gpe_pl.schema import BOUNDARY, MATERIALS, STICKY, node_code, param_names
 from gpe_pl.shape_values import moved
@@ -177,7 +177,9 @@ class Boundary:
         return replace(first, motion=Motion(inside, vel, normals)).at(0)
 
     def inside(self, periodicity: Periodicity) -> Boundary:
-        """The same, of NumPy arrays, in a periodic domain: nodes are inside, those that meet at a seam exist once, and shapes know their images."""
+        """The same, of NumPy arrays, in a periodic domain: nodes are inside, those that meet at a seam exist once and those within an image of a shape not at
+        all, and shapes know their images.
+        """
         if not periodicity:
             return self
         pos, motion = periodicity.wrapped(self.pos), self.motion
@@ -187,11 +189,13 @@ class Boundary:
         if motion is not None:
             same &= (np.abs(periodicity.shortest(motion.pos[:, i] - motion.pos[:, j])) <= close).all(axis=(0, 2))
             same &= ((motion.normal[:, i] * motion.normal[:, j]).sum(axis=2) > 0.999).all(axis=0)
-        kept = np.setdiff1d(np.arange(len(pos)), i[same])
+        shapes = repeated(self.shapes, periodicity)
+        free = ~is_covered(self.pos, self.normal, self.shapes, shapes)
+        kept = np.setdiff1d(np.flatnonzero(free), i[same])
         if motion is not None:
             motion = Motion(motion.pos[:, kept], motion.vel[:, kept], motion.normal[:, kept])
         pos, vel, normal, friction, restitution = (x[kept] for x in (pos, self.vel, self.normal, self.friction, self.restitution))
-        return Boundary(pos, vel, normal, friction, restitution, repeated(self.shapes, periodicity), motion)
+        return Boundary(pos, vel, normal, friction, restitution, shapes, motion)
 
     def to_numpy(self) -> Boundary:
         """The same with NumPy arrays of its own."""
@@ -241,6 +245,21 @@ def _unit(normal: np.ndarray) -> np.ndarray:
         where = f"frame {frame[0]}, " if frame else ""
         raise ArrayError(f"boundary normal: {where}boundary_node {node} has length 0; it must point into free space", *frame)
     return np.asarray(normal / length)
+
+
+def _check_steps(boundary: Boundary, frame_dt: float, periodicity: Periodicity) -> None:
+    """Refuse nodes that move by more than half a period between frames: they cross a seam that their motion does not know."""
+    if boundary.motion is None:
+        return
+    for axis in periodicity.axes:
+        step = np.abs(boundary.motion.vel[..., axis]) * frame_dt
+        if (step > 0.5001 * periodicity.period[axis]).any():
+            frame, node = np.unravel_index(int(step.argmax()), step.shape)
+            raise ArrayError(
+                f"boundary: boundary_node {node} moves by {step[frame, node]:.4g} m along {'xyz'[axis]} after frame {frame}, more than half the period "
+                f"{periodicity.period[axis]:.4g} m; pass periodicity=Periodicity(bounds, periodic) and the same frame_dt to Boundary.moving",
+                int(frame),
+            )
 
 
 def _numpy(x: Array) -> np.ndarray:
@@ -546,6 +565,7 @@ class Trajectory:
         repeats = flags("periodic", periodic, dim)
         bounds = checked_bounds(bounds, repeats, pos, way)
         periodicity = Periodicity(bounds, repeats)
+        _check_steps(boundary, frame_dt, periodicity)
         boundary = boundary.inside(periodicity)
         if periodicity:
             pos = np.stack([periodicity.wrapped(frame.astype(np.float64)).astype(pos.dtype) for frame in pos])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -255,7 +255,7 @@ class GraphBuilder:
         if state.rest_pos is None:
             raise GraphError("state has cells but no rest_pos; a mesh needs both, or graph=particles takes its nodes as particles")
         rest_pos, cells = state.rest_pos.cpu().numpy(), state.cells.cpu().numpy()
-        mesh = multiscale_graph(rest_pos, cells, self.scales.spacing, self.spec.num_levels)
+        mesh = multiscale_graph(rest_pos, cells, self.scales.spacing, self.spec.num_levels, state.periodicity)
         kinds = state.node_type[state.cells]
         codes = torch.tensor([node_code(m) for m in self._meshes], device=kinds.device)
         wrong = (kinds != kinds[:, :1]).any(dim=1) | ~torch.isin(kinds[:, 0], codes)
@@ -279,7 +279,7 @@ class GraphBuilder:
             row[r] = torch.arange(len(r), device=device)
         row[n:] = torch.cat([torch.arange(size, device=device) for size in sizes]) if sizes else row[n:]
 
-        values = torch.cat([self._kept_whole(state, mesh), cast(Tensor, state.rest_pos), history_of(state).flatten(1)], dim=1)
+        values = torch.cat([self._kept_whole(state, mesh), torch.tensor(mesh.rest_pos, device=device), history_of(state).flatten(1)], dim=1)
         above, below = torch.tensor(mesh.descent, device=device)
         above, mass = above - n, state.mass[below][:, None]
         total = mass.new_zeros(sum(sizes), 1).index_add_(0, above, mass)

@@ -21,6 +21,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from gpe_pl.errors import GpeError
+from gpe_pl.graphs.islands import unwrapped
+from gpe_pl.periodicity import NOWHERE, Periodicity
 
 SNAP = 1e-3
 """Nodes this near (in rest spacings) below the face of a box count as on it, so that rounding does not tear the rows of a lattice apart."""
@@ -41,7 +43,7 @@ class MultiscaleGraph:
     """What stays the same about the mesh of a scene. Points are the nodes of the state, followed by the virtual nodes in the order of their levels.
 
     Attributes:
-        rest_pos: of the nodes of the state [m].
+        rest_pos: of the nodes of the state [m]; in a periodic domain the images that do not tear bodies apart.
         body: connected body of each point; a node of no cell is a body of its own.
         level: of each point, 0 for the nodes of the state.
         parent: virtual node one level up, or -1: roots, nodes of no cell, and the top of bodies that are deeper than the levels asked for.
@@ -97,7 +99,11 @@ def levels_of(extent: float, spacing: float) -> int:
 
 
 def multiscale_graph(
-    rest_pos: Float64[np.ndarray, "node dim"], cells: Int64[np.ndarray, "cell corner"], spacing: float, num_levels: int
+    rest_pos: Float64[np.ndarray, "node dim"],
+    cells: Int64[np.ndarray, "cell corner"],
+    spacing: float,
+    num_levels: int,
+    periodicity: Periodicity = NOWHERE,
 ) -> MultiscaleGraph:
     """The multi-scale graph of a mesh, built once for equal arguments; its arrays are read-only.
 
@@ -106,19 +112,27 @@ def multiscale_graph(
         cells: nodes of each cell.
         spacing: rest spacing [m].
         num_levels: the most levels of virtual nodes; a body ends at its root or here.
+        periodicity: where space repeats.
 
     Raises:
         MeshError: a cell has a node that does not exist, or a rest position is not finite.
     """
     rest_pos, cells = np.ascontiguousarray(rest_pos, np.float64), np.ascontiguousarray(cells, np.int64)
-    return _cached(rest_pos.tobytes(), rest_pos.shape, cells.tobytes(), cells.shape, spacing, num_levels)
+    return _cached(rest_pos.tobytes(), rest_pos.shape, cells.tobytes(), cells.shape, spacing, num_levels, periodicity)
 
 
 @lru_cache(maxsize=MESHES_HELD)
 def _cached(
-    rest_pos: bytes, rest_shape: tuple[int, ...], cells: bytes, cells_shape: tuple[int, ...], spacing: float, num_levels: int
+    rest_pos: bytes,
+    rest_shape: tuple[int, ...],
+    cells: bytes,
+    cells_shape: tuple[int, ...],
+    spacing: float,
+    num_levels: int,
+    periodicity: Periodicity,
 ) -> MultiscaleGraph:
-    graph = build(np.frombuffer(rest_pos).reshape(rest_shape), np.frombuffer(cells, np.int64).reshape(cells_shape), spacing, num_levels)
+    nodes, corners = np.frombuffer(rest_pos).reshape(rest_shape), np.frombuffer(cells, np.int64).reshape(cells_shape)
+    graph = build(nodes, corners, spacing, num_levels, periodicity)
     for array in vars(graph).values():
         if isinstance(array, np.ndarray):
             array.setflags(write=False)
@@ -142,7 +156,7 @@ def _moving_bodies(graph: MultiscaleGraph, kind: bytes, spacing: float) -> Int64
     return body
 
 
-def build(rest_pos: np.ndarray, cells: np.ndarray, spacing: float, num_levels: int) -> MultiscaleGraph:
+def build(rest_pos: np.ndarray, cells: np.ndarray, spacing: float, num_levels: int, periodicity: Periodicity = NOWHERE) -> MultiscaleGraph:
     """``multiscale_graph`` without memory."""
     num_nodes = len(rest_pos)
     bad = np.flatnonzero(((cells < 0) | (cells >= num_nodes)).any(axis=1))
@@ -152,6 +166,7 @@ def build(rest_pos: np.ndarray, cells: np.ndarray, spacing: float, num_levels: i
     if len(bad):
         raise MeshError(f"node {bad[0]} has a rest position that is not finite")
     edges = cell_edges(cells, num_nodes)
+    rest_pos, _ = unwrapped(rest_pos, edges, periodicity)
     ones = np.ones(edges.shape[1], dtype=bool)
     num_bodies, body = connected_components(coo_array((ones, tuple(edges)), shape=(num_nodes, num_nodes)), directed=False)
     body = body.astype(np.int64)

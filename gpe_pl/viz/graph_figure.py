@@ -25,14 +25,13 @@ def multiscale_figure(trajectory: Trajectory, frame: int = 0) -> Figure:
     """
     if trajectory.rest_pos is None or trajectory.cells is None or len(trajectory.cells) == 0:
         raise ValueError(f"{trajectory.metadata.dataset}: the trajectory has no mesh to draw; choose one of data=elastomer or data=fem")
-    bounds = np.array(trajectory.metadata.bounds)
-    spacing = trajectory.metadata.spacing
-    graph = multiscale_graph(trajectory.rest_pos, trajectory.cells, spacing, levels_of(float(np.ptp(bounds, axis=1).max()), spacing))
+    m = trajectory.metadata
+    graph = multiscale_graph(trajectory.rest_pos, trajectory.cells, m.spacing, levels_of(m.longest_side, m.spacing), m.periodicity)
     above, below = graph.descent
     mass = trajectory.mass[below].astype(np.float64)
     count = len(graph.level)
     total = np.bincount(above, mass, count)[graph.num_nodes :]
-    pos, _ = unwrapped(trajectory.pos[frame].astype(np.float64), graph.cell_edges, trajectory.metadata.periodicity)
+    pos, _ = unwrapped(trajectory.pos[frame].astype(np.float64), graph.cell_edges, m.periodicity)
     mean = [np.bincount(above, mass * x[below], count)[graph.num_nodes :] / total for x in pos.T]
     points = np.concatenate([pos, np.stack(mean, axis=1)])[:, [0, -1]]
 

@@ -12,7 +12,9 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
+from gpe_pl.arrays import ArrayError
 from gpe_pl.containment import contain
 from gpe_pl.data.importers import ImportSettings, import_dataset
 from gpe_pl.data.validate import validate
@@ -201,6 +203,44 @@ def test_a_plate_around_the_domain_has_no_seam() -> None:
     assert set(np.round(boundary.pos[:, 1], 9)) == {0.1, 0.2}
 
 
+FLOORS = {
+    "even": ((0.1, -0.1), (0.9, -0.1), (0.9, 0.1), (0.5, 0.2), (0.1, 0.1)),
+    "with a step at the seam": ((0.1, -0.1), (0.9, -0.15), (0.9, 0.05), (0.6, 0.2), (0.1, 0.1)),
+    "of other corners first": ((0.9, 0.1), (0.5, 0.2), (0.1, 0.1), (0.1, -0.1), (0.9, -0.1)),
+}
+
+
+@pytest.mark.parametrize("knows", [True, False])
+@pytest.mark.parametrize("corners", FLOORS.values(), ids=FLOORS)
+def test_a_polygon_from_seam_to_seam_has_no_face_there(corners: Any, knows: bool) -> None:
+    """It is as deep at the seam as its image beside it says, and no boundary node lies in it; where its ends differ, a step is left."""
+    floor = Polygon(corners, 0.3)
+    (here,) = repeated((floor,), CHANNEL)
+    long = [Polygon(tuple((x + shift, y) for x, y in corners), 0.3) for shift in (-0.8, 0.0, 0.8)]
+    rng = np.random.default_rng(0)
+    points = rng.uniform([0.1, -0.05], [0.9, 0.3], (500, 2))
+    inside = np.min([image.signed_distance(points) for image in long], axis=0) < 0
+    distance = here.signed_distance(points)
+    np.testing.assert_array_equal(distance < 0, inside)
+    # the nearest place on the surface: by brute force, of the outline that no image covers
+    outline = np.concatenate([image.sample(5e-4)[0] for image in long])
+    outline = outline[np.min([image.signed_distance(outline) for image in long], axis=0) > -1e-9]
+    on_seam = np.abs((outline[:, 0] - 0.1) / 0.8 - np.round((outline[:, 0] - 0.1) / 0.8)) < 1e-9
+    ends = [sorted(y for x, y in corners if x == end) for end in (0.1, 0.9)]
+    common = max(ends[0][0], ends[1][0]), min(ends[0][1], ends[1][1])
+    outline = outline[~(on_seam & (outline[:, 1] > common[0] + 1e-9) & (outline[:, 1] < common[1] - 1e-9))]
+    nearest = cKDTree(outline).query(points)[0]
+    np.testing.assert_allclose(np.abs(distance), nearest, atol=5e-4)
+    np.testing.assert_allclose(here.signed_distance(points + np.array([0.8, 0.0])), distance, atol=1e-12)
+
+    made = Boundary.sample((floor,), 0.05, 2, CHANNEL) if knows else Boundary.sample((floor,), 0.05, 2).inside(CHANNEL)
+    np.testing.assert_allclose(here.signed_distance(made.pos), 0.0, atol=1e-9)
+    in_front = here.signed_distance(made.pos + 1e-4 * made.normal)
+    assert (in_front[~np.isclose(made.pos[:, 0], 0.1)] > 0.99e-4).all() and (in_front > -1e-4).all()
+    seam = np.isclose(made.pos[:, 0], 0.1) & (np.abs(made.normal[:, 0]) > 0.99)
+    assert seam.any() == (ends[0] != ends[1])
+
+
 def test_what_enters_the_part_behind_a_seam_is_put_back_and_counted() -> None:
     sphere = Sphere((0.86, 0.2), 0.12, 0.3)
     trajectory = fluid(Boundary.sample((sphere,), 0.03, 2))
@@ -228,6 +268,15 @@ def test_what_is_put_back_across_a_seam_stays_inside() -> None:
 
 
 # --- files -------------------------------------------------------------------------------------------------------------------------------
+
+
+def test_a_lid_whose_motion_does_not_know_the_seam_is_refused() -> None:
+    way = np.stack([0.1 + (np.arange(16) * 0.05 + 0.02 * np.arange(5)[:, None]) % 0.8, np.full((5, 16), 0.4)], axis=-1)
+    with pytest.raises(
+        ArrayError, match=r"boundary_node 15 moves by 0\.78 m along x after frame \d, more than half the period 0\.8 m; pass periodicity="
+    ):
+        fluid(Boundary.moving(way, np.tile([0.0, -1.0], (16, 1)), 0.01))
+    fluid(Boundary.moving(way, np.tile([0.0, -1.0], (16, 1)), 0.01, periodicity=CHANNEL))
 
 
 @pytest.mark.parametrize("normals", [True, False])
