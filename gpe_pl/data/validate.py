@@ -23,7 +23,7 @@ import h5py
 import numpy as np
 
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
-from gpe_pl.data.motion import motion_of, rounding_fault, rounding_of
+from gpe_pl.data.motion import motion_of, rounding_fault
 from gpe_pl.geometry import Shape
 from gpe_pl.hdf5_arrays import attribute, is_named
 from gpe_pl.json_text import parsed
@@ -78,7 +78,7 @@ class Group:
     params: dict[str, set[float]] = field(default_factory=dict)
     flights: list[FreeFlight] = field(default_factory=list)
     squared_accelerations: list[tuple[float, int]] = field(default_factory=list)
-    rounding: float = 0.0
+    rounding: tuple[float, str] = (0.0, "in float32")
 
     def add(self, metadata: Metadata, arrays: dict[str, np.ndarray]) -> None:
         """Count one more trajectory."""
@@ -91,8 +91,12 @@ class Group:
             self.params.setdefault(name, set()).update(np.unique(column[~np.isnan(column)]).tolist())
         self.flights.append(joined(free_flights(metadata, arrays), metadata.dim))
         if len(pos) > 2:
-            self.squared_accelerations.append((motion_of(metadata, pos).acceleration ** 2, pos[2:].size))
-            self.rounding = max(self.rounding, float(rounding_of(np.abs(pos).max(axis=(0, 1)), metadata.frame_dt).max()))
+            motion = motion_of(metadata, pos)
+            self.squared_accelerations.append((motion.acceleration**2, pos[2:].size))
+            stored, given = motion.rounding(np.float32, np.zeros(metadata.dim)), motion.rounding_to_marks
+            self.rounding = max(
+                self.rounding, (float(stored.max()), "in float32"), (float(given.max()), f"in steps of {motion.marks.max():.3g} m")
+            )
 
     def __str__(self) -> str:
         m = self.metadata
@@ -119,8 +123,9 @@ class Group:
 
     def _about_rounding(self) -> Iterator[str]:
         squares, counts = zip(*self.squared_accelerations, strict=True) if self.squared_accelerations else ((0.0,), (1,))
-        if fault := rounding_fault(self.rounding, math.sqrt(np.average(squares, weights=counts))):
-            yield f"{fault}: a model would learn noise; a longer frame_dt is needed, or positions nearer to 0"
+        error, where = self.rounding
+        if fault := rounding_fault(error, math.sqrt(np.average(squares, weights=counts)), where):
+            yield f"{fault}: a model would learn noise; a longer frame_dt is needed, or positions nearer to 0 or with more digits"
 
     def _about_free_flight(self) -> Iterator[str]:
         flight = self.flight

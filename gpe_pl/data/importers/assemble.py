@@ -397,11 +397,12 @@ class _Conversion:
             report.repairs.append(Event("all splits", "all trajectories", -1, f"the origin was moved to ({where}) m: {what}"))
             self.about["origin"] = self.origin.tolist()
         for split, name, motion in motions:
-            for precision, origin, remedy in (
-                (motion.precision, nowhere, "write them with more digits"),
-                (np.float32, self.origin, "take a larger time step, or a smaller domain"),
+            for error, where, remedy in (
+                (motion.rounding_to_marks, f"in steps of {motion.marks.max():.3g} m", "write them with more digits"),
+                (motion.rounding(motion.precision, nowhere), f"in {motion.precision.__name__}", "write them with more digits"),
+                (motion.rounding(np.float32, self.origin), "in float32", "take a larger time step, or a smaller domain"),
             ):
-                if fault := rounding_fault(float(motion.rounding(precision, origin).max()), typical, precision):
+                if fault := rounding_fault(float(error.max()), typical, where):
                     suspects.append(Event(split, name, -1, f"{fault}: {remedy}"))
                     break
 

@@ -200,3 +200,30 @@ def test_crossing_the_seam_is_no_jump(tmp_path: Path) -> None:
     sources.lagrangebench_h5(tmp_path / "raw" / "train.h5", [(p, np.zeros(20, int)) for p in pos])
     report = import_dataset(tmp_path, ImportSettings("lagrangebench", str(tmp_path / "raw"), "set"))
     assert not any("moves by" in w for w in report.warnings)
+
+
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+@pytest.mark.parametrize("step", [1e-3, 1 / 640], ids=["three decimals", "pixels"])
+def test_positions_with_few_digits_are_named(tmp_path: Path, step: float, precision: type) -> None:
+    """What is rounded before it is stored, as in text files and videos, is rounding all the same, and looks like acceleration."""
+    error = step / (np.sqrt(2) * DT**2)
+    true = [motion_of(Trajectory.from_numpy(swinging(seed), DT, "sand", {"sand": 30.0}).metadata, swinging(seed)) for seed in range(4)]
+    assert error > 0.2 * true[0].acceleration
+    assert not any(motion.marks.any() for motion in true)
+    report = converted(tmp_path, "coarse", [(step * np.round(swinging(seed) / step)).astype(precision) for seed in range(4)])
+    what = rf"positions in steps of {step:.3g} m round accelerations by {error:.3g} m/s², those of the data are .* rms: write them with more digits"
+    assert len([w for w in report.warnings if re.search(what, w)]) == 4
+    (group, *_) = validate([Path(report.folder) / "train"]).groups.values()
+    assert f"positions in steps of {step:.3g} m round accelerations by" in str(group)
+
+
+def test_motion_of_few_values_lies_on_no_marks() -> None:
+    """Free fall beside nodes at rest, layers that slide over each other, and a lattice that is shaken."""
+    lattice, time = swinging()[0], DT * np.arange(30)[:, None, None]
+    falls = lattice - np.array([0.0, 4.9]) * time**2 * (np.arange(len(lattice)) % 2)[:, None]
+    shear = lattice + np.stack([lattice[:, 1], 0 * lattice[:, 1]], axis=1) * time
+    shaken = lattice + 0.02 * np.sin(8 * time)
+    for pos in (falls, shear, shaken):
+        for precision in (np.float32, np.float64):
+            moved = pos.astype(precision)
+            assert not motion_of(Trajectory.from_numpy(moved, DT, "sand", {"sand": 30.0}).metadata, moved).marks.any()
