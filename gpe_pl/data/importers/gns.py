@@ -104,13 +104,16 @@ def _loaded(
 def _in_records(path: Path, dim: int, length: int | None, settings: ImportSettings) -> list[Item]:
     def load(record: tfrecord.Record, facts: Facts) -> Loaded:
         context, lists = tfrecord.sequence_example(record.read())
-        frames = [_buffer(entry, "position", "<f4") for entry in lists.get("position", [])]
         types = _buffer(context.get("particle_type"), "particle_type", "<i8")
-        wrong = [k for k, frame in enumerate(frames) if frame.size != dim * types.size]
-        if not frames or wrong:
-            sizes = f"position has {frames[wrong[0]].size} numbers" if wrong else "there is no position"
-            raise Refusal(f"{sizes}, expected {dim} for each of the {types.size} particle types", wrong[0] if wrong else -1)
-        return _loaded(np.stack(frames).reshape(len(frames), -1, dim), types, None, length, settings, facts)
+        frames, count = lists.get("position"), dim * types.size
+        if not frames:
+            raise Refusal(f"there is no position, expected {dim} for each of the {types.size} particle types")
+        strings = frames.strings(4 * count)
+        if len(strings) < len(frames) or count == 0:
+            wrong = 0 if count == 0 else len(strings)
+            found = _buffer(frames[wrong], "position", "<f4").size
+            raise Refusal(f"position has {found} numbers, expected {dim} for each of the {types.size} particle types", wrong)
+        return _loaded(strings.view("<f4").reshape(len(frames), -1, dim), types, None, length, settings, facts)
 
     return [Item(f"record {k}", partial(load, record)) for k, record in enumerate(tfrecord.records(path))]
 

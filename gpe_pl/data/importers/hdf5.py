@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from gpe_pl.data.importers.source import ImportFailure, Refusal, natural
+from gpe_pl.data.importers.source import MAX_TRAJECTORIES, ImportFailure, Refusal, natural
 from gpe_pl.errors import GpeError
 from gpe_pl.hdf5_arrays import dataset_in, is_named, is_own, obstacle
 
@@ -40,6 +40,10 @@ def groups(path: Path) -> list[str]:
     """Names of a file's groups, by their numbers; raises ``ImportFailure``."""
     try:
         with opened(path) as file:
+            if len(file) > MAX_TRAJECTORIES:
+                raise ImportFailure(
+                    f"{path}: holds {len(file)} groups, one of which each trajectory should be; at most {MAX_TRAJECTORIES} are read"
+                )
             names = [name for name in sorted(file, key=natural) if is_own(file, name) and isinstance(file[name], h5py.Group)]
     except Refusal as refusal:
         raise ImportFailure(f"{path}: {refusal}") from None

@@ -41,6 +41,8 @@ WIDEST = 1.05
 """Periods that nodes may spread over in a first frame."""
 
 MAX_JSON_BYTES = 2**24
+MAX_TRAJECTORIES = 100_000
+"""In one file; a file of 100 MB can name millions of empty ones."""
 
 
 class ImportFailure(GpeError, ValueError):

@@ -11,15 +11,15 @@ Sources: TensorFlow, "TFRecord and tf.train.Example" (guide) and tensorflow/core
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
 from numba import njit
 
-from gpe_pl.data.importers.source import ImportFailure, Refusal
+from gpe_pl.data.importers.source import MAX_TRAJECTORIES, ImportFailure, Refusal
 
 Feature = list[bytes] | np.ndarray
 """Byte strings, or numbers as float32 or int64."""
@@ -27,6 +27,22 @@ Feature = list[bytes] | np.ndarray
 _POLYNOMIAL = 0x82F63B78  # Castagnoli, bits reversed
 _MASK = 0xA282EAD8
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
+
+MAX_NAMES = 128
+"""Features of an ``Example``; those of the formats that are read have fewer than ten."""
+MAX_STRINGS = 1024
+"""In one feature; the features that are used have one."""
+MAX_FIELDS = 2**22
+"""Of one number in one message, such as frames."""
+
+_ENDS, _LONG, _WIRE, _SIZE, _MANY = range(1, 6)
+FAULTS = {
+    _ENDS: "it ends within a number",
+    _LONG: "a number of more than 10 bytes",
+    _WIRE: "wire type {what} at byte {place}",
+    _SIZE: "a field of {what} bytes where {place} are left",
+    _MANY: f"{{what}} fields of one kind, at most {MAX_FIELDS} are read",
+}
 
 
 def _table() -> np.ndarray:
@@ -79,10 +95,12 @@ def records(path: Path) -> list[Record]:
     """All records of a file. Where its structure breaks, the last one says so; what comes after cannot be found."""
     try:
         total = path.stat().st_size
-        found = []
+        found: list[Record] = []
         with open(path, "rb") as file:
             start = 0
             while start < total:
+                if len(found) == MAX_TRAJECTORIES:
+                    raise ImportFailure(f"{path}: holds more than {MAX_TRAJECTORIES} records, one of which each trajectory should be")
                 head = file.read(12)
                 if len(head) < 12:
                     found.append(Record(path, start, 0, f"the file ends within the head of a record at {start}: truncated"))
@@ -112,106 +130,243 @@ def records(path: Path) -> list[Record]:
 # --- protocol buffers ----------------------------------------------------------------------------------------------------------------------
 
 
-def example(data: bytes) -> dict[str, Feature]:
+@dataclass(frozen=True)
+class _Message:
+    """A part of a record's data."""
+
+    data: np.ndarray
+    start: int
+    stop: int
+
+    def fields(self, number: int) -> np.ndarray:
+        """Wire type, start, and size of each field [field, 3] of a number; of an integer its value in the place of the size. Raises ``Refusal``."""
+        rows, fault, detail = _fields(self.data, self.start, self.stop, number)
+        if fault:
+            what, place = (int(value) for value in detail)
+            raise Refusal(f"not a protocol buffer: {FAULTS[fault].format(what=what % 2**64, place=place)}")
+        return rows
+
+    def messages(self, number: int) -> Iterator[_Message]:
+        """The messages in the fields of a number."""
+        for wire, start, size in self.fields(number).tolist():
+            if wire != _BYTES:
+                raise Refusal("not a protocol buffer: a number where a message should be")
+            yield _Message(self.data, start, start + size)
+
+    def only(self, number: int) -> _Message:
+        """The message in the first field of a number; empty where there is none."""
+        return next(self.messages(number), _Message(self.data, 0, 0))
+
+    def content(self) -> bytes:
+        return self.data[self.start : self.stop].tobytes()
+
+    def named(self) -> dict[str, _Message]:
+        """Values of a map by their keys."""
+        if (count := len(self.fields(1))) > MAX_NAMES:
+            raise Refusal(f"holds {count} features, at most {MAX_NAMES} are read")
+        entries = [(entry.alone(1).content(), entry.alone(2)) for entry in self.messages(1)]
+        return {key.decode("utf-8", "replace"): value for key, value in entries}
+
+    def alone(self, number: int) -> _Message:
+        """The message in the one field of a number; empty where there is none."""
+        if len(self.fields(number)) > 1:
+            raise Refusal("not an Example: an entry of a map has several names or values")
+        return self.only(number)
+
+    def feature(self) -> Feature:
+        for kind in (1, 2, 3):
+            for values in self.messages(kind):
+                rows = values.fields(1)
+                if kind == 1:
+                    if len(rows) > MAX_STRINGS:
+                        raise Refusal(f"a feature holds {len(rows)} strings, at most {MAX_STRINGS} are read")
+                    return [string.content() for string in values.messages(1)]
+                if kind == 2:
+                    return np.frombuffer(_joined(self.data, rows[rows[:, 0] != _VARINT]).tobytes(), "<f4")
+                integers, is_whole = _integers(self.data, rows)
+                if not is_whole:
+                    raise Refusal("not a protocol buffer: a list of integers ends within a number, or has one of more than 10 bytes")
+                return np.asarray(integers)
+        return []
+
+
+class Features(Mapping[str, Feature]):
+    """Features by name, which are decoded when they are looked up; raises ``Refusal``."""
+
+    def __init__(self, features: _Message) -> None:
+        self._named = features.named()
+
+    def __getitem__(self, name: str) -> Feature:
+        return self._named[name].feature()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._named)
+
+    def __len__(self) -> int:
+        return len(self._named)
+
+
+class Frames:
+    """Features with an entry per frame, which are decoded when they are wanted; raises ``Refusal``."""
+
+    def __init__(self, entries: _Message) -> None:
+        self._data, self._rows = entries.data, entries.fields(1)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, frame: int) -> Feature:
+        wire, start, size = self._rows[frame].tolist()
+        if wire != _BYTES:
+            raise Refusal("not a protocol buffer: a number where a message should be", frame)
+        return _Message(self._data, start, start + size).feature()
+
+    def __iter__(self) -> Iterator[Feature]:
+        return (self[frame] for frame in range(len(self)))
+
+    def strings(self, size: int) -> np.ndarray:
+        """Bytes [frame, byte] of the frames before the first that is not one string of ``size`` bytes."""
+        return np.asarray(_strings(self._data, self._rows, size))
+
+
+def example(data: bytes) -> Features:
     """Features of an ``Example`` by name; raises ``Refusal``."""
-    return _features(_only(memoryview(data), 1))
+    return Features(_whole(data).only(1))
 
 
-def sequence_example(data: bytes) -> tuple[dict[str, Feature], dict[str, list[Feature]]]:
-    """Context features, and lists of features with an entry per frame, of a ``SequenceExample``; raises ``Refusal``."""
-    message = memoryview(data)
-    lists: dict[str, list[Feature]] = {}
-    for number, value in _fields(_only(message, 2)):
-        if number == 1:
-            name, entries = _entry(value)
-            lists[name] = [_feature(entry) for n, entry in _fields(entries) if n == 1]
-    return _features(_only(message, 1)), lists
+def sequence_example(data: bytes) -> tuple[Features, dict[str, Frames]]:
+    """Context features, and features by name with an entry per frame, of a ``SequenceExample``; raises ``Refusal``."""
+    message = _whole(data)
+    return Features(message.only(1)), {name: Frames(entries) for name, entries in message.only(2).named().items()}
 
 
-def _features(message: memoryview) -> dict[str, Feature]:
-    found = {}
-    for number, value in _fields(message):
-        if number == 1:
-            name, feature = _entry(value)
-            found[name] = _feature(feature)
-    return found
+def _whole(data: bytes) -> _Message:
+    return _Message(np.frombuffer(data, np.uint8), 0, len(data))
 
 
-def _entry(message: Any) -> tuple[str, memoryview]:
-    """Key and value of an entry of a map."""
-    parts = dict(_fields(message))
-    key, value = parts.get(1, memoryview(b"")), parts.get(2, memoryview(b""))
-    if not isinstance(key, memoryview) or not isinstance(value, memoryview):
-        raise Refusal("not an Example: an entry of a map has no name or value")
-    return bytes(key).decode("utf-8", "replace"), value
-
-
-def _feature(message: Any) -> Feature:
-    for kind, values in _fields(message):
-        if kind == 1:
-            return [bytes(value) for number, value in _fields(values) if number == 1 and isinstance(value, memoryview)]
-        if kind == 2:
-            parts = [value for number, value in _fields(values, packed=True) if number == 1]
-            return np.frombuffer(b"".join(bytes(part) for part in parts), "<f4")
-        if kind == 3:
-            integers: list[int] = []
-            for number, value in _fields(values):
-                if number == 1:
-                    integers += list(_varints(value)) if isinstance(value, memoryview) else [value]
-            return np.array([n - 2**64 if n >= 2**63 else n for n in integers], np.int64)
-    return []
-
-
-def _only(message: memoryview, wanted: int) -> memoryview:
-    """The message in a field; empty where there is none."""
-    for number, value in _fields(message):
-        if number == wanted:
-            if not isinstance(value, memoryview):
-                break
-            return value
-    return memoryview(b"")
-
-
-def _fields(message: Any, packed: bool = False) -> Iterator[tuple[int, Any]]:
-    """Numbers and values of a message's fields: integers, or bytes; those of 4 bytes too if ``packed``."""
-    if not isinstance(message, memoryview):
-        raise Refusal("not a protocol buffer: a number where a message should be")
-    place = 0
-    while place < len(message):
-        key, place = _varint(message, place)
-        number, wire = key >> 3, key & 7
-        if wire == _VARINT:
-            value, place = _varint(message, place)
-            yield number, value
-            continue
-        if wire == _BYTES:
-            size, place = _varint(message, place)
-        elif wire in (_FIXED64, _FIXED32):
-            size = 8 if wire == _FIXED64 else 4
-        else:
-            raise Refusal(f"not a protocol buffer: wire type {wire} at byte {place}")
-        if place + size > len(message):
-            raise Refusal(f"not a protocol buffer: a field of {size} bytes where {len(message) - place} are left")
-        if wire == _BYTES or packed:
-            yield number, message[place : place + size]
-        place += size
-
-
-def _varint(message: memoryview, place: int) -> tuple[int, int]:
-    value = 0
-    for shift in range(0, 70, 7):
-        if place >= len(message):
-            raise Refusal("not a protocol buffer: it ends within a number")
-        byte = message[place]
+@njit(cache=True)
+@no_type_check
+def _varint(data, place, stop):
+    """Value modulo 2⁶⁴, as it is in int64, and where the next begins; a fault, negative, in its place."""
+    value = np.int64(0)
+    for k in range(10):
+        if place >= stop:
+            return value, -_ENDS
+        byte = np.int64(data[place])
         place += 1
-        value |= (byte & 0x7F) << shift
+        value |= (byte & 0x7F) << (7 * k)
         if byte < 0x80:
-            return value & 0xFFFFFFFFFFFFFFFF, place
-    raise Refusal("not a protocol buffer: a number of more than 10 bytes")
+            return value, place
+    return value, -_LONG
 
 
-def _varints(message: memoryview) -> Iterator[int]:
-    place = 0
-    while place < len(message):
-        value, place = _varint(message, place)
-        yield value
+@njit(cache=True)
+@no_type_check
+def _field(data, place, stop):
+    """Number, wire type, start, size or value, and where the next begins; a fault, negative, in its place."""
+    key, place = _varint(data, place, stop)
+    number, wire, value = (key >> 3) & 0x1FFFFFFFFFFFFFFF, key & 7, np.int64(0)
+    if place < 0:
+        return number, wire, place, value, place
+    if wire == _VARINT:
+        start = place
+        value, place = _varint(data, place, stop)
+        return number, wire, start, value, place
+    if wire == _BYTES:
+        value, place = _varint(data, place, stop)
+        if place < 0:
+            return number, wire, place, value, place
+    elif wire == _FIXED64:
+        value = np.int64(8)
+    elif wire == _FIXED32:
+        value = np.int64(4)
+    else:
+        return number, wire, place, wire, -_WIRE
+    if value < 0 or value > stop - place:
+        return number, wire, stop - place, value, -_SIZE
+    return number, wire, place, value, place + value
+
+
+@njit(cache=True)
+@no_type_check
+def _fields(data, start, stop, wanted):
+    """Rows of ``_Message.fields``; or a fault, with a value and a place that explain it."""
+    count, place = 0, start
+    rows, detail = np.empty((0, 3), np.int64), np.zeros(2, np.int64)
+    while place < stop:
+        number, _, begin, value, place = _field(data, place, stop)
+        if place < 0:
+            detail[:] = value, begin
+            return rows, -place, detail
+        count += number == wanted
+    if count > MAX_FIELDS:
+        detail[:] = count, 0
+        return rows, _MANY, detail
+    rows, count, place = np.empty((count, 3), np.int64), 0, start
+    while place < stop:
+        number, wire, begin, value, place = _field(data, place, stop)
+        if number == wanted:
+            rows[count] = wire, begin, value
+            count += 1
+    return rows, 0, detail
+
+
+@njit(cache=True)
+@no_type_check
+def _joined(data, rows):
+    """The bytes of fields, one after the other."""
+    joined, end = np.empty(rows[:, 2].sum(), np.uint8), 0
+    for k in range(len(rows)):
+        start, size = rows[k, 1], rows[k, 2]
+        joined[end : end + size] = data[start : start + size]
+        end += size
+    return joined
+
+
+@njit(cache=True)
+@no_type_check
+def _integers(data, rows):
+    """Integers in fields, of one number each or of many, and whether all were whole."""
+    count = 0
+    for k in range(len(rows)):
+        if rows[k, 0] == _VARINT:
+            count += 1
+        elif rows[k, 0] == _BYTES:
+            for place in range(rows[k, 1], rows[k, 1] + rows[k, 2]):
+                count += data[place] < 0x80
+    integers, count = np.empty(count, np.int64), 0
+    for k in range(len(rows)):
+        if rows[k, 0] == _VARINT:
+            integers[count] = rows[k, 2]
+            count += 1
+        elif rows[k, 0] == _BYTES:
+            place, stop = rows[k, 1], rows[k, 1] + rows[k, 2]
+            while place < stop:
+                value, place = _varint(data, place, stop)
+                if place < 0:
+                    return integers, False
+                integers[count] = value
+                count += 1
+    return integers, True
+
+
+@njit(cache=True)
+@no_type_check
+def _strings(data, rows, size):
+    """Bytes of the frames [frame, byte] in fields, up to the first that does not hold one string of ``size`` bytes in the way that writers do."""
+    starts = np.empty(len(rows), np.int64)
+    count = 0
+    for k in range(len(rows)):
+        stop = rows[k, 1] + rows[k, 2]
+        number, wire, start, held, place = _field(data, rows[k, 1], stop)
+        if rows[k, 0] != _BYTES or number != 1 or wire != _BYTES or place != stop:
+            break
+        number, wire, start, held, place = _field(data, start, stop)
+        if number != 1 or wire != _BYTES or held != size or place != stop:
+            break
+        starts[k] = start
+        count += 1
+    strings = np.empty((count, size), np.uint8)
+    for k in range(count):
+        strings[k] = data[starts[k] : starts[k] + size]
+    return strings

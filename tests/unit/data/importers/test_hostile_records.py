@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import re
 import struct
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from gpe_pl.data.importers import tfrecord
+from gpe_pl.data.importers.source import ImportFailure, Refusal
 from gpe_pl.data.importers.tfrecord import example, masked_crc, sequence_example
 from tests import sources
 from tests.refusals import WATER, convert, only_refusal, refused, unreadable, write
@@ -37,8 +40,75 @@ def test_every_kind_of_feature_is_read() -> None:
         np.testing.assert_array_equal(read["integers"], features["integers"])
     context, lists = sequence_example(sources.sequence_example({"key": np.array([7])}, {"x": [b"a", b"b"], "y": [np.ones(1, np.float32)]}))
     assert context["key"].tolist() == [7]  # type: ignore[union-attr]
-    assert lists["x"] == [[b"a"], [b"b"]]
-    assert len(lists["y"]) == 1
+    assert list(lists["x"]) == [[b"a"], [b"b"]]
+    assert len(list(lists["y"])) == 1
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (sources.message(1, b"\x0a\x00" * 200), "holds 200 features, at most 128"),
+        (sources.message(1, b"\x0a\x00" * (tfrecord.MAX_FIELDS + 1)), f"{tfrecord.MAX_FIELDS + 1} fields of one kind"),
+        (sources.message(1, sources.message(1, sources.message(1, b"x") * 2)), "several names or values"),
+        (sources.message(1, b"\x08\x01"), "a number where a message should be"),
+        (b"\x0a" + b"\xff" * 9 + b"\x01", f"a field of {2**64 - 1} bytes where 0 are left"),
+        (b"\x0b", "wire type 3 at byte 1"),
+        (b"\x80" * 10 + b"\x00", "a number of more than 10 bytes"),
+    ],
+)
+def test_messages_that_are_no_examples(data: bytes, message: str) -> None:
+    with pytest.raises(Refusal, match=message):
+        example(data)
+
+
+@pytest.mark.parametrize(
+    ("kind", "content", "message"),
+    [
+        (1, b"\x0a\x00" * 2000, "holds 2000 strings, at most 1024"),
+        (3, sources.message(1, b"\x80" * 3), "ends within a number"),
+        (3, sources.message(1, b"\xff" * 11 + b"\x00"), "more than 10 bytes"),
+    ],
+)
+def test_features_are_decoded_when_they_are_looked_up(kind: int, content: bytes, message: str) -> None:
+    bad = sources.message(1, sources.message(1, b"bad") + sources.message(2, sources.message(kind, content)))
+    found = example(sources.message(1, sources.named({"good": sources.feature(b"x", True)}) + bad))
+    assert list(found) == ["good", "bad"] and found["good"] == [b"x"]
+    with pytest.raises(Refusal, match=message):
+        found["bad"]
+
+
+def test_a_million_tiny_numbers_take_a_moment() -> None:
+    """Counted in lines of Python that run, of which there were several for each."""
+    numbers = sources.message(1, b"\x01" * 10**6) + b"\x08\x02" * 10**6
+    found = example(sources.message(1, sources.message(1, sources.message(1, b"n") + sources.message(2, sources.message(3, numbers)))))
+    lines = 0
+
+    def count(frame: Any, event: str, argument: Any) -> Any:
+        nonlocal lines
+        lines += event == "line"
+        return count
+
+    before = sys.gettrace()
+    sys.settrace(count)
+    try:
+        integers = found["n"]
+    finally:
+        sys.settrace(before)
+    assert lines < 100_000
+    np.testing.assert_array_equal(integers, np.repeat([1, 2], 10**6))
+
+
+def test_wrong_frames_cost_one_of_them(tmp_path: Path, records: list[bytes]) -> None:
+    bad = sources.sequence_example({"particle_type": WATER.tobytes()}, {"position": [motion()[0].tobytes(), *[b""] * 5]})
+    write(tmp_path, *records[:3], sources.record(bad))
+    assert "record 3, frame 1: position has 0 numbers" in unreadable(tmp_path, "gns")
+
+
+def test_a_file_of_empty_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tfrecord, "MAX_TRAJECTORIES", 10)
+    (tmp_path / "many").write_bytes(sources.record(b"") * 11)
+    with pytest.raises(ImportFailure, match="holds more than 10 records"):
+        tfrecord.records(tmp_path / "many")
 
 
 def test_a_flipped_bit_costs_one_record(tmp_path: Path, records: list[bytes]) -> None:
