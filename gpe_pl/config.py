@@ -36,6 +36,7 @@ from gpe_pl.pretrained import model_name
 from gpe_pl.printable import clean_messages, one_line, speak_utf8
 from gpe_pl.run_folder import refuse_links
 from gpe_pl.signatures import checked, parameters
+from gpe_pl.typed_keys import without_effect
 
 WITHOUT_KEY = {"comparison", "experiment", "recipe", "scene", "solver"}
 """Config groups that fill other keys than one of their own."""
@@ -181,6 +182,8 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             try:
                 if "dimension" in list(cfg) and cfg.dimension not in (2, 3):
                     raise ConfigError(f"dimension={cfg.dimension}: must be 2 or 3")
+                if unread := without_effect(cfg, HydraConfig.get().overrides.task):
+                    raise ConfigError(unread)
                 OmegaConf.resolve(cfg)
                 construct(Paths, cfg.paths, "paths")
                 _check_top_level(cfg, config_name)

@@ -253,7 +253,7 @@ class GraphBuilder:
         if state.cells is None or state.cells.shape[0] == 0:
             return None
         if state.rest_pos is None:
-            raise GraphError("state has cells but no rest_pos; a mesh needs both, or graph=particles takes its nodes as particles")
+            raise GraphError("state has cells but no rest_pos; a mesh needs both, or graph.mesh=false takes its nodes as particles")
         rest_pos, cells = state.rest_pos.cpu().numpy(), state.cells.cpu().numpy()
         mesh = multiscale_graph(rest_pos, cells, self.scales.spacing, self.spec.num_levels, state.periodicity)
         kinds = state.node_type[state.cells]

@@ -62,7 +62,7 @@ class ContinuousConvNet(nn.Module):
         others = sorted({r[1] for r in spec.relations} - {RADIUS})
         if others:
             raise NotAParticleGraphError(
-                f"ContinuousConvNet convolves over {RADIUS} edges; the graph also has {', '.join(others)}: set graph=particles"
+                f"ContinuousConvNet convolves over {RADIUS} edges; the graph also has {', '.join(others)}: set graph.mesh=false"
             )
         self.settings = {"num_convolutions": num_convolutions, "hidden_channels": hidden_channels, "kernel_size": kernel_size}
         self.spec, self.kernel_size = spec, kernel_size

@@ -12,7 +12,7 @@ the decoder::
 Where this differs from the paper, because all models here share graphs, inputs and targets:
 
 - edges carry the channels that ``graph.features`` asks for, and the length of the standardised displacement; relations of meshes, if the graph has any, carry
-  theirs (the paper's topology is ``graph=particles``);
+  theirs (the paper's topology is ``graph.mesh=false``);
 - walls are boundary nodes with velocity, normal and boundary condition, as in the other models, instead of distances to the box; they have no edges among
   themselves;
 - gravity and the material parameter are inputs, and the target is the acceleration without gravity.

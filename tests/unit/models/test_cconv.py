@@ -132,5 +132,5 @@ def test_offset_is_the_displacement_over_the_radius(features: str) -> None:
 
 
 def test_refuses_meshes() -> None:
-    with pytest.raises(NotAParticleGraphError, match="cell, down, same: set graph=particles"):
+    with pytest.raises(NotAParticleGraphError, match="cell, down, same: set graph.mesh=false"):
         ContinuousConvNet(meshes.spec(2))
