@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gpe_pl import integrators
+from gpe_pl.cells import mean_over_corners
 from gpe_pl.graphs.features import history_of
 from gpe_pl.graphs.islands import islands_within
 from gpe_pl.graphs.multiscale import cell_edges
@@ -163,7 +164,7 @@ def _combined_stress(state: State, after: State, awake: Tensor, moved: Tensor) -
         return state.stress if not bool(awake.any()) else None
     node = after.stress.node.new_zeros(state.num_nodes, after.stress.node.shape[1]) if state.stress is None else state.stress.node.clone()
     node[awake] = after.stress.node[moved]
-    return Stress(node, node[state.cells].mean(dim=1))
+    return Stress(node, mean_over_corners(node, state.cells))
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,13 @@ Cells are stored in one array [cell, corner]. A cell with fewer corners than oth
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from gpe_pl.schema import CELL_KINDS
+
+Array = Any
 
 
 def fitting_kinds(num_corners: int, dim: int) -> list[str]:
@@ -33,14 +36,16 @@ def kinds_of(cells: np.ndarray, cell_dim: int | None, dim: int) -> np.ndarray:
     return kinds
 
 
-def is_corner(cells: np.ndarray) -> np.ndarray:
-    """Which entries of cells [cell, corner] are corners, and not the last one again."""
-    return np.concatenate([np.ones((len(cells), 1), bool), cells[:, 1:] != cells[:, :-1]], axis=1)
+def is_corner(cells: Array) -> Array:
+    """Which entries of cells [cell, corner], arrays or tensors, are corners, and not the last one again."""
+    own = cells >= 0  # all of them
+    own[:, 1:] = cells[:, 1:] != cells[:, :-1]
+    return own
 
 
-def mean_over_corners(values: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Mean [cell] over the corners of each cell [cell, corner] of values [node]."""
-    own = is_corner(cells)
+def mean_over_corners(values: Array, cells: Array) -> Array:
+    """Mean [cell, …] over the corners of each cell [cell, corner] of values [node, …], arrays or tensors."""
+    own = is_corner(cells).reshape(*cells.shape, *[1] * (values.ndim - 1))
     return (values[cells] * own).sum(axis=1) / own.sum(axis=1)
 
 

@@ -25,6 +25,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl import integrators
 from gpe_pl.atomic import replace_bytes
+from gpe_pl.cells import mean_over_corners
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
@@ -385,7 +386,7 @@ class LearnedSimulator(nn.Module):
         for scene, rows, part in _per_scene(predicted, graphs):
             node[scene][rows] = part.double() * self.stress_std
         return [
-            state if state.cells is None else replace(state, stress=Stress(n, n[state.cells].mean(dim=1)))
+            state if state.cells is None else replace(state, stress=Stress(n, mean_over_corners(n, state.cells)))
             for state, n in zip(states, node, strict=True)
         ]
 

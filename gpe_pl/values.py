@@ -11,7 +11,8 @@ from functools import partial
 
 import numpy as np
 
-from gpe_pl.schema import FIELDS, LARGEST, MATERIALS, MOTION
+from gpe_pl.cells import is_corner, kinds_of
+from gpe_pl.schema import CELL_KINDS, FIELDS, LARGEST, MATERIALS, MOTION
 
 UNIT_TOLERANCE = 1e-4
 """Largest difference of a unit vector's length from 1."""
@@ -172,10 +173,16 @@ def _wrong_parameter(material: str, values: np.ndarray, place: tuple[int, ...]) 
     return f"is {values[place]:g} {MATERIALS[material].unit} of {material}, must be {MATERIALS[material].rule}"
 
 
-def _nodes(scene: _Scene, array: np.ndarray) -> Iterator[_Found]:
-    count = len(scene.arrays["node_type"])
+def _cells(scene: _Scene, array: np.ndarray) -> Iterator[_Found]:
+    count, dims = len(scene.arrays["node_type"]), scene.arrays.get("cell_dim", np.array([]))
     if array.size and not (array.min() >= 0 and array.max() < count):
         yield _Found((array < 0) | (array >= count), lambda _: f"no such node, there are {count}")
+        return
+    kinds = kinds_of(array, int(dims[0]) if len(dims) else None, scene.arrays["pos"].shape[2])
+    corners = np.array([*(number for _, number in CELL_KINDS.values()), 0])[kinds]
+    bad = corners != is_corner(array).sum(axis=1)
+    if bad.any():
+        yield _Found(bad, lambda place: f"has the nodes {array[place[0]].tolist()}, and is none of {', '.join(CELL_KINDS)}")
 
 
 def _dimension_of_cells(scene: _Scene, array: np.ndarray) -> Iterator[_Found]:
@@ -193,6 +200,6 @@ _RULES: dict[str, _Rule] = {
     "unit vectors": _unit_vectors,
     "node types": _node_types,
     "parameters": _parameters,
-    "nodes": _nodes,
+    "cells": _cells,
     "dimension of cells": _dimension_of_cells,
 }

@@ -3,7 +3,8 @@
 ``source`` is a folder with ``meta.json`` and ``train``, ``valid`` and ``test`` as ``.tfrecord`` (an ``Example`` per trajectory, each field one string of
 bytes) or ``.h5`` (a group per trajectory with a data set per field). ``meta.json`` gives ``field_names``, ``trajectory_length``, ``dt``, and of each of the
 ``features`` its ``type`` (``static`` has one frame, ``dynamic`` all, ``dynamic_varlen`` another number of nodes in each), ``dtype`` and ``shape``. Read are
-``world_pos`` [frame, node, 3], ``mesh_pos`` [1, node, 2 or 3], ``cells`` [1, cell, corner], which are triangles or tetrahedra, and ``node_type`` [1, node, 1].
+``world_pos`` [frame, node, 3], ``mesh_pos`` [1, node, 2 or 3], ``cells`` [1, cell, corner] and ``node_type`` [1, node, 1]. Cells of four corners are
+quadrilaterals where ``mesh_pos`` lies in a plane, else tetrahedra.
 
 Types are 0 normal, 1 obstacle, 3 handle and 6 wall. Normal nodes become an ``elastomer``, the others boundary nodes, still or moving as the source has
 them: cells with such nodes are left out, and the neighbour radius connects a handle to its cloth. Without ``world_pos`` the mesh is still and a field moves on
@@ -135,7 +136,10 @@ def _loaded(fields: Mapping[str, np.ndarray], length: int, settings: ImportSetti
     if rest.shape[1] != num_nodes or types.shape[1:] != (num_nodes, 1) or not 1 <= rest.shape[2] <= dim:
         raise Refusal(f"world_pos, mesh_pos and node_type are {list(pos.shape)}, {list(rest.shape)} and {list(types.shape)}")
     warnings = length_warning(len(pos), "trajectory_length", length)
-    kind = "triangle" if cells.shape[2] == 3 else "tetrahedron"
     flat = np.zeros((num_nodes, dim), np.float64)  # a sheet lies in a plane when at rest
     flat[:, : rest.shape[2]] = rest[0]
+    is_sheet = dim == 2 or cells.shape[2] == 3 or (np.ptp(flat, axis=0) == 0).any()
+    kind = ({3: "triangle", 4: "quadrilateral"} if is_sheet else {4: "tetrahedron", 8: "hexahedron"}).get(cells.shape[2])
+    if kind is None:
+        raise Refusal(f"cells have {cells.shape[2]} corners, which no kind of cell {'of a sheet ' if is_sheet else ''}has")
     return build(typed(pos, types[0, :, 0], TYPES, settings, cells={kind: cells[0]}, rest_pos=flat, warnings=warnings), facts)

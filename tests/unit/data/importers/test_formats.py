@@ -302,6 +302,21 @@ def test_a_mesh_of_tetrahedra(tmp_path: Path) -> None:
     assert "stress of the source is von Mises' only: left out" in report.notes
 
 
+@pytest.mark.parametrize("axes", [2, 3])
+def test_a_cloth_of_quadrilaterals(tmp_path: Path, axes: int) -> None:
+    """Four corners are no tetrahedron where the mesh lies in a plane."""
+    number = np.arange(30).reshape(5, 6)
+    corners = np.stack([number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]], axis=-1).reshape(-1, 4)
+    for k in range(3):
+        cloth = sources.sheet(seed=k) | {"cells": corners[None].astype(np.int32), "node_type": np.zeros((1, 30, 1), np.int32)}
+        cloth["mesh_pos"] = np.pad(cloth["mesh_pos"], ((0, 0), (0, 0), (0, axes - 2)))
+        sources.mgn_meta(tmp_path / "raw", cloth)
+        sources.mgn_tfrecord(tmp_path / "raw" / f"{SPLITS[k]}.tfrecord", [cloth])
+    _, stored = imported(tmp_path, tmp_path / "raw", "meshgraphnets")
+    np.testing.assert_array_equal(stored["train"][0].cells, corners)
+    assert stored["train"][0].cell_dim == 2
+
+
 def test_a_plate_that_an_actuator_deforms(tmp_path: Path) -> None:
     """As in deforming_plate: an obstacle moves in a prescribed way, handles stand still."""
     points = np.argwhere(np.ones((4, 4, 2))).astype(float)
