@@ -97,7 +97,13 @@ def test_parts_of_a_data_set_are_generated_by_any_launcher(tiny_data: Path, tmp_
 @pytest.mark.long
 def test_optuna_searches_with_any_launcher(tiny_data: Path, tmp_path: Path) -> None:
     pytest.importorskip("optuna")
-    search = ["experiment=search", "evaluation.num_trajectories=1", "hydra.sweeper.num_trials=3", "hydra.sweeper.num_at_once=2", "training.budget_minutes=null"]
+    search = [
+        "experiment=search",
+        "evaluation.num_trajectories=1",
+        "hydra.sweeper.num_trials=3",
+        "hydra.sweeper.num_at_once=2",
+        "training.budget_minutes=null",
+    ]
     command = [sys.executable, "-m", "gpe_pl.fit", *DATA, *RUN, *search, f"paths.data={tiny_data}", f"paths.runs={tmp_path}"]
     result = subprocess.run(command, capture_output=True, text=True, timeout=500)
     assert result.returncode == 0, result.stdout + result.stderr
