@@ -65,7 +65,7 @@ def test_predicted_stress_does_not_depend_on_how_cells_are_stored(asleep: bool) 
     ],
 )
 def test_a_stored_row_that_is_no_cell_is_a_fault(cell: list[int], dim: int, is_sound: bool) -> None:
-    arrays = {"pos": np.zeros((3, 8, dim)), "node_type": np.zeros(8, np.uint8), "cells": np.array([cell])}
+    arrays: dict[str, np.ndarray] = {"pos": np.zeros((3, 8, dim)), "node_type": np.zeros(8, np.uint8), "cells": np.array([cell])}
     found = [fault for fault in faults(arrays, ["elastomer"], ["elastomer"], []) if fault.field == "cells"]
     assert bool(found) != is_sound
     assert all("triangle" in str(fault) and str(cell) in str(fault) for fault in found)
