@@ -132,7 +132,7 @@ Values = Literal[
     "unit vectors",
     "node types",  # of the data set's materials
     "parameters",  # finite where a node's material has the parameter, and positive where it enters by its logarithm
-    "cells",  # rows of nodes, as many different ones as a kind of cell has corners
+    "nodes of cells",  # rows of nodes, as many different ones as a kind of cell has corners
     "dimension of cells",  # 2 or 3, and at most that of space
 ]
 """What a stored array may hold; ``gpe_pl.values`` compares."""
@@ -181,7 +181,7 @@ FIELDS: dict[str, Field] = {
         "1",
         "node indices of each mesh cell; one with fewer corners than others repeats its last",
         required=False,
-        values="cells",
+        values="nodes of cells",
     ),
     "cell_dim": Field(
         ("one",),

@@ -200,6 +200,6 @@ _RULES: dict[str, _Rule] = {
     "unit vectors": _unit_vectors,
     "node types": _node_types,
     "parameters": _parameters,
-    "cells": _cells,
+    "nodes of cells": _cells,
     "dimension of cells": _dimension_of_cells,
 }
