@@ -363,22 +363,38 @@ def plan(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1)) ->
 def discard_damaged(root: Path | str, spec: DatasetSpec, num_workers: int = 1, part: tuple[int, int] = (0, 1)) -> None:
     """Read all shards and statistics that are there and delete those whose content disagrees with their checksums, so that ``generate`` makes them again.
 
-    Each of them is logged. This takes about a twentieth of the time to generate them. Arguments and errors are those of ``generate``.
+    Each of them is logged. This takes about a twentieth of the time to generate them. Where nothing is damaged, nothing is written. Arguments and errors are
+    those of ``generate``.
     """
     folder = Path(root) / spec.name / spec.size
     paths = [path for shard in _shards(spec, part) if (path := shard_path(folder, *shard)).is_file()]
     if not paths:
         return
     _claim(folder, spec)
+    damaged = []
     with pool(num_workers) as workers:
         for path, fault in results(workers, _fault, [(path,) for path in paths]):
             if fault:
                 log.warning("generating a shard again: %s", fault)
-                path.unlink(missing_ok=True)
+                damaged.append(path)
     statistics = folder / STATISTICS_FILE
     if statistics.is_file() and not _has_intact_statistics(statistics):
         log.warning("computing the statistics again: %s is damaged", statistics)
-        statistics.unlink(missing_ok=True)
+        damaged.append(statistics)
+    if damaged:
+        with written(root, spec, part):
+            for path in damaged:
+                path.unlink(missing_ok=True)
+
+
+def is_complete(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1)) -> bool:
+    """Whether ``generate`` with the same arguments would only read."""
+    return not plan(root, spec, part).missing and _is_described(Path(root) / spec.name / spec.size, part)
+
+
+def _is_described(folder: Path, part: tuple[int, int]) -> bool:
+    needed = [SPEC_FILE, *([] if part[0] else [CONTACT_SHEET_FILE])]
+    return all((folder / name).is_file() for name in needed) and _has_statistics(folder)
 
 
 def _has_intact_statistics(path: Path) -> bool:
@@ -468,8 +484,7 @@ def generate(
         raise ValueError(f"num_workers must be at least 1, got {num_workers}")
     folder = Path(root) / spec.name / spec.size
     to_do = plan(root, spec, part)
-    needed = [SPEC_FILE, *([] if part[0] else [CONTACT_SHEET_FILE])]
-    if not to_do.missing and all((folder / name).is_file() for name in needed) and _has_statistics(folder):
+    if not to_do.missing and _is_described(folder, part):
         _claim(folder, spec)
         if on_progress is not None:
             on_progress(to_do.num_done, to_do.num_done)

@@ -6,6 +6,7 @@ The same command resumes a run that was killed. Of what is there it reads every 
 from __future__ import annotations
 
 import os
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -112,7 +113,7 @@ def evaluated_config(cfg: DictConfig) -> DictConfig:
 
 def simulate(cfg: DictConfig) -> None:
     """Generate a data set, or what is missing of it or damaged, and say beforehand what a large one takes."""
-    from gpe_pl.generation import CONTACT_SHEET_FILE, written
+    from gpe_pl.generation import CONTACT_SHEET_FILE, is_complete, written
 
     if not (cfg.num_workers is None or (isinstance(cfg.num_workers, int) and cfg.num_workers >= 1)):
         raise ConfigError(f"num_workers={cfg.num_workers!r}: must be null (one per core) or an integer of at least 1")
@@ -120,7 +121,7 @@ def simulate(cfg: DictConfig) -> None:
         raise ConfigError(f"part={cfg.part!r}, num_parts={cfg.num_parts!r}: must be integers with 0 <= part < num_parts")
     spec, num_workers = dataset_spec(cfg), cfg.num_workers or os.cpu_count() or 1
     part = (cfg.part, cfg.num_parts)
-    with written(cfg.paths.data, spec, part):
+    with nullcontext() if is_complete(cfg.paths.data, spec, part) else written(cfg.paths.data, spec, part):
         folder = _simulate(cfg.paths.data, spec, part, num_workers)
     for path in (folder / CONTACT_SHEET_FILE, folder):
         if path.exists():  # only the first part draws the sheet

@@ -21,6 +21,7 @@ from omegaconf import OmegaConf
 from gpe_pl import locks, save_dataset
 from gpe_pl.config import Report
 from gpe_pl.locks import FolderError, held
+from gpe_pl.simulate import simulate
 from gpe_pl.trajectory import Trajectory
 from tests.runs import DATA, compose, generate_tiny
 
@@ -226,6 +227,17 @@ def test_hydra_starts_nothing_in_a_folder_that_cannot_be_used(
 def test_complete_data_are_read_where_nothing_can_be_written(tiny_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(locks, "_acquired", lambda *_: pytest.fail("reading needs no lock"))
     generate_tiny(tiny_data)
+    simulate(compose("simulate", *DATA, f"paths.data={tiny_data}", "num_workers=1"))
+
+
+def test_what_is_damaged_is_deleted_by_one_process_only(tiny_data: Path, tmp_path: Path) -> None:
+    shutil.copytree(tiny_data, tmp_path / "data")
+    shard = next((tmp_path / "data").rglob("shard-*.h5"))
+    shard.write_bytes(shard.read_bytes()[:-1000])
+    cfg = compose("simulate", *DATA, f"paths.data={tmp_path / 'data'}", "num_workers=1")
+    with held_elsewhere(tmp_path / "data" / "sand" / "tiny"), pytest.raises(FolderError, match="another command writes to it"):
+        simulate(cfg)
+    assert shard.exists()
 
 
 def test_long_names_have_locks_too(tmp_path: Path) -> None:
