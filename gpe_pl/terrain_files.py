@@ -6,6 +6,7 @@ Nothing that is read is executed, and no file but the named one is opened.
 from __future__ import annotations
 
 import io
+import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from gpe_pl.errors import GpeError
+from gpe_pl.zip_members import num_members
 
 MESHES = (".obj", ".stl", ".ply")
 POINT_CLOUDS = (".ply", ".xyz", ".npy", ".npz")
@@ -23,6 +25,9 @@ MAX_FILE_BYTES = 2**30
 MAX_TRIANGLES = 2_000_000
 MAX_POINTS = 5_000_000
 MAX_HEIGHTS = 2**25
+MAX_MEMBERS = 1000
+HEADER_BYTES = 2**16
+"""In which a PLY file says how many elements it has."""
 
 
 class TerrainError(GpeError, ValueError):
@@ -65,6 +70,8 @@ def read_surface(path: Path) -> Mesh | Cloud | Heights:
         raise TerrainError(f"{path}: no such file (searched from {Path.cwd()})")
     if path.stat().st_size > MAX_FILE_BYTES:
         raise TerrainError(f"{path}: {path.stat().st_size} bytes are too many, at most {MAX_FILE_BYTES}; simplify it first")
+    if extension in COUNTED:
+        _require_countable(path, extension)
     try:
         source = READERS[extension](path)
     except TerrainError:
@@ -74,6 +81,29 @@ def read_surface(path: Path) -> Mesh | Cloud | Heights:
     except Exception as error:  # the readers raise anything on damaged files
         raise TerrainError(f"{path}: cannot be read as {extension[1:].upper()}: {type(error).__name__}: {error}") from error
     return source
+
+
+COUNTED = {
+    ".obj": ((b"\nf", MAX_TRIANGLES, "triangles"), (b"\nv ", MAX_POINTS, "vertices")),
+    ".stl": ((b"endfacet", MAX_TRIANGLES, "triangles"),),
+    ".xyz": ((b"\n", MAX_POINTS, "points"),),
+    ".ply": (),
+    ".csv": ((b",", MAX_HEIGHTS, "heights"), (b"\n", MAX_HEIGHTS, "heights")),
+}
+"""What a line or a value of a text format has, by extension: readers take far longer than counting these."""
+
+
+def _require_countable(path: Path, extension: str) -> None:
+    """Refuse what would take minutes to read before it turns out to be too much."""
+    content = path.read_bytes()
+    if extension == ".stl" and not content[:512].lstrip().lower().startswith(b"solid"):
+        return  # its header says how many, which the reader compares with the size
+    for mark, most, what in COUNTED[extension]:
+        if (count := content.count(mark)) > most:
+            raise TerrainError(f"{path}: about {count} {what} are too many, at most {most}; simplify it first")
+    for what, count in re.findall(rb"element (vertex|face) +(\d{1,20})", content[:HEADER_BYTES]) if extension == ".ply" else ():
+        if (MAX_TRIANGLES if what == b"face" else MAX_POINTS) < int(count) <= len(content):  # a header that promises more is damaged
+            raise TerrainError(f"{path}: {int(count)} elements of kind {what.decode()} are too many; simplify it first")
 
 
 def _read_mesh(path: Path) -> Mesh | Cloud:
@@ -152,6 +182,8 @@ def _read_npy(path: Path) -> Cloud | Heights:
 
 
 def _read_npz(path: Path) -> Cloud | Heights:
+    if (count := num_members(path)) > MAX_MEMBERS:
+        raise TerrainError(f"{path}: holds {count} arrays, at most {MAX_MEMBERS} are read")
     with zipfile.ZipFile(path) as archive:
         unpacked = sum(entry.file_size for entry in archive.infolist())
     if unpacked > MAX_FILE_BYTES:

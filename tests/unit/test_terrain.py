@@ -15,7 +15,7 @@ from gpe_pl.canyon import canyon
 from gpe_pl.geometry import DistanceGrid
 from gpe_pl.grid_distance import unsigned
 from gpe_pl.terrain import read_terrain
-from gpe_pl.terrain_files import TerrainError
+from gpe_pl.terrain_files import TerrainError, read_surface
 
 UNIT = ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
 
@@ -431,3 +431,32 @@ def test_canyon_is_reproducible_and_differs_by_seed() -> None:
     difference = np.abs(fine.terrain.signed_distance(points) - made.terrain.signed_distance(points))
     assert np.quantile(difference, 0.95) < 0.5 / 16  # the same canyon, seen more closely
     assert fine.fall == made.fall
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "repeated", "count", "message"),
+    [
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 1", b"\nf 1 2 3", terrain_files.MAX_TRIANGLES, "triangles are too many"),
+        ("a.stl", b"solid a\n", b"endfacet\n", terrain_files.MAX_TRIANGLES, "triangles are too many"),
+        ("a.xyz", b"", b"1 2\n", terrain_files.MAX_POINTS, "points are too many"),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 3\nelement face 2000001\n",
+            b"\n",
+            2_000_001,
+            "2000001 elements of kind face are too many",
+        ),
+        ("a.npz", b"PK\x03\x04", b"PK\x01\x02", terrain_files.MAX_MEMBERS, "holds 1001 arrays"),
+    ],
+)
+def test_what_is_too_much_is_counted_before_it_is_read(
+    tmp_path: Path, name: str, start: bytes, repeated: bytes, count: int, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def read(*_: Any, **__: Any) -> None:
+        raise AssertionError
+
+    for module, function in (("numpy", "loadtxt"), ("zipfile", "ZipFile"), ("trimesh", "load_scene")):
+        monkeypatch.setattr(f"{module}.{function}", read)
+    (tmp_path / name).write_bytes(start + repeated * (count + 1))
+    with pytest.raises(TerrainError, match=message):
+        read_surface(tmp_path / name)

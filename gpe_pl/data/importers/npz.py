@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from gpe_pl.data.importers.source import ImportFailure, Refusal
+from gpe_pl.data.importers.source import MAX_TRAJECTORIES, ImportFailure, Refusal
 from gpe_pl.hdf5_arrays import LARGEST_DEFLATE_RATIO
+from gpe_pl.zip_members import num_members
 
 HEADERS: dict[tuple[int, int], Any] = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
@@ -30,9 +31,13 @@ DAMAGE = (
 def names(path: Path) -> list[str]:
     """Names of the arrays in an archive, in its order; raises ``ImportFailure``."""
     try:
+        if (count := num_members(path)) > MAX_TRAJECTORIES:
+            raise ImportFailure(f"{path}: holds {count} arrays, at most {MAX_TRAJECTORIES} are read")
         with zipfile.ZipFile(path) as archive:
             return [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
     except DAMAGE as error:
+        if isinstance(error, ImportFailure):
+            raise
         raise ImportFailure(f"{path}: not a readable .npz archive ({error})") from None
 
 

@@ -6,10 +6,11 @@ import struct
 import zipfile
 from pathlib import Path
 
+import h5py
 import pytest
 
-from gpe_pl.data.importers import npz
-from gpe_pl.data.importers.source import Refusal
+from gpe_pl.data.importers import hdf5, npz
+from gpe_pl.data.importers.source import ImportFailure, Refusal
 
 HEADERS = {
     "brackets": "[" * 9000,
@@ -39,3 +40,23 @@ def test_a_header_that_is_none_is_a_refusal(tmp_path: Path, what: str, version: 
     with pytest.raises(Refusal, match="'pos'") as refused:
         npz.read(path, "pos")
     assert len(str(refused.value)) < 5000
+
+
+def test_a_directory_of_very_many_arrays_is_not_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(npz, "MAX_TRAJECTORIES", 10)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        for k in range(11):
+            archive.writestr(f"{k}.npy", b"")
+    with pytest.raises(ImportFailure, match="holds 11 arrays, at most 10"):
+        npz.names(tmp_path / "a.npz")
+    monkeypatch.setattr(npz, "MAX_TRAJECTORIES", 11)
+    assert len(npz.names(tmp_path / "a.npz")) == 11
+
+
+def test_a_file_of_very_many_groups_is_not_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hdf5, "MAX_TRAJECTORIES", 2)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for k in range(3):
+            file.create_group(str(k))
+    with pytest.raises(ImportFailure, match="holds 3 groups"):
+        hdf5.groups(tmp_path / "a.h5")
