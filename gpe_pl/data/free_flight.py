@@ -6,6 +6,7 @@ in the frame before, as one island or several. Nothing in the graph tells a mode
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -103,10 +104,10 @@ def free_flights(metadata: Metadata, arrays: dict[str, np.ndarray], most_frames:
         arrays: by the names of ``schema.FIELDS``: ``pos``, ``mass``, ``boundary_pos`` and, for meshes, ``cells``.
         most_frames: that are looked at.
     """
-    half_step = float(np.finfo(arrays["pos"].dtype).eps) / 2
     pos, mass = arrays["pos"].astype(np.float64), arrays["mass"].astype(np.float64)
     gravity, dt, radius = np.asarray(metadata.gravity), metadata.frame_dt, metadata.connectivity_radius
-    resolution = 4 * half_step * float(np.max(np.abs(pos), initial=0.0)) / dt**2
+    half_step = float(np.finfo(arrays["pos"].dtype).eps) / 2 * float(np.max(np.abs(pos), initial=0.0))
+    resolution = 4 * half_step * math.sqrt(metadata.dim) / dt**2  # (x₂ − 2 x₁ + x₀)/Δt² has at most four such errors along each axis
     boundary = arrays["boundary_pos"].astype(np.float64)
     cells = arrays.get("cells", np.empty((0, 2), np.int64)).astype(np.int64)
     mesh = np.concatenate([np.stack([cells[:, 0], cells[:, k]]) for k in range(1, cells.shape[1])], axis=1)
@@ -123,9 +124,19 @@ def free_flights(metadata: Metadata, arrays: dict[str, np.ndarray], most_frames:
             window = metadata.periodicity.shortest(window - pos[frame])
         of_nodes = np.diff(window, 2, axis=0)[0] / dt**2
         acceleration = islands.mean(of_nodes, mass)[free]
-        uncertain = resolution / np.sqrt(np.bincount(islands.label, minlength=count))[free]
+        uncertain = resolution / np.sqrt(_independent(islands.label, pos[frame], count)[free])
         rms = float(np.sqrt(np.mean(np.sum(of_nodes**2, axis=-1))))
         yield FreeFlight(count, acceleration, np.broadcast_to(gravity, acceleration.shape), uncertain, np.full(len(acceleration), rms))
+
+
+def _independent(label: np.ndarray, pos: np.ndarray, count: int) -> np.ndarray:
+    """Nodes of each island [island] whose positions [node, dim] are rounded independently: in the rows of a lattice all are rounded alike."""
+    different = []
+    for x in pos.T:
+        order = np.lexsort((x, label))
+        is_new = np.append(True, (np.diff(x[order]) != 0) | (np.diff(label[order]) != 0))
+        different.append(np.bincount(label[order][is_new], minlength=count))
+    return np.min(different, axis=0)
 
 
 def vector(values: Iterable[float]) -> str:

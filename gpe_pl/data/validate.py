@@ -138,7 +138,7 @@ class Group:
                 + (
                     "they agree on another acceleration: gravity, frame_dt or the unit of length is not that of the data"
                     if flight.agrees_on_another
-                    else "above 0.1 % choose a larger connectivity_radius"
+                    else "above 0.1 % choose a larger connectivity_radius, unless positions are measured or air resists"
                 )
             )
         elif flight.num_islands:

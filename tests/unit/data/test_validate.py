@@ -417,6 +417,20 @@ def test_without_gravity_the_scale_of_accelerations_tells_what_is_small(new_traj
         assert (sum(f.num_free for f in flights), sum(f.num_disturbed for f in flights)) == (4, disturbed)
 
 
+@pytest.mark.parametrize("is_lattice", [True, False])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_rounding_of_free_fall_is_no_disturbance(dim: int, is_lattice: bool) -> None:
+    """Bodies that fall exactly, in single precision: the nodes in a row of a lattice are all rounded alike, which no mean over them lessens."""
+    rng, time = np.random.default_rng(0), 0.005 * np.arange(40)[:, None, None]
+    lattice = 0.05 * np.stack(np.meshgrid(*[np.arange(3)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
+    gravity = np.eye(dim)[-1] * -9.81
+    starts = [lattice + (0 if is_lattice else rng.uniform(0, 0.01, lattice.shape)) + 3.0 + 1.5 * k for k in range(5)]
+    pos = np.concatenate([start + rng.uniform(-1, 1, dim) * time + 0.5 * gravity * time**2 for start in starts], axis=1).astype(np.float32)
+    t = Trajectory.from_numpy(pos, 0.005, "sand", {"sand": 30.0}, bounds=[(-10, 20)] * dim, spacing=0.05, gravity=gravity)
+    flights = list(free_flights(t.metadata, {"pos": pos, "mass": t.mass, "boundary_pos": np.empty((1, 0, dim))}))
+    assert (sum(f.num_free for f in flights), sum(f.num_disturbed for f in flights)) == (5 * 38, 0)
+
+
 def test_rounding_of_positions_is_named(
     tmp_path: Path, new_trajectory: Callable[..., Trajectory], capsys: pytest.CaptureFixture[str]
 ) -> None:
