@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from gpe_pl.atomic import replacing
-from gpe_pl.generation import DatasetSpec, initial_state, parameter_values, trajectory_metadata
+from gpe_pl.ground_truth import DatasetSpec, initial_state, parameter_values, trajectory_metadata
 from gpe_pl.rollout import rollout
 from gpe_pl.simulate import dataset
 from gpe_pl.trajectory import State

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from gpe_pl.errors import GpeError as GpeError
     from gpe_pl.export import write_npz as write_npz
     from gpe_pl.export import write_vtk as write_vtk
-    from gpe_pl.generation import generate_trajectory as generate_trajectory
     from gpe_pl.geometry import domain_walls as domain_walls
+    from gpe_pl.ground_truth import generate_trajectory as generate_trajectory
     from gpe_pl.learned_simulator import LearnedSimulator as LearnedSimulator
     from gpe_pl.metrics import rollout_metrics as rollout_metrics
     from gpe_pl.portable import export_model as export_model
@@ -55,7 +55,7 @@ _MODULES = {
     "dataset": "simulate",
     "domain_walls": "geometry",
     "export_model": "portable",
-    "generate_trajectory": "generation",
+    "generate_trajectory": "ground_truth",
     "iter_trajectories": "store",
     "read_trajectory": "store",
     "roll_out": "rollout",

@@ -81,7 +81,7 @@ def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
 
 def _own_data(simulator: LearnedSimulator) -> str:
     """Overrides that choose data like those of the training; empty where none do."""
-    from gpe_pl.generation import trajectory_metadata
+    from gpe_pl.ground_truth import trajectory_metadata
     from gpe_pl.simulate import IMPORTED, dataset
 
     own = simulator.builder.metadata

@@ -17,7 +17,7 @@ from gpe_pl.schema import SPLITS
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-    from gpe_pl.generation import DatasetSpec
+    from gpe_pl.ground_truth import DatasetSpec
     from gpe_pl.trajectory import Metadata
 
 IMPORTED = "imported"
@@ -31,7 +31,7 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     """The data set that a config describes; raises ``ConfigError`` that names key and value."""
     from omegaconf import OmegaConf
 
-    from gpe_pl.generation import DatasetSpec
+    from gpe_pl.ground_truth import DatasetSpec
 
     if cfg.size.name not in cfg.data.sizes:
         raise ConfigError(f"size={cfg.size.name}: data={cfg.data.name} has the sizes {', '.join(cfg.data.sizes)}")
@@ -79,7 +79,7 @@ def ensure_data(cfg: DictConfig) -> Path:
 
 def scene_metadata(cfg: DictConfig, split: str) -> Metadata:
     """What is known of the scenes of a split before any is generated."""
-    from gpe_pl.generation import trajectory_metadata
+    from gpe_pl.ground_truth import trajectory_metadata
     from gpe_pl.store import iter_trajectories
 
     if cfg.data.size == IMPORTED:

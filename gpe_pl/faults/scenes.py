@@ -14,9 +14,9 @@ import torch
 from gpe_pl.containment import Contained
 from gpe_pl.errors import GpeError
 from gpe_pl.faults.verdict import Fault, Verdict, judge
-from gpe_pl.generation import DatasetSpec, initial_state, trajectory_metadata
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.ground_truth import DatasetSpec, initial_state, trajectory_metadata
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout import Guard, rollout

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 
 from gpe_pl.containment import Contained
-from gpe_pl.generation import initial_state
 from gpe_pl.graphs.features import history_of
+from gpe_pl.ground_truth import initial_state
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.metrics import displacement
 from gpe_pl.rollout import Simulator, Start, rollout, rollouts

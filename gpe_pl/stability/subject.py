@@ -14,8 +14,8 @@ from torch import Tensor
 from torch_geometric.data import HeteroData
 
 from gpe_pl import integrators
-from gpe_pl.generation import DatasetSpec
 from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.ground_truth import DatasetSpec
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.base import Prediction
 from gpe_pl.rollout import Guard

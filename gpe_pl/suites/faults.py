@@ -18,7 +18,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.faults import checkpoints, configs, isolation, runs, scenes, stores
 from gpe_pl.faults.runs import Command
 from gpe_pl.faults.verdict import BAD, GOOD, Fault, Verdict
-from gpe_pl.generation import DatasetSpec
+from gpe_pl.ground_truth import DatasetSpec
 from gpe_pl.markdown import table_row
 from gpe_pl.suites.trained import Case
 

@@ -24,7 +24,7 @@ from gpe_pl.baselines import BASELINES
 from gpe_pl.containment import Contained
 from gpe_pl.errors import GpeError
 from gpe_pl.finished_runs import Run
-from gpe_pl.generation import DatasetSpec, generate_trajectory, initial_state
+from gpe_pl.ground_truth import DatasetSpec, generate_trajectory, initial_state
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.markdown import table_row
 from gpe_pl.metrics import bootstrap_interval, energy_distance

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from gpe_pl.errors import GpeError
-from gpe_pl.generation import DatasetSpec, initial_state, trajectory_metadata
+from gpe_pl.ground_truth import DatasetSpec, initial_state, trajectory_metadata
 from gpe_pl.rollout import rollout
 from gpe_pl.store import array_bytes, write_shard
 

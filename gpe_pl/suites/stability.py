@@ -19,7 +19,7 @@ import torch
 from pydantic import Field
 
 from gpe_pl.errors import GpeError
-from gpe_pl.generation import DatasetSpec, generate_trajectory
+from gpe_pl.ground_truth import DatasetSpec, generate_trajectory
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.markdown import table_row
 from gpe_pl.stability import conservation, geometry, horizon, inputs, invariances, precision

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from gpe_pl.finished_runs import Run, axes_of, finished_runs
-from gpe_pl.generation import DatasetSpec
+from gpe_pl.ground_truth import DatasetSpec
 from gpe_pl.learned_simulator import LearnedSimulator
 
 DEPTHS = ("num_message_passing_steps", "num_propagation_steps", "num_convolutions")

@@ -16,9 +16,9 @@ from gpe_pl.config import ConfigError
 from gpe_pl.evaluate import evaluate_checkpoint
 from gpe_pl.evaluation import Row, read_rows
 from gpe_pl.fit import fit
-from gpe_pl.generation import trajectory_metadata
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.ground_truth import trajectory_metadata
 from gpe_pl.learned_simulator import LearnedSimulator, SceneError
 from gpe_pl.models.gpe import GPE
 from gpe_pl.report import summary

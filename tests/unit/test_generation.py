@@ -23,18 +23,15 @@ import pytest
 from gpe_pl import generation
 from gpe_pl.config import ConfigError
 from gpe_pl.data.validate import validate
-from gpe_pl.generation import (
+from gpe_pl.generation import discard_damaged, generate, plan, seconds_per_trajectory
+from gpe_pl.ground_truth import (
     DatasetSpec,
     GenerationError,
     ParameterValues,
-    discard_damaged,
-    generate,
     generate_trajectory,
     initial_state,
     parameter_values,
-    plan,
     scene_seed,
-    seconds_per_trajectory,
 )
 from gpe_pl.progress import progress_bar
 from gpe_pl.schema import SPLITS

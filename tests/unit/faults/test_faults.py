@@ -19,7 +19,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.faults import checkpoints, configs, runs, scenes, stores
 from gpe_pl.faults.isolation import Ended, verdicts
 from gpe_pl.faults.verdict import GOOD, Fault, Verdict, judge
-from gpe_pl.generation import DatasetSpec
+from gpe_pl.ground_truth import DatasetSpec
 from gpe_pl.simulate import dataset
 from gpe_pl.suites.faults import report
 

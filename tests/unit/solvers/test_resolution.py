@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gpe_pl.generation import DatasetSpec, initial_state
+from gpe_pl.ground_truth import DatasetSpec, initial_state
 from gpe_pl.simulate import dataset_spec
 from gpe_pl.solvers.resolution import Resolved, coarser, finer, outline
 from gpe_pl.trajectory import State

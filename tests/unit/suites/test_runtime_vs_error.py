@@ -11,9 +11,9 @@ import pytest
 from gpe_pl import sealed
 from gpe_pl.baselines import ConstantVelocity
 from gpe_pl.finished_runs import Run
-from gpe_pl.generation import generate_trajectory, initial_state, trajectory_metadata
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.ground_truth import generate_trajectory, initial_state, trajectory_metadata
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE

@@ -14,9 +14,9 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.benchmark import benchmark
 from gpe_pl.finished_runs import Run
-from gpe_pl.generation import DatasetSpec, generate_trajectory
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.ground_truth import DatasetSpec, generate_trajectory
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
