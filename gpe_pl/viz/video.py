@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from gpe_pl.atomic import replacing
+from gpe_pl.errors import GpeError
 from gpe_pl.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
 from gpe_pl.viz.captions import in_common, with_heading
@@ -23,6 +24,10 @@ PANEL_PIXELS, FILM_PIXELS = 360, 960
 CHARACTER_PIXELS = 7
 """About the width of a character of the line that names materials."""
 DPI = 100
+
+
+class FilmError(GpeError):
+    """A film is not whole; ffmpeg says nothing of it to the program that calls it."""
 
 
 def write_animation(
@@ -47,6 +52,7 @@ def write_animation(
     Raises:
         ValueError: another file type, a stride or frame rate that is not positive, or a GIF with more than 50 frames per
             second, no trajectory has what ``color`` needs, or a prediction has the name of the first panel.
+        FilmError: ffmpeg could not write the whole MP4. FullDiskError: there is no room for a GIF.
         ModuleNotFoundError: MP4 without imageio-ffmpeg.
     """
     frames = range(0, ground_truth.num_frames, stride) if stride >= 1 else range(0)
@@ -71,7 +77,7 @@ def _write(
         if path.suffix == ".gif":
             _write_gif(part, images, fps, _palette(color))
         else:
-            _write_mp4(part, images, fps)
+            _write_mp4(part, images, fps, path)
 
 
 def _images(rows: dict[str, Trajectory], frames: range, coloring: Coloring, panel_pixels: int) -> Iterator[np.ndarray]:
@@ -134,7 +140,8 @@ def _write_gif(path: Path, images: Iterator[np.ndarray], fps: int | float, palet
     next(pictures).save(path, format="GIF", save_all=True, append_images=pictures, duration=10 * round(100 / fps), loop=0)
 
 
-def _write_mp4(path: Path, images: Iterator[np.ndarray], fps: int | float) -> None:
+def _write_mp4(path: Path, images: Iterator[np.ndarray], fps: int | float, shown: Path) -> None:
+    """Write images to a path that errors call ``shown``."""
     try:
         import imageio_ffmpeg
     except ImportError:
@@ -143,11 +150,28 @@ def _write_mp4(path: Path, images: Iterator[np.ndarray], fps: int | float) -> No
     size = (first.shape[1], first.shape[0])
     # With its index in front a browser starts playing before the end has arrived.
     writer = imageio_ffmpeg.write_frames(
-        str(path), size, fps=fps, codec="libx264", quality=8, macro_block_size=2, output_params=["-movflags", "+faststart"]
+        str(path),
+        size,
+        fps=fps,
+        codec="libx264",
+        quality=8,
+        macro_block_size=2,
+        ffmpeg_log_level="quiet",
+        output_params=["-movflags", "+faststart"],
     )
+    count, reason = 0, "it ended early"
     try:
         writer.send(None)
         for image in chain([first], images):
             writer.send(np.ascontiguousarray(image))
+            count += 1
+        writer.close()
+        written = imageio_ffmpeg.count_frames_and_secs(str(path))[0]
+        if written == count:
+            return
+        reason = f"{written} of {count} frames are in the file"
+    except (OSError, RuntimeError, IndexError):  # the last one of a file without frames
+        pass
     finally:
         writer.close()
+    raise FilmError(f"{shown}: ffmpeg could not write the film ({reason}); is the disk full?")

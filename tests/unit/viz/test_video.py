@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gpe_pl.viz.video import write_animation
+from gpe_pl.viz.video import FilmError, write_animation
 
 
 def frames_of(path) -> list[np.ndarray]:
@@ -90,3 +90,17 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path, ground_truth, 
 def test_senseless_requests_are_refused(tmp_path, ground_truth, name, options, message):
     with pytest.raises(ValueError, match=message):
         write_animation(tmp_path / name, ground_truth, {}, **options)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files as POSIX does")
+def test_a_film_that_does_not_fit_is_refused_and_leaves_nothing(tmp_path, ground_truth):
+    """ffmpeg only says so by a file without frames."""
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    truncating = tmp_path / "truncating"
+    truncating.write_text(f'#!/bin/sh\nulimit -f 4\nexec {imageio_ffmpeg.get_ffmpeg_exe()} "$@"\n', encoding="utf-8")
+    truncating.chmod(0o755)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("IMAGEIO_FFMPEG_EXE", str(truncating))
+        with pytest.raises(FilmError, match=r"films/a\.mp4: ffmpeg could not write the film"):
+            write_animation(tmp_path / "films" / "a.mp4", ground_truth, {})
+    assert not list((tmp_path / "films").iterdir())
