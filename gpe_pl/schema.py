@@ -38,11 +38,11 @@ class MaterialParameter:
     @property
     def rule(self) -> str:
         """What a stored value must be; the solvers accept less, see ``solvers.materials.LIMITS``."""
-        return "positive and finite" if self.scale == "log" else "finite"
+        return "positive and finite" if self.scale == "log" else "finite and not negative"
 
     def accepts(self, values: Any) -> Any:
         """Which values of an array or tensor follow the rule; for a number, whether it does."""
-        return (values > (0.0 if self.scale == "log" else -math.inf)) & (values < math.inf)
+        return ((values > 0.0) if self.scale == "log" else (values >= 0.0)) & (values < math.inf)
 
 
 MATERIALS: dict[str, MaterialParameter] = {

@@ -248,7 +248,7 @@ def guard(subject: Subject) -> Outcome:
     stop = limits.check(inside, 3)
     found["deep inside"] = stop is not None and (stop.reason, stop.frame, stop.node) == ("tunnelling", 3, 0)
     params = state.material_params.clone()
-    params[1] = 1e30
+    params[1] = -1.0
     result = rollout(subject.simulator, replace(state, material_params=params), 5, subject.scenes[0].metadata, limits)
     stop = result.termination
     found["material"] = stop is not None and (stop.reason, stop.frame, stop.node) == ("material", 0, 1)

@@ -178,10 +178,10 @@ def test_metadata_that_describe_no_scene_are_refused(tmp_path: Path, trajectory:
         read_trajectory(tmp_path / "a.h5", "00000")
 
 
-def test_parameters_that_enter_by_their_logarithm_are_positive(trajectory: Trajectory) -> None:
+def test_parameters_are_not_negative_and_positive_where_they_enter_by_their_logarithm(trajectory: Trajectory) -> None:
     codes = np.array([node_code("sand"), node_code("fluid")], np.uint8)
     for value, number in ((0.0, 1), (-1.0, 1), (1e-30, 0)):
-        params = np.array([[-5.0, INF], [NAN, value]], np.float32)  # what does not apply is not looked at
+        params = np.array([[0.0, INF], [NAN, value]], np.float32)  # what does not apply is not looked at
         arrays: dict[str, np.ndarray] = {"node_type": codes, "material_params": params}
         materials = ("sand", "fluid")
         found = list(faults(arrays, ("sand", "snow", "fluid"), materials, param_names(materials)))
@@ -189,6 +189,9 @@ def test_parameters_that_enter_by_their_logarithm_are_positive(trajectory: Traje
         assert all(
             fault.message.startswith(f"kinematic_viscosity: node 1: is {value:g} m^2/s of fluid, must be positive") for fault in found
         )
+    arrays["material_params"] = np.array([[-5.0, INF], [NAN, 1.0]], np.float32)
+    (fault,) = faults(arrays, ("sand", "snow", "fluid"), materials, param_names(materials))
+    assert fault.message == "friction_angle: node 0: is -5 deg of sand, must be finite and not negative"
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
