@@ -18,22 +18,13 @@ from gpe_pl.finished_runs import groups_of
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.pretrained import FOLDER
 from gpe_pl.report import summary
-from gpe_pl.scene_ranges import described
-from gpe_pl.schema import MATERIALS
 
 
 def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows: list[Row], settings: dict[str, object]) -> str:
     """The model card."""
     metadata, model = simulator.builder.metadata, type(simulator.model).__name__
     size = sum(p.numel() for p in simulator.parameters())
-    ranges = []
-    for material, count in simulator.builder.spec.param_channels.items():
-        low, high = simulator.get_buffer(f"trained_{material}").tolist() if count else ([], [])
-        ranges += [
-            f"| {MATERIALS[material].name} of {material} | {a:g} – {b:g} {MATERIALS[material].unit} |"
-            for a, b in zip(low, high, strict=True)
-        ]
-    ranges += [f"| {kind} | {values} |" for kind, values in described(simulator.trained_scene.numpy())]
+    ranges = [f"| {kind} | {values} |" for kind, values in simulator.described_training()]
     training = settings["training"]
     assert isinstance(training, dict)
     lines = [

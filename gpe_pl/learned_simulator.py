@@ -35,7 +35,7 @@ from gpe_pl.models.base import Prediction
 from gpe_pl.nn.static_friction import is_held, supported
 from gpe_pl.pretrained import checkpoint_path, names
 from gpe_pl.rollout import SimulationError
-from gpe_pl.scene_ranges import outside, scene_range, united, unlimited
+from gpe_pl.scene_ranges import described, outside, scene_range, united, unlimited
 from gpe_pl.schema import BOUNDARY, MATERIALS, EdgeType, node_code
 from gpe_pl.signatures import check_plain, checked
 from gpe_pl.skips import Skips
@@ -202,6 +202,14 @@ class LearnedSimulator(nn.Module):
         """Lowest and highest value [2, param] of each material's parameters in training."""
         for material in self.builder.spec.param_channels:
             yield material, self.get_buffer(f"trained_{material}")
+
+    def described_training(self) -> Iterator[tuple[str, str]]:
+        """What training had of material parameters, gravity and boundary nodes: a name and its values with their unit, for each kind of value."""
+        for material, trained in self.trained_ranges():
+            spec = MATERIALS[material]
+            for low, high in trained.T.tolist():
+                yield f"{spec.name} of {material}", f"{low:g} to {high:g} {spec.unit}"
+        yield from described(self.trained_scene.cpu().numpy())
 
     def untrained_parameters(self, state: State) -> list[str]:
         """What in a scene lies outside the range of the training data: one line per material parameter, empty if nothing does."""

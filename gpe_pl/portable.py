@@ -311,6 +311,7 @@ def _description(simulator: LearnedSimulator, inputs: dict[str, Input]) -> dict[
         "connectivity_radius": builder.scales.radius,
         "bounds": builder.metadata.bounds,
         "periodic": builder.metadata.periodic,
+        "trained": dict(simulator.described_training()),
         "inputs": {name: asdict(about) for name, about in inputs.items()},
     }
 

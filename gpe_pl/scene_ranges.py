@@ -50,7 +50,8 @@ def _values(name: str, boundary: Boundary, periodicity: Periodicity) -> np.ndarr
         return np.asarray(np.linalg.norm(boundary.vel if boundary.motion is None else boundary.motion.vel, axis=-1))
     if len(boundary.pos) < 2:
         return np.empty(0)
-    return np.array([np.median(nearest_distances(np.asarray(boundary.pos, np.float64), periodicity))])
+    nearest = nearest_distances(np.asarray(boundary.pos, np.float64), periodicity)
+    return np.array([np.median(nearest), nearest.max()])  # the typical one, and the widest, as of a single coarse obstacle
 
 
 def unlimited(dim: int) -> Float64[np.ndarray, "2 channel"]:

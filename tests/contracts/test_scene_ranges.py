@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +14,10 @@ import torch
 from gpe_pl import sealed
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
+from gpe_pl.data.importers.source import joined
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
-from gpe_pl.geometry import domain_walls
+from gpe_pl.geometry import Sphere, domain_walls
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator
@@ -94,6 +96,20 @@ def test_what_training_had_constant_and_a_scene_changes_is_warned_of(
     for _ in range(3):
         simulator.standing(state, simulator.builder.metadata)
     assert [r.getMessage() for r in caplog.records] == [f"outside the training data: {line}"]
+
+
+def test_an_obstacle_with_wider_gaps_than_the_walls_is_warned_of() -> None:
+    """Few of many nodes, so that the typical spacing is that of training; nodes that are cut out where shapes meet are none."""
+    simulator, space = trained(ONE), scenes.SPACING
+    ball = Sphere((0.5, 0.4), 0.15, 0.3)
+    whole = Boundary.sample((*WALLS, ball), space, 2)
+    whole = replace(whole, friction=np.full(len(whole.pos), 0.3), restitution=np.zeros(len(whole.pos)))
+    assert simulator.untrained_scene(scene(b=whole)) == []
+    coarse, walls = Boundary.sample((ball,), 2.5 * space, 2), boundary()
+    assert 10 * len(coarse.pos) < len(walls.pos)
+    both = joined(2, walls, coarse)
+    (line,) = simulator.untrained_scene(scene(b=both))
+    assert re.fullmatch(r"spacing of boundary nodes is 0\.1\d* m, in training it was 0\.05 m", line)
 
 
 def test_other_values_of_a_kind_that_was_warned_of_add_no_line(caplog: pytest.LogCaptureFixture) -> None:

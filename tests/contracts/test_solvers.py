@@ -15,6 +15,7 @@ from gpe_pl.rollout import SimulationError, Simulator, rollout
 from gpe_pl.schema import MATERIALS, NODE_TYPES, param_names
 from gpe_pl.solvers.fem import FEM
 from gpe_pl.solvers.flip import FLIP
+from gpe_pl.solvers.materials import LIMITS, check_limits
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.solid_scenes import SolidScene
 from gpe_pl.trajectory import Boundary, State, Stress
@@ -154,6 +155,19 @@ def test_a_parameter_outside_the_limits_is_refused(case):
     with pytest.raises(SimulationError, match=message) as caught:
         solver.step(replace(state, material_params=params))
     assert (caught.value.reason, caught.value.node) == ("input", node)
+
+
+@pytest.mark.parametrize("end", ["low", "high"])
+@pytest.mark.parametrize("material", LIMITS)
+def test_a_parameter_at_the_limits_is_accepted_again_from_a_file(material: str, end: str) -> None:
+    """Water has the smallest viscosity that is allowed; the store rounds it to single precision, and solvers compute in double."""
+    value = getattr(LIMITS[material], end)
+    stored = np.array([value], np.float32).astype(np.float64)
+    check_limits(material, stored, np.arange(1))
+    for beyond in (value * (1 - 1e-6), value * (1 + 1e-6)):
+        if not LIMITS[material].low <= beyond <= LIMITS[material].high:
+            with pytest.raises(SimulationError, match="the limits of the solvers"):
+                check_limits(material, np.array([beyond]), np.arange(1))
 
 
 def test_input_is_not_modified(case):

@@ -230,6 +230,8 @@ def test_a_program_of_a_periodic_domain(tmp_path: Path) -> None:
         assert_same_step(program, learned, state.to_torch())
     description = json.loads(files[DESCRIPTION])
     assert (description["bounds"], description["periodic"]) == ([[0.0, 1.0], [0.0, 1.0]], [True, True])
+    assert description["trained"] == dict(learned.described_training())
+    assert {"friction_angle of sand", "gravity", "spacing of boundary nodes"} <= {*description["trained"]}
 
 
 @pytest.mark.slow
