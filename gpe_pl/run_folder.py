@@ -12,6 +12,8 @@ from gpe_pl.errors import GpeError
 CONFIG = "config.json"
 DATA_CHECKSUMS = "data_sha256"
 """Key of a configuration: the checksums of the splits that were used. Data of one name may be replaced."""
+HYDRA = ".hydra"
+"""Folder in that of a run, in which Hydra writes through links."""
 OFFERED = ("comparison", "larger")
 """Tables of ``data`` and ``size`` that other keys are taken from."""
 
@@ -43,7 +45,7 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
 def refuse_links(run_dir: Path) -> None:
     """Raise ``RunError`` where a folder, which may be someone else's, has a link through which a run would write outside of it."""
     inside = run_dir.resolve()
-    for path in sorted(run_dir.iterdir()) if run_dir.is_dir() else []:
+    for path in sorted(path for folder in (run_dir, run_dir / HYDRA) if folder.is_dir() for path in folder.iterdir()):
         if path.is_symlink() and not path.resolve().is_relative_to(inside):
             raise RunError(f"{path}: a link that leads out of the run folder; remove it, or make the folder itself a link")
 

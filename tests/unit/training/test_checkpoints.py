@@ -295,12 +295,15 @@ def test_no_path_in_a_checkpoint_is_followed(data: Path, tmp_path: Path, scores:
     assert str(tmp_path) not in (run / "checkpoints" / "last.ckpt").read_bytes().decode(errors="replace")
 
 
-@pytest.mark.parametrize("name", ["checkpoints", "log", "metrics.csv", "rollout_test_00.png"])
+@pytest.mark.parametrize("name", ["checkpoints", "log", "metrics.csv", "rollout_test_00.png", ".hydra/config.yaml"])
 @pytest.mark.parametrize("target", ["../outside", "{folder}/outside", "missing/../../outside"])
 def test_a_link_that_leads_out_of_a_run_folder_is_refused(tmp_path: Path, name: str, target: str) -> None:
     (tmp_path / "outside").mkdir()
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / name).symlink_to(target.format(folder=tmp_path))
+    link = tmp_path / "run" / name
+    link.parent.mkdir(exist_ok=True)
+    upwards = "" if target.startswith("{folder}") else "../" * name.count("/")
+    link.symlink_to(upwards + target.format(folder=tmp_path))
     with pytest.raises(RunError, match=rf"run/{name}: a link that leads out of the run folder"):
         claim(tmp_path / "run", {"seed": 0})
     assert [*(tmp_path / "outside").iterdir()] == []
