@@ -336,6 +336,9 @@ class Report(Callback):
     command ends.
     """
 
+    def __init__(self) -> None:
+        self._lock = contextlib.ExitStack()
+
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         with contextlib.suppress(OmegaConfBaseException):  # of a name that is refused; Hydra meets it again, and ends
             self._hold(Path(config.hydra.run.dir))
@@ -348,15 +351,18 @@ class Report(Callback):
         """Until the process ends. Ends it where the folder cannot be used: Hydra turns an exception of a callback into a warning, and goes on."""
         from gpe_pl.locks import held
 
-        stack = contextlib.ExitStack()
         try:
             refuse_links(folder)
-            stack.enter_context(held(folder))
+            self._lock.enter_context(held(folder))
         except GpeError as error:
             _fail(error)
         except OSError as error:
             _fail(ConfigError(f"{folder}: cannot be read or written ({error.strerror}); choose another folder with paths.runs=…"))
-        atexit.register(stack.close)
+        atexit.register(self._release)
+
+    def _release(self) -> None:
+        with contextlib.suppress(GpeError):  # of a folder that was deleted meanwhile; the command has ended with it
+            self._lock.close()
 
     def on_run_end(self, config: DictConfig, **_: Any) -> None:
         self._report(Path(config.hydra.run.dir), is_sweep=False)
@@ -380,6 +386,7 @@ class Report(Callback):
                 if (folder / "metrics.csv").exists():
                     print(conclusion(folder))
             print(folder)
+            self._lock.close()  # refuses a folder that was deleted meanwhile
         except GpeError as error:
             _fail(error)
         except Exception as error:

@@ -71,8 +71,12 @@ def held(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bool
         FolderError: another command writes to the folder, the folder cannot be made, or it was deleted inside.
     """
     path = _beside(folder, "lock")
-    if path in _held or _is_later_process():
+    if _is_later_process():
         yield
+        return
+    if path in _held:
+        with _same(folder):
+            yield
         return
     made = _make(folder if makes else folder.parent, key)
     lock = _acquired(folder, path, waits)

@@ -139,6 +139,31 @@ def test_a_folder_that_was_deleted_meanwhile_is_an_error(tmp_path: Path, ends_wi
         (tmp_path / "a" / "file").touch()
 
 
+@pytest.mark.parametrize("ends_with", [None, FileNotFoundError])
+def test_a_deleted_folder_is_an_error_also_where_the_process_holds_it_already(tmp_path: Path, ends_with: type[OSError] | None) -> None:
+    """As in a training, whose folder Hydra's callback holds: the inner block ends with it, and the callback's end says nothing more."""
+    lost = "a: was deleted or replaced while this command wrote to it"
+    with pytest.raises(FolderError, match=lost), held(tmp_path / "a"), pytest.raises(FolderError, match=lost), held(tmp_path / "a"):
+        shutil.rmtree(tmp_path / "a")
+        if ends_with:
+            raise ends_with
+
+
+@pytest.mark.parametrize("kind", ["run", "multirun"])
+def test_a_command_whose_folder_was_deleted_does_not_succeed(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
+    folder = tmp_path / "a"
+    config = OmegaConf.create({"hydra": {"run": {"dir": str(folder)}, "sweep": {"dir": str(folder)}}})
+    callback = Report()
+    getattr(callback, f"on_{kind}_start")(config)
+    shutil.rmtree(folder)
+    folder.mkdir()
+    with pytest.raises(SystemExit, match="2"):
+        getattr(callback, f"on_{kind}_end")(config)
+    assert "a: was deleted or replaced while this command wrote to it" in capsys.readouterr().err
+    callback._release()
+    assert not capsys.readouterr().err and not list(tmp_path.glob(".a.*"))
+
+
 def test_other_errors_stay_what_they_are(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="mine"), held(tmp_path / "a"):
         raise ValueError("mine")
