@@ -12,7 +12,11 @@ if TYPE_CHECKING:
 
 
 def fit(cfg: DictConfig) -> float:
-    """Generate what data is missing, train or resume, evaluate; returns the mean full-length rollout MSE [m²] on the first split evaluated."""
+    """Generate what data is missing, train or resume, evaluate.
+
+    Returns:
+        The mean full-length rollout MSE [m²] on the first split evaluated; failed rollouts count as in tables (``finished_runs.rollout_errors``).
+    """
     from gpe_pl.locks import held
     from gpe_pl.names import data_name, run_name
 
@@ -34,6 +38,7 @@ def _fit(cfg: DictConfig, run_dir: Path) -> float:
     from gpe_pl.data.dataset import open_split, window_counts
     from gpe_pl.data.sampling import BatchSize
     from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
+    from gpe_pl.finished_runs import Run, rollout_errors
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
     from gpe_pl.pretrained import fingerprint
@@ -119,11 +124,8 @@ def _fit(cfg: DictConfig, run_dir: Path) -> float:
         rows = evaluate(LearnedSimulator.from_checkpoint(best, device), evaluated, evaluation, run_dir)
         publish(loggers, run_dir, means(rows))
 
-    values = [
-        r.value
-        for r in read_rows(run_dir / "metrics.csv")
-        if (r.model, r.split, r.metric, r.horizon) == (LEARNED, evaluation.splits[0], "rollout_mse", "full")
-    ]
+    run = Run(run_dir, {}, list(read_rows(run_dir / "metrics.csv")))
+    values = [value for errors in rollout_errors([run], evaluation.splits[0], "full") for value in errors.values()]
     if not values:
         path = run_dir / "metrics.csv"
         raise RunError(f"{path}: has no rollout_mse of {LEARNED} on {evaluation.splits[0]}; delete the file to evaluate again")

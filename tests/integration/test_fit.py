@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import re
 import shutil
 import signal
@@ -22,7 +23,7 @@ from gpe_pl.data import sampling
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import NoiseError
 from gpe_pl.errors import GpeError
-from gpe_pl.evaluation import StartError, read_rows
+from gpe_pl.evaluation import StartError, read_rows, write_rows
 from gpe_pl.finished_runs import validation_curve
 from gpe_pl.fit import fit
 from gpe_pl.learned_simulator import LearnedSimulator
@@ -237,6 +238,19 @@ def test_a_finished_run_is_left_as_it_is(tiny_data: Path, tmp_path: Path, monkey
     monkeypatch.setattr(TrajectoryDataModule, "__init__", lambda *_, **__: pytest.fail("opened the data"))
     assert fit(cfg) == value
     assert {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in tmp_path.rglob("*") if p.is_file()} == files
+
+
+def test_a_failed_rollout_counts_in_a_search_as_in_tables(tiny_data: Path, tmp_path: Path) -> None:
+    cfg = tiny(tiny_data, tmp_path, "evaluation.splits=[test]")
+    value = fit(cfg)
+    metrics = tmp_path / "fit" / "metrics.csv"
+    rows = list(read_rows(metrics))
+    judged = [r for r in rows if (r.metric, r.horizon) == ("rollout_mse", "full")]
+    learned, flight = ([r.value for r in judged if r.model == name] for name in ("learned", "ballistic"))
+    assert value == pytest.approx(np.mean(learned))
+    failed = next(r for r in judged if r.model == "learned")
+    write_rows(metrics, [replace(r, value=math.inf) if r is failed else r for r in rows])
+    assert fit(cfg) == pytest.approx(np.mean([flight[0], *learned[1:]]))
 
 
 @pytest.mark.parametrize(
