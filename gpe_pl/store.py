@@ -77,6 +77,8 @@ def array_bytes(trajectory: Trajectory) -> int:
     return sum(array.nbytes for array in stored_arrays(trajectory).values())
 
 
+PREDICTION = "prediction"
+"""Attribute that only predictions have."""
 ATTRIBUTES = ("metadata", "shapes", "node_types")
 """Of a trajectory's group, beside the digest."""
 
@@ -148,6 +150,8 @@ def _write_trajectory(group: h5py.Group, trajectory: Trajectory) -> None:
     for key, text in attributes.items():
         _write_text(group, key, text)
     _write_text(group, "sha256", digest(arrays, attributes))
+    if trajectory.is_prediction:
+        _write_text(group, PREDICTION, "")
     for key, array in arrays.items():
         empty = array.size == 0
         options = {} if empty else {"chunks": _chunks(array, FIELDS[key].dims), "fletcher32": True, **COMPRESSION}
@@ -324,7 +328,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
             raise StoreError(f"{path}:{name}: has only one of the fields 'node_stress' and 'cell_stress'")
         for conflict in size_conflicts(arrays, metadata.dim, len(metadata.param_names)):
             raise StoreError(f"{path}:{name}: {conflict}")
-        shapes, names = shapes_of(group), node_types_of(group)
+        shapes, names, is_prediction = shapes_of(group), node_types_of(group), PREDICTION in group.attrs
     for key, violation in metadata.violations():
         raise UnsoundError(f"{path}:{name}", f"{key} {violation}")
     if (wrong := shapes_fault(shapes, metadata.periodicity)) is not None:
@@ -355,6 +359,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         cell_dim=int(arrays["cell_dim"][0]) if "cell_dim" in arrays else None,
         stress=Stress(arrays["node_stress"], arrays["cell_stress"]) if "node_stress" in arrays else None,
         start_time=metadata.frame_dt * (0 if frames is None else frames.start or 0),
+        is_prediction=is_prediction,
     )
 
 

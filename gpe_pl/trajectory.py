@@ -483,7 +483,7 @@ class Trajectory:
         stress: of the mesh in every frame.
         termination: set when a rollout stopped before its last frame.
         start_time: of the first frame, in s since the start of the scene; not stored.
-        is_prediction: whether a rollout of anything but a ground-truth solver made it; not stored.
+        is_prediction: whether a rollout of anything but a ground-truth solver made it.
     """
 
     metadata: Metadata

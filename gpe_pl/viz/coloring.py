@@ -88,6 +88,8 @@ class Coloring:
     @property
     def bar_label(self) -> str | None:
         """Label of a colour bar, where one helps."""
+        if self.by == "error" and self._truth is not None and self._truth.is_prediction:
+            return "distance from the first row [m]"
         return BAR_LABELS.get(self.by)
 
     def values(self, trajectory: Trajectory, frame: int) -> tuple[Float[np.ndarray, "node"], Float[np.ndarray, "cell"]]:

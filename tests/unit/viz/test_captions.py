@@ -14,6 +14,7 @@ from gpe_pl.baselines import Ballistic
 from gpe_pl.data.importers import draw_contact_sheet, save_dataset
 from gpe_pl.rollout import rollout
 from gpe_pl.schema import node_code
+from gpe_pl.store import read_trajectory, write_shard
 from gpe_pl.trajectory import Trajectory
 from gpe_pl.viz import contact_sheet as sheets
 from gpe_pl.viz import video
@@ -131,3 +132,13 @@ def test_values_have_their_unit() -> None:
     assert (parameter_value("snow", 8.0), parameter_value("sand", 20.0, 30.0)) == ("8", "20 … 30°")
     assert row_label({"sand": 20.0}) == "friction angle\n20°" and row_label({"sand": 20.0, "snow": 8.0}) == "sand 20°\nsnow 8"
     assert describe(replace(truth(), material_params=np.full((truth().num_nodes, 1), np.nan))) == "sand"
+
+
+def test_a_stored_prediction_stays_one(tmp_path: Path) -> None:
+    write_shard(tmp_path / "a.h5", [truth(), predicted()])
+    assert [read_trajectory(tmp_path / "a.h5", name).is_prediction for name in ("00000", "00001")] == [False, True]
+
+
+def test_a_distance_between_predictions_is_no_error() -> None:
+    bars = [rollout_figure(first, {"other": predicted()}, color="error").axes[-1].get_ylabel() for first in (truth(), predicted())]
+    assert bars == ["position error [m]", "distance from the first row [m]"]
