@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from gpe_pl import regular_files
 from gpe_pl.approximate import approximate
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.baselines import BASELINES
@@ -272,8 +273,13 @@ def read_rows(path: Path) -> Iterator[Row]:
     Raises:
         MetricsError: it is not what ``write_rows`` has written.
     """
-    content = path.read_bytes()
     digest = _digest_file(path)
+    try:
+        regular_files.check(path)
+        regular_files.check(digest)
+    except OSError as error:
+        raise MetricsError(f"{error.filename}: {error.strerror}; delete it to evaluate again") from None
+    content = path.read_bytes()
     if digest.exists() and digest.read_bytes().split()[:1] != [hashlib.sha256(content).hexdigest().encode()]:
         raise MetricsError(
             f"{path}: damaged or changed (checksum mismatch); delete the file to evaluate again, or {digest.name} to take it as it is"

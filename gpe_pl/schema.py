@@ -42,7 +42,7 @@ class MaterialParameter:
 
     def accepts(self, values: Any) -> Any:
         """Which values of an array or tensor follow the rule; for a number, whether it does."""
-        return ((values > 0.0) if self.scale == "log" else (values >= 0.0)) & (values < math.inf)
+        return ((values > 0.0) if self.scale == "log" else (values >= 0.0)) & (values < LARGEST)
 
 
 MATERIALS: dict[str, MaterialParameter] = {

@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from gpe_pl import json_text
+from gpe_pl import json_text, regular_files
 from gpe_pl.atomic import replace_text
 from gpe_pl.errors import GpeError
 
@@ -69,6 +69,10 @@ def parsed(path: Path, advice: str) -> Any:
         SealError: it is none.
         OSError: it cannot be read.
     """
+    try:
+        regular_files.check(path)
+    except OSError as error:
+        raise SealError(f"{path}: {error.strerror}; {advice}") from None
     with open(path, "rb") as file:
         content = file.read(MOST_BYTES + 1)
     try:

@@ -9,6 +9,7 @@ import runpy
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from gpe_pl.errors import GpeError
-from gpe_pl.faults.verdict import MAX_DETAIL, Fault, Verdict
+from gpe_pl.faults.verdict import GOOD, MAX_DETAIL, Fault, Verdict
 
 PRELOADED = [
     "torch",
@@ -30,6 +31,12 @@ PRELOADED = [
     "gpe_pl.training.run",
 ]
 PRELOADED += ["gpe_pl.evaluation", "gpe_pl.generation", "gpe_pl.solvers.scenes", "gpe_pl.solvers.mpm", "gpe_pl.models.gpe", "gpe_pl.report"]
+
+
+HANG = 10.0
+"""Seconds beyond what something takes where nothing is wrong, after which it hangs."""
+CANARY = "canary"
+"""Folder beside those that are attacked, which none of them may change."""
 
 
 class IsolationError(GpeError):
@@ -98,15 +105,37 @@ def _attack(faults: Sequence[Fault], answers: Connection, folder: str) -> None:
     with open(os.devnull, "wb") as null:  # what a fault prints is of no interest
         os.dup2(null.fileno(), 1)
         os.dup2(null.fileno(), 2)
+    canary = Path(folder) / CANARY
     for number, fault in enumerate(faults):
-        own = Path(folder) / str(number)
-        own.mkdir()
-        try:
-            verdict = fault.attack(own)
-        except Exception as error:
-            verdict = Verdict("traceback", f"{type(error).__name__}: {error}"[:MAX_DETAIL])
+        verdict = _watched(fault, Path(folder) / str(number), canary)
+        if verdict.status == "hung":  # or the machine was busy: what hangs does so again
+            verdict = _watched(fault, Path(folder) / str(number), canary)
         answers.send(verdict)
-        shutil.rmtree(own, ignore_errors=True)
+
+
+def _watched(fault: Fault, own: Path, canary: Path) -> Verdict:
+    """Attack in a new folder with another one beside it; takes too long, or changes the other one: that is what came of it."""
+    own.mkdir()
+    shutil.rmtree(canary, ignore_errors=True)
+    (canary / "checkpoints").mkdir(parents=True)
+    for name in ("metrics.csv", "checkpoints/best.ckpt", "checkpoints/last.ckpt"):
+        (canary / name).write_text("somebody else's", encoding="utf-8")
+    before, started = _contents(canary), time.monotonic()
+    try:
+        verdict = fault.attack(own)
+    except Exception as error:
+        verdict = Verdict("traceback", f"{type(error).__name__}: {error}"[:MAX_DETAIL])
+    seconds = time.monotonic() - started
+    shutil.rmtree(own, ignore_errors=True)
+    if (after := _contents(canary)) != before:
+        return Verdict("outside", f"changed: {', '.join(sorted(str(name) for name, _ in before ^ after))}; {verdict.detail}"[:MAX_DETAIL])
+    if verdict.status in GOOD and seconds > fault.seconds + HANG:
+        return Verdict("hung", f"{seconds:.0f} s, where nothing is wrong {fault.seconds:.0f} s; {verdict.detail}"[:MAX_DETAIL])
+    return verdict
+
+
+def _contents(folder: Path) -> set[tuple[Path, bytes]]:
+    return {(path.relative_to(folder), path.read_bytes() if path.is_file() else b"") for path in folder.rglob("*")}
 
 
 # --- commands -----------------------------------------------------------------------------------------------------------------------------

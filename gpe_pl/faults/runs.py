@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import shutil
 import signal
@@ -38,6 +39,8 @@ SAVED = (
 """What of a training checkpoint does not depend on where it lies."""
 
 
+MEASURED = "results.json"
+"""Of benchmarks: times are never the same, so their number and the settings are compared."""
 MESSAGE_BYTES = 1000
 """What a command prints goes to a file, too: with less room in it the error would be cut off."""
 
@@ -51,12 +54,14 @@ class Command:
         module: ``python -m gpe_pl.{module}``.
         arguments: all but the folders.
         data: folder of the data, or None if the command makes them in its own.
+        seconds: that it takes undisturbed.
     """
 
     name: str
     module: str
     arguments: tuple[str, ...]
     data: str | None = None
+    seconds: float = math.inf
 
     def given(self, folder: Path) -> list[str]:
         """The arguments with the folders."""
@@ -75,13 +80,19 @@ def digests(folder: Path) -> dict[str, str]:
     for path in _final_files(folder):
         relative = path.relative_to(folder)
         name = str(relative)
-        if "log" in relative.parts:
+        if "log" in relative.parts or not path.is_file():
             continue
         if path.suffix == ".ckpt":
             stored = load_checkpoint(path)
             found[name] = _digest({key: stored[key] for key in SAVED})
+        elif path.name == MEASURED:
+            values = json.loads(path.read_text(encoding="utf-8"))
+            found[name] = _digest([values["settings"], len(values["records"])])
         elif path.suffix == ".json":
-            found[name] = _digest(json.loads(path.read_text(encoding="utf-8")))
+            values = json.loads(path.read_text(encoding="utf-8"))
+            found[name] = _digest({k: v for k, v in values.items() if k != "folder"} if path.name == "report.json" else values)
+        elif path.with_name(MEASURED).exists():
+            found[name] = "of what was measured"
         elif path.suffix == ".h5" or path.name in ("metrics.csv", "table.csv", "table.md"):
             found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
     return found
@@ -126,15 +137,15 @@ def incomplete(folder: Path) -> list[str]:
 
 
 def leftovers(folder: Path) -> list[str]:
-    """Temporary files."""
-    return [path.name for path in folder.rglob("*.part*")]
+    """Temporary files, and locks that nobody holds."""
+    return sorted(path.name for pattern in ("*.part*", ".*.lock", ".*.holder") for path in folder.rglob(pattern))
 
 
 def _final_files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if not path.name.startswith("."))
 
 
-def _finished(command: Command, folder: Path, expected: dict[str, str], limit: float) -> Verdict:
+def finished(command: Command, folder: Path, expected: dict[str, str], limit: float) -> Verdict:
     """Run a command to its end, and compare what it leaves."""
     ended = isolation.run(command.module, command.given(folder), limit)
     if ended.code != 0:
@@ -148,11 +159,15 @@ def _finished(command: Command, folder: Path, expected: dict[str, str], limit: f
     return Verdict("half-written", f"left behind: {', '.join(left)}") if left else Verdict("harmless", "equal bit for bit")
 
 
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+"""What ends a command before its time."""
+
+
 # --- kills --------------------------------------------------------------------------------------------------------------------------------
 
 
 def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: int = 0, limit: float = 600.0) -> Iterator[Verdict]:
-    """Kill a command at random moments, with SIGKILL and SIGTERM in turn, start it again, and after some kills let it finish.
+    """Kill a command at random moments, with SIGKILL, SIGTERM and SIGINT in turn, start it again, and after some kills let it finish.
 
     What it then leaves is compared with an undisturbed run. Yields a verdict per kill, which names the moment.
     """
@@ -170,7 +185,7 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
         moments: list[str] = []
         problem: Verdict | None = None
         while len(moments) < min(in_a_row, count - number):
-            kind = signal.SIGKILL if len(moments) % 2 == 0 else signal.SIGTERM
+            kind = SIGNALS[(number + len(moments)) % len(SIGNALS)]
             moment = float(rng.uniform(0.0, duration))
             process = isolation.start(command.module, command.given(own), folder / "output")
             try:
@@ -188,18 +203,18 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
                     shutil.rmtree(own, ignore_errors=True)
                     continue
                 os.kill(process.pid, kind)
-                if not isolation.waited(process, limit):
+                if not isolation.waited(process, min(limit, command.seconds + isolation.HANG)):
                     problem = Verdict("hung", f"after {kind.name}")
             finally:
                 isolation.end(process)
             moments.append(f"{kind.name} after {moment:.2f} s")
             output = (folder / "output").read_text(encoding="utf-8", errors="replace")
-            if kind is signal.SIGTERM and "Traceback (most recent call last)" in output:
+            if kind is not signal.SIGKILL and "Traceback (most recent call last)" in output:
                 problem = problem or Verdict("traceback", output.strip().splitlines()[-1][:200])
             if broken := incomplete(own):
                 problem = problem or Verdict("half-written", "; ".join(broken))
         number += len(moments)
-        verdict = problem or _finished(command, own, expected, limit)
+        verdict = problem or finished(command, own, expected, limit)
         for text in moments:
             yield Verdict(verdict.status, f"{text}; {verdict.detail}")
         shutil.rmtree(own, ignore_errors=True)
@@ -210,11 +225,18 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
 
 def damaged_file(command: Command, sound: Path, name: str, damage: Callable[[bytes], bytes], limit: float, folder: Path) -> Verdict:
     """Damage a file that a command has left, and give the command again: it refuses, or what it leaves is sound."""
+    return changed_file(command, sound, name, partial(_damaged_bytes, damage), limit, folder)
+
+
+def _damaged_bytes(damage: Callable[[bytes], bytes], path: Path) -> None:
+    path.write_bytes(damage(path.read_bytes()))
+
+
+def changed_file(command: Command, sound: Path, name: str, change: Callable[[Path], None], limit: float, folder: Path) -> Verdict:
+    """Change a file that a command has left, or what lies in its place, and give the command again: the same."""
     for part in sound.iterdir():
         (shutil.copytree if part.is_dir() else shutil.copy)(part, folder / part.name)
-    path = folder / name
-    before = path.read_bytes()
-    path.write_bytes(damage(before))
+    change(folder / name)
     ended = isolation.run(command.module, command.given(folder), limit)
     if ended.code != 0:
         return ended.verdict()
@@ -240,7 +262,7 @@ def damage_faults(command: Command, sound: Path, count: int, seed: int, limit: f
     for _ in range(count if names else 0):
         name, (kind, what, damage) = names[int(rng.integers(len(names)))], kinds[int(rng.integers(len(kinds)))]
         attack = partial(damaged_file, command, sound, name, damage, limit)
-        found.append(Fault(f"file of a run, {kind}", f"{command.name}: {name}, {what}", attack))
+        found.append(Fault(f"file of a run, {kind}", f"{command.name}: {name}, {what}", attack, command.seconds))
     return found
 
 
@@ -283,7 +305,7 @@ def full_disk(command: Command, size: int, expected: dict[str, str], limit: floa
             return Verdict("half-written", "; ".join(broken))
         if is_mounted:
             subprocess.run(["mount", "-o", f"remount,size={2**28}", str(own)], check=True, capture_output=True)
-        again = _finished(command, own, expected, limit)
+        again = finished(command, own, expected, limit)
         how = f"{size} bytes" if is_mounted else f"{size} bytes per file, for want of the right to mount"
         return again if again.status != "harmless" else Verdict("refused", f"{how}: {verdict.detail}; then {again.detail}")
 
@@ -295,7 +317,7 @@ def file_limit(command: Command, size: int, expected: dict[str, str], limit: flo
         return verdict
     if broken := incomplete(folder):
         return Verdict("half-written", "; ".join(broken))
-    again = _finished(command, folder, expected, limit)
+    again = finished(command, folder, expected, limit)
     return again if again.status != "harmless" else Verdict("refused", f"{verdict.detail}; then {again.detail}")
 
 
@@ -325,9 +347,14 @@ def disk_faults(command: Command, sizes: Sequence[int], expected: dict[str, str]
     """Full disks and files of so many bytes, and folders that cannot be written."""
     found = []
     for size in sizes:
-        found.append(Fault("disk full", f"{command.name}, {size} bytes", partial(full_disk, command, size, expected, limit)))
+        found.append(
+            Fault("disk full", f"{command.name}, {size} bytes", partial(full_disk, command, size, expected, limit), 2 * command.seconds)
+        )
         if size >= MESSAGE_BYTES:
-            found.append(Fault("file too large", f"{command.name}, {size} bytes", partial(file_limit, command, size, expected, limit)))
-    found.append(Fault("folder not writable", f"{command.name}, read-only", partial(read_only, command, limit)))
-    found.append(Fault("folder not writable", f"{command.name}, a file in the way", partial(file_in_the_way, command, limit)))
+            attack = partial(file_limit, command, size, expected, limit)
+            found.append(Fault("file too large", f"{command.name}, {size} bytes", attack, 2 * command.seconds))
+    found.append(Fault("folder not writable", f"{command.name}, read-only", partial(read_only, command, limit), command.seconds))
+    found.append(
+        Fault("folder not writable", f"{command.name}, a file in the way", partial(file_in_the_way, command, limit), command.seconds)
+    )
     return found

@@ -15,13 +15,14 @@ Status = Literal[
     "accepted",  # silently: a result that cannot be trusted
     "traceback",  # an error of no type that a user could act on
     "executed",  # a payload ran
+    "outside",  # a file changed in a folder that is none of the command's
     "half-written",  # something incomplete lies where something complete belongs
     "different",  # what was resumed is not what an undisturbed run gives
     "hung",
     "died",
 ]
 GOOD: tuple[Status, ...] = ("refused", "harmless")
-BAD: tuple[Status, ...] = ("accepted", "traceback", "executed", "half-written", "different", "hung", "died")
+BAD: tuple[Status, ...] = ("accepted", "traceback", "executed", "outside", "half-written", "different", "hung", "died")
 
 T = TypeVar("T")
 MAX_DETAIL = 300
@@ -43,11 +44,13 @@ class Fault:
         kind: row of the matrix.
         name: what exactly, so that it can be done again.
         attack: does it in an empty folder and says what came of it; can be pickled.
+        seconds: that the same takes where nothing is wrong.
     """
 
     kind: str
     name: str
     attack: Callable[[Path], Verdict]
+    seconds: float = 0.0
 
 
 def judge(action: Callable[[], T], is_sound: Callable[[T], bool]) -> Verdict:

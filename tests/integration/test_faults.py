@@ -8,15 +8,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 import yaml
 
 from gpe_pl.config import CONF
-from gpe_pl.faults import isolation, runs
+from gpe_pl.faults import isolation, outside, pairs, runs
 from gpe_pl.faults.runs import Command
-from gpe_pl.faults.verdict import Verdict
+from gpe_pl.faults.verdict import GOOD, Fault, Verdict
 from gpe_pl.training.checkpoints import AtomicCheckpoints
 
 pytestmark = pytest.mark.long
@@ -43,6 +44,23 @@ def test_killed_at_random_moments(data: Path, tmp_path: Path, name: str) -> None
     found = list(runs.kills(command(name, None if name == "simulate" else data), tmp_path, 4, in_a_row=4, seed=1))
     assert len(found) == 4
     assert all(v.status == "harmless" for v in found), found
+
+
+def test_two_trainings_at_once(data: Path, tmp_path: Path) -> None:
+    fit = command("fit", data)
+    assert isolation.run("fit", fit.given(tmp_path / "whole")).code == 0
+    left = runs.digests(tmp_path / "whole")
+    own = tmp_path / "pair"
+    own.mkdir()
+    verdict = pairs.together((fit, fit), (left, left), 0.5, 600.0, own)
+    assert verdict.status == "refused" and pairs.HELD.search(verdict.detail), verdict
+
+
+@pytest.mark.parametrize("state", outside.STATES)
+def test_paths_in_checkpoints_lead_nowhere(data: Path, tmp_path: Path, state: str) -> None:
+    attack = partial(outside.resumed, command("fit", data), state, "{canary}/checkpoints/best.ckpt", 600.0)
+    verdict = isolation._watched(Fault("kind", state, attack, 600.0), tmp_path / "own", tmp_path / isolation.CANARY)
+    assert verdict.status in GOOD, verdict
 
 
 @pytest.mark.parametrize("size", [100, 20_000])

@@ -17,7 +17,7 @@ from gpe_pl.geometry import Box, Polygon, Shape, Sphere, Wall
 from gpe_pl.periodicity import Periodicity
 from gpe_pl.repeated_shapes import Repeated
 from gpe_pl.rollout import rollout
-from gpe_pl.schema import FIELDS, LARGEST, node_code, param_names
+from gpe_pl.schema import FIELDS, LARGEST, MATERIALS, NODE_TYPES, node_code, param_names
 from gpe_pl.store import StoreError, UnsoundError, read_trajectory, stored_arrays, write_shard
 from gpe_pl.trajectory import Boundary, Motion, State, Trajectory
 from gpe_pl.values import faults
@@ -176,6 +176,13 @@ def test_metadata_that_describe_no_scene_are_refused(tmp_path: Path, trajectory:
     write_shard(tmp_path / "a.h5", [replace(trajectory, metadata=replace(trajectory.metadata, gravity=(0.0, NAN)))])
     with pytest.raises(UnsoundError, match=r"a.h5:00000: gravity is \(0.0, nan\), must be finite"):
         read_trajectory(tmp_path / "a.h5", "00000")
+
+
+@pytest.mark.parametrize("value", [2e19, 1e30])
+def test_parameters_whose_squares_overflow_are_not_finite(trajectory: Trajectory, value: float) -> None:
+    broken = with_value(trajectory, "material_params", (7, 0), value)
+    (found,) = faults(stored_arrays(broken), NODE_TYPES, ("sand",), ("friction_angle",))
+    assert str(found) == f"field 'material_params': friction_angle: node 7: is {value:g} deg of sand, must be {MATERIALS['sand'].rule}"
 
 
 def test_parameters_are_not_negative_and_positive_where_they_enter_by_their_logarithm(trajectory: Trajectory) -> None:

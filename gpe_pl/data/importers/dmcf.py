@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from gpe_pl import regular_files
 from gpe_pl.data.importers.source import (
     Facts,
     ImportFailure,
@@ -162,6 +163,7 @@ def _frames(path: Path) -> list[Any]:
     msgpack, zstandard = _libraries()
     data = bytearray()
     try:
+        regular_files.check(path)
         most = min(MAX_BYTES, path.stat().st_size * LARGEST_DEFLATE_RATIO)
         with (
             open(path, "rb") as file,

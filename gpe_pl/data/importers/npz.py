@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
+from gpe_pl import regular_files
 from gpe_pl.data.importers.source import MAX_TRAJECTORIES, ImportFailure, Refusal
 from gpe_pl.hdf5_arrays import LARGEST_DEFLATE_RATIO
 from gpe_pl.zip_members import num_members
@@ -31,6 +32,7 @@ DAMAGE = (
 def names(path: Path) -> list[str]:
     """Names of the arrays in an archive, in its order; raises ``ImportFailure``."""
     try:
+        regular_files.check(path)
         if (count := num_members(path)) > MAX_TRAJECTORIES:
             raise ImportFailure(f"{path}: holds {count} arrays, at most {MAX_TRAJECTORIES} are read")
         with zipfile.ZipFile(path) as archive:

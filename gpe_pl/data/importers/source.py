@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from gpe_pl import regular_files
 from gpe_pl.arrays import estimated_normals, numbers
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry import domain_walls
@@ -406,6 +407,7 @@ def typed(pos: np.ndarray, types: np.ndarray, table: Mapping[int, str], settings
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON object; raises ``ImportFailure``."""
     try:
+        regular_files.check(path)
         if path.stat().st_size > MAX_JSON_BYTES:
             raise ImportFailure(f"{path}: has {path.stat().st_size} bytes, far more than a description of data")
         values = parsed(path.read_bytes())

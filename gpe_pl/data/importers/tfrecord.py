@@ -19,6 +19,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
+from gpe_pl import regular_files
 from gpe_pl.data.importers.source import MAX_TRAJECTORIES, ImportFailure, Refusal
 
 Feature = list[bytes] | np.ndarray
@@ -94,6 +95,7 @@ class Record:
 def records(path: Path) -> list[Record]:
     """All records of a file. Where its structure breaks, the last one says so; what comes after cannot be found."""
     try:
+        regular_files.check(path)
         total = path.stat().st_size
         found: list[Record] = []
         with open(path, "rb") as file:

@@ -7,6 +7,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,8 +17,8 @@ import pytest
 import torch
 
 from gpe_pl.errors import GpeError
-from gpe_pl.faults import checkpoints, configs, runs, scenes, stores
-from gpe_pl.faults.isolation import Ended, verdicts
+from gpe_pl.faults import checkpoints, configs, field_values, isolation, pairs, runs, scenes, side_files, stores
+from gpe_pl.faults.isolation import CANARY, Ended, verdicts
 from gpe_pl.faults.verdict import GOOD, Fault, Verdict, judge
 from gpe_pl.ground_truth import DatasetSpec
 from gpe_pl.simulate import dataset
@@ -79,6 +80,22 @@ def test_impossible_scenes(spec: DatasetSpec, tmp_path: Path, learned: bool) -> 
     every = [f for f in scenes.faults({"sand": spec}, 1) if ("model" in f.name) is learned]
     assert {f.kind.removeprefix("scene, ") for f in every} == set(scenes.CHANGES)
     assert not bad(every, tmp_path)
+
+
+@pytest.mark.parametrize("step", [23, pytest.param(1, marks=pytest.mark.long)])
+def test_values_that_break_a_rule(shard: Path, tmp_path: Path, step: int) -> None:
+    faults = field_values.faults({"sand": shard})
+    assert {f.kind.removeprefix("value, ") for f in faults} == set(field_values.WAYS)
+    assert len(faults) > 200
+    assert not bad(faults[::step], tmp_path)
+
+
+@pytest.mark.parametrize("step", [9, pytest.param(1, marks=pytest.mark.long)])
+def test_small_files_and_archives(tmp_path: Path, step: int) -> None:
+    side_files.raw_arrays(tmp_path / "raw")
+    faults = side_files.faults(tmp_path / "raw")
+    assert len(faults) > 100
+    assert not bad(faults[::step], tmp_path)
 
 
 # --- and it is seen when it is not ----------------------------------------------------------------------------------------------------------
@@ -182,19 +199,93 @@ def _sleeps(seconds: float, _: Path) -> Verdict:
     return Verdict("harmless")
 
 
+def _writes_outside(path: str, own: Path) -> Verdict:
+    (own.parent / CANARY / path).write_text("changed")
+    return Verdict("harmless")
+
+
+@pytest.mark.parametrize("path", ["checkpoints/best.ckpt", "new"])
+def test_what_changes_a_folder_beside_its_own_is_outside(tmp_path: Path, path: str) -> None:
+    verdict = isolation._watched(Fault("kind", "name", partial(_writes_outside, path)), tmp_path / "own", tmp_path / CANARY)
+    assert verdict.status == "outside" and path in verdict.detail
+
+
+def test_what_takes_longer_than_it_may_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(isolation, "HANG", 0.05)
+    fault = Fault("kind", "name", partial(_sleeps, 0.2))
+    assert isolation._watched(fault, tmp_path / "own", tmp_path / CANARY).status == "hung"
+    assert isolation._watched(replace(fault, seconds=30.0), tmp_path / "own", tmp_path / CANARY).status == "harmless"
+
+
+@dataclass
+class Ends:
+    """A command that has ended already."""
+
+    exitcode: int
+
+    def kill(self) -> None:
+        pass
+
+    def join(self, _: float = 0.0) -> None:
+        pass
+
+
+HELD = "error: runs/fit: another command writes to it (process 7 on here, since noon: fit); wait until it has ended"
+
+
+def ends_at_once(monkeypatch: pytest.MonkeyPatch, codes: tuple[int, ...], said: str, found: dict[str, str]) -> None:
+    """Commands end with these codes, say this where it is not 0, and leave files with these digests."""
+    ended = iter(codes)
+
+    def start(module: str, arguments: list[str], output: Path) -> Ends:
+        code = next(ended)
+        output.write_text(said if code else "")
+        return Ends(code)
+
+    monkeypatch.setattr(isolation, "start", start)
+    monkeypatch.setattr(runs, "digests", lambda _: found)
+
+
+COMMANDS = [runs.Command(name, "fit", ()) for name in ("one", "other")]
+
+
+@pytest.mark.parametrize(
+    ("codes", "said", "left", "status"),
+    [
+        ((0, 2), HELD, "first", "refused"),
+        ((0, 2), HELD, "second", "different"),  # of the one that was refused
+        ((0, 2), HELD, "both", "different"),
+        ((0, 0), "", "both", "harmless"),
+        ((0, 0), "", "first", "different"),  # the other said that it succeeded
+        ((2, 2), HELD, "", "different"),
+        ((0, 1), "Traceback (most recent call last):", "first", "traceback"),
+        ((2, 0), "error: something is in the way", "second", "accepted"),  # of whom?
+        ((2, 0), HELD, "second", "refused"),
+    ],
+)
+def test_two_commands_are_judged_by_what_they_leave(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codes: tuple[int, int], said: str, left: str, status: str
+) -> None:
+    expected = ({"a": "1", "b": "2"}, {"a": "1", "c": "3"})
+    ends_at_once(monkeypatch, codes, said, {"first": expected[0], "second": expected[1], "both": expected[0] | expected[1], "": {}}[left])
+    assert pairs.together(COMMANDS, expected, 0.0, 10.0, tmp_path).status == status
+
+
 def test_the_matrix_counts_and_shows_what_is_bad() -> None:
     records = [{"kind": "shard, truncated", "fault": f"{k}", "status": "refused", "detail": "x"} for k in range(3)]
     records += [{"kind": "shard, truncated", "fault": "7|8", "status": "accepted", "detail": "no error"}]
+    records += [{"kind": "file", "fault": "a pipe", "status": "hung", "detail": "12 s"}]
     records += [
         {"kind": "fit killed", "fault": "", "status": status, "detail": "SIGKILL after 1 s"}
         for status in ("harmless", "harmless", "different")
     ]
     text = report(records)
     assert text.startswith(
-        "4 corrupted or hostile inputs: 0 tracebacks without a typed error, 1 silent acceptances, 0 executed payloads, 0 other failures. 3 kills: 2 "
+        "5 corrupted or hostile inputs: 0 tracebacks without a typed error, 1 silent acceptances, 0 executed payloads, "
+        "0 paths outside, 1 hangs over 10 s, 0 other failures. 3 kills: 2 "
     )
-    assert "| fault | number | refused | harmless | accepted | different |" in text
-    assert "| shard, truncated | 4 | 3 | 0 | 1 | 0 |" in text
-    assert "| fit killed | 3 | 0 | 2 | 0 | 1 |" in text
+    assert "| fault | number | refused | harmless | accepted | different | hung |" in text
+    assert "| shard, truncated | 4 | 3 | 0 | 1 | 0 | 0 |" in text
+    assert "| fit killed | 3 | 0 | 2 | 0 | 1 | 0 |" in text
     assert "- shard, truncated, 7\\|8: accepted: no error" in text
-    assert "**2 failures**" in text
+    assert "**3 failures**" in text
