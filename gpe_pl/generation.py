@@ -34,6 +34,7 @@ from gpe_pl.ground_truth import DatasetSpec, GenerationError, generate_trajector
 from gpe_pl.locks import held
 from gpe_pl.progress import Progress
 from gpe_pl.rollout import SimulationError
+from gpe_pl.run_folder import refuse_links
 from gpe_pl.solvers.caution import unresolved
 from gpe_pl.store import StoreError, read_trajectory, trajectory_names, write_shard
 from gpe_pl.trajectory import Trajectory
@@ -358,7 +359,8 @@ def _labelled_trajectory(spec: DatasetSpec, index: int, label: str, values: dict
 
 
 def _claim(folder: Path, spec: DatasetSpec) -> None:
-    """Write the spec into the folder, or check that the one there is the same."""
+    """Write the spec into the folder, or check that the one there is the same, and that nothing in it leads elsewhere."""
+    refuse_links(folder)
     path, values = folder / SPEC_FILE, spec.as_dict()
     if not path.is_file():
         if any(folder.glob("*/shard-*.h5")):

@@ -43,11 +43,11 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
 
 
 def refuse_links(run_dir: Path) -> None:
-    """Raise ``RunError`` where a folder, which may be someone else's, has a link through which a run would write outside of it."""
+    """Raise ``RunError`` where the folder of a run or data set, which may be someone else's, has a link through which a command would write outside of it."""
     inside = run_dir.resolve()
     for path in sorted(path for folder in (run_dir, run_dir / HYDRA) if folder.is_dir() for path in folder.iterdir()):
         if path.is_symlink() and not path.resolve().is_relative_to(inside):
-            raise RunError(f"{path}: a link that leads out of the run folder; remove it, or make the folder itself a link")
+            raise RunError(f"{path}: a link that leads out of its folder; remove it, or make the folder itself a link")
 
 
 def release(run_dir: Path) -> None:

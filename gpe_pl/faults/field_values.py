@@ -20,7 +20,8 @@ from gpe_pl.data.validate import validate
 from gpe_pl.errors import GpeError
 from gpe_pl.faults.scenes import small_model
 from gpe_pl.faults.verdict import MAX_DETAIL, Fault, Verdict
-from gpe_pl.generation import DatasetSpec, generate_trajectory, shard_path
+from gpe_pl.generation import shard_path
+from gpe_pl.ground_truth import DatasetSpec, generate_trajectory
 from gpe_pl.rollout import rollout
 from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, Values, node_code
 from gpe_pl.store import digest, read_trajectory, stored_arrays, write_shard
@@ -36,7 +37,7 @@ OFFENDERS: dict[Values, tuple[float, ...]] = {
     "unit vectors": (*NOT_NUMBERS, 0.5, 3.0),
     "node types": (255, len(NODE_TYPES), node_code("boundary")),
     "parameters": NOT_NUMBERS,
-    "nodes": (-1, 2**31 - 1),
+    "nodes of cells": (-1, 2**31 - 1),
     "dimension of cells": (0, 1, 7),
 }
 """Values that break each rule, in whichever element they stand."""

@@ -16,7 +16,7 @@ from gpe_pl.faults.isolation import CANARY
 from gpe_pl.faults.runs import Command
 from gpe_pl.faults.verdict import Fault, Verdict
 
-LEADING_OUT = ("../../canary", "a/../../../canary", "{canary}", "file://{canary}", "../../canary/../canary/x", "~/canary", "..", ".", "/")
+LEADING_OUT = ("../../canary", "a/../../../canary", "{canary}", "file://{canary}", "../../canary/../canary/x", "..", ".", "/")
 """Names; ``{canary}`` stands for the path of a folder beside that of the command."""
 
 

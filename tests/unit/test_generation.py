@@ -34,6 +34,7 @@ from gpe_pl.ground_truth import (
     scene_seed,
 )
 from gpe_pl.progress import progress_bar
+from gpe_pl.run_folder import RunError
 from gpe_pl.schema import SPLITS
 from gpe_pl.simulate import dataset, dataset_spec
 from gpe_pl.solvers.mpm import MPM
@@ -267,6 +268,24 @@ def test_folder_with_foreign_shards_is_refused(tmp_path):
     shard.write_bytes(b"")
     with pytest.raises(GenerationError, match=r"holds shards but no dataset\.json"):
         generate(tmp_path, SPEC)
+
+
+@pytest.mark.parametrize("split", ["train", "test_unseen"])
+def test_nothing_is_written_through_a_link_in_the_folder(tmp_path, split):
+    elsewhere, own = tmp_path / "elsewhere", tmp_path / "data" / SPEC.name / SPEC.size
+    elsewhere.mkdir()
+    own.mkdir(parents=True)
+    (own / split).symlink_to(elsewhere)
+    with pytest.raises(RunError, match=f"{split}: a link that leads out of its folder; remove it"):
+        generate(tmp_path / "data", SPEC)
+    assert not list(elsewhere.iterdir())
+
+
+def test_the_folder_itself_may_be_a_link(folder, tmp_path):
+    own = tmp_path / SPEC.name / SPEC.size
+    own.parent.mkdir()
+    own.symlink_to(folder)
+    assert generate(tmp_path, SPEC) == own
 
 
 @dataclasses.dataclass(frozen=True)

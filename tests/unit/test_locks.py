@@ -235,7 +235,7 @@ def test_hydra_starts_nothing_in_a_folder_that_cannot_be_used(
     (tmp_path / "a" / "multirun.yaml").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(SystemExit, match="2"):
         start(config)
-    assert "multirun.yaml: a link that leads out of the run folder" in capsys.readouterr().err
+    assert "multirun.yaml: a link that leads out of its folder" in capsys.readouterr().err
 
     def refused(_: Path) -> None:
         raise PermissionError(errno.EACCES, "Permission denied", "a")

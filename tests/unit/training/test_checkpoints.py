@@ -304,7 +304,7 @@ def test_a_link_that_leads_out_of_a_run_folder_is_refused(tmp_path: Path, name: 
     link.parent.mkdir(exist_ok=True)
     upwards = "" if target.startswith("{folder}") else "../" * name.count("/")
     link.symlink_to(upwards + target.format(folder=tmp_path))
-    with pytest.raises(RunError, match=rf"run/{name}: a link that leads out of the run folder"):
+    with pytest.raises(RunError, match=rf"run/{name}: a link that leads out of its folder"):
         claim(tmp_path / "run", {"seed": 0})
     assert [*(tmp_path / "outside").iterdir()] == []
 
