@@ -24,7 +24,7 @@ UNREAD: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "graph.num_levels": ("graph.mesh", lambda mesh: not mesh),
     "dimension": ("data.size", lambda size: size == "imported"),
 }
-"""Keys, and for which values of another key nothing reads them."""
+"""Keys, and for which values of another key nothing reads them. Zero asks for nothing, so it may always be typed."""
 
 
 def without_effect(cfg: DictConfig, overrides: Sequence[str]) -> str:
@@ -39,7 +39,7 @@ def without_effect(cfg: DictConfig, overrides: Sequence[str]) -> str:
         if _is_offer(key) and not key.startswith(OF_SWEEPS) and not _is_read(cfg, key):
             return f"{key}={value}: has no effect, because no other setting takes its value here; leave it out"
         other, is_unread = UNREAD.get(key, ("", bool))
-        if other and is_unread(decides := OmegaConf.select(cfg, other)):
+        if other and value != "0" and is_unread(decides := OmegaConf.select(cfg, other)):
             return f"{key}={value}: has no effect with {other}={'null' if decides is None else decides}; leave out one of the two"
     return ""
 

@@ -45,6 +45,7 @@ def test_what_nothing_reads_is_refused(beside: str, typed: str, because: str) ->
 @pytest.mark.parametrize(
     ("beside", "typed"),
     [
+        ("recipe=paper", "training.warmup_steps=0"),
         ("experiment=table1", "size.comparison.budget_minutes=3"),
         ("experiment=table1", "size.comparison.seeds='0'"),
         ("experiment=table1", "data.comparison.connectivity_spacings.default=3.0"),
