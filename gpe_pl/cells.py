@@ -21,7 +21,7 @@ def fitting_kinds(num_corners: int, dim: int) -> list[str]:
 
 
 def kinds_of(cells: np.ndarray, cell_dim: int | None, dim: int) -> np.ndarray:
-    """Kind of each cell [cell] as its place in ``schema.CELL_KINDS``, -1 where the number of corners is that of none.
+    """Kind of each cell [cell] as its place in ``schema.CELL_KINDS``, -1 where the number of corners is that of none, or a node is there twice.
 
     Args:
         cells: nodes of each cell [cell, corner].
@@ -30,9 +30,11 @@ def kinds_of(cells: np.ndarray, cell_dim: int | None, dim: int) -> np.ndarray:
     """
     ordered = np.sort(cells, axis=1)
     corners = 1 + (ordered[:, 1:] != ordered[:, :-1]).sum(axis=1)
+    repeated = (is_corner(cells) != (np.arange(cells.shape[1]) < corners[:, None])).any(axis=1)  # other than the last corner, at the end
     kinds = np.full(len(cells), -1)
     for code, (own_dim, number) in enumerate(CELL_KINDS.values()):
         kinds[(corners == number) & (own_dim == (cell_dim or dim) or number == 3)] = code
+    kinds[repeated] = -1
     return kinds
 
 

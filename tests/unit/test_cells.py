@@ -58,6 +58,10 @@ def test_predicted_stress_does_not_depend_on_how_cells_are_stored(asleep: bool) 
         ([0, 1, 2, 2], 2, True),
         ([0, 1, 2, 2], 3, True),
         ([0, 1, 0, 2], 2, False),
+        ([0, 1, 1, 2], 2, False),
+        ([0, 0, 1, 2], 2, False),
+        ([0, 1, 1, 2, 3, 3, 3, 3], 3, False),
+        ([0, 1, 2, 3, 3, 3, 3, 3], 3, True),
         ([0, 1, 1, 1], 2, False),
         ([0, 1, 2, 3, 4], 2, False),
         ([0, 1, 2, 3, 4, 5, 6, 7], 2, False),
@@ -69,3 +73,15 @@ def test_a_stored_row_that_is_no_cell_is_a_fault(cell: list[int], dim: int, is_s
     found = [fault for fault in faults(arrays, ["elastomer"], ["elastomer"], []) if fault.field == "cells"]
     assert bool(found) != is_sound
     assert all("triangle" in str(fault) and str(cell) in str(fault) for fault in found)
+
+
+@pytest.mark.parametrize(("dim", "cell_dim", "allowed"), [(2, 0, "2"), (2, 3, "2"), (3, 7, "2 or 3")])
+def test_dimensions_that_no_cell_has(dim: int, cell_dim: int, allowed: str) -> None:
+    arrays: dict[str, np.ndarray] = {
+        "pos": np.zeros((3, 8, dim)),
+        "node_type": np.zeros(8, np.uint8),
+        "cells": np.array([[0, 1, 2]]),
+        "cell_dim": np.array([cell_dim], np.uint8),
+    }
+    (found,) = [str(fault) for fault in faults(arrays, ["elastomer"], ["elastomer"], []) if fault.field == "cell_dim"]
+    assert found.endswith(f"is {cell_dim}, must be {allowed} in {dim}D")
