@@ -17,6 +17,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from gpe_pl import early_interrupts
 from gpe_pl.caches import prepare
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from gpe_pl.viz.video import write_animation as write_animation
     from gpe_pl.viz.viewer import write_viewer as write_viewer
 
+early_interrupts.begin()
 prepare()  # before Numba and Matplotlib are imported
 
 _MODULES = {

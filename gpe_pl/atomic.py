@@ -7,7 +7,7 @@ import glob
 import os
 import platform
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,6 +17,9 @@ from gpe_pl.errors import GpeError
 
 FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 """What systems answer where there is no room: on the disk, in a file, for this user."""
+
+ALMOST_FULL = 2**20
+"""Bytes. A command that ends has removed what it could not finish."""
 
 
 class FullDiskError(GpeError):
@@ -57,6 +60,15 @@ def replacing(path: Path) -> Iterator[Path]:
         raise FullDiskError(path, os.strerror(error.errno)) from None
     finally:
         _remove(part)
+
+
+def unnamed(error: OSError, folders: Iterable[Path]) -> OSError | FullDiskError:
+    """What to say of an error: one of a full disk that names no file names those of the folders whose disks are full, or all of them."""
+    if error.errno is None or error.errno not in FULL or error.filename is not None:
+        return error
+    places = list(dict.fromkeys(folders))
+    full = [place for place in places if free_bytes(place) < ALMOST_FULL] or places
+    return FullDiskError(Path(" or ".join(map(str, full))), os.strerror(error.errno))
 
 
 def free_bytes(folder: Path) -> int:

@@ -13,6 +13,7 @@ import json
 import os
 import re
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +29,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
 from pydantic import ValidationError
 
-from gpe_pl import plugins
+from gpe_pl import early_interrupts, plugins
+from gpe_pl.atomic import replace_text, unnamed
 from gpe_pl.errors import GpeError
 from gpe_pl.launcher import RESULT, USAGE_ERROR, SweepError, end_with_sweep
 from gpe_pl.names import NameRefused, run_name, sweep_name
@@ -56,9 +58,6 @@ OmegaConf.register_new_resolver("model_name", model_name, replace=True)  # ${mod
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # ${run_name:name}: of a folder of results in conf/
 OmegaConf.register_new_resolver("sweep_name", sweep_name, replace=True)
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C, as shells have it."""
-
 CONF = Path(__file__).resolve().parent.parent / "conf"
 T = TypeVar("T")
 
@@ -66,6 +65,9 @@ T = TypeVar("T")
 class ConfigError(GpeError, ValueError):
     """A config value is not allowed; the message names key, value and what is allowed."""
 
+
+_results: list[Path] = []
+"""Folder of the results of this process, where a ``Report`` knows it."""
 
 LARGEST_INTEGER = 2**63 - 1
 """Of settings: what NumPy, PyTorch and ``range`` can count with."""
@@ -189,7 +191,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
                 _check_top_level(cfg, config_name)
                 value = task(cfg)
                 if RESULT in os.environ:
-                    Path(os.environ[RESULT]).write_text(json.dumps(value), encoding="utf-8")
+                    replace_text(Path(os.environ[RESULT]), json.dumps(value))
                 return value
             except InterpolationKeyError as error:
                 if verbose:
@@ -203,11 +205,12 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             ) as error:  # OSError: full disks, folders that cannot be written, files that are gone
                 if verbose:
                     raise
-                _fail(error)
+                _fail(unnamed(error, _written(cfg.paths)) if isinstance(error, OSError) else error)
 
         def main() -> Any:
             if not CONF.is_dir():
                 _fail(ConfigError(f"{CONF} not found: install gpe_pl from a clone with `pip install -e .`"))
+            early_interrupts.end()
             speak_utf8()
             clean_messages()
             sys.argv[1:] = [quoted(argument) for argument in sys.argv[1:]]
@@ -215,8 +218,8 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             try:
                 return hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
             except KeyboardInterrupt:
-                print("interrupted", file=sys.stderr)
-                sys.exit(INTERRUPTED)
+                print(early_interrupts.NOTICE, file=sys.stderr)
+                sys.exit(early_interrupts.STATUS)
             except SweepError as error:
                 _fail(error)
             except (HydraException, OmegaConfBaseException, ValueError) as error:  # some of Hydra's are an OSError too
@@ -226,6 +229,8 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             except OSError as error:  # before the command itself begins: Hydra makes the folder of the results
                 if verbose:
                     raise
+                if error.filename is None:
+                    _fail(unnamed(error, _written()))
                 _fail(
                     OSError(
                         f"{error.filename}: cannot be made or written ({error.strerror}); choose another folder with paths.runs=… or paths.data=…"
@@ -262,8 +267,15 @@ def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
     return cfg
 
 
+def _written(paths: Mapping[str, str] | None = None) -> list[Path]:
+    """Folders that this process writes to, its own and those of libraries."""
+    own = [*_results] if paths is None else [*paths.values()]
+    return [Path(folder) for folder in (*own, os.environ.get("NUMBA_CACHE_DIR", "."), tempfile.gettempdir(), Path.cwd())]
+
+
 def _fail(error: Exception) -> None:
-    print(f"error: {one_line(str(error))}", file=sys.stderr)
+    with contextlib.suppress(OSError):  # into a file on a full disk
+        print(f"error: {one_line(str(error))}", file=sys.stderr)
     sys.exit(USAGE_ERROR if RESULT in os.environ and isinstance(error, (ConfigError, NameRefused)) else 2)
 
 
@@ -351,6 +363,7 @@ class Report(Callback):
         """Until the process ends. Ends it where the folder cannot be used: Hydra turns an exception of a callback into a warning, and goes on."""
         from gpe_pl.locks import held
 
+        _results.append(folder)
         try:
             refuse_links(folder)
             self._lock.enter_context(held(folder))

@@ -7,8 +7,10 @@ formats, XML part [Kitware, docs.vtk.org]. Nodes of meshes belong to their cells
 from __future__ import annotations
 
 import base64
+import contextlib
+import shutil
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -70,6 +72,7 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
 
     Raises:
         ValueError: another file type, a stride that is not positive, a ground truth with other nodes, or a cell of no kind in ``schema.CELL_KINDS``.
+        FullDiskError: there is no room; what has been written of a new series is removed.
     """
     path = Path(path)
     if path.suffix != ".pvd":
@@ -86,23 +89,35 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     cells, num_particles = _cells(trajectory)
     mesh = np.empty((0, 3), np.int64) if trajectory.cells is None else trajectory.cells.astype(np.int64)
     edges = cell_edges(mesh, trajectory.num_nodes)
-    folder.mkdir(parents=True, exist_ok=True)
     moved = _displacements(trajectory, edges)
     entries = []
-    for frame in range(0, trajectory.num_frames, stride):
-        name = f"frame_{frame:05d}.vtu"
-        points, in_cells = _point_data(trajectory, frame, ground_truth), _cell_data(trajectory, frame, num_particles)
-        if moved is not None:
-            points["displacement"] = _in_3d(moved[frame])
-        pos, _ = unwrapped(trajectory.pos[frame].astype(np.float64), edges, trajectory.metadata.periodicity)
-        replace_text(folder / name, _grid(pos.astype(trajectory.pos.dtype), cells, points, in_cells))
-        time = frame * trajectory.metadata.frame_dt
-        entries.append(f'<DataSet timestep="{time:.9g}" part="0" file={quoteattr(f"{folder.name}/{name}")}/>')
-    boundary = trajectory.boundary
-    if len(boundary.pos):
-        data = {"normal": _in_3d(boundary.normal), "friction": boundary.friction, "restitution": boundary.restitution}
-        replace_text(folder / "boundary.vtu", _grid(boundary.pos, _vertices(np.arange(len(boundary.pos))), data, {}))
-    replace_text(path, _document("Collection", "<Collection>\n" + "\n".join(entries) + "\n</Collection>"))
+    with _whole(folder):
+        for frame in range(0, trajectory.num_frames, stride):
+            name = f"frame_{frame:05d}.vtu"
+            points, in_cells = _point_data(trajectory, frame, ground_truth), _cell_data(trajectory, frame, num_particles)
+            if moved is not None:
+                points["displacement"] = _in_3d(moved[frame])
+            pos, _ = unwrapped(trajectory.pos[frame].astype(np.float64), edges, trajectory.metadata.periodicity)
+            replace_text(folder / name, _grid(pos.astype(trajectory.pos.dtype), cells, points, in_cells))
+            time = frame * trajectory.metadata.frame_dt
+            entries.append(f'<DataSet timestep="{time:.9g}" part="0" file={quoteattr(f"{folder.name}/{name}")}/>')
+        boundary = trajectory.boundary
+        if len(boundary.pos):
+            data = {"normal": _in_3d(boundary.normal), "friction": boundary.friction, "restitution": boundary.restitution}
+            replace_text(folder / "boundary.vtu", _grid(boundary.pos, _vertices(np.arange(len(boundary.pos))), data, {}))
+        replace_text(path, _document("Collection", "<Collection>\n" + "\n".join(entries) + "\n</Collection>"))
+
+
+@contextlib.contextmanager
+def _whole(folder: Path) -> Iterator[None]:
+    """What is written to a new folder stays if the block ends well."""
+    is_new = not folder.exists()
+    try:
+        yield
+    except BaseException:
+        if is_new:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 class _Cells(NamedTuple):

@@ -49,7 +49,11 @@ def speak_utf8() -> None:
 
 
 def clean_messages() -> None:
-    """From now on what this process logs and warns of is one line, whatever handler writes it, and the lines of its tracebacks are printable."""
+    """From now on what this process logs and warns of is one line, whatever handler writes it, and the lines of its tracebacks are printable.
+
+    A line that cannot be written to a log file, as on a full disk, is lost; ``logging`` would print a traceback for each.
+    """
+    logging.raiseExceptions = False
     logging.setLogRecordFactory(LogRecord)
     warnings.formatwarning = _one_line_warning
     sys.excepthook = _print_traceback

@@ -6,6 +6,7 @@ import logging
 import netrc
 import os
 import re
+import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +14,9 @@ from typing import Any, Literal
 from urllib.parse import urlparse
 
 from lightning.pytorch.loggers import CSVLogger, Logger
+from lightning.pytorch.utilities import rank_zero_only
 
-from gpe_pl.atomic import replace_text
+from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.errors import GpeError
 
 log = logging.getLogger(__name__)
@@ -41,7 +43,7 @@ class LoggerSettings:
             name: of the experiment or sweep that the run belongs to, the group in W&B.
             config: of the run, shown in W&B.
         """
-        loggers: list[Logger] = [CSVLogger(run_dir, name="log", flush_logs_every_n_steps=1)]
+        loggers: list[Logger] = [Log(run_dir, name="log", flush_logs_every_n_steps=1)]
         if self.kind == "wandb":
             mode = self.mode or os.environ.get("WANDB_MODE") or ("online" if has_key() else "offline")
             loggers.append(self._wandb(run_dir, name, config, mode))
@@ -63,6 +65,26 @@ class LoggerSettings:
                 return self._wandb(run_dir, name, config, "offline")
             raise TrackingError(f"W&B: {error}; logger.mode=offline keeps the run here") from None
         return logger
+
+
+class Log(CSVLogger):
+    """A CSV file that is whole at any time: the end of a number that is cut off would not be missed."""
+
+    @rank_zero_only
+    def save(self) -> None:
+        """Write what has been logged since the last time. Raises ``FullDiskError``."""
+        writer: Any = self.experiment
+        path = Path(writer.metrics_file_path)
+        if not writer.metrics:
+            return
+        with replacing(path) as part:
+            if path.exists():
+                shutil.copyfile(path, part)
+            writer.metrics_file_path = str(part)
+            try:
+                super().save()
+            finally:
+                writer.metrics_file_path = str(path)
 
 
 class TrackingError(GpeError):

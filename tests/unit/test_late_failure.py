@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import errno
+import io
+import logging
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from gpe_pl.atomic import FullDiskError, replace_bytes, replace_text, replacing
+from gpe_pl.atomic import FullDiskError, replace_bytes, replace_text, replacing, unnamed
+from gpe_pl.export import write_vtk
 from gpe_pl.late_failure import LateFailure
+from gpe_pl.printable import clean_messages
 from gpe_pl.store import read_trajectory, write_shard
 from gpe_pl.trajectory import Trajectory
 
@@ -98,6 +103,45 @@ def test_texts_and_bytes(tmp_path: Path) -> None:
     replace_text(tmp_path / "a", "ü")
     replace_bytes(tmp_path / "b", b"x")
     assert (tmp_path / "a").read_bytes() == "ü".encode() and (tmp_path / "b").read_bytes() == b"x"
+
+
+@pytest.mark.parametrize("full", ["frame_00002.vtu", "boundary.vtu", "a.pvd"])
+def test_a_series_for_which_there_is_no_room(tmp_path: Path, trajectory: Trajectory, monkeypatch: pytest.MonkeyPatch, full: str) -> None:
+    def write(path: Path, text: str) -> None:
+        if path.name == full:
+            raise FullDiskError(path, "No space left on device")
+        replace_text(path, text)
+
+    monkeypatch.setattr("gpe_pl.export.replace_text", write)
+    with pytest.raises(FullDiskError, match=f"{full}: cannot be written"):
+        write_vtk(tmp_path / "a.pvd", trajectory)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_that_names_no_file_names_full_disks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    full, other = tmp_path / "full" / "not there yet", tmp_path / "other"
+    monkeypatch.setattr("gpe_pl.atomic.free_bytes", lambda folder: 0 if folder == full else 2**30)
+    error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert str(unnamed(error, [other, full, full])).startswith(f"{full}: cannot be written, there is no room")
+    assert str(unnamed(error, [other, tmp_path])).startswith(f"{other} or {tmp_path}: cannot be written")
+    for known in (OSError(errno.ENOSPC, "no", "a.txt"), OSError(errno.EIO, "no"), OSError("no")):
+        assert unnamed(known, [full]) is known
+
+
+def test_a_log_file_that_cannot_be_written_prints_no_traceback(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full(io.StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    for owner, name in ((logging, "raiseExceptions"), (sys, "excepthook"), (warnings, "formatwarning")):
+        monkeypatch.setattr(owner, name, getattr(owner, name))  # put back afterwards
+    factory = logging.getLogRecordFactory()
+    try:
+        clean_messages()
+        logging.StreamHandler(Full()).handle(logging.makeLogRecord({"msg": "text"}))
+    finally:
+        logging.setLogRecordFactory(factory)
+    assert capsys.readouterr().err == ""
 
 
 LIMITED = """

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import errno
 import logging
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,6 +13,7 @@ import wandb
 from lightning.pytorch import loggers as lightning_loggers
 from lightning.pytorch.loggers import Logger
 
+from gpe_pl.atomic import FullDiskError
 from gpe_pl.training import tracking
 from gpe_pl.training.tracking import LoggerSettings, TrackingError, publish, run_id
 
@@ -104,3 +107,25 @@ def test_every_start_of_a_run_is_to_be_uploaded(tmp_path: Path, monkeypatch: pyt
     with caplog.at_level(logging.WARNING):
         publish([logger], tmp_path, {"test/rollout_mse@full": 1.0})
     assert f"wandb sync {folders[0]} {folders[1]}`" in caplog.text
+
+
+@pytest.mark.parametrize("room", [0, 10, 60])
+def test_a_log_for_which_there_is_no_room_stays_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int) -> None:
+    (log,) = LoggerSettings().loggers(tmp_path, "run", {})
+    log.log_metrics({"train/loss": 0.5}, step=0)
+    path = tmp_path / "log" / "version_0" / "metrics.csv"
+    before = path.read_bytes()
+
+    def write(self: csv.DictWriter[str], rows: Any) -> None:  # a part of a line, as a disk that fills up takes it
+        self.writer.writerow(["0.0012345678"[:room]])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(csv.DictWriter, "writerows", write)
+        with pytest.raises(FullDiskError, match="metrics.csv: cannot be written, there is no room"):
+            log.log_metrics({"train/loss": 0.25, "val/one_step_nmse": 0.1}, step=50)
+    assert path.read_bytes() == before
+    assert [each.name for each in path.parent.iterdir()] == [path.name]
+    log.save()
+    with path.open(newline="") as file:
+        assert [row["train/loss"] for row in csv.DictReader(file)] == ["0.5", "0.25"]

@@ -1,0 +1,32 @@
+"""Ctrl-C while a command imports what it needs, before it can catch anything itself."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from types import FrameType
+
+NOTICE = "interrupted"
+STATUS = 130
+"""Exit status after Ctrl-C, as shells have it."""
+COMMANDS = ("fit", "simulate", "evaluate", "benchmark", "convert")
+
+
+def begin() -> None:
+    """End the process with one line on Ctrl-C from now on, if it is a command that begins: ``python -m gpe_pl.COMMAND``."""
+    is_command = sys.argv[:1] == ["-m"] and any(f"gpe_pl.{name}" in sys.orig_argv for name in COMMANDS)
+    if is_command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where it is ignored
+        signal.signal(signal.SIGINT, _end_process)
+
+
+def end() -> None:
+    """Ctrl-C raises ``KeyboardInterrupt`` again."""
+    if signal.getsignal(signal.SIGINT) is _end_process:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _end_process(number: int, frame: FrameType | None) -> None:
+    """At once: nothing has been written, and libraries may take an exception in their imports for another one."""
+    os.write(2, f"{NOTICE}\n".encode())
+    os._exit(STATUS)

@@ -1,0 +1,36 @@
+"""Ctrl-C before a command has begun."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gpe_pl import early_interrupts
+
+
+@pytest.mark.skipif(os.name == "nt", reason="sends a signal")
+@pytest.mark.parametrize("command", ["fit", "convert"])
+def test_a_command_that_is_interrupted_in_its_imports_ends_with_one_line(command: str, tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    line = [sys.executable, "-X", "importtime", "-m", f"gpe_pl.{command}"]
+    with subprocess.Popen(line, stderr=subprocess.PIPE, text=True, env=environment, cwd=tmp_path) as process:
+        assert process.stderr is not None
+        while "omegaconf" not in process.stderr.readline():  # Hydra's imports follow
+            assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        lines = [text for text in process.stderr.read().splitlines() if not text.startswith("import time:")]
+    assert (lines, process.returncode) == (["interrupted"], early_interrupts.STATUS)
+
+
+def test_programs_that_import_the_package_keep_their_own_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = signal.getsignal(signal.SIGINT)
+    for argv, orig in ((["-m"], ["python", "-m", "other"]), (["program.py"], ["python", "program.py", "gpe_pl.fit"])):
+        monkeypatch.setattr(sys, "argv", argv)
+        monkeypatch.setattr(sys, "orig_argv", orig)
+        early_interrupts.begin()
+        assert signal.getsignal(signal.SIGINT) is before
