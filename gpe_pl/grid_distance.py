@@ -16,6 +16,8 @@ Solid = Literal["inside", "outside", "below"]
 
 _BAND = 2
 """Cells around a triangle whose distances are exact by construction; farther ones inherit the nearest triangle of a neighbour."""
+MAX_PAIRS = 2**30
+"""Of triangles and grid nodes near them, whose distances are computed: about half a minute."""
 
 
 def lattice(bounds: Bounds, spacing: float) -> tuple[np.ndarray, tuple[int, ...]]:
@@ -51,14 +53,22 @@ def _ground(heights: np.ndarray, low: np.ndarray, spacing: float, cells: np.ndar
 
 
 def mesh_distances(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...], solid: Solid) -> np.ndarray:
-    """Signed distances to triangles [triangle, 3, 3]; raises ``ValueError`` where nothing lies ``below`` them."""
+    """Signed distances to triangles [triangle, 3, 3].
+
+    Raises:
+        ValueError: nothing lies ``below`` them, or so many are so large that it would take minutes.
+    """
     from scipy.ndimage import distance_transform_edt
 
+    if (count := _num_pairs(corners, low, spacing, counts)) > MAX_PAIRS:
+        raise ValueError(
+            f"{len(corners)} triangles have together {count:.3g} grid nodes beside them, at most {MAX_PAIRS:.3g}; simplify the mesh, or use a wider spacing"
+        )
     if solid == "below":
         above, top = _crossings(corners, low, spacing, counts, 2)
         covered = np.isfinite(top)
         if not covered.any():
-            raise ValueError("the surface lies nowhere over the domain")
+            raise ValueError("the surface lies nowhere over the domain; check the options fit and up")
         rim = distance_transform_edt(~covered, return_distances=False, return_indices=True)
         top = top[tuple(rim)]
         z = low[2] + spacing * np.arange(counts[2])
@@ -99,6 +109,14 @@ def unsigned(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple
     _near(triangles, origin, float(spacing), _BAND, distance, nearest)
     _spread(triangles, origin, float(spacing), distance, nearest)
     return np.sqrt(distance)
+
+
+def _num_pairs(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> float:
+    """Triangles and grid nodes that ``unsigned`` compares: those in the box around each triangle, wider by ``_BAND`` cells."""
+    place = (corners - low) / spacing
+    last = np.array(counts) - 1.0
+    first = np.floor(np.clip(place.min(axis=1) - _BAND, 0.0, last))
+    return float((np.floor(np.clip(place.max(axis=1) + _BAND, 0.0, last)) - first + 1).prod(axis=1).sum())
 
 
 def _crossings(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...], axis: int) -> tuple[np.ndarray, np.ndarray]:

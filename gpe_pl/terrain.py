@@ -82,7 +82,7 @@ def read_terrain(
         try:
             values = mesh_distances(vertices[source.faces], low, spacing, counts, solid)
         except ValueError as error:
-            raise TerrainError(f"{path}: {error}; check the options fit and up") from None
+            raise TerrainError(f"{path}: {error}") from None
     else:
         points, normals = _placed(path, source.points, source.normals, bounds, fit, up, relief)
         if solid == "below" or normals is None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gpe_pl import terrain, terrain_files
+from gpe_pl import grid_distance, terrain, terrain_files
 from gpe_pl.canyon import canyon
 from gpe_pl.geometry import DistanceGrid
 from gpe_pl.grid_distance import unsigned
@@ -460,3 +460,33 @@ def test_what_is_too_much_is_counted_before_it_is_read(
     (tmp_path / name).write_bytes(start + repeated * (count + 1))
     with pytest.raises(TerrainError, match=message):
         read_surface(tmp_path / name)
+
+
+def stl(path: Path, corners: np.ndarray) -> Path:
+    """Write triangles [triangle, 3, 3] as a binary STL file."""
+    facets = np.zeros(len(corners), [("normal", "<f4", 3), ("corners", "<f4", 9), ("attributes", "<u2")])
+    facets["corners"] = corners.reshape(-1, 9)
+    path.write_bytes(bytes(80) + np.uint32(len(corners)).tobytes() + facets.tobytes())
+    return path
+
+
+def test_a_mesh_of_many_large_triangles_is_refused_before_the_work(tmp_path: Path) -> None:
+    path = stl(tmp_path / "soup.stl", np.random.default_rng(0).random((30_000, 3, 3)))
+    with pytest.raises(
+        TerrainError, match=r"soup.stl: 30000 triangles have together .* grid nodes beside them, at most 1.07e\+09; simplify the mesh"
+    ):
+        read_terrain(path, UNIT, 1 / 120, solid="inside")
+
+
+def test_work_is_what_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One triangle in a corner, one across, one outside of a grid of 11 nodes along each axis."""
+    corners = np.array(
+        [[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 0, 0], [10, 10, 0], [10, 10, 10]], [[99, 99, 99], [99, 98, 99], [98, 99, 99]]], float
+    )
+    count = grid_distance._num_pairs(corners, np.zeros(3), 1.0, (11, 11, 11))
+    assert count == 4 * 4 * 3 + 11**3 + 1
+    monkeypatch.setattr(grid_distance, "MAX_PAIRS", count)
+    grid_distance.mesh_distances(corners, np.zeros(3), 1.0, (11, 11, 11), "inside")
+    monkeypatch.setattr(grid_distance, "MAX_PAIRS", count - 1)
+    with pytest.raises(ValueError, match="3 triangles have together"):
+        grid_distance.mesh_distances(corners, np.zeros(3), 1.0, (11, 11, 11), "inside")
