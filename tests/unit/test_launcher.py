@@ -146,6 +146,7 @@ def test_an_interrupted_sweep_says_how_far_it_is(tmp_path: Path, monkeypatch: py
             yield 1, JobReturn(jobs[1].overrides, status=JobStatus.COMPLETED, _return_value=0.5)
             raise KeyboardInterrupt
 
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", SimpleNamespace(name="gpe_pl.fit"))
     launcher = Interrupted(1)
     launcher.config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}})
     monkeypatch.setattr(launcher, "_job", lambda number, overrides: Job([*overrides], Path("sweep"), f"x={number}", tmp_path))
