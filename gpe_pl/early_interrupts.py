@@ -16,7 +16,13 @@ COMMANDS = ("fit", "simulate", "evaluate", "benchmark", "convert")
 def begin() -> None:
     """End the process with one line on Ctrl-C from now on, if it is a command that begins: ``python -m gpe_pl.COMMAND``."""
     is_command = sys.argv[:1] == ["-m"] and any(f"gpe_pl.{name}" in sys.orig_argv for name in COMMANDS)
-    if is_command and signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where it is ignored
+    if is_command:
+        catch()
+
+
+def catch() -> None:
+    """The same in any process, unless Ctrl-C is ignored or somebody else catches it."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end_process)
 
 

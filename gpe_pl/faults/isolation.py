@@ -16,6 +16,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from gpe_pl import early_interrupts
 from gpe_pl.errors import GpeError
 from gpe_pl.faults.verdict import GOOD, MAX_DETAIL, Fault, Verdict
 
@@ -164,6 +165,7 @@ class Ended:
 
 def start(command: str, arguments: Sequence[str], output: Path, prepare: Callable[[], Any] | None = None) -> Any:
     """``python -m gpe_pl.{command} {arguments}`` as a process that prints into a file; ``prepare`` is called in it first."""
+    output.touch()  # also where it is killed before it prints
     process = forks().Process(target=_run_command, args=(command, list(arguments), str(output), prepare))
     process.start()
     return process
@@ -177,7 +179,7 @@ def run(command: str, arguments: Sequence[str], limit: float = 600.0, prepare: C
         process.join(limit)
         code = process.exitcode
         end(process)
-        return Ended(code, output.read_text(encoding="utf-8", errors="replace") if output.exists() else "")
+        return Ended(code, output.read_text(encoding="utf-8", errors="replace"))
 
 
 def end(process: Any) -> None:
@@ -188,6 +190,7 @@ def end(process: Any) -> None:
 
 
 def _run_command(command: str, arguments: list[str], output: str, prepare: Callable[[], Any] | None) -> None:
+    early_interrupts.catch()  # as `python -m` does
     with open(output, "wb", buffering=0) as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)

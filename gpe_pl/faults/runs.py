@@ -41,6 +41,8 @@ SAVED = (
 
 MEASURED = "results.json"
 """Of benchmarks: times are never the same, so their number and the settings are compared."""
+LOCKS = (".*.lock", ".*.holder")
+"""Files of locks."""
 MESSAGE_BYTES = 1000
 """What a command prints goes to a file, too: with less room in it the error would be cut off."""
 
@@ -137,16 +139,21 @@ def incomplete(folder: Path) -> list[str]:
 
 
 def leftovers(folder: Path) -> list[str]:
-    """Temporary files, and locks that nobody holds."""
-    return sorted(path.name for pattern in ("*.part*", ".*.lock", ".*.holder") for path in folder.rglob(pattern))
+    """Temporary files, and the files of locks, which a command removes unless it is killed."""
+    return sorted(path.name for pattern in ("*.part*", *LOCKS) for path in folder.rglob(pattern))
+
+
+def released(folder: Path) -> frozenset[str]:
+    """Files of locks that killed commands have left: the operating system has released them, and the next command that needs one removes it."""
+    return frozenset(path.name for pattern in LOCKS for path in folder.rglob(pattern))
 
 
 def _final_files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.rglob("*") if not path.name.startswith("."))
 
 
-def finished(command: Command, folder: Path, expected: dict[str, str], limit: float) -> Verdict:
-    """Run a command to its end, and compare what it leaves."""
+def finished(command: Command, folder: Path, expected: dict[str, str], limit: float, stays: frozenset[str] = frozenset()) -> Verdict:
+    """Run a command to its end, and compare what it leaves; names in ``stays`` may be left over."""
     ended = isolation.run(command.module, command.given(folder), limit)
     if ended.code != 0:
         verdict = ended.verdict()
@@ -155,7 +162,7 @@ def finished(command: Command, folder: Path, expected: dict[str, str], limit: fl
     wrong = sorted(name for name in found.keys() | expected.keys() if found.get(name) != expected.get(name))
     if wrong:
         return Verdict("different", ", ".join(wrong))
-    left = leftovers(folder)
+    left = [name for name in leftovers(folder) if name not in stays]
     return Verdict("half-written", f"left behind: {', '.join(left)}") if left else Verdict("harmless", "equal bit for bit")
 
 
@@ -214,7 +221,7 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
             if broken := incomplete(own):
                 problem = problem or Verdict("half-written", "; ".join(broken))
         number += len(moments)
-        verdict = problem or finished(command, own, expected, limit)
+        verdict = problem or finished(command, own, expected, limit, released(own))
         for text in moments:
             yield Verdict(verdict.status, f"{text}; {verdict.detail}")
         shutil.rmtree(own, ignore_errors=True)

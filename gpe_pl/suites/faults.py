@@ -138,7 +138,9 @@ def _prepared(settings: Settings, root: Path) -> dict[str, Command]:
         arguments = [argument.replace("{root}", str(root)) for argument in attacked.arguments]
         if attacked.module in OF_DATA:
             arguments = [*settings.data, *arguments]
-        command = _timed(Command(name, attacked.module, tuple(arguments), data if attacked.module in READS_DATA else None), settings, root)
+        command = Command(name, attacked.module, tuple(arguments), data if attacked.module in READS_DATA else None)
+        _timed(replace(command, name=f"{name} for the first time"), settings, root)  # it compiles then
+        command = _timed(command, settings, root)
         for other, overrides in attacked.others.items():
             _timed(replace(command, name=f"{name} {other}", arguments=(*command.arguments, *overrides)), settings, root)
         data = data or str(root / name / "data")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import runpy
 import shutil
+import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,12 +18,14 @@ import numpy as np
 import pytest
 import torch
 
+from gpe_pl import early_interrupts
 from gpe_pl.errors import GpeError
 from gpe_pl.faults import checkpoints, configs, field_values, isolation, pairs, runs, scenes, side_files, stores
 from gpe_pl.faults.isolation import CANARY, Ended, verdicts
 from gpe_pl.faults.verdict import GOOD, Fault, Verdict, judge
 from gpe_pl.ground_truth import DatasetSpec
 from gpe_pl.simulate import dataset
+from gpe_pl.suites import faults as suite
 from gpe_pl.suites.faults import report
 
 
@@ -269,6 +273,68 @@ def test_two_commands_are_judged_by_what_they_leave(
     expected = ({"a": "1", "b": "2"}, {"a": "1", "c": "3"})
     ends_at_once(monkeypatch, codes, said, {"first": expected[0], "second": expected[1], "both": expected[0] | expected[1], "": {}}[left])
     assert pairs.together(COMMANDS, expected, 0.0, 10.0, tmp_path).status == status
+
+
+@pytest.mark.parametrize(("left", "status"), [(".fit.lock", "harmless"), (".fit.holder", "harmless"), ("x.part", "half-written")])
+def test_a_lock_of_a_killed_command_may_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: str, status: str) -> None:
+    """The operating system has released it; but the command that ends by itself removes what is temporary."""
+
+    class Runs(Ends):
+        pid = 0
+
+    process, waits = Runs(0), iter([False, True])
+
+    def start(module: str, arguments: list[str], output: Path) -> Runs:
+        output.touch()
+        (tmp_path / "killed-0" / "runs").mkdir(parents=True)
+        (tmp_path / "killed-0" / "runs" / left).touch()
+        return process
+
+    monkeypatch.setattr(isolation, "start", start)
+    monkeypatch.setattr(isolation, "run", lambda *_: Ended(0, ""))
+    monkeypatch.setattr(isolation, "waited", lambda *_: next(waits))
+    monkeypatch.setattr(os, "kill", lambda *_: None)
+    assert [verdict.status for verdict in runs.kills(COMMANDS[0], tmp_path, 1)] == [status]
+
+
+def test_a_command_that_is_killed_at_once_has_printed_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Context:
+        def Process(self, **_: object) -> Context:
+            return self
+
+        def start(self) -> None:
+            pass
+
+    monkeypatch.setattr(isolation, "forks", Context)
+    isolation.start("fit", [], tmp_path / "output")
+    assert (tmp_path / "output").read_bytes() == b""
+
+
+def test_an_early_interrupt_is_one_line_in_a_forked_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in one that ``python -m`` starts."""
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(os, "dup2", lambda *_: None)
+    caught: list[object] = []
+    monkeypatch.setattr(runpy, "run_module", lambda *_, **__: caught.append(signal.getsignal(signal.SIGINT)))
+    monkeypatch.setattr("sys.argv", [])
+    try:
+        isolation._run_command("fit", [], str(tmp_path / "output"), None)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert caught == [early_interrupts._end_process]
+
+
+def test_the_time_of_a_command_is_that_without_compilation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, takes = [0.0], iter([60.0, 2.0])
+
+    def run(*_: object) -> Ended:
+        clock[0] += next(takes)
+        return Ended(0, "")
+
+    monkeypatch.setattr(isolation, "run", run)
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    settings = suite.Settings(cases={}, data=[], commands={"simulate": suite.Attacked("simulate", [])})
+    assert suite._prepared(settings, tmp_path)["simulate"].seconds == 2.0
 
 
 def test_the_matrix_counts_and_shows_what_is_bad() -> None:
