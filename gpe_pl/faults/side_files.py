@@ -27,37 +27,42 @@ from gpe_pl.training.run import TrainingSettings
 Change = Callable[[Path], None]
 
 NUMBER = re.compile(rb"(?<![\w.])-?\d+(\.\d+)?(e[-+]?\d+)?(?![\w.])")
-DEPTH, HUGE = 100_000, "1" + 5000 * "0"
-LONG_NAME = "x" * 60_000
-TEXTS: dict[str, bytes] = {
+_DEPTH, _HUGE = 100_000, "1" + 5000 * "0"
+_LONG_NAME = "x" * 60_000
+_TEXTS: dict[str, bytes] = {
     "empty": b"",
     "blank": b"\n",
     "null": b"null",
     "a number": b"7",
     "a list": b"[1, 2]",
     "another table": b'{"a": 1}',
-    "deep lists": b"[" * DEPTH,
-    "deep tables": b'{"a":' * DEPTH + b"1" + b"}" * DEPTH,
-    "a huge integer": f'{{"a": {HUGE}}}'.encode(),
+    "deep lists": b"[" * _DEPTH,
+    "deep tables": b'{"a":' * _DEPTH + b"1" + b"}" * _DEPTH,
+    "a huge integer": f'{{"a": {_HUGE}}}'.encode(),
     "a huge exponent": b'{"a": 1e999}',
     "NaN": b'{"a": NaN}',
     "Latin-1": '{"Länge": "Größe"}'.encode("latin-1"),
-    "a long name": f'{{"{LONG_NAME}": 1}}'.encode(),
-    "a long name in a column": f"{LONG_NAME},b\n1,2\n".encode(),
+    "a long name": f'{{"{_LONG_NAME}": 1}}'.encode(),
+    "a long name in a column": f"{_LONG_NAME},b\n1,2\n".encode(),
     "zeros": bytes(1000),
     "escapes": b'{"\\u001b]0;x\\u0007\\u001b[2J": "\\u001b[31m"}',
 }
 """Whole contents."""
-NUMBERS = {"NaN": b"NaN", "infinity": b"Infinity", "0": b"0", "negative": b"-1", "text": b'"soon"', "a huge integer": HUGE.encode()}
+_NUMBERS = {"NaN": b"NaN", "infinity": b"Infinity", "0": b"0", "negative": b"-1", "text": b'"soon"', "a huge integer": _HUGE.encode()}
 """What may stand in place of a number."""
-VALUES: dict[str, Any] = {"null": None, "a list": [[1]], "a table": {"a": 1}, "text": "x", "a long text": LONG_NAME, "deep": None}
+_VALUES: dict[str, Any] = {
+    "null": None,
+    "a list": [[1]],
+    "a table": {"a": 1},
+    "text": "x",
+    "a long text": _LONG_NAME,
+    "deep": json.loads("[" * 500 + "]" * 500),
+}
 """What may stand in place of a value in a table whose checksum fits."""
-for _ in range(500):
-    VALUES["deep"] = [VALUES["deep"]]
 
 
 def _text(name: str, path: Path) -> None:
-    path.write_bytes(TEXTS[name])
+    path.write_bytes(_TEXTS[name])
 
 
 def _truncated(path: Path) -> None:
@@ -83,7 +88,7 @@ def _value(seed: int, name: str, path: Path) -> None:
     values = json.loads(path.read_bytes())
     keys = sorted(set(values) - {sealed.SEAL})
     key = keys[int(np.random.default_rng(seed).integers(len(keys)))]
-    path.write_text(json.dumps(sealed.sealed({**values, key: VALUES[name]})), encoding="utf-8")
+    path.write_text(json.dumps(sealed.sealed({**values, key: _VALUES[name]})), encoding="utf-8")
 
 
 def _folder(path: Path) -> None:
@@ -103,12 +108,12 @@ def _fifo(path: Path) -> None:
 
 def changes(is_table: bool, seed: int = 0) -> Iterator[tuple[str, Change]]:
     """Name and function of everything that may come of a small file; of a table in JSON, also values of other types."""
-    for name in TEXTS:
+    for name in _TEXTS:
         yield name, partial(_text, name)
     yield "truncated", _truncated
-    for name, text in {**NUMBERS, "another digit": None}.items():
+    for name, text in {**_NUMBERS, "another digit": None}.items():
         yield f"a number: {name}", partial(_number, seed, text)
-    for name in VALUES if is_table else ():
+    for name in _VALUES if is_table else ():
         yield f"a value: {name}", partial(_value, seed, name)
     yield "a folder", _folder
     for target in ("nothing", "/dev/zero", "/dev/null", ".."):
@@ -185,7 +190,7 @@ def _member(name: str, header: str, path: Path) -> None:
     with zipfile.ZipFile(path) as archive:
         parts = {each: archive.read(each) for each in archive.namelist()}
     with zipfile.ZipFile(path, "w") as archive:
-        for each, old in {**parts, name: HEADERS[header]}.items():
+        for each, old in {**parts, name: _HEADERS[header]}.items():
             archive.writestr(each, old)
 
 
@@ -200,10 +205,10 @@ def _array(value: Any) -> bytes:
     return file.getvalue()
 
 
-HEADERS: dict[str, bytes] = {
+_HEADERS: dict[str, bytes] = {
     "brackets": _npy("[" * 60_000),
     "parentheses": _npy("{'descr': '<f4', 'fortran_order': False, 'shape': " + "(" * 9000),
-    "a huge integer": _npy(f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({HUGE},)}}"),
+    "a huge integer": _npy(f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({_HUGE},)}}"),
     "a huge shape": _npy("{'descr': '<f4', 'fortran_order': False, 'shape': (1000000, 1000000, 2)}"),
     "a negative shape": _npy("{'descr': '<f4', 'fortran_order': False, 'shape': (-1, 20, 2)}"),
     "a shape of floats": _npy("{'descr': '<f4', 'fortran_order': False, 'shape': (nan, 2)}"),
@@ -214,7 +219,7 @@ HEADERS: dict[str, bytes] = {
     "dates": _array(np.zeros((8, 20, 2), "datetime64[s]")),
     "no axes": _array(1.0),
     "nothing in it": _array(np.zeros((0, 20, 2))),
-    "a long name": _npy(f"{{'{LONG_NAME}': 1}}"),
+    "a long name": _npy(f"{{'{_LONG_NAME}': 1}}"),
     "Latin-1": _npy("{'descr': '<f4', 'größe': 1}".encode("latin-1")),
     "not a number": _array(np.full((8, 20, 2), np.nan)),
     "a version of later": _npy("{}", version=b"\x09\x00"),
@@ -229,10 +234,10 @@ SOUND = {("params_fluid", "no axes"), ("frame_dt", "no axes")}
 def archive_changes() -> Iterator[tuple[str, Change]]:
     """Everything that may come of an archive of arrays."""
     for key in ("pos", "frame_dt", "materials", "bounds", "params_fluid"):
-        for name in HEADERS:
+        for name in _HEADERS:
             if (key, name) not in SOUND:
                 yield f"{key}: {name}", partial(_member, f"{key}.npy", name)
-    for name in (f"{LONG_NAME}.npy", "../../canary/x.npy", "/x.npy", "\x1b[2J.npy", "params_lava.npy", "boundary_vel.npy"):
+    for name in (f"{_LONG_NAME}.npy", "../../canary/x.npy", "/x.npy", "\x1b[2J.npy", "params_lava.npy", "boundary_vel.npy"):
         yield f"a member {name[:20]!r}", partial(_member, name, "no axes")
     for name in ("empty", "zeros", "Latin-1"):
         yield name, partial(_text, name)
