@@ -41,6 +41,8 @@ SAVED = (
 
 MEASURED = "results.json"
 """Of benchmarks: times are never the same, so their number and the settings are compared."""
+ONCE = ("convert",)
+"""Commands that refuse to do again what is done."""
 LOCKS = (".*.lock", ".*.holder")
 """Files of locks."""
 MESSAGE_BYTES = 1000
@@ -155,13 +157,16 @@ def _final_files(folder: Path) -> list[Path]:
 def finished(command: Command, folder: Path, expected: dict[str, str], limit: float, stays: frozenset[str] = frozenset()) -> Verdict:
     """Run a command to its end, and compare what it leaves; names in ``stays`` may be left over."""
     ended = isolation.run(command.module, command.given(folder), limit)
-    if ended.code != 0:
-        verdict = ended.verdict()
+    verdict = ended.verdict()
+    may_be_done = command.module in ONCE and verdict.status == "refused"
+    if ended.code != 0 and not may_be_done:
         return Verdict("different", f"does not resume: {verdict.status}: {verdict.detail}")
+    if broken := incomplete(folder):
+        return Verdict("half-written", "; ".join(broken))
     found = digests(folder)
     wrong = sorted(name for name in found.keys() | expected.keys() if found.get(name) != expected.get(name))
     if wrong:
-        return Verdict("different", ", ".join(wrong))
+        return Verdict("different", f"{', '.join(wrong)}; {verdict.detail}")
     left = [name for name in leftovers(folder) if name not in stays]
     return Verdict("half-written", f"left behind: {', '.join(left)}") if left else Verdict("harmless", "equal bit for bit")
 

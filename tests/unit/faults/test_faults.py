@@ -265,6 +265,7 @@ COMMANDS = [runs.Command(name, "fit", ()) for name in ("one", "other")]
         ((0, 1), "Traceback (most recent call last):", "first", "traceback"),
         ((2, 0), "error: something is in the way", "second", "accepted"),  # of whom?
         ((2, 0), HELD, "second", "refused"),
+        ((2, 0), HELD.replace("fit)", f"fit {'x' * 400})"), "second", "refused"),
     ],
 )
 def test_two_commands_are_judged_by_what_they_leave(
@@ -295,6 +296,23 @@ def test_a_lock_of_a_killed_command_may_stay(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(isolation, "waited", lambda *_: next(waits))
     monkeypatch.setattr(os, "kill", lambda *_: None)
     assert [verdict.status for verdict in runs.kills(COMMANDS[0], tmp_path, 1)] == [status]
+
+
+@pytest.mark.parametrize(
+    ("module", "found", "said", "status"),
+    [
+        ("convert", "1", "error: exists already", "harmless"),
+        ("convert", "2", "error: exists already", "different"),
+        ("convert", "1", "Traceback (most recent call last):", "different"),
+        ("fit", "1", "error: exists already", "different"),
+    ],
+)
+def test_an_import_that_is_done_need_not_be_done_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, found: str, said: str, status: str
+) -> None:
+    monkeypatch.setattr(isolation, "run", lambda *_: Ended(2, said))
+    monkeypatch.setattr(runs, "digests", lambda _: {"a": found})
+    assert runs.finished(runs.Command("one", module, ()), tmp_path, {"a": "1"}, 1.0).status == status
 
 
 def test_a_command_that_is_killed_at_once_has_printed_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
