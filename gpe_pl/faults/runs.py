@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -43,6 +44,8 @@ MEASURED = "results.json"
 """Of benchmarks: times are never the same, so their number and the settings are compared."""
 ONCE = ("convert",)
 """Commands that refuse to do again what is done."""
+TRACEBACK = re.compile(r".*\n?Traceback \(most recent call last\)[^\n]*(\n .*)*(\n.*)?")
+"""With the line before, which says whether it was ignored, and the one after, which names the error."""
 LOCKS = (".*.lock", ".*.holder")
 """Files of locks."""
 MESSAGE_BYTES = 1000
@@ -221,8 +224,8 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
                 isolation.end(process)
             moments.append(f"{kind.name} after {moment:.2f} s")
             output = (folder / "output").read_text(encoding="utf-8", errors="replace")
-            if kind is not signal.SIGKILL and "Traceback (most recent call last)" in output:
-                problem = problem or Verdict("traceback", output.strip().splitlines()[-1][:200])
+            if kind is not signal.SIGKILL and (said := TRACEBACK.search(output)):
+                problem = problem or Verdict("traceback", " ".join(said.group().split())[-MAX_DETAIL:])
             if broken := incomplete(own):
                 problem = problem or Verdict("half-written", "; ".join(broken))
         number += len(moments)

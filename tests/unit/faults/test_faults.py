@@ -315,6 +315,13 @@ def test_an_import_that_is_done_need_not_be_done_again(
     assert runs.finished(runs.Command("one", module, ()), tmp_path, {"a": "1"}, 1.0).status == status
 
 
+def test_a_traceback_is_shown_where_more_was_printed_after_it() -> None:
+    text = "a\nException ignored in: <x>\nTraceback (most recent call last):\n  File 'a'\n    b()\nKeyboardInterrupt\nruns/fit\n"
+    found = runs.TRACEBACK.search(text)
+    assert found is not None
+    assert found.group() == text[2:-10]
+
+
 def test_a_command_that_is_killed_at_once_has_printed_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     class Context:
         def Process(self, **_: object) -> Context:
