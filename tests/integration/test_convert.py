@@ -123,7 +123,7 @@ def test_trajectories_of_any_length(tmp_path: Path, caplog: pytest.LogCaptureFix
     assert {r.trajectory: r.value for r in rows if r.metric == "num_good_frames"} == {0: 17.0, 1: 11.0}  # after 2 of history
     assert (tmp_path / "runs" / "fit" / "error_curve_test.png").exists()
     for split, number in (("val", 0), ("test", 1)):
-        assert f"{split}, trajectory {number}: left out, its 3 frames are fewer than the 4" in caplog.text
+        assert f"{split}/shard-00000.h5:{number:05d}: left out, its 3 frames are fewer than the 4" in caplog.text
 
 
 def test_what_cannot_be_evaluated_is_said_before_the_training(tmp_path: Path) -> None:

@@ -286,7 +286,7 @@ def test_a_folder_in_which_nothing_was_saved_is_free(tiny_data: Path, tmp_path: 
         fit(tiny(tiny_data, tmp_path, "graph.history=11"))
     assert fit(tiny(tiny_data, tmp_path)) > 0
     (tmp_path / "fit" / "config.json").write_text("{")
-    with pytest.raises(RunError, match="config.json is damaged"):
+    with pytest.raises(RunError, match="config.json: unreadable"):
         fit(tiny(tiny_data, tmp_path))
 
 
