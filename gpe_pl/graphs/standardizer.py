@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
 from gpe_pl.nn.blocks import Standardize
-from gpe_pl.schema import MATERIALS, EdgeType, FeatureSpec, role
+from gpe_pl.schema import MATERIALS, RADIUS, EdgeType, FeatureSpec, role
 
 
 def _no_more(roles: frozenset[str]) -> list[HeteroData]:
@@ -76,7 +76,7 @@ class GraphStandardizer(nn.Module):
         """Set all statistics from graphs of the training split, those of what is rare from further ones if it is a ``StatisticsSample``.
 
         Returns:
-            Materials, and relations between what occurs, that no graph has: these are not standardised.
+            Materials, and contacts between what occurs, that no graph has: these are not standardised. Relations of meshes are missing where there is no mesh.
         """
 
         def fit(module: nn.Module, values: Iterable[Tensor]) -> bool:
@@ -97,7 +97,8 @@ class GraphStandardizer(nn.Module):
             seen = looked_at(role(relations[0][0]), role(relations[0][2]))
             found = fit(module, (g[r].odd for g in seen for r in relations))
             fit(self.even[key], (g[r].even for g in seen for r in relations))
-            if not found and any(len(g[r[0]].x) and len(g[r[2]].x) for g in seen for r in relations):
+            is_contact = relations[0][1] == RADIUS
+            if not found and is_contact and any(len(g[r[0]].x) and len(g[r[2]].x) for g in seen for r in relations):
                 missing.append(named(relations[0]))
         mass = [g[m].mass for g in sample for m in self.spec.materials]
         if sum(len(x) for x in mass):
