@@ -76,8 +76,16 @@ def started(command: str, arguments: Sequence[str], override: str, must_fail: bo
     return verdict
 
 
-def faults(command: str, arguments: Sequence[str], count: int, seed: int = 0, limit: float = 120.0) -> list[Fault]:
-    """So many mutations of the configuration that a command gets with some arguments, each kind as often.
+def faults(command: str, arguments: Sequence[str], count: int, seed: int = 0, limit: float = 120.0, seconds: float = 0.0) -> list[Fault]:
+    """Mutations of the configuration that a command gets with some arguments.
+
+    Args:
+        command: ``fit`` and so on.
+        arguments: of the command where nothing is wrong.
+        count: of the mutations, equally many of each kind.
+        seed: of their choice.
+        limit: seconds after which a command is stopped.
+        seconds: that the command takes where nothing is wrong. Some mutations change nothing, and the command runs to its end.
 
     Raises:
         NoConfigError: the arguments themselves do not fit.
@@ -95,5 +103,5 @@ def faults(command: str, arguments: Sequence[str], count: int, seed: int = 0, li
         chosen = rng.permutation(len(every))[: math.ceil(count / len(by_kind))]
         for override, must_fail in (every[k] for k in sorted(chosen)):
             attack = partial(started, command, tuple(arguments), override, must_fail, limit)
-            found.append(Fault(f"configuration, {kind}", f"{command} {override}", attack))
+            found.append(Fault(f"configuration, {kind}", f"{command} {override}", attack, seconds))
     return found

@@ -20,6 +20,7 @@ from gpe_pl.faults.runs import Command
 from gpe_pl.faults.verdict import BAD, GOOD, Fault, Verdict
 from gpe_pl.ground_truth import DatasetSpec
 from gpe_pl.markdown import table_row
+from gpe_pl.progress import progress_bar
 from gpe_pl.suites.trained import Case
 
 log = logging.getLogger(__name__)
@@ -108,12 +109,18 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
         root.chmod(0o755)
         commands = _prepared(settings, root)
         faults = _faults(settings, specs, commands, root)
-        for fault, verdict in zip(faults, isolation.verdicts(faults, 4 * settings.limit), strict=True):
-            _note(records, fault.kind, fault.name, verdict)
+        with progress_bar("faults") as on_progress:
+            for done, (fault, verdict) in enumerate(zip(faults, isolation.verdicts(faults, 4 * settings.limit), strict=True), start=1):
+                _note(records, fault.kind, fault.name, verdict)
+                on_progress(done, len(faults))
         for name, command in commands.items():
             count = settings.commands[name].num_kills
-            for verdict in runs.kills(command, root / f"kills-{name}", count, seed=settings.seed, limit=settings.limit) if count else ():
-                _note(records, f"{name} {KILLED}", "", verdict)
+            if count:
+                with progress_bar(f"kills of {name}") as on_progress:
+                    found = runs.kills(command, root / f"kills-{name}", count, seed=settings.seed, limit=settings.limit)
+                    for done, verdict in enumerate(found, start=1):
+                        _note(records, f"{name} {KILLED}", "", verdict)
+                        on_progress(done, count)
     return records, report(records)
 
 
@@ -173,7 +180,7 @@ def _faults(settings: Settings, specs: dict[str, DatasetSpec], commands: dict[st
         attacked, sound = settings.commands[name], root / name
         given = [*command.arguments, f"paths.data={command.data or sound / 'data'}"]
         if attacked.num_configs:
-            found += configs.faults(command.module, given, attacked.num_configs, settings.seed, settings.limit)
+            found += configs.faults(command.module, given, attacked.num_configs, settings.seed, settings.limit, command.seconds)
         found += runs.damage_faults(command, sound, attacked.num_damages, settings.seed, settings.limit)
         found += side_files.command_faults(command, sound, attacked.num_contents, settings.seed, settings.limit)
         found += outside.faults(command, sound, attacked.names, attacked.leads_out, settings.limit)
