@@ -10,6 +10,7 @@ import atexit
 import contextlib
 import importlib
 import json
+import math
 import os
 import re
 import sys
@@ -343,6 +344,12 @@ def output_dir(cfg: DictConfig) -> Path:
     return Path(HydraConfig.get().runtime.output_dir) if HydraConfig.initialized() else Path(cfg.paths.runs) / run_name(cfg.name)
 
 
+def num_processes(cfg: DictConfig) -> int:
+    """How many processes a training is to have, as Lightning starts or finds them; 1 where the setting is not one that ``fit`` accepts."""
+    counts = [OmegaConf.select(cfg, f"trainer.{key}") for key in ("devices", "num_nodes")]
+    return math.prod(count if type(count) is int else 1 for count in counts)
+
+
 class Report(Callback):
     """Holds the folder of the results of a command, a single run or a sweep, from before anything is written to it, and writes tables and figures when the
     command ends.
@@ -353,20 +360,20 @@ class Report(Callback):
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         with contextlib.suppress(OmegaConfBaseException):  # of a name that is refused; Hydra meets it again, and ends
-            self._hold(Path(config.hydra.run.dir))
+            self._hold(Path(config.hydra.run.dir), num_processes(config))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         with contextlib.suppress(OmegaConfBaseException):
             self._hold(Path(config.hydra.sweep.dir))
 
-    def _hold(self, folder: Path) -> None:
+    def _hold(self, folder: Path, num_processes: int = 1) -> None:
         """Until the process ends. Ends it where the folder cannot be used: Hydra turns an exception of a callback into a warning, and goes on."""
         from gpe_pl.locks import held
 
         _results.append(folder)
         try:
             refuse_links(folder)
-            self._lock.enter_context(held(folder))
+            self._lock.enter_context(held(folder, num_processes=num_processes))
         except GpeError as error:
             _fail(error)
         except OSError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpe_pl.config import ConfigError, bind, construct, entry_point, output_dir
+from gpe_pl.config import ConfigError, bind, construct, entry_point, num_processes, output_dir
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -23,7 +23,7 @@ def fit(cfg: DictConfig) -> float:
     data_name(cfg.data.name, "data.name")
     if cfg.reuse is not None:
         run_name(cfg.reuse, "reuse")
-    with held(output_dir(cfg)):
+    with held(output_dir(cfg), num_processes=num_processes(cfg)):
         return _fit(cfg, output_dir(cfg))
 
 

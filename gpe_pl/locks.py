@@ -56,22 +56,23 @@ class Holder:
 
 
 @contextlib.contextmanager
-def held(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bool = True) -> Iterator[None]:
+def held(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bool = True, num_processes: int = 1) -> Iterator[None]:
     """Inside, no other command writes to the folder.
 
-    A process that holds a folder may do so again. Of the processes of one run, the first holds it for all.
+    A process that holds a folder may do so again.
 
     Args:
         folder: of a run, a sweep or a data set.
         key: where its parent is configured, for messages.
         waits: until the other command has ended, rather than refuse; a log line says for whom.
         makes: the folder.
+        num_processes: of the run. Of several, which ``RANKS`` number, the first holds the folder for all.
 
     Raises:
         FolderError: another command writes to the folder, the folder cannot be made, or it was deleted inside.
     """
     path = _beside(folder, "lock")
-    if _is_later_process():
+    if num_processes > 1 and _is_later_process():
         yield
         return
     if path in _held:

@@ -93,18 +93,31 @@ def test_who_waits_says_so_and_goes_on(tmp_path: Path, caplog: pytest.LogCapture
     assert f"waiting until another command has written it (process {process.pid} on " in caplog.text
 
 
-def test_processes_of_one_run_share_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("LOCAL_RANK", "1")
-    with held_elsewhere_as_first(tmp_path / "a"), held(tmp_path / "a"):
-        pass
+@pytest.mark.parametrize("key", locks.RANKS)
+def test_processes_of_one_run_share_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, key: str) -> None:
+    for other in locks.RANKS:
+        monkeypatch.delenv(other, raising=False)
+    with held_elsewhere(tmp_path / "a"):
+        monkeypatch.setenv(key, "1")
+        with held(tmp_path / "a", num_processes=2):
+            pass
+        monkeypatch.setenv(key, "0")
+        with pytest.raises(FolderError, match="another command writes to it"):
+            held(tmp_path / "a", num_processes=2).__enter__()
 
 
-@contextmanager
-def held_elsewhere_as_first(folder: Path) -> Iterator[None]:
-    rank = os.environ.pop("LOCAL_RANK")
-    with held_elsewhere(folder):
-        os.environ["LOCAL_RANK"] = rank
-        yield
+def test_hydra_lets_later_processes_of_a_training_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of one that has several; each of a command that ``srun -n 2`` starts twice is alone, and so is each sweep."""
+    monkeypatch.setenv("SLURM_PROCID", "1")
+    folders = {"run": {"dir": str(tmp_path / "a")}, "sweep": {"dir": str(tmp_path / "a")}}
+    settings = {"devices": 2, "num_nodes": 1}
+    with held_elsewhere(tmp_path / "a"):
+        callback = Report()
+        callback.on_run_start(OmegaConf.create({"hydra": folders, "trainer": settings}))
+        callback._release()
+        for start, devices in ((Report().on_run_start, 1), (Report().on_run_start, "two"), (Report().on_multirun_start, 2)):
+            with pytest.raises(SystemExit, match="2"):
+                start(OmegaConf.create({"hydra": folders, "trainer": settings | {"devices": devices}}))
 
 
 def test_disks_without_locks_have_lock_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -188,8 +201,12 @@ def test_a_folder_that_cannot_be_made_names_the_key(tmp_path: Path) -> None:
         ("simulate", [*DATA, "part=1", "num_parts=2"], "data/sand/tiny-part-1-of-2"),
     ],
 )
-def test_commands_refuse_a_folder_that_another_writes_to(tmp_path: Path, command: str, overrides: list[str], folder: str) -> None:
-    """Fast: nothing is computed before."""
+@pytest.mark.parametrize("number", ["0", "1"])
+def test_commands_refuse_a_folder_that_another_writes_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str, overrides: list[str], folder: str, number: str
+) -> None:
+    """Fast: nothing is computed before. Slurm numbers the processes of a command that is started twice like those of one run."""
+    monkeypatch.setenv("SLURM_PROCID", number)
     module = importlib.import_module(f"gpe_pl.{command}")
     tasks = {"evaluate": "evaluate_checkpoint"}
     paths = [f"paths.runs={tmp_path}/runs", *([] if command == "benchmark" else [f"paths.data={tmp_path}/data"])]
@@ -200,7 +217,11 @@ def test_commands_refuse_a_folder_that_another_writes_to(tmp_path: Path, command
         assert not list((tmp_path / folder).rglob("*"))
 
 
-def test_imports_refuse_a_data_set_that_another_writes(tmp_path: Path, trajectory: Trajectory) -> None:
+@pytest.mark.parametrize("number", ["0", "1"])
+def test_imports_refuse_a_data_set_that_another_writes(
+    tmp_path: Path, trajectory: Trajectory, monkeypatch: pytest.MonkeyPatch, number: str
+) -> None:
+    monkeypatch.setenv("SLURM_PROCID", number)
     (tmp_path / "mine").mkdir()
     other = (
         f"from pathlib import Path\nfrom gpe_pl.locks import held\nwith held(Path({str(tmp_path / 'mine' / 'imported')!r}), makes=False):"
