@@ -58,21 +58,34 @@ DataName = Annotated[str, AfterValidator(_plain)]
 
 
 def sweep_name(overrides: str) -> str:
-    """The overrides of a run of a sweep, as the path of its folder in the sweep's. Their values can be paths, with ``/`` in them.
+    """The overrides of a run of a sweep, as the path of its folder in the sweep's. Their values can be paths, with ``/`` in them; the rest is ``portable``.
 
     Raises:
         NameRefused: that path leads elsewhere, or a part of it is longer than file systems allow.
     """
-    for part in overrides.split("/"):
+    parts = overrides.lstrip("/").split("/")
+    for part in parts:
         if part == "..":
             raise NameRefused(
                 f"{_quoted(overrides)}: the run's folder is named by its overrides, and /../ leads out of it; give a path without"
             )
-        if not part.isprintable() or len(part.encode()) > MOST_BYTES_OF_VALUES:
+        if not part.isprintable() or len(portable(part).encode()) > MOST_BYTES_OF_VALUES:
             raise NameRefused(
                 f"{_quoted(part)}: the run's folder is named by its overrides, which must be printable and have at most {MOST_BYTES_OF_VALUES} bytes each"
             )
-    return overrides.lstrip("/")
+    return "/".join(map(portable, parts))
+
+
+def portable(part: str) -> str:
+    """A part of a path, with ``~`` and two hexadecimal digits for each character that Windows does not take there. Different parts stay different."""
+    text = "".join(_coded(letter) if letter in FORBIDDEN or letter == "~" else letter for letter in part)
+    if text.endswith((".", " ")):
+        text = f"{text[:-1]}{_coded(text[-1])}"
+    return f"{_coded(text[0])}{text[1:]}" if _is_device(text) else text
+
+
+def _coded(letter: str) -> str:
+    return f"~{ord(letter):02X}"
 
 
 def _fault(part: str) -> str | None:
@@ -89,9 +102,13 @@ def _fault(part: str) -> str | None:
         return f"holds {' '.join(sorted(forbidden))}, which not every system allows in the name of a folder"
     if part[-1] in ". " or part[0] == " ":
         return "must not end in a dot, nor begin or end with a space"
-    if part.partition(".")[0].lower() in RESERVED:
+    if _is_device(part):
         return "is a device of Windows; choose another name"
     return None
+
+
+def _is_device(part: str) -> bool:
+    return part.partition(".")[0].lower() in RESERVED
 
 
 def _quoted(name: Any, most: int = 100) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from hashlib import sha256
 from pathlib import Path
 
+from gpe_pl.names import portable
+
 FOLDER = Path(__file__).parent
 SUFFIX = ".ckpt"
 BEST = Path("checkpoints") / f"best{SUFFIX}"
@@ -31,16 +33,16 @@ def fingerprint(checkpoint: Path | str) -> str:
 
 
 def model_name(checkpoint: Path | str | None, runs: Path | str) -> str:
-    """What a model is called in the name of a folder: as it is shipped, or as its run below the folder ``runs``, ``_`` for ``/``."""
+    """What a model is called in the name of a folder: as it is shipped, or as its run below the folder ``runs``, ``_`` for ``/``. It is ``names.portable``."""
     if checkpoint is None or str(checkpoint) in names():
         return str(checkpoint)
     path = Path(checkpoint).resolve()
     if path.suffix != SUFFIX:
         run, own = path, ""
     elif path.parent.name != BEST.parent.name:
-        return path.stem
+        return portable(path.stem)
     else:
         run, own = path.parent.parent, "" if path.name == BEST.name else path.stem
     root = Path(runs).resolve()
     parts = run.relative_to(root).parts if run.is_relative_to(root) else (run.name,)
-    return "_".join(part for part in (*parts, own) if part)
+    return "_".join(portable(part) for part in (*parts, own) if part)

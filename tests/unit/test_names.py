@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gpe_pl.config import ConfigError, compose
 from gpe_pl.evaluate import evaluate_checkpoint
 from gpe_pl.fit import fit
-from gpe_pl.names import NameRefused, data_name, run_name, sweep_name
+from gpe_pl.names import NameRefused, data_name, portable, run_name, sweep_name
 from gpe_pl.simulate import imported_data
 
 LEAD_OUT = ["..", "../x", "a/../../x", "/etc/x", "a//b", "a/", "", " ", ".", "./a", ".hidden", "a/.lock"]
@@ -54,10 +54,26 @@ def test_names_of_data_sets_are_plain() -> None:
 def test_the_folder_of_a_run_in_a_sweep_stays_in_the_sweep() -> None:
     assert sweep_name("seed=0/model.interaction=odd") == "seed=0/model.interaction=odd"
     assert sweep_name("start_from=/runs/sand/seed=1") == "start_from=/runs/sand/seed=1"
-    assert sweep_name("start_from=../sand") == "start_from=../sand"  # a folder of that name
+    assert sweep_name("start_from=../sand") == "start_from=.~2E/sand"  # a folder of that name
     for overrides in ("start_from=a/../../../x", "..", "name=\x1b[31m", "x=" + 255 * "a"):
         with pytest.raises(NameRefused):
             sweep_name(overrides)
+
+
+def test_the_folder_of_a_run_in_a_sweep_can_be_made_on_windows() -> None:
+    assert sweep_name(r"start_from='C:\runs\a'/seed=0") == "start_from='C~3A~5Cruns~5Ca'/seed=0"
+    assert sweep_name("a={b:1}/c=*/d='x?'/e=\"f\"/g=a~b") == "a={b~3A1}/c=~2A/d='x~3F'/e=~22f~22/g=a~7Eb"
+    assert sweep_name("start_from=/aux/con.ckpt/end./x ") == "start_from=/~61ux/~63on.ckpt/end~2E/x~20"
+    with pytest.raises(NameRefused, match="at most 255 bytes"):
+        sweep_name("x=" + 100 * ":")
+
+
+@given(st.text(".~ :*2Eaconx=", max_size=8), st.text(".~ :*2Eaconx=", max_size=8))
+def test_parts_of_paths_become_portable_and_stay_different(one: str, other: str) -> None:
+    one, other = one.lstrip(". "), other.lstrip(". ")
+    for part in filter(None, (one, other)):
+        assert run_name(portable(part)) == portable(part)
+    assert (portable(one) == portable(other)) == (one == other)
 
 
 def test_commands_refuse_names_before_they_make_folders(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ def test_a_model_is_called_as_its_run(tmp_path: Path) -> None:
     assert model_name(run / "checkpoints" / "last.ckpt", tmp_path / "runs") == "sweep_seed=0_last"
     assert model_name(run / "checkpoints" / "best.ckpt", tmp_path / "other") == "seed=0"
     assert model_name(tmp_path / "water.ckpt", tmp_path / "runs") == "water"
+    assert model_name(tmp_path / "c:d.ckpt", tmp_path) == "c~3Ad" and model_name(tmp_path / "a" / "c=*", tmp_path) == "a_c=~2A"
 
 
 @pytest.mark.parametrize("name", names())
