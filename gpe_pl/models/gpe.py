@@ -163,7 +163,7 @@ class GPE(nn.Module):
         decoder: ``node`` decodes an acceleration per node (paper); ``pair`` an antisymmetric force per edge, divided by the node's mass; ``contact`` decodes
             both in meshes: a body moves and turns as a whole by the forces of its ``radius`` edges to others alone, which are where it touches something, and
             each node adds only what deforms it. Nodes of no cell are part of the body beside them. Forces between bodies have no sum. What is no mesh has
-            an acceleration per node: with it, ``island_momentum`` keeps the sum.
+            an acceleration per node, and beside it ``island_momentum`` has to keep the sum.
         edge_state: ``latent`` updates a hidden state per edge (Algorithm 1); ``geometry`` feeds the raw edge features to every layer.
         material_embedding: ``affine`` (the paper's interpolation rule) or ``mlp``.
         num_message_passing_steps: processor layers; 12 in the paper.
@@ -178,7 +178,8 @@ class GPE(nn.Module):
 
     Raises:
         StressError: ``stress`` without a material that has one.
-        IslandError: ``island_momentum``, or meshes with the ``contact`` decoder, with graphs that do not know islands and bodies.
+        IslandError: ``island_momentum``, or meshes with the ``contact`` decoder, with graphs that do not know islands and bodies; or meshes beside other
+            materials with the ``contact`` decoder and nothing that keeps the sum of momentum.
     """
 
     skips = Skips()
@@ -219,6 +220,12 @@ class GPE(nn.Module):
         self.bodies = tuple(r[0] for r in spec.relations if r[1] == CELL) if decoder == "contact" else ()
         if self.bodies and not spec.islands:
             raise IslandError("model.decoder=contact needs graph.islands=true")
+        others = [m for m in spec.materials if m not in self.bodies]
+        if self.bodies and others and island_momentum == "ignored":
+            raise IslandError(
+                f"model.decoder=contact with model.island_momentum=ignored: momentum has no exact sum where {', '.join(others)} touch "
+                f"{', '.join(self.bodies)}; choose model.island_momentum=linear or angular, or model.decoder=pair or node"
+            )
         if stress and not spec.stress_channels:
             raise StressError(
                 f"model.stress=true, but no stress is stored of {', '.join(spec.materials)}; choose model.stress=false or data=fem"

@@ -420,7 +420,7 @@ def same_stores(data: HeteroData, levels: int) -> list[Any]:
 VARIANTS: dict[str, dict[str, Any]] = {
     **{i: {"interaction": i} for i in ("directed", "negated", "odd", "odd_even")},
     "pair": {"decoder": "pair", "interaction": "odd"},
-    "contact": {"decoder": "contact"},
+    "contact": {"decoder": "contact", "island_momentum": "linear"},
     "geometry": {"edge_state": "geometry"},
     "separate": {"level_weights": "separate"},
     "sweep": {"schedule": "sweep"},
