@@ -18,11 +18,21 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 from array_api_compat import array_namespace, device
 
+from gpe_pl.errors import GpeError
+
 Array = Any
 
 
 ON_SURFACE = 1e-6
 """Fraction of the extent of a boundary within which a point lies on its surface: some ten roundings of a position in single precision."""
+
+
+MOST_SAMPLED = 10_000_000
+"""Nodes on one surface."""
+
+
+class SamplingError(GpeError, ValueError):
+    """A surface would have more nodes than fit into memory."""
 
 
 @runtime_checkable
@@ -63,24 +73,35 @@ def _norm(x: Array) -> Array:
 
 def _segment(start: np.ndarray, end: np.ndarray, spacing: float) -> np.ndarray:
     """Points from ``start`` to ``end``, end excluded, no further apart than ``spacing``."""
-    count = max(1, math.ceil(np.linalg.norm(end - start) / spacing - 1e-9))
+    count = max(1, _count(float(np.linalg.norm(end - start)) / spacing - 1e-9))
     return start + (end - start) * (np.arange(count) / count)[:, None]
+
+
+def _count(nodes: float | int) -> int:
+    """A number of nodes, rounded up."""
+    if not nodes <= MOST_SAMPLED:
+        raise SamplingError(
+            f"a wall or obstacle would have {nodes:.3g} boundary nodes, at most {MOST_SAMPLED} are made; choose a larger spacing"
+        )
+    return math.ceil(nodes)
 
 
 def _grid(low: list[float], high: list[float], spacing: float) -> np.ndarray:
     """A regular grid over an axis-aligned face, corners included; shape [points, len(low)]."""
-    axes = [np.linspace(a, b, max(2, math.ceil((b - a) / spacing - 1e-9) + 1)) for a, b in zip(low, high, strict=True)]
+    counts = [_count((b - a) / spacing - 1e-9) for a, b in zip(low, high, strict=True)]
+    _count(math.prod(counts))
+    axes = [np.linspace(a, b, max(2, count + 1)) for a, b, count in zip(low, high, counts, strict=True)]
     return np.stack([m.ravel() for m in np.meshgrid(*axes, indexing="ij")], axis=-1)
 
 
 def _directions(dim: int, radius: float, spacing: float) -> np.ndarray:
     """Unit vectors [points, dim] to points of a circle or sphere that are about ``spacing`` [m] apart at the distance ``radius``."""
     if dim == 2:
-        count = max(6, math.ceil(2 * math.pi * radius / spacing))
+        count = max(6, _count(2 * math.pi * radius / spacing))
         angle: np.ndarray = 2 * math.pi * np.arange(count) / count
         return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     # golden-angle spiral: near-uniform density on the sphere
-    count = max(12, math.ceil(4 * math.pi * radius**2 / spacing**2))
+    count = max(12, _count(4 * math.pi * (radius / spacing) ** 2))
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.arange(count) * math.pi * (3 - math.sqrt(5))
     rho = np.sqrt(1 - z * z)

@@ -14,6 +14,8 @@ from gpe_pl.json_text import MAX_CHARACTERS
 
 LARGEST_DEFLATE_RATIO = 1032
 """Deflate cannot compress better than this (RFC 1951: 258 bytes by two bits)."""
+LARGEST_RATIO, SPARE_UNPACKED = 64, 2**29
+"""What is stored unpacks to no more than so many times its bytes, and so many more: constants in a file of megabytes would be gigabytes in memory."""
 
 FILTERS = {
     h5py.h5z.FILTER_DEFLATE: "gzip",
@@ -54,11 +56,18 @@ def attribute(owner: h5py.HLObject, name: str) -> Any:
     return owner.attrs[name] if stored.shape == () and stored.dtype.kind in "iuS" and stored.dtype.itemsize <= MAX_CHARACTERS else None
 
 
+def most_unpacked(stored: int) -> int:
+    """Bytes that so many stored ones may unpack to."""
+    return min(stored * LARGEST_DEFLATE_RATIO, stored * LARGEST_RATIO + SPARE_UNPACKED)
+
+
 def obstacle(dataset: h5py.Dataset) -> str | None:
     """Why an array cannot be read without more memory or time than it is worth; None where it can."""
     stored, size = dataset.id.get_storage_size(), dataset.nbytes
     if size > stored * LARGEST_DEFLATE_RATIO or stored > dataset.file.id.get_filesize():
         return f"claims {size} bytes, the file holds {min(stored, dataset.file.id.get_filesize())}"
+    if size > most_unpacked(stored):
+        return f"unpacks to {size} bytes from {stored}, at most {most_unpacked(stored)} are read; store it without compression"
     filters = _filters(dataset)
     unknown = [name for code, name in filters if code not in FILTERS]
     if unknown or len({code for code, _ in filters}) < len(filters):

@@ -12,7 +12,6 @@ import inspect
 import io
 import json
 import logging
-import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl import integrators
 from gpe_pl.atomic import replace_bytes
 from gpe_pl.cells import mean_over_corners
+from gpe_pl.checkpoint_archive import check_archive, check_values
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
@@ -518,11 +518,10 @@ def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:
         shipped = f", or a model that comes with the package: {', '.join(names())}" if names() else ""
         raise CheckpointError(f"{path}: no such checkpoint; give the folder of a run, the path of a checkpoint{shipped}")
     try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-        if damaged is not None:
-            raise zipfile.BadZipFile(f"checksum mismatch in {damaged}")
-        return torch.load(path, map_location=device, weights_only=True)
+        check_archive(Path(path))
+        values = torch.load(path, map_location=device, weights_only=True)
+        check_values(values)
+        return values
     except Exception as error:  # zipfile and torch raise many types for damaged or unsafe files
         raise CheckpointError(
             f"{path}: not a safe, complete checkpoint ({reason(error)}); if it was copied, copy it again, or take another of the run, such as last.ckpt"

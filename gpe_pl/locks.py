@@ -160,7 +160,8 @@ def _same(folder: Path) -> Iterator[None]:
         if before is not None and _identity(folder) != before:
             raise FolderError(lost)
     except OSError as error:
-        if _identity(folder) != before:
+        is_missing = isinstance(error, FileNotFoundError | NotADirectoryError) or error.errno == getattr(errno, "ESTALE", errno.ENOENT)
+        if is_missing and _identity(folder) != before:  # with another error, the command itself has removed what it had begun
             raise FolderError(lost) from error
         raise
     finally:

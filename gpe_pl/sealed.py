@@ -16,7 +16,8 @@ from gpe_pl.atomic import replace_text
 from gpe_pl.errors import GpeError
 
 SEAL = "sha256"
-MOST_BYTES = 2**24
+MOST_BYTES = 2**22
+"""The largest table of the project has some tens of thousands."""
 
 
 class SealError(GpeError, ValueError):

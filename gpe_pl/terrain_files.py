@@ -25,7 +25,17 @@ MAX_FILE_BYTES = 2**30
 MAX_TRIANGLES = 2_000_000
 MAX_POINTS = 5_000_000
 MAX_HEIGHTS = 2**25
-MAX_MEMBERS = 1000
+MAX_MEMBERS = MAX_PARTS = 1000
+MAX_TEXT_TRIANGLES, MAX_TEXT_VERTICES, MAX_TEXT_VALUES = 1_000_000, 2_000_000, 10_000_000
+MAX_ASCII_TRIANGLES, MAX_ASCII_ELEMENTS, MAX_ASCII_BYTES = 300_000, 1_000_000, 2**24
+"""What readers of text get through in some seconds."""
+BINARY = {
+    ".obj": "write it as a binary .stl or .ply",
+    ".stl": "write it as a binary .stl",
+    ".ply": "write it as a binary .ply",
+    ".xyz": "write it as .npy",
+    ".csv": "write it as .npy",
+}
 HEADER_BYTES = 2**16
 """In which a PLY file says how many elements it has."""
 
@@ -83,14 +93,19 @@ def read_surface(path: Path) -> Mesh | Cloud | Heights:
     return source
 
 
-COUNTED = {
-    ".obj": ((b"\nf", MAX_TRIANGLES, "triangles"), (b"\nv ", MAX_POINTS, "vertices")),
-    ".stl": ((b"endfacet", MAX_TRIANGLES, "triangles"),),
-    ".xyz": ((b"\n", MAX_POINTS, "points"),),
+COUNTED: dict[str, tuple[tuple[tuple[bytes, ...], int, str], ...]] = {
+    ".obj": (
+        ((b"\nf", b"\rf"), MAX_TEXT_TRIANGLES, "triangles"),
+        ((b"\nv", b"\rv"), MAX_TEXT_VERTICES, "vertices"),
+        ((b"usemtl", b"\no", b"\ng", b"\ro", b"\rg"), MAX_PARTS, "parts"),
+        ((b"\n", b"\r", b" ", b"\t"), 2 * MAX_TEXT_VALUES, "values"),
+    ),
+    ".stl": (((b"endfacet",), MAX_ASCII_TRIANGLES, "triangles"),),
+    ".xyz": (((b"\n", b"\r", b" ", b"\t"), MAX_TEXT_VALUES, "values"),),
     ".ply": (),
-    ".csv": ((b",", MAX_HEIGHTS, "heights"), (b"\n", MAX_HEIGHTS, "heights")),
+    ".csv": (((b"\n", b"\r", b","), MAX_TEXT_VALUES, "heights"),),
 }
-"""What a line or a value of a text format has, by extension: readers take far longer than counting these."""
+"""What begins or separates the parts of a text format, by extension: readers take far longer than counting these."""
 
 
 def _require_countable(path: Path, extension: str) -> None:
@@ -98,12 +113,26 @@ def _require_countable(path: Path, extension: str) -> None:
     content = path.read_bytes()
     if extension == ".stl" and not content[:512].lstrip().lower().startswith(b"solid"):
         return  # its header says how many, which the reader compares with the size
-    for mark, most, what in COUNTED[extension]:
-        if (count := content.count(mark)) > most:
-            raise TerrainError(f"{path}: about {count} {what} are too many, at most {most}; simplify it first")
-    for what, count in re.findall(rb"element (vertex|face) +(\d{1,20})", content[:HEADER_BYTES]) if extension == ".ply" else ():
-        if (MAX_TRIANGLES if what == b"face" else MAX_POINTS) < int(count) <= len(content):  # a header that promises more is damaged
-            raise TerrainError(f"{path}: {int(count)} elements of kind {what.decode()} are too many; simplify it first")
+    for marks, most, what in COUNTED[extension]:
+        if (count := sum(map(content.count, marks))) > most:
+            raise TerrainError(
+                f"{path}: about {count} {what} are too many for text, at most {most}; simplify it first, or {BINARY[extension]}"
+            )
+    if extension == ".ply":
+        _require_countable_elements(path, content)
+
+
+def _require_countable_elements(path: Path, content: bytes) -> None:
+    head = content[:HEADER_BYTES].partition(b"end_header")[0]
+    counts = [(kind, int(count)) for kind, count in re.findall(rb"element\s+(\S{1,100})\s+(\d{1,20})", head)]
+    for kind, count in counts:
+        if (MAX_TRIANGLES if kind == b"face" else MAX_POINTS) < count <= len(content):  # a header that promises more is damaged
+            raise TerrainError(f"{path}: {count} elements of kind {kind.decode(errors='replace')} are too many; simplify it first")
+    is_text = re.search(rb"format\s+ascii", head) is not None
+    if is_text and (len(content) > MAX_ASCII_BYTES or MAX_ASCII_ELEMENTS < sum(count for _, count in counts) <= len(content)):
+        raise TerrainError(
+            f"{path}: too large for text, of which {MAX_ASCII_BYTES} bytes and {MAX_ASCII_ELEMENTS} elements are read; {BINARY['.ply']}"
+        )
 
 
 def _read_mesh(path: Path) -> Mesh | Cloud:

@@ -435,6 +435,8 @@ class Metadata:
         unknown = [name for name in self.materials if name not in MATERIALS]
         if unknown or not self.materials:
             yield "materials", f"names {unknown or 'nothing'}; known: {', '.join(MATERIALS)}"
+        elif len(set(self.materials)) < len(self.materials):
+            yield "materials", "names a material twice"
         elif self.param_names != param_names(self.materials):
             yield "param_names", f"is {self.param_names}, expected {param_names(self.materials)} for {self.materials}"
         for key in ("frame_dt", "spacing", "connectivity_radius"):

@@ -12,6 +12,11 @@ from gpe_pl.periodicity import NOWHERE, Periodicity
 from gpe_pl.rollout import CROWDING_LIMIT, SimulationError, crowding
 from gpe_pl.trajectory import search_tree
 
+MOST_PAIRS = 2**26
+"""That are listed; a gigabyte of indices."""
+NUM_SAMPLED = 64
+"""Nodes from whose neighbours the number of all pairs is estimated."""
+
 
 def pairs_at_rest(num_nodes: int, radius: float, spacing: float, dim: int) -> float:
     """Pairs of a cloud with one node per spacing^dim: N/2 V_dim (R / spacing)^dim."""
@@ -46,11 +51,17 @@ def check_crowding(pos: Float64[np.ndarray, "node dim"], radius: float, spacing:
 
 
 def radius_pairs(pos: Float64[np.ndarray, "node dim"], radius: float, periodicity: Periodicity = NOWHERE) -> Int64[np.ndarray, "2 edge"]:
-    """Unordered pairs of distinct nodes at most ``radius`` [m] apart; row 0 is the source, row 1 the target, each pair once."""
+    """Unordered pairs of distinct nodes at most ``radius`` [m] apart; row 0 is the source, row 1 the target, each pair once.
+
+    Raises:
+        SimulationError: more than can be listed.
+    """
     if len(pos) < 2:
         return np.empty((2, 0), dtype=np.int64)
     periodicity.check_radius(radius)
-    pairs = search_tree(pos, periodicity).query_pairs(radius, output_type="ndarray")
+    tree = search_tree(pos, periodicity)
+    _check_number(tree, tree, radius)
+    pairs = tree.query_pairs(radius, output_type="ndarray")
     return np.ascontiguousarray(pairs.T, dtype=np.int64)
 
 
@@ -67,10 +78,29 @@ def radius_between(
         target: positions [m].
         radius: [m].
         periodicity: where space repeats; a tree given as ``source`` must have been built for it.
+
+    Raises:
+        SimulationError: more than can be listed.
     """
     tree = source if isinstance(source, cKDTree) else search_tree(source, periodicity)
     if tree.n == 0 or len(target) == 0:
         return np.empty((2, 0), dtype=np.int64)
     periodicity.check_radius(radius)
-    found = tree.sparse_distance_matrix(search_tree(target, periodicity), radius, output_type="ndarray")
+    other = search_tree(target, periodicity)
+    _check_number(tree, other, radius)
+    found = tree.sparse_distance_matrix(other, radius, output_type="ndarray")
     return np.stack([found["i"], found["j"]]).astype(np.int64)
+
+
+def _check_number(tree: cKDTree, other: cKDTree, radius: float) -> None:
+    """Raise ``SimulationError`` where the pairs of two sets, as estimated from some nodes, would fill the memory: a radius in another unit makes that many."""
+    if tree.n * other.n <= MOST_PAIRS:
+        return
+    sample = np.unique(np.linspace(0, other.n - 1, NUM_SAMPLED).astype(int))
+    number = float(np.mean(tree.query_ball_point(other.data[sample], radius, return_length=True))) * other.n
+    if number > 2 * MOST_PAIRS:
+        raise SimulationError(
+            f"about {number / tree.n:.3g} nodes within the radius of {radius:.3g} m of each of {tree.n} nodes are too many; the radius "
+            "(connectivity_radius) or the positions may be in another unit",
+            reason="clustering",
+        )

@@ -382,7 +382,7 @@ def test_a_description_of_another_model_is_refused(simulator: LearnedSimulator, 
         (
             "standardizer.node.sand.std",
             lambda x: x[:1].clone().expand_as(x),
-            "standardizer.node.sand.std has fewer values than its shape says",
+            "has fewer values than its shape says",
         ),
     ],
 )
@@ -664,9 +664,9 @@ def _nested(levels: int, width: int = 1) -> Any:
 
 
 UNBOUNDED = {
-    "shared": (_nested(60, 2), "values nested more than 20 levels deep|more than 20000 values"),
-    "shared, flat": (_nested(15, 4), "more than 20000 values"),
-    "deep": (_nested(200), "values nested more than 20 levels deep"),
+    "shared": (_nested(60, 2), r"values nested more than \d+ levels deep|more than \d+ values"),
+    "shared, flat": (_nested(15, 4), r"more than \d+ values"),
+    "deep": (_nested(200), r"values nested more than \d+ levels deep"),
     "wide": (list(range(10**5)), "more than 20000 values"),
     "long": ("x" * 10**7, "a text of 10000000 characters"),
     "large": (2**1000, "an integer beyond 64 bits"),

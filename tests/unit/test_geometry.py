@@ -18,6 +18,7 @@ from gpe_pl.geometry import (
     Box,
     DistanceGrid,
     Polygon,
+    SamplingError,
     Shape,
     Sphere,
     Wall,
@@ -415,3 +416,16 @@ def test_unusable_grid_values_are_refused() -> None:
         DistanceGrid.from_values((0.0,), 0.5, np.zeros(4), 0.0)
     with pytest.raises(ValueError, match="wider spacing"):
         DistanceGrid.from_values((0.0, 0.0), 0.5, np.broadcast_to(0.0, (2**13, 2**13)), 0.0)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        *domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.3),
+        *domain_walls(((0.0, 1e6), (0.0, 1e6), (0.0, 1.0)), 0.3)[4:],
+        *SOLIDS.values(),
+    ],
+)
+def test_a_surface_with_more_nodes_than_fit_into_memory_is_refused(shape: Shape) -> None:
+    with pytest.raises(SamplingError, match=r"would have \S+ boundary nodes, at most 10000000 are made; choose a larger spacing"):
+        shape.sample(1e-9)

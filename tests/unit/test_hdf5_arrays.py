@@ -34,6 +34,16 @@ def bomb(group: h5py.Group, name: str, values: np.ndarray) -> None:
     dataset.id.write_direct_chunk((0,) * values.ndim, b"".join(pack.compress(bytes(2**24)) for _ in range(4)) + pack.flush())
 
 
+def constant(group: h5py.Group, name: str, values: np.ndarray) -> None:
+    """Zeros, 600 MiB in 600 kiB."""
+    row = values[0].size
+    shape, chunk = (600 * 2**20 // values.itemsize // row, *values.shape[1:]), (2**20 // values.itemsize // row, *values.shape[1:])
+    dataset = group.create_dataset(name, shape, values.dtype, chunks=chunk, compression="gzip")
+    packed = zlib.compress(bytes(values.itemsize * row * chunk[0]), 9)
+    for start in range(0, shape[0], chunk[0]):
+        dataset.id.write_direct_chunk((start,) + (0,) * (values.ndim - 1), packed)
+
+
 def many_chunks(group: h5py.Group, name: str, values: np.ndarray) -> None:
     """Chunks of one number each, of which few are stored."""
     row = values[0].size
@@ -71,6 +81,7 @@ def elsewhere(group: h5py.Group, name: str, values: np.ndarray) -> None:
 REFUSED: list[tuple[Make, str]] = [
     (huge_chunk, r"holds \d+ bytes in 1 chunks \[\d+.*\] of 335544.. bytes in all"),
     (bomb, r"holds \d+ bytes, for which \d+ bytes are stored"),
+    (constant, r"unpacks to \d+ bytes from \d+, at most \d+ are read"),
     (many_chunks, r"holds \d+ bytes in \d+ chunks \[1.*store it in larger chunks"),
     (filtered(scaleoffset=0), r"filters scaleoffset \(6\)|filters .*\(6\)"),
     (external, "not an array inside this file"),

@@ -162,6 +162,13 @@ def test_a_deleted_folder_is_an_error_also_where_the_process_holds_it_already(tm
             raise ends_with
 
 
+def test_a_command_that_removes_its_empty_folder_keeps_its_own_error(tmp_path: Path) -> None:
+    """As ``evaluate`` does where the disk of the compile cache is full."""
+    with pytest.raises(OSError, match="No space left on device"), held(tmp_path / "a"):
+        (tmp_path / "a").rmdir()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
 @pytest.mark.parametrize("kind", ["run", "multirun"])
 def test_a_command_whose_folder_was_deleted_does_not_succeed(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
     folder = tmp_path / "a"

@@ -436,9 +436,16 @@ def test_canyon_is_reproducible_and_differs_by_seed() -> None:
 @pytest.mark.parametrize(
     ("name", "start", "repeated", "count", "message"),
     [
-        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 1", b"\nf 1 2 3", terrain_files.MAX_TRIANGLES, "triangles are too many"),
-        ("a.stl", b"solid a\n", b"endfacet\n", terrain_files.MAX_TRIANGLES, "triangles are too many"),
-        ("a.xyz", b"", b"1 2\n", terrain_files.MAX_POINTS, "points are too many"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 1", b"\nf 1 2 3", terrain_files.MAX_TEXT_TRIANGLES, "triangles are too many"),
+        ("a.obj", b"v 0 0 0\rv 1 0 0\rv 0 1 1", b"\rf 1 2 3", terrain_files.MAX_TEXT_TRIANGLES, "triangles are too many"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 1", b"\nvt 0 0", terrain_files.MAX_TEXT_VERTICES, "vertices are too many"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 1", b"\nusemtl a\nf 1 2 3", terrain_files.MAX_PARTS, "parts are too many"),
+        ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 1\nf", b" 1 2 3", 7_000_000, "values are too many"),
+        ("a.stl", b"solid a\n", b"endfacet\n", terrain_files.MAX_ASCII_TRIANGLES, "triangles are too many"),
+        ("a.xyz", b"", b"1 2\r", terrain_files.MAX_TEXT_VALUES // 2, "values are too many"),
+        ("a.csv", b"", b"1,2\n", terrain_files.MAX_TEXT_VALUES // 2, "heights are too many"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement  foo 1000001\n", b"1\n", 1_000_001, "too large for text"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 3\n", b"1 ", terrain_files.MAX_ASCII_BYTES // 2, "too large for text"),
         (
             "a.ply",
             b"ply\nformat ascii 1.0\nelement vertex 3\nelement face 2000001\n",

@@ -321,3 +321,8 @@ def test_to_torch_and_back(trajectory: Trajectory) -> None:
         assert str(tensor.dtype) == "torch.float64", key
         np.testing.assert_array_equal(tensor.numpy(), getattr(trajectory.state(4, history=2), key))
     assert str(state.node_type.dtype) == "torch.int64"
+
+
+def test_materials_named_twice_are_refused(trajectory: Trajectory) -> None:
+    twice = replace(trajectory.metadata, materials=trajectory.metadata.materials * 2, param_names=trajectory.metadata.param_names * 2)
+    assert ("materials", "names a material twice") in list(twice.violations())

@@ -57,6 +57,9 @@ KEYS = (
 )
 PREFIXES = ("params_", "cells_")
 """Keys that begin so end in a material, or in a kind of cells."""
+PER_NODE = ("frame_dt", "materials", "mass", "bounds", "periodic", "gravity", "spacing", "connectivity_radius")
+"""Keys, and those that begin with ``params_``, that have a value for each node at most, or ``FEW`` for the scene."""
+FEW = 6
 SCALARS = ("frame_dt", "spacing", "connectivity_radius")
 
 
@@ -76,7 +79,12 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
 def _load(path: Path, facts: Facts) -> Loaded:
     try:
         names = npz.names(path)
-        values: dict[str, Any] = {name: npz.read(path, name) for name in names if name in KEYS or name.startswith(PREFIXES)}
+        values: dict[str, Any] = {}
+        for name in sorted(names, key="pos".__ne__):  # which says how many nodes there are
+            if name in KEYS or name.startswith(PREFIXES):
+                pos = values.get("pos")
+                few = pos is not None and pos.ndim > 1 and (name in PER_NODE or name.startswith("params_"))
+                values[name] = npz.read(path, name, most_values=max(pos.shape[1], FEW) if few and pos is not None else None)
     except ImportFailure as failure:
         raise Refusal(str(failure)) from None
     wrong = [name for name in names if name not in KEYS and not name.startswith(PREFIXES)]

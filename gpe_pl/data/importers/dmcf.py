@@ -36,7 +36,7 @@ from gpe_pl.data.importers.source import (
     natural,
     split_folders,
 )
-from gpe_pl.hdf5_arrays import LARGEST_DEFLATE_RATIO
+from gpe_pl.hdf5_arrays import most_unpacked
 
 ENDING = ".msgpack.zst"
 PART = re.compile(r"(_\d+)_(\d+)$")
@@ -45,7 +45,7 @@ FRAME_DT = 0.02
 GRAVITY = (0.0, -9.81, 0.0)
 """Usual in the format [m/s²], where a scene has no ``grav``."""
 MAX_BYTES = 2**32
-"""Of one file, unpacked; and no more than ``LARGEST_DEFLATE_RATIO`` times its size, which zstandard exceeds with constants only."""
+"""Of one file, unpacked; and no more than ``most_unpacked`` of its size, which zstandard exceeds with constants only."""
 BYTES_AT_ONCE = 2**20
 MOST = {"max_array_len": 2**16, "max_map_len": 2**10, "max_str_len": 2**16, "max_ext_len": 0}
 """Frames of a file, entries of a frame, text in one: lists that claim more would be allocated before they are read."""
@@ -164,7 +164,7 @@ def _frames(path: Path) -> list[Any]:
     data = bytearray()
     try:
         regular_files.check(path)
-        most = min(MAX_BYTES, path.stat().st_size * LARGEST_DEFLATE_RATIO)
+        most = min(MAX_BYTES, most_unpacked(path.stat().st_size))
         with (
             open(path, "rb") as file,
             zstandard.ZstdDecompressor(max_window_size=2**27).stream_reader(file, read_across_frames=True) as stream,

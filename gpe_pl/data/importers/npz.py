@@ -16,7 +16,7 @@ from numpy.lib import format as npy
 
 from gpe_pl import regular_files
 from gpe_pl.data.importers.source import MAX_TRAJECTORIES, ImportFailure, Refusal
-from gpe_pl.hdf5_arrays import LARGEST_DEFLATE_RATIO
+from gpe_pl.hdf5_arrays import LARGEST_DEFLATE_RATIO, most_unpacked
 from gpe_pl.zip_members import num_members
 
 HEADERS: dict[tuple[int, int], Any] = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -43,11 +43,11 @@ def names(path: Path) -> list[str]:
         raise ImportFailure(f"{path}: not a readable .npz archive ({error})") from None
 
 
-def read(path: Path, name: str, allow_pickle: bool = False) -> np.ndarray:
-    """One array.
+def read(path: Path, name: str, allow_pickle: bool = False, most_values: int | None = None) -> np.ndarray:
+    """One array, of at most so many values.
 
     Raises:
-        Refusal: it is damaged, or larger than the archive can hold.
+        Refusal: it is damaged, larger than the archive can hold, unpacks to far more than is stored, or has more values.
         ImportFailure: it holds Python objects, and ``allow_pickle`` is false.
     """
     try:
@@ -55,6 +55,10 @@ def read(path: Path, name: str, allow_pickle: bool = False) -> np.ndarray:
             member = archive.getinfo(f"{name}.npy")
             if member.file_size > max(member.compress_size, 1) * LARGEST_DEFLATE_RATIO:
                 raise Refusal(f"{name!r} claims {member.file_size} bytes, the archive holds {member.compress_size}")
+            if member.compress_type != zipfile.ZIP_STORED and member.file_size > (most := most_unpacked(member.compress_size)):
+                raise Refusal(
+                    f"{name!r} unpacks to {member.file_size} bytes from {member.compress_size}, at most {most} are read; write it with numpy.savez"
+                )
             if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise Refusal(f"{name!r} is compressed in another way than NumPy does; write it with numpy.savez_compressed")
             with archive.open(member) as file:
@@ -67,6 +71,8 @@ def read(path: Path, name: str, allow_pickle: bool = False) -> np.ndarray:
                         f"{path}: {name!r} is an array of Python objects, a pickle, which can run any code when it is read. If you trust whoever wrote "
                         "it, pass allow_pickle=true"
                     )
+                if most_values is not None and math.prod(shape) > most_values:
+                    raise Refusal(f"{name}: has shape {list(shape)}, at most {most_values} values are expected")
                 left = member.file_size - file.tell()
                 if not dtype.hasobject and math.prod(shape) * dtype.itemsize != left:
                     raise Refusal(

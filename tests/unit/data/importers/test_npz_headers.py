@@ -11,6 +11,8 @@ import pytest
 
 from gpe_pl.data.importers import hdf5, npz
 from gpe_pl.data.importers.source import ImportFailure, Refusal
+from gpe_pl.faults.side_files import raw_arrays
+from tests.refusals import convert, only_refusal
 
 HEADERS = {
     "brackets": "[" * 9000,
@@ -60,3 +62,36 @@ def test_a_file_of_very_many_groups_is_not_listed(tmp_path: Path, monkeypatch: p
             file.create_group(str(k))
     with pytest.raises(ImportFailure, match="holds 3 groups"):
         hdf5.groups(tmp_path / "a.h5")
+
+
+def packed(path: Path, name: str, shape: str, size: int, dtype: str = "<f4") -> None:
+    """An archive of one array of zeros, which packs to a thousandth."""
+    header = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}}}".encode()
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+        file.write(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header)
+        for _ in range(size // 2**24):
+            file.write(bytes(2**24))
+
+
+def test_an_array_that_unpacks_to_far_more_than_is_stored_is_refused(tmp_path: Path) -> None:
+    packed(tmp_path / "a.npz", "pos", f"({40 * 2**22},)", 40 * 2**24)
+    with pytest.raises(
+        Refusal, match=rf"'pos' unpacks to {40 * 2**24 + 73} bytes from \d+, at most \d+ are read; write it with numpy.savez"
+    ):
+        npz.read(tmp_path / "a.npz", "pos")
+    packed(tmp_path / "b.npz", "pos", f"({2**22},)", 2**24)
+    assert npz.read(tmp_path / "b.npz", "pos").shape == (2**22,)  # constants are fine where they are few
+
+
+@pytest.mark.parametrize(("key", "dtype"), [("frame_dt", "<f4"), ("materials", "<U1"), ("params_fluid", "<f4"), ("bounds", "<f4")])
+def test_values_for_more_nodes_than_there_are_are_not_read(tmp_path: Path, key: str, dtype: str) -> None:
+    raw_arrays(tmp_path / "raw")
+    path = tmp_path / "raw" / "train" / "00.npz"
+    packed(tmp_path / "large.npz", key, f"({2**22},)", 2**24, dtype)
+    with zipfile.ZipFile(path) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist() if name != f"{key}.npy"}
+    with zipfile.ZipFile(tmp_path / "large.npz") as large, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in {f"{key}.npy": large.read(f"{key}.npy"), **parts}.items():
+            archive.writestr(name, content)
+    report = convert(tmp_path, "arrays")
+    assert f"{key}: has shape [4194304], at most 20 values are expected" in only_refusal(report)
