@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import textwrap
+
 import numpy as np
 from matplotlib.figure import Figure
 
 from gpe_pl.graphs.islands import unwrapped
 from gpe_pl.graphs.multiscale import levels_of, multiscale_graph
 from gpe_pl.trajectory import Trajectory
+from gpe_pl.viz.captions import describe
 from gpe_pl.viz.coloring import PALETTE
-from gpe_pl.viz.film_strip import new_figure
+from gpe_pl.viz.film_strip import CHARACTER, new_figure
 
 PANEL = 1.8
 """Width and height [inch] of a panel."""
@@ -18,7 +21,7 @@ PANEL = 1.8
 def multiscale_figure(trajectory: Trajectory, frame: int = 0) -> Figure:
     """One panel for the cell edges and one for each level of virtual nodes, with its ``same`` edges and, faint, those ``down`` to its children.
 
-    A scene in space is seen along y.
+    Above them stand materials and parameter values. A scene in space is seen along y.
 
     Raises:
         ValueError: the trajectory has no mesh.
@@ -49,4 +52,5 @@ def multiscale_figure(trajectory: Trajectory, frame: int = 0) -> Figure:
         panel.set_title(f"{len(here)} × grid_{level}" if level else f"{len(here)} mesh nodes", fontsize=8)
         panel.set_aspect("equal")
         panel.set_axis_off()
+    figure.suptitle(textwrap.fill(describe(trajectory), int(figure.get_figwidth() / CHARACTER)), fontsize=8)
     return figure

@@ -30,6 +30,7 @@ def test_every_level_is_a_panel_with_its_nodes_and_edges(kind: str) -> None:
     for axes, size in zip(figure.axes, sizes, strict=True):
         assert len(axes.collections[0].get_offsets()) == size  # type: ignore[arg-type]
         drawn += sum(len(line.get_xdata()) // 3 for line in axes.lines)  # type: ignore[arg-type]
+    assert figure.get_suptitle() == "sand, friction angle 30°"
     assert drawn == graph.cell_edges.shape[1] + graph.same_edges.shape[1] + graph.down_edges.shape[1]
 
 
