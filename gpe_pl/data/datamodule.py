@@ -23,7 +23,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.standardizer import StatisticsSample
 from gpe_pl.scene_ranges import scene_range, united
-from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES, grid, node_code, role
+from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES, EdgeType, grid, node_code, role
 from gpe_pl.store import StoreError
 from gpe_pl.trajectory import Trajectory
 
@@ -33,6 +33,10 @@ NUM_VAL_GRAPHS = 8
 
 ENOUGH = 0.25
 """Fraction of the windows for statistics: what may be in fewer of them gets as many windows of its own."""
+FEW_CONTACTS = 1 / 16
+"""Fraction of these windows: contacts that fewer of them have are looked for in others."""
+MOST_SEARCHED = 8
+"""Windows that are looked at for rare contacts, in units of those for statistics."""
 
 
 def data_statistics(root: Path | str) -> dict[str, float]:
@@ -112,7 +116,7 @@ class TrajectoryDataModule(L.LightningDataModule):
     def statistics_sample(self) -> StatisticsSample:
         """Training graphs, noise included, for the standardisation of features: evenly spread over the split, and over the trajectories of what is rare."""
         windows = _spread(len(self.train_set), self.num_statistics_windows)
-        return StatisticsSample([self.train_set[int(window)] for window in windows], self._rare_graphs)
+        return StatisticsSample([self.train_set[int(window)] for window in windows], self._rare_graphs, self._touching_graphs)
 
     def _rare_graphs(self, roles: frozenset[str]) -> list[HeteroData]:
         """Graphs evenly spread over the trajectories that have nodes of all these roles.
@@ -129,6 +133,21 @@ class TrajectoryDataModule(L.LightningDataModule):
         counts = np.diff(self.train_set.ends, prepend=0)
         windows = np.flatnonzero(np.repeat(has, counts))
         return [self.train_set[int(windows[k])] for k in _spread(len(windows), enough)]
+
+    def _touching_graphs(self, relation: EdgeType, known: list[HeteroData]) -> list[HeteroData]:
+        """Graphs with edges of a relation, from random windows, where few of the known graphs have any; otherwise the known ones."""
+        num_known = sum(graph[relation].edge_index.shape[1] > 0 for graph in known)
+        if num_known >= max(1, round(FEW_CONTACTS * self.num_statistics_windows)):
+            return known
+        has = np.array([{role(relation[0]), role(relation[2])} <= own for own in self._roles])
+        windows = np.flatnonzero(np.repeat(has, np.diff(self.train_set.ends, prepend=0)))
+        if len(windows) <= len(known):  # these are all
+            return known
+        order = np.random.default_rng(0).permutation(windows)[: MOST_SEARCHED * self.num_statistics_windows]
+        graphs = (self.train_set[int(window)] for window in order)
+        touching = (graph for graph in graphs if graph[relation].edge_index.shape[1])
+        found = list(islice(touching, max(1, round(ENOUGH * self.num_statistics_windows))))
+        return found if len(found) > num_known else known
 
     @cached_property
     def _roles(self) -> list[frozenset[str]]:

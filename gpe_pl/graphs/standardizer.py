@@ -20,6 +20,10 @@ def _no_more(roles: frozenset[str]) -> list[HeteroData]:
     return []
 
 
+def _as_they_are(relation: EdgeType, graphs: list[HeteroData]) -> list[HeteroData]:
+    return graphs
+
+
 @dataclass(frozen=True)
 class StatisticsSample:
     """Training graphs that statistics are taken from.
@@ -28,10 +32,12 @@ class StatisticsSample:
         graphs: evenly spread over the split.
         rare: gives graphs of trajectories that have nodes of all these roles (see ``schema.role``), where ``graphs`` has too few of them; none where it has
             enough.
+        touching: takes a relation of contacts and these graphs, and gives others that have such contacts where too few of these have.
     """
 
     graphs: list[HeteroData]
     rare: Callable[[frozenset[str]], list[HeteroData]] = _no_more
+    touching: Callable[[EdgeType, list[HeteroData]], list[HeteroData]] = _as_they_are
 
     def of(self, *roles: str) -> list[HeteroData]:
         """The graphs to look at for nodes of one role, or edges between two."""
@@ -94,10 +100,11 @@ class GraphStandardizer(nn.Module):
             fit(module, (self._material_scale(m, g[m].material_params) for g in looked_at(m)))
         for key, module in self.odd.items():
             relations = [r for r in self.spec.relations if self._key(r) == key]
-            seen = looked_at(role(relations[0][0]), role(relations[0][2]))
+            seen, is_contact = looked_at(role(relations[0][0]), role(relations[0][2])), relations[0][1] == RADIUS
+            if is_contact:
+                seen = sample.touching(relations[0], seen)
             found = fit(module, (g[r].odd for g in seen for r in relations))
             fit(self.even[key], (g[r].even for g in seen for r in relations))
-            is_contact = relations[0][1] == RADIUS
             if not found and is_contact and any(len(g[r[0]].x) and len(g[r[2]].x) for g in seen for r in relations):
                 missing.append(named(relations[0]))
         mass = [g[m].mass for g in sample for m in self.spec.materials]

@@ -151,10 +151,10 @@ def test_parameter_ranges_cover_what_the_sample_of_windows_leaves_out(root: Path
 FRAMES, BLOCK = 4, 0.05 * np.stack(np.meshgrid(np.arange(3), np.arange(3)), -1).reshape(-1, 2)
 
 
-def scene(seed: int, *materials: tuple[str, float]) -> Trajectory:
-    """Nine nodes of each material, with its parameter, that move at random; the materials are far from each other."""
+def scene(seed: int, *materials: tuple[str, float], gap: float = 0.5) -> Trajectory:
+    """Nine nodes of each material, with its parameter, that move at random; the materials are far from each other, or as far apart as is said."""
     rng = np.random.default_rng(seed)
-    first = np.concatenate([BLOCK + np.array([0.5 * k, 0.0]) for k in range(len(materials))])
+    first = np.concatenate([BLOCK + np.array([gap * k, 0.0]) for k in range(len(materials))])
     pos = first + np.cumsum(rng.normal(scale=2e-3, size=(FRAMES, *first.shape)), axis=0)
     names = [name for name, _ in materials for _ in BLOCK]
     return Trajectory.from_numpy(pos, 0.005, names, dict(materials), bounds=((-1, 2), (-1, 2)), spacing=0.05)
@@ -191,6 +191,23 @@ def test_a_rare_material_is_standardised_like_any_other(tmp_path: Path, caplog: 
     assert float(statistics["params.snow.mean"]) == 7.0
     missing = [r.message for r in caplog.records]
     assert missing == ["not in the training windows that statistics are taken from: snow–radius–fluid; its features are not standardised"]
+
+
+@pytest.mark.parametrize("num_touching", [2, 12])
+def test_a_rare_contact_is_standardised_like_any_other(tmp_path: Path, caplog: pytest.LogCaptureFixture, num_touching: int) -> None:
+    """Sand and fluid are in all trajectories, and touch in two that the eight windows skip; or in all, of which the eight windows tell enough."""
+    data = (("fluid", 1e-3), ("sand", 30.0))
+    sampled = np.linspace(0, 11, 8).round().astype(int).tolist()
+    touching = (sorted({*range(12)} - {*sampled}) + sampled)[:num_touching]
+    module = imported(tmp_path, [scene(k, *data, gap=0.15 if k in touching else 0.5) for k in range(12)])
+    statistics = with_statistics(module).standardizer.state_dict()
+    graphs = [module.train_set[k] for k in (touching if num_touching == 2 else sampled)]
+    odd = torch.cat([graph["sand", "radius", "fluid"].odd for graph in graphs])
+    assert len(odd)
+    torch.testing.assert_close(statistics["odd.sand__radius__fluid.std"], odd.double().square().mean(dim=0).sqrt().float())
+    x = torch.cat([module.train_set[k]["sand"].x for k in sampled])
+    torch.testing.assert_close(statistics["node.sand.mean"], x.double().mean(dim=0).float())
+    assert not caplog.records
 
 
 def test_the_statistics_of_what_is_common_are_those_of_the_sample(root: Path) -> None:
