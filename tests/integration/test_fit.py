@@ -33,6 +33,7 @@ from gpe_pl.run_folder import RunError, claim
 from gpe_pl.store import StoreError, write_shard
 from gpe_pl.training import callbacks
 from gpe_pl.training.module import TrainingError, TrainingModule
+from tests.checkpoints import assert_equal, assert_same_checkpoint
 from tests.runs import tiny
 
 STEPS = ("training.num_steps=6", "training.val_interval=2", "training.warmup_steps=2")
@@ -76,35 +77,6 @@ def checkpoint(cfg: DictConfig, name: str = "last") -> dict[str, Any]:
     return torch.load(Path(cfg.paths.runs) / cfg.name / "checkpoints" / f"{name}.ckpt", weights_only=True)
 
 
-def assert_equal(a: Any, b: Any, path: str = "") -> None:
-    """Nested values with tensors, bit for bit."""
-    if isinstance(a, dict):
-        assert a.keys() == b.keys(), path
-        for key in a:
-            assert_equal(a[key], b[key], f"{path}.{key}")
-    elif isinstance(a, (list, tuple)):
-        assert len(a) == len(b), path
-        for k, (x, y) in enumerate(zip(a, b, strict=True)):
-            assert_equal(x, y, f"{path}[{k}]")
-    elif isinstance(a, torch.Tensor):
-        assert a.dtype == b.dtype, path
-        assert a.numpy().tobytes() == b.numpy().tobytes(), path
-    else:
-        assert a == b, path
-
-
-STATE = (
-    "state_dict",
-    "current_model_state",
-    "averaging_state",
-    "optimizer_states",
-    "lr_schedulers",
-    "global_step",
-    "simulator",
-    "excursions",
-)
-
-
 @pytest.mark.parametrize(
     ("killed_at", "saved", "late"),
     [
@@ -143,8 +115,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     assert {step: set(taken) for step, taken in losses.items()} == {step: {loss} for step, loss in expected.items()}
     for name in ("last", "best"):
         a, b = checkpoint(whole, name), checkpoint(parts, name)
-        assert set(STATE) <= set(a)
-        assert_equal({k: a[k] for k in STATE}, {k: b[k] for k in STATE})
+        assert_same_checkpoint(a, b)
     curves = [[v.tolist() for v in validation_curve(tmp_path / name)] for name in ("whole", "parts")]
     assert curves[0] == curves[1]
     assert curves[0][0] == [2, 4, 6]

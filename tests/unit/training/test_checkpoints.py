@@ -35,18 +35,9 @@ from gpe_pl.training.interruption import Interruption
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, train
 from gpe_pl.trajectory import Trajectory
+from tests.checkpoints import assert_same_checkpoint
 
 STEPS, INTERVAL = 9, 3
-STATE = (
-    "state_dict",
-    "current_model_state",
-    "averaging_state",
-    "optimizer_states",
-    "lr_schedulers",
-    "global_step",
-    "excursions",
-    "skipped",
-)
 
 
 class Killed(BaseException):
@@ -131,22 +122,10 @@ def stored(run: Path, name: str = "last") -> dict[str, Any]:
     return torch.load(run / "checkpoints" / f"{name}.ckpt", weights_only=True)
 
 
-def same(a: Any, b: Any) -> bool:
-    """Nested values with tensors, bit for bit."""
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, (list, tuple)):
-        return len(a) == len(b) and all(map(same, a, b))
-    if isinstance(a, torch.Tensor):
-        return a.dtype == b.dtype and a.numpy().tobytes() == b.numpy().tobytes()
-    return bool(a == b)
-
-
 def assert_like(run: Path, whole: Path) -> None:
     """Both checkpoints hold the same, and know the same of the best one."""
     for name in ("last", "best"):
-        a, b = stored(run, name), stored(whole, name)
-        assert [key for key in STATE if not same(a[key], b[key])] == []
+        assert_same_checkpoint(stored(run, name), stored(whole, name))
     assert stored(run)["callbacks"]["Checkpoints"] == stored(whole)["callbacks"]["Checkpoints"]
 
 

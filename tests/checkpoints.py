@@ -1,0 +1,31 @@
+"""Whether two checkpoints of a training hold the same."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from gpe_pl.faults.runs import SAVED
+
+
+def assert_same_checkpoint(a: dict[str, Any], b: dict[str, Any]) -> None:
+    """All that does not depend on where a checkpoint lies, bit for bit."""
+    assert_equal({key: a[key] for key in SAVED}, {key: b[key] for key in SAVED})
+
+
+def assert_equal(a: Any, b: Any, path: str = "") -> None:
+    """Nested values with tensors, bit for bit."""
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), path
+        for key in a:
+            assert_equal(a[key], b[key], f"{path}.{key}")
+    elif isinstance(a, (list, tuple)):
+        assert len(a) == len(b), path
+        for k, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_equal(x, y, f"{path}[{k}]")
+    elif isinstance(a, torch.Tensor):
+        assert a.dtype == b.dtype, path
+        assert a.numpy().tobytes() == b.numpy().tobytes(), path
+    else:
+        assert a == b, path
