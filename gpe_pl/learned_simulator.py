@@ -12,6 +12,7 @@ import inspect
 import io
 import json
 import logging
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from jaxtyping import Float64
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
@@ -47,6 +49,8 @@ CHECKPOINT_FORMAT = 3
 
 RANGE_TOLERANCE = 1e-5
 """Material parameters are stored in single precision; differences below this share of the value are none."""
+MASS_FACTOR = 2.0
+"""By which masses of nodes may leave the range of training: those at corners of meshes differ between bodies of one kind."""
 
 
 class CheckpointError(GpeError, ValueError):
@@ -76,6 +80,7 @@ class LearnedSimulator(nn.Module):
     acceleration_std: Tensor
     stress_std: Tensor
     trained_scene: Tensor
+    trained_mass: Tensor
     holds_parameters: bool = True
 
     def __init__(self, model: nn.Module, builder: GraphBuilder) -> None:
@@ -88,10 +93,18 @@ class LearnedSimulator(nn.Module):
         self.register_buffer("acceleration_std", torch.ones((), dtype=torch.float64))
         self.register_buffer("stress_std", torch.ones((), dtype=torch.float64))
         self.register_buffer("trained_scene", torch.from_numpy(unlimited(builder.spec.dim)))
+        self.register_buffer("trained_mass", self._any_mass())
         for material, count in builder.spec.param_channels.items():
             self.register_buffer(
                 f"trained_{material}", torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).expand(2, count).clone()
             )
+
+    def _any_mass(self) -> Float64[Tensor, "2 material"]:
+        return torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).repeat(1, len(self.builder.spec.materials))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        state_dict.setdefault(f"{prefix}trained_mass", self._any_mass())  # which the models that come with the package do not know
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property
     def skips(self) -> Skips:
@@ -148,6 +161,10 @@ class LearnedSimulator(nn.Module):
         if stress:
             rms = torch.cat(stress).double().square().mean().sqrt()
             self.stress_std.copy_(torch.where(rms > 0, rms, 1.0))
+        for k, material in enumerate(self.builder.spec.materials):
+            mass = torch.cat([g[material].mass for g in sample.of(material)])
+            if len(mass):
+                self.trained_mass[:, k] = torch.stack([mass.min(), mass.max()])
         if trained_scene is not None:
             self.trained_scene.copy_(torch.from_numpy(trained_scene))
         if parameter_ranges is None:
@@ -173,7 +190,7 @@ class LearnedSimulator(nn.Module):
             raise CheckpointError(f"the model to start from is another one or has other graphs; choose {' '.join(different)}")
         ranges = {material: values.clone() for material, values in self.trained_ranges()}
         statistics = copy.deepcopy(self.standardizer)
-        scene = self.trained_scene.cpu().numpy().copy()
+        scene, mass = self.trained_scene.cpu().numpy().copy(), self.trained_mass.clone()
         try:
             self.load_state_dict(trained.state_dict())
         except RuntimeError as error:  # one set of weights per level of a mesh, and meshes of other sizes
@@ -186,6 +203,8 @@ class LearnedSimulator(nn.Module):
                 values[0].copy_(torch.stack(known).amin(dim=0)[0])
                 values[1].copy_(torch.stack(known).amax(dim=0)[1])
         self.trained_scene.copy_(torch.from_numpy(united([scene, self.trained_scene.cpu().numpy()])))
+        self.trained_mass[0] = torch.minimum(mass[0], self.trained_mass[0])
+        self.trained_mass[1] = torch.maximum(mass[1], self.trained_mass[1])
 
     def _choices(self) -> dict[str, str]:
         """Overrides that make such a model and such graphs; the radius in spacings, whether the graph's or the data set's."""
@@ -204,11 +223,14 @@ class LearnedSimulator(nn.Module):
             yield material, self.get_buffer(f"trained_{material}")
 
     def described_training(self) -> Iterator[tuple[str, str]]:
-        """What training had of material parameters, gravity and boundary nodes: a name and its values with their unit, for each kind of value."""
+        """What training had of material parameters, masses, gravity and boundary nodes: a name and its values with their unit, for each kind of value."""
         for material, trained in self.trained_ranges():
             spec = MATERIALS[material]
             for low, high in trained.T.tolist():
                 yield f"{spec.name} of {material}", f"{low:g} to {high:g} {spec.unit}"
+        for material, (low, high) in zip(self.builder.spec.materials, self.trained_mass.T.tolist(), strict=True):
+            if math.isfinite(high):
+                yield f"mass of nodes of {material}", f"{low:g} to {high:g} kg"
         yield from described(self.trained_scene.cpu().numpy())
 
     def untrained_parameters(self, state: State) -> list[str]:
@@ -227,13 +249,19 @@ class LearnedSimulator(nn.Module):
                 yield kind, f"{kind} is {values[is_outside][0].item():g} {spec.unit}, trained were {low:g} to {high:g}"
 
     def untrained_scene(self, state: State) -> list[str]:
-        """What gravity and boundary nodes of a scene have that training had not: one line per kind of value, empty if there is nothing."""
+        """What masses, gravity and boundary nodes of a scene are that training had not: one line per kind of value, empty if there is nothing."""
         return [line for _, line in self._outside_scene(state)]
 
     def _outside_scene(self, state: State) -> Iterator[tuple[str, str]]:
         own = self.builder.metadata
         here = scene_range(state.gravity.cpu().numpy(), state.boundary.to_numpy(), state.periodicity)
         yield from outside(self.trained_scene.cpu().numpy(), here, own.spacing / own.frame_dt)
+        for material, (low, high) in zip(self.builder.spec.materials, self.trained_mass.T.tolist(), strict=True):
+            mass = state.mass[state.node_type == node_code(material)]
+            is_outside = (mass < low / MASS_FACTOR) | (mass > high * MASS_FACTOR)
+            if bool(is_outside.any()):
+                kind = f"mass of nodes of {material}"
+                yield kind, f"{kind} is {mass[is_outside][0].item():g} kg, in training it was {low:g} to {high:g} kg"
 
     def forward(self, data: HeteroData) -> Prediction:
         """Accelerations without gravity per material, in units of ``acceleration_std``."""
@@ -428,7 +456,7 @@ class LearnedSimulator(nn.Module):
                 raise ValueError(f"{name} is of type {value.dtype}")
             if value.untyped_storage().nbytes() < value.numel() * value.element_size():
                 raise ValueError(f"{name} has fewer values than its shape says")
-        missing = expected.keys() - weights.keys()
+        missing = expected.keys() - weights.keys() - {"trained_mass"}
         if missing:
             raise ValueError(f"Missing key {min(missing)}")
 
@@ -446,6 +474,8 @@ class LearnedSimulator(nn.Module):
         low, high = self.trained_scene
         if not bool(((low <= high) | (low.isposinf() & high.isneginf())).all()):
             raise ValueError("trained_scene ends before it begins")
+        if not bool((self.trained_mass[0] <= self.trained_mass[1]).all()):
+            raise ValueError("trained_mass ends before it begins")
 
     # --- checkpoints ----------------------------------------------------------------------------------------------------------------------
 

@@ -61,8 +61,10 @@ def trained(*scenes_: tuple[tuple[float, float], Boundary]) -> LearnedSimulator:
     return simulator
 
 
-def scene(gravity: tuple[float, float] = GRAVITY, b: Boundary | None = None) -> State:
-    return replace(scenes.state(20), gravity=np.array(gravity), boundary=boundary() if b is None else b).to_torch()
+def scene(gravity: tuple[float, float] = GRAVITY, b: Boundary | None = None, mass: float = 1.0) -> State:
+    """Masses are ``mass`` times those of training."""
+    plain = scenes.state(20)
+    return replace(plain, mass=mass * plain.mass, gravity=np.array(gravity), boundary=boundary() if b is None else b).to_torch()
 
 
 ONE = (GRAVITY, boundary())
@@ -95,6 +97,20 @@ def test_what_training_had_constant_and_a_scene_changes_is_warned_of(
     assert simulator.untrained_scene(state) == [line]
     for _ in range(3):
         simulator.standing(state, simulator.builder.metadata)
+    assert [r.getMessage() for r in caplog.records] == [f"outside the training data: {line}"]
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_nodes_of_other_masses_are_warned_of(factor: float, caplog: pytest.LogCaptureFixture) -> None:
+    simulator, masses = trained(ONE), scenes.state(20).mass
+    known = f"{masses.min():g} to {masses.max():g} kg"
+    assert dict(simulator.described_training())["mass of nodes of sand"] == known
+    for near in (0.6, 1.9):
+        assert simulator.untrained_scene(scene(mass=near)) == []
+    state = scene(mass=factor)
+    line = f"mass of nodes of sand is {state.mass[0].item():g} kg, in training it was {known}"
+    assert simulator.untrained_scene(state) == [line]
+    simulator.standing(state, simulator.builder.metadata)
     assert [r.getMessage() for r in caplog.records] == [f"outside the training data: {line}"]
 
 
@@ -151,10 +167,23 @@ def test_the_range_travels_in_the_checkpoint(tmp_path: Path) -> None:
     again = LearnedSimulator.from_checkpoint(tmp_path / "a.ckpt")
     assert torch.equal(again.trained_scene, simulator.trained_scene)
     assert again.untrained_scene(scene((9.81, 0.0))) == simulator.untrained_scene(scene((9.81, 0.0))) != []
+    assert torch.equal(again.trained_mass, simulator.trained_mass)
+    assert again.untrained_scene(scene(mass=10.0)) == simulator.untrained_scene(scene(mass=10.0)) != []
     simulator.trained_scene[0, 1] = 3.0
     simulator.save(tmp_path / "b.ckpt")
     with pytest.raises(CheckpointError, match="trained_scene ends before it begins"):
         LearnedSimulator.from_checkpoint(tmp_path / "b.ckpt")
+
+
+def test_a_checkpoint_without_the_range_of_masses_warns_of_none(tmp_path: Path) -> None:
+    simulator = trained(ONE)
+    simulator.save(tmp_path / "a.ckpt")
+    content = torch.load(tmp_path / "a.ckpt", weights_only=True)
+    del content["state_dict"]["simulator.trained_mass"]
+    torch.save(content, tmp_path / "a.ckpt")
+    again = LearnedSimulator.from_checkpoint(tmp_path / "a.ckpt")
+    assert again.untrained_scene(scene(mass=10.0)) == []
+    assert "mass of nodes of sand" not in dict(again.described_training())
 
 
 def test_what_begins_with_other_weights_knows_both_ranges() -> None:
