@@ -155,6 +155,7 @@ class Snow:
         critical_compression: θ_c; principal stretches below 1 - θ_c become plastic.
         critical_stretch: θ_s; principal stretches above 1 + θ_s become plastic.
         max_hardening: largest factor on the elastic moduli. It bounds the wave speed, hence the number of substeps.
+        memory_cells: as of ``Elastomer``; without it snow settles the higher the shorter substeps are.
     """
 
     youngs_modulus: Positive = 1.4e5
@@ -163,6 +164,7 @@ class Snow:
     critical_compression: Annotated[float, Field(gt=0, lt=1)] = 2.5e-2
     critical_stretch: Positive = 7.5e-3
     max_hardening: Annotated[float, Field(ge=1)] = 20.0
+    memory_cells: Annotated[float, Field(ge=0)] = 2.0
     law: ClassVar[int] = SNOW
 
     def constants(self, hardening_coefficient: np.ndarray, dim: int) -> np.ndarray:
@@ -176,6 +178,7 @@ class Snow:
             SMALLEST=1.0 - self.critical_compression,
             LARGEST=1.0 + self.critical_stretch,
             MAX_HARDENING=self.max_hardening,
+            MEMORY=_memory(self.memory_cells, lam, mu, self.density),
         )
 
     @property
@@ -219,15 +222,22 @@ class Fluid:
     Attributes:
         bulk_modulus: [Pa]; a numerical choice: a column of height H is compressed by ρ g H over it at its foot.
         density: mass per volume at rest [kg/m³].
+        memory_cells: as of ``Elastomer``; the longer, the less viscosity the grid adds.
     """
 
     bulk_modulus: Positive = 5e5
     density: Positive = 1000.0
+    memory_cells: Annotated[float, Field(ge=0)] = 2.0
     law: ClassVar[int] = SAND
 
     def constants(self, kinematic_viscosity: np.ndarray, dim: int) -> np.ndarray:
         """What the law reads [node, constant]."""
-        return _constants(len(kinematic_viscosity), LAMBDA=self.bulk_modulus, VISCOSITY=kinematic_viscosity)
+        return _constants(len(kinematic_viscosity), LAMBDA=self.bulk_modulus, VISCOSITY=kinematic_viscosity, MEMORY=self.memory)
+
+    @property
+    def memory(self) -> float:
+        """Time [s] per grid spacing [m] for which a particle keeps a velocity that the grid does not hold."""
+        return _memory(self.memory_cells, self.bulk_modulus, 0.0, self.density)
 
     @property
     def smallest_stiffness(self) -> float:

@@ -1,4 +1,4 @@
-"""How much the solver of elastomers and sand depends on its time step and its grid."""
+"""How much the material point solver depends on its time step and its grid."""
 
 from dataclasses import replace
 from typing import Any
@@ -9,7 +9,8 @@ import pytest
 from gpe_pl import dataset
 from gpe_pl.geometry import domain_walls
 from gpe_pl.trajectory import Boundary
-from tests.particles import block
+from tests.particles import block, run
+from tests.physics.test_convergence_flip import effective_viscosity
 from tests.physics.test_mpm import L0, collapse
 
 pytestmark = pytest.mark.slow
@@ -17,13 +18,13 @@ pytestmark = pytest.mark.slow
 HEIGHT, SIDE, GRAVITY = 0.3, 0.25, 9.81
 
 
-def bounce(solver, modulus):
+def bounce(solver, modulus, spacing):
     """Height that the centre of a block of elastomer rises to again from a smooth floor, over the height that it fell from rest."""
-    dim, spacing = len(solver.bounds), solver.grid_spacing / 2
+    dim = len(solver.bounds)
     down, side = -np.eye(dim)[-1], round(SIDE / spacing) * spacing
     low = (*(0.375,) * (dim - 1), HEIGHT)
     boundary = Boundary.sample(domain_walls(solver.bounds, 0.0), spacing, dim)
-    state = block(low, (side,) * dim, spacing, "elastomer", value=modulus, boundary=boundary, gravity=GRAVITY * down)
+    state = block(low, (side,) * dim, spacing, "elastomer", value=modulus, jitter=0.0, boundary=boundary, gravity=GRAVITY * down)
     fall, heights = np.sqrt(2 * HEIGHT / GRAVITY), []
     for _ in range(round(2.9 * fall / solver.frame_dt)):
         state = solver.step(state)
@@ -34,17 +35,57 @@ def bounce(solver, modulus):
     return (max(heights[lowest:]) - HEIGHT - side / 2) / HEIGHT + 1
 
 
-@pytest.mark.parametrize(("size", "dim"), [("tiny", 2), ("small", 2), ("paper", 2), ("tiny", 3), ("small", 3)])
-def test_bounce(size, dim, physics):
+FEW_PARTICLES = ("mixed", "tiny", 3)
+"""Five across a body: the step decides how gradually the floor stops the lowest fifth of it."""
+
+CASES = [(data, size, dim) for data in ("elastomer", "mixed") for size, dim in (("tiny", 2), ("small", 2), ("tiny", 3), ("small", 3))]
+
+
+@pytest.mark.parametrize(("data", "size", "dim"), [*CASES, ("elastomer", "paper", 2)])
+def test_bounce(data, size, dim, physics):
     """From the softest to the stiffest material of the data, with the time step of the data and with half of it."""
-    spec = dataset("data=elastomer", f"size={size}", f"dimension={dim}")
-    solver: Any = spec.solver
+    spec: Any = dataset(f"data={data}", f"size={size}", f"dimension={dim}")
+    solver, tolerance = replace(spec.solver, materials=("elastomer",)), 0.1 if (data, size, dim) == FEW_PARTICLES else 0.03
     values = spec.parameters["elastomer"]
     every = sorted((*values.seen, *values.extrapolated))
     for modulus in (every[0], values.seen[4], every[-1]) if dim == 2 else (every[0], every[-1]):
-        own, half = (bounce(replace(solver, cfl=factor * solver.cfl), modulus) for factor in (1.0, 0.5))
+        own, half = (bounce(replace(solver, cfl=factor * solver.cfl), modulus, spec.scene.spacing) for factor in (1.0, 0.5))
         formula, source = "the same with half the time step", f"Δ = {solver.grid_spacing:.4g} m, cfl = {solver.cfl:g}"
-        physics(f"bounce height over drop height, E = {modulus:g} Pa", own, half, 0.03, formula=formula, source=source)
+        physics(f"bounce height over drop height, E = {modulus:g} Pa", own, half, tolerance, formula=formula, source=source)
+
+
+def settled_height(solver, hardening, spacing):
+    """Of the centre of a block of snow that was thrown at a rough floor [m]."""
+    dim = len(solver.bounds)
+    down, low = -np.eye(dim)[-1], (*(0.375,) * (dim - 1), 0.25)
+    boundary = Boundary.sample(domain_walls(solver.bounds, 0.3), spacing, dim)
+    fall = {"velocity": down, "boundary": boundary, "gravity": GRAVITY * down}
+    after = run(solver, block(low, (SIDE,) * dim, spacing, "snow", value=hardening, **fall), round(0.6 / solver.frame_dt))
+    return after.mass @ after.pos[:, -1] / after.mass.sum()
+
+
+@pytest.mark.parametrize(("size", "dim"), [("tiny", 2), ("small", 2), ("tiny", 3)])
+def test_settled_snow(size, dim, physics):
+    """Of the softest and the hardest snow of the data, with the time step of the data and with half of it."""
+    spec: Any = dataset("data=snow", f"size={size}", f"dimension={dim}")
+    solver, values = spec.solver, spec.parameters["snow"].extrapolated
+    for hardening in (min(values), max(values)):
+        own, half = (settled_height(replace(solver, cfl=factor * solver.cfl), hardening, spec.scene.spacing) for factor in (1.0, 0.5))
+        formula, source = "the same with half the time step", f"Δ = {solver.grid_spacing:.4g} m, cfl = {solver.cfl:g}"
+        physics(f"height of the centre of settled snow, ξ = {hardening:g}", own, half, 0.03, formula=formula, source=source, unit="m")
+
+
+@pytest.mark.parametrize(("size", "dim"), [("tiny", 2), ("small", 2), ("paper", 2), ("tiny", 3)])
+def test_effective_viscosity_of_liquid_under_snow(size, dim, physics):
+    """Of the thinnest liquid of the data: the nominal viscosity and the grid's own add up, and shorter steps do not raise it."""
+    spec: Any = dataset("data=snow_on_liquid", f"size={size}", f"dimension={dim}")
+    solver = replace(spec.solver, materials=("fluid",))
+    viscosity, own = min(spec.parameters["fluid"].extrapolated), solver.numerical_viscosity
+    whole, half = (effective_viscosity(replace(solver, cfl=factor * solver.cfl), viscosity, 0.3) for factor in (1.0, 0.5))
+    source = f"Δ = {solver.grid_spacing:.4g} m, ν_grid = Δ²/(256 (τ + h)) = {own:.3g} m²/s"
+    physics(f"effective viscosity at ν = {viscosity:g} m²/s", whole, viscosity + own, 0.2, formula="ν + ν_grid", source=source, unit="m²/s")
+    formula, source = "the same with half the time step", f"Δ = {solver.grid_spacing:.4g} m, cfl = {solver.cfl:g}"
+    physics("the same against half the time step", whole, half, 0.03, formula=formula, source=source, unit="m²/s")
 
 
 @pytest.mark.parametrize("angle", [20.0, 40.0])

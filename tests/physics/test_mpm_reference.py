@@ -79,7 +79,13 @@ def compare(physics, got, expected, start, tolerances):
 
 
 SNOW_CONSTANTS = Snow(
-    youngs_modulus=MODULUS, poisson_ratio=0.2, density=DENSITY, critical_compression=2.5e-2, critical_stretch=4.5e-3, max_hardening=1e30
+    youngs_modulus=MODULUS,
+    poisson_ratio=0.2,
+    density=DENSITY,
+    critical_compression=2.5e-2,
+    critical_stretch=4.5e-3,
+    max_hardening=1e30,
+    memory_cells=0,
 )
 
 

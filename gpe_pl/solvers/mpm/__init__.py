@@ -7,7 +7,7 @@ Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC). One substep of length h, wit
     v_i ← boundary conditions (v_i + h g),   with gravity over the mean of this h and the one before
     v_p = Σ_i w_ip v_i,   C_p = ∇v_p = Σ_i w_ip v_i (x_i - x_p)ᵀ / D,   x_p ← x_p + h v_p
 
-Sand and elastomers keep a part of the velocity that the grid does not hold; otherwise they would lose more energy the shorter the substeps are (``smoothing``).
+Particles keep a part of the velocity that the grid does not hold; otherwise they would lose more energy the shorter the substeps are (``smoothing``).
 
 Particles of all materials share the grid; each has its own constitutive law. ``solver`` is the ``Simulator``, ``frame`` the time loop, ``transfer_*`` the
 first and last line above, ``laws_*`` the return mappings and stresses, ``collider`` the walls and obstacles. Only transfers and laws exist once for each

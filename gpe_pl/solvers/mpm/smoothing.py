@@ -1,4 +1,4 @@
-"""What a trip to the grid and back takes from the velocities of particles, and how much of it sand and elastomers keep.
+"""What a trip to the grid and back takes from the velocities of particles, and how much of it they keep.
 
 The grid holds fewer numbers than the particles, so a trip to it and back smooths their velocities. APIC applies that filter in every substep, and the energy
 that it takes per second grows without bound as substeps get shorter. Here the remainder of the filter, ``s - G P s`` with the velocity and the affine part of

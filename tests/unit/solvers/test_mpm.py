@@ -207,6 +207,33 @@ def test_bounce_does_not_depend_on_the_time_step(modulus):
     assert bounce(2, modulus, 0.125) == pytest.approx(bounce(2, modulus, 0.5), rel=0.03)
 
 
+def settled_height(hardening, cfl):
+    """Of the centre of a block of snow [m], with one particle per cell, after a fall."""
+    state = block((0.3, 0.25), (0.25, 0.25), CELL, "snow", value=hardening, velocity=(0.0, -1.0), boundary=closed(2), gravity=(0.0, -9.81))
+    after = run(MPM(bounds=bounds(2), grid_spacing=CELL, materials=("snow",), cfl=cfl), state, 120)
+    return after.mass @ after.pos[:, 1] / after.mass.sum()
+
+
+def test_how_snow_settles_does_not_depend_on_the_time_step():
+    assert settled_height(3.0, 0.125) == pytest.approx(settled_height(3.0, 0.5), rel=0.03)
+
+
+def test_viscosity_does_not_depend_on_the_time_step():
+    """A shear wave of 16 cells in a free body of liquid decays by its viscosity and the grid's own, which shorter substeps do not raise."""
+    nominal, wave, amplitude = 6e-3, 2 * math.pi / (16 * CELL), []
+    solver = MPM(bounds=((0.0, 32 * CELL),) * 2, grid_spacing=CELL, materials=("fluid",))
+    state = block((2 * CELL,) * 2, (28 * CELL,) * 2, CELL, "fluid", value=nominal)
+    state.vel[:, 0] = 1e-3 * np.sin(wave * state.pos[:, 1])
+    for cfl in (0.5, 0.125):
+        after = run(replace(solver, cfl=cfl), state, 28)
+        amplitude.append(
+            (after.vel[:, 0] * np.sin(wave * after.pos[:, 1])).sum() / (state.vel[:, 0] * np.sin(wave * state.pos[:, 1])).sum()
+        )
+    coarse, fine = -np.log(amplitude) / (28 * solver.frame_dt * wave**2)
+    assert fine == pytest.approx(coarse, rel=0.05)
+    assert coarse == pytest.approx(nominal + solver.numerical_viscosity, rel=0.1)
+
+
 # --- obstacles -----------------------------------------------------------------------------------------------------------------------------
 
 
