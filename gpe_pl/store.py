@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, fields
@@ -79,16 +80,19 @@ def array_bytes(trajectory: Trajectory) -> int:
 
 PREDICTION = "prediction"
 """Attribute that only predictions have."""
+START_TIME = "start_time"
+"""Attribute of trajectories that begin later than their scene, in s: solvers do not take their first frame for undeformed."""
 ATTRIBUTES = ("metadata", "shapes", "node_types")
 """Of a trajectory's group, beside the digest."""
 
 
 def stored_attributes(trajectory: Trajectory) -> dict[str, str]:
-    """What else is stored of a trajectory, as JSON: its metadata, the shapes of its boundary, and the names behind ``node_type``."""
+    """What else is stored of a trajectory, as JSON: metadata, shapes of its boundary, the names behind ``node_type``, and when it begins, if not at 0."""
     m = trajectory.metadata
     meta = json.dumps(asdict(m), sort_keys=True)
     shapes = json.dumps([shape_to_dict(s) for s in trajectory.boundary.shapes], sort_keys=True)
-    return {"metadata": meta, "shapes": shapes, "node_types": json.dumps(NODE_TYPES)}
+    begins = {START_TIME: repr(float(trajectory.start_time))} if trajectory.start_time else {}
+    return {"metadata": meta, "shapes": shapes, "node_types": json.dumps(NODE_TYPES), **begins}
 
 
 def digest(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
@@ -284,6 +288,21 @@ def shapes_of(group: h5py.Group) -> tuple[Shape, ...]:
         raise StoreError(f"{_where(group)}: attribute 'shapes' is unreadable: {error}") from None
 
 
+def start_time_of(group: h5py.Group) -> float:
+    """When the first frame of a trajectory's group is, in s since the start of its scene."""
+    if START_TIME not in group.attrs:
+        return 0.0
+    try:
+        seconds = parsed(read_text(group, START_TIME))
+        if type(seconds) not in (int, float) or not math.isfinite(seconds):
+            raise ValueError("must be a number of seconds")
+    except StoreError:
+        raise
+    except ValueError as error:
+        raise StoreError(f"{_where(group)}: attribute {START_TIME!r} is unreadable: {error}") from None
+    return float(seconds)
+
+
 def node_types_of(group: h5py.Group) -> tuple[str, ...]:
     """The names behind the integers of ``node_type`` in a trajectory's group; all of them are in ``schema.NODE_TYPES``."""
     try:
@@ -318,8 +337,9 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         group = open_group(file, name)
         metadata = metadata_of(group)
         arrays = {key: read_field(group, key, frames) for key, spec in FIELDS.items() if spec.required or is_named(group, key)}
+        first_frame = 0 if frames is None else frames.indices(open_field(group, "pos").shape[0])[0]
         if verify:
-            attributes = {key: read_text(group, key) for key in ATTRIBUTES}
+            attributes = {key: read_text(group, key) for key in (*ATTRIBUTES, START_TIME) if key in (*ATTRIBUTES, *group.attrs)}
             if digest(arrays, attributes) != read_text(group, "sha256"):
                 raise StoreError(
                     f"{path}:{name}: SHA-256 digest does not match the content; delete the shard and generate or import the data again"
@@ -328,12 +348,11 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
             raise StoreError(f"{path}:{name}: has only one of the fields 'node_stress' and 'cell_stress'")
         for conflict in size_conflicts(arrays, metadata.dim, len(metadata.param_names)):
             raise StoreError(f"{path}:{name}: {conflict}")
-        shapes, names, is_prediction = shapes_of(group), node_types_of(group), PREDICTION in group.attrs
+        shapes, names, is_prediction, begins = shapes_of(group), node_types_of(group), PREDICTION in group.attrs, start_time_of(group)
     for key, violation in metadata.violations():
         raise UnsoundError(f"{path}:{name}", f"{key} {violation}")
     if (wrong := shapes_fault(shapes, metadata.periodicity)) is not None:
         raise UnsoundError(f"{path}:{name}", wrong)
-    first_frame = 0 if frames is None else frames.start or 0
     for fault in faults(arrays, names, metadata.materials, metadata.param_names, first_frame):
         raise UnsoundError(f"{path}:{name}", str(fault))
     motion = Motion(arrays["boundary_pos"], arrays["boundary_vel"], arrays["boundary_normal"])
@@ -358,7 +377,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         cells=arrays.get("cells"),
         cell_dim=int(arrays["cell_dim"][0]) if "cell_dim" in arrays else None,
         stress=Stress(arrays["node_stress"], arrays["cell_stress"]) if "node_stress" in arrays else None,
-        start_time=metadata.frame_dt * (0 if frames is None else frames.start or 0),
+        start_time=begins + metadata.frame_dt * first_frame,
         is_prediction=is_prediction,
     )
 

@@ -484,7 +484,7 @@ class Trajectory:
         rest_pos, cells, cell_dim: reference configuration of meshes, as in ``State``.
         stress: of the mesh in every frame.
         termination: set when a rollout stopped before its last frame.
-        start_time: of the first frame, in s since the start of the scene; not stored.
+        start_time: of the first frame, in s since the start of the scene.
         is_prediction: whether a rollout of anything but a ground-truth solver made it.
     """
 

@@ -363,7 +363,8 @@ Schema version {version}. One HDF5 file per shard, a group per trajectory, SI un
 {{data set}}/{{size}}/{{split}}/shard-00000.h5
     attributes: schema_version, units (JSON), num_trajectories
     00000/  00001/  …                      a trajectory each
-        attributes: metadata (JSON), shapes (JSON), node_types (JSON), sha256
+        attributes: metadata (JSON), shapes (JSON), node_types (JSON), sha256; start_time (JSON, s) of parts that begin later than their
+                    scene; prediction of what a model made
         pos  vel  …                        fields, each with its attribute unit
 ```
 
@@ -371,7 +372,7 @@ Imported data sets have the size `imported`, and beside their splits a `report.m
 
 Files are written under a temporary name and renamed, so a file that exists is complete. Equal content gives equal bytes. Every array has a
 fletcher32 checksum per chunk; arrays with frames are cut along them. `sha256` covers names, shapes, types and bytes of all arrays and the
-other three attributes. Arrays are compressed without loss (shuffle and gzip, which every HDF5 library reads). Text has a fixed length, and nothing
+other attributes but `prediction`. Arrays are compressed without loss (shuffle and gzip, which every HDF5 library reads). Text has a fixed length, and nothing
 refers to another file.
 
 Splits: {splits}. The material parameters of the first three have the trained values; those of the last one lie between or outside them, as

@@ -93,6 +93,24 @@ def test_only_some_frames(shard: Path, trajectory: Trajectory) -> None:
         read_trajectory(shard, "00000", verify=True, frames=slice(2, 5))
 
 
+def test_a_part_remembers_when_it_begins(tmp_path: Path, trajectory: Trajectory) -> None:
+    """Also from the end, as a part of a part, and with a checksum; whole trajectories have no such attribute."""
+    dt, last = trajectory.metadata.frame_dt, trajectory.num_frames - 1
+    write_shard(tmp_path / "part.h5", [trajectory, trajectory.frames(1)])
+    whole, part = (read_trajectory(tmp_path / "part.h5", name, verify=True) for name in ("00000", "00001"))
+    assert (whole.start_time, part.start_time) == (0.0, dt)
+    for name in ("00000", "00001"):
+        end = read_trajectory(tmp_path / "part.h5", name, frames=slice(-1, None))
+        assert end.start_time == pytest.approx(last * dt) and end.num_frames == 1
+    with h5py.File(tmp_path / "part.h5", "r+") as file:
+        assert "start_time" not in file["00000"].attrs
+        for text, message in (("1.5", "SHA-256"), ("null", "'start_time' is unreadable: must be a number"), ("NaN", "must be a number")):
+            file["00001"].attrs["start_time"] = np.bytes_(text.encode())
+            file.flush()
+            with pytest.raises(StoreError, match=message):
+                read_trajectory(tmp_path / "part.h5", "00001", verify=True)
+
+
 def test_node_types_are_stored_by_name(shard: Path, trajectory: Trajectory) -> None:
     """A later schema may number the node types differently; names decide."""
     with h5py.File(shard, "r+") as file:
