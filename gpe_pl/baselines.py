@@ -14,7 +14,9 @@ NUM_BISECTIONS = 30
 
 
 def _later(state: State, dt: float, pos: Array, vel: Array) -> State:
-    return replace(state, pos=pos, vel=vel, velocity_history=None, time=state.time + dt, stress=None, boundary=state.boundary.at(1))
+    return replace(
+        state, pos=pos, vel=vel, velocity_history=None, time=state.time + dt, stress=None, boundary=state.boundary.at(1), internal=None
+    )
 
 
 @dataclass(frozen=True)

@@ -230,10 +230,28 @@ def _step(simulator: Simulator, state: State) -> State | SimulationError:
 
 @runtime_checkable
 class GroundTruth(Protocol):
-    """What tells a ground-truth solver from other simulators: the name and version under which its results are stored."""
+    """What tells a ground-truth solver from other simulators: the name and version under which its results are stored, and which scenes it computes."""
 
     name: ClassVar[str]
     version: ClassVar[str]
+
+    @property
+    def frame_dt(self) -> float: ...
+
+    @property
+    def materials(self) -> tuple[str, ...]: ...
+
+
+def unfit(simulator: Simulator, metadata: Metadata) -> Termination | None:
+    """Why the frames of a solver are not those that the metadata describe, or None: it would step by another time, or read the parameters of others."""
+    if not isinstance(simulator, GroundTruth):
+        return None
+    solver, wrong = f"the solver {simulator.name}", ""
+    if not math.isclose(simulator.frame_dt, metadata.frame_dt, rel_tol=1e-6):
+        wrong = f"{solver} has frame_dt = {simulator.frame_dt:g} s, the scene {metadata.frame_dt:g} s"
+    elif tuple(simulator.materials) != metadata.materials:
+        wrong = f"{solver} has the materials {', '.join(simulator.materials)}, the scene {', '.join(metadata.materials)}, in this order"
+    return Termination("input", 0, -1, f"{wrong}; give the solver those of the scene") if wrong else None
 
 
 @dataclass(frozen=True)
@@ -259,7 +277,11 @@ def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int,
     live = {}
     guards = [None if start.guard is None else start.guard.of(start.state) for start in starts]
     for scene, (start, guard) in enumerate(zip(starts, guards, strict=True)):
-        impossible = unsound(start.state, start.metadata) or (None if guard is None else guard.check(start.state, 0))
+        impossible = (
+            unfit(simulator, start.metadata)
+            or unsound(start.state, start.metadata)
+            or (None if guard is None else guard.check(start.state, 0))
+        )
         if impossible is None:
             live[scene] = start.state
         else:

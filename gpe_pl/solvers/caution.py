@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,8 +18,8 @@ THIN_SHARE = 0.1
 """Of the nodes of a mesh: less is not worth a word."""
 
 
-def unresolved(solver: Any, parameters: Mapping[str, Sequence[float]], state: State) -> Iterator[str]:
-    """One sentence for each thing that the solver does not resolve of these parameter values and of a scene's initial state."""
+def unresolved(solver: Any, parameters: Mapping[str, Sequence[float]], scenes: Iterable[State]) -> Iterator[str]:
+    """One sentence for each thing that the solver does not resolve of these parameter values and of the initial states of some scenes."""
     for material, smallest in getattr(solver, "smallest_resolved", {}).items():
         name, unit = MATERIALS[material].name, MATERIALS[material].unit
         values = [value for value in parameters.get(material, ()) if value < smallest]
@@ -28,12 +28,13 @@ def unresolved(solver: Any, parameters: Mapping[str, Sequence[float]], state: St
                 f"{name} = {', '.join(f'{value:g}' for value in values)} {unit} is below {smallest:.3g} {unit}, which the grid of the solver {solver.name} "
                 "adds by itself: such trajectories differ little; choose a smaller grid_spacing, or leave these values out"
             )
-    if state.cells is not None and solver.stores_stress:
-        share = float(np.mean(thin_nodes(np.asarray(state.cells), state.num_nodes, state.dim)))
-        if share > THIN_SHARE:
+    if solver.stores_stress:
+        shares = [float(np.mean(thin_nodes(np.asarray(s.cells), s.num_nodes, s.dim))) for s in scenes if s.cells is not None]
+        thin = [share for share in shares if share > THIN_SHARE]
+        if thin:
             yield (
-                f"of the first scene, {100 * share:.0f} % of the nodes are where the mesh has fewer than {CELLS_ACROSS} cells across: it is too stiff "
-                "in bending there; choose more cells (data.scene.num_cells=…)"
+                f"in {len(thin)} of the first {len(shares)} scenes, up to {100 * max(thin):.0f} % of the nodes are where the mesh has fewer than "
+                f"{CELLS_ACROSS} cells across: it is too stiff in bending there; choose more cells (data.scene.num_cells=…)"
             )
 
 

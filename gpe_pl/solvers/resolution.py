@@ -104,6 +104,8 @@ def _rows(state: State, rows: np.ndarray, pos: np.ndarray, mass: np.ndarray) -> 
 def _check_triangles(state: State) -> None:
     if state.dim != 2 or state.cells is None or state.cells.shape[1] != 3:
         raise ValueError("only meshes of triangles can be divided or meshed anew")
+    if state.time > 0:
+        raise ValueError(f"the mesh at {state.time:g} s is deformed; only the start of a scene can have another resolution")
 
 
 def _divided_triangles(state: State) -> Resolved:

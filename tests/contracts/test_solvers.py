@@ -4,13 +4,16 @@ A new solver joins by an entry in ``SOLVERS``: a solver and an initial state in 
 """
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
+from gpe_pl.baselines import Ballistic
 from gpe_pl.geometry import Shape, Sphere, domain_walls
+from gpe_pl.periodicity import Periodicity
 from gpe_pl.rollout import SimulationError, Simulator, rollout
 from gpe_pl.schema import MATERIALS, NODE_TYPES, param_names
 from gpe_pl.solvers.fem import FEM
@@ -18,6 +21,7 @@ from gpe_pl.solvers.flip import FLIP
 from gpe_pl.solvers.materials import LIMITS, check_limits
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.solid_scenes import SolidScene
+from gpe_pl.store import read_trajectory, write_shard
 from gpe_pl.trajectory import Boundary, State, Stress
 from tests.particles import block, run, together
 from tests.scenes import metadata
@@ -127,20 +131,91 @@ def test_restart_equals_run_through(case):
     assert_same_bytes(run(fresh, middle, 15), run(solver, state, 40))
 
 
-@pytest.mark.parametrize("start_of_part", [False, True], ids=["frame", "first frame of a part"])
-def test_stored_frame_is_continued_or_refused(case, start_of_part):
+def from_a_file(part, folder):
+    write_shard(folder / "part.h5", [part])
+    return read_trajectory(folder / "part.h5", "00000", verify=True)
+
+
+@pytest.mark.parametrize("way", ["frame", "first frame of a part", "first frame of a stored part", "stored frames"])
+def test_stored_frame_is_continued_or_refused(case, way, tmp_path):
     """A stored frame has positions and velocities only. A solver that needs more refuses it; the others go on as if they had not stopped."""
     solver, state = case
     whole = rollout(solver, state, 30, metadata(solver.materials, state.dim))
-    middle = whole.frames(20).state(0) if start_of_part else whole.state(20)
-    assert middle.internal is None
+    if way == "stored frames":
+        write_shard(tmp_path / "whole.h5", [whole.frames(4)])
+        middle = read_trajectory(tmp_path / "whole.h5", "00000", frames=slice(16, None)).state(0)
+    else:
+        part = {"frame": lambda: whole, "first frame of a part": lambda: whole.frames(20)}.get(
+            way, lambda: from_a_file(whole.frames(20), tmp_path)
+        )()
+        middle = part.state(20 if way == "frame" else 0)
+    assert middle.internal is None and middle.time == pytest.approx(20 * solver.frame_dt)
     rest = rollout(solver, middle, 10, whole.metadata)
     if solver.name == "mpm":
         assert rest.num_frames == 1 and rest.termination is not None
         assert rest.termination.reason == "input" and "the state at 0.1 s has no internal part" in rest.termination.message
+    elif "stored" in way:
+        np.testing.assert_allclose(rest.pos, whole.pos[20:], atol=1e-4 * CELL)  # in single precision
     else:
         np.testing.assert_array_equal(rest.pos, whole.pos[20:])
         np.testing.assert_array_equal(rest.vel, whole.vel[20:])
+
+
+def test_what_another_simulator_moved_is_not_as_deformed_as_before(case):
+    """A solver that needs to know how particles are deformed refuses what a baseline made of its state."""
+    solver, state = case
+    moved = Ballistic(solver.frame_dt).step(run(solver, state, 5))
+    if solver.name == "mpm":
+        with pytest.raises(SimulationError, match="has no internal part"):
+            solver.step(moved)
+    else:
+        solver.step(moved)
+
+
+def moving_later(boundary):
+    """Still in the first frame, then lifted."""
+    lift = np.eye(boundary.pos.shape[1])[-1] * np.array([0.0, 0.0, 0.01])[:, None, None]
+    return Boundary.moving(boundary.pos + lift, boundary.normal, 5e-3, friction=boundary.friction)
+
+
+SURROUNDINGS = {
+    "does not compute periodic domains; the scene repeats along x": lambda s: replace(
+        s, periodicity=Periodicity(((0.0, 1.0),) * s.dim, (True, *(False,) * (s.dim - 1)))
+    ),
+    "supports only boundaries at rest": lambda s: replace(s, boundary=replace(moving_later(s.boundary), shapes=s.boundary.shapes)),
+    "takes walls and obstacles from the shapes of the boundary": lambda s: replace(s, boundary=replace(s.boundary, shapes=())),
+}
+
+
+@pytest.mark.parametrize("message", SURROUNDINGS)
+def test_surroundings_that_a_solver_would_leave_out_are_refused(case, message):
+    solver, state = case
+    with pytest.raises(SimulationError, match=message) as caught:
+        solver.step(SURROUNDINGS[message](state))
+    assert caught.value.reason == "input"
+
+
+def test_a_boundary_with_a_motion_that_never_moves_is_at_rest(case):
+    solver, state = case
+    b = state.boundary
+    still = replace(Boundary.moving(np.stack([b.pos] * 3), b.normal, solver.frame_dt, friction=b.friction), shapes=b.shapes)
+    assert still.motion is not None
+    np.testing.assert_array_equal(solver.step(replace(state, boundary=still)).pos, solver.step(state).pos)
+
+
+def test_frames_are_those_that_the_metadata_describe(case):
+    """A solver with another frame interval, or with materials in another order, would fill a trajectory with what it is not."""
+    solver, state = case
+    about = metadata(solver.materials, state.dim)
+    other_order = solver.materials[::-1] if len(solver.materials) > 1 else ("elastomer",)
+    others = {
+        "has frame_dt = 0.005 s, the scene 0.01 s": replace(about, frame_dt=0.01),
+        "has the materials .*, the scene .*, in this order": metadata(other_order, state.dim),
+    }
+    for message, other in others.items():
+        stop = rollout(solver, state, 2, other).termination
+        assert stop is not None and (stop.reason, stop.frame) == ("input", 0) and re.search(message, stop.message), stop
+    assert rollout(solver, state, 2, about).termination is None
 
 
 def test_a_parameter_outside_the_limits_is_refused(case):

@@ -34,6 +34,7 @@ from gpe_pl.solvers.fem.elements import (
     elastic_energy,
 )
 from gpe_pl.solvers.materials import LIMITS, check_limits, lame_parameters
+from gpe_pl.solvers.supported import check_surroundings
 from gpe_pl.trajectory import Boundary, State
 
 OK, NOT_FINITE, ESCAPE, TOO_MANY_SUBSTEPS = 0, 1, 2, 3
@@ -182,8 +183,7 @@ class FEM:
         _require(np.asarray(state.node_type) == node_code("solid"), "node_type is not solid")
         modulus = np.asarray(state.material_params, dtype=np.float64)[:, 0]
         check_limits("solid", modulus, np.arange(num_nodes))
-        if np.any(np.asarray(state.boundary.vel) != 0) or np.any(np.asarray(state.boundary.restitution) != 0):
-            raise SimulationError("FEM supports only boundaries at rest and without restitution", reason="input")
+        check_surroundings(state, "FEM")
         mesh = build_mesh(state.rest_pos, state.cells, state.mass)
         lam_per_modulus, mu_per_modulus = lame_parameters(1.0, self.poisson_ratio)
         of_cell = modulus[mesh.cells].mean(axis=1)

@@ -17,6 +17,7 @@ from gpe_pl.solvers.flip import islands, pressure, transfer, viscosity
 from gpe_pl.solvers.flip.grid import HALF, Grid, Solids, make_grid, make_solids
 from gpe_pl.solvers.flip.linear import conjugate_gradients, incomplete_cholesky
 from gpe_pl.solvers.materials import check_limits
+from gpe_pl.solvers.supported import check_surroundings
 from gpe_pl.trajectory import Boundary, State
 
 MATERIAL = "fluid"
@@ -288,8 +289,6 @@ class FLIP:
 
     def solids(self, boundary: Boundary) -> Solids:
         """The boundary on the solver's grid."""
-        if np.any(np.asarray(boundary.vel) != 0) or np.any(np.asarray(boundary.restitution) != 0):
-            raise SimulationError("FLIP supports only boundaries at rest and without restitution", reason="input")
         for shape in boundary.shapes:
             if thickness(shape) < self.grid_spacing * (1 - 1e-6):
                 raise SimulationError(
@@ -400,6 +399,7 @@ class FLIP:
         for name, (array, expected) in shapes.items():
             if np.shape(array) != expected:
                 raise SimulationError(f"{name} has shape {np.shape(array)}, expected {expected}", reason="input")
+        check_surroundings(state, "FLIP")
         if state.internal is not None:
             raise SimulationError(f"internal state is of type {type(state.internal).__name__}, expected None", reason="input")
         _require(np.isfinite(state.mass), "mass is not finite", reason="nan")

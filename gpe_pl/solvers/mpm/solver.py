@@ -18,6 +18,7 @@ from gpe_pl.solvers.materials import LIMITS, MEMORY, NUM_CONSTANTS, Elastomer, F
 from gpe_pl.solvers.mpm.collider import Collider, collider
 from gpe_pl.solvers.mpm.frame import ESCAPE, NOT_FINITE, OK, advance
 from gpe_pl.solvers.mpm.particles import Particles
+from gpe_pl.solvers.supported import check_surroundings
 from gpe_pl.trajectory import Boundary, State
 
 PADDING = 3
@@ -137,6 +138,7 @@ class MPM:
             SimulationError: with reason ``input`` (arrays or obstacles that do not fit the solver, or no ``internal`` where it is needed), ``nan``,
                 ``escape`` (a particle left the domain through an open side or started outside) or ``explosion`` (more than ``max_substeps``).
         """
+        check_surroundings(state, "MPM")
         internal = state.internal if state.internal is not None else MPMInternal.at_rest(state.num_nodes, len(self.bounds))
         particles = self._particles(state, internal)
         if state.internal is None:
@@ -185,8 +187,6 @@ class MPM:
                 raise SimulationError(message, reason="input", node=node)
 
     def _collider(self, boundary: Boundary, origin: tuple[float, ...], counts: tuple[int, ...]) -> Collider:
-        if np.any(np.asarray(boundary.vel) != 0) or np.any(np.asarray(boundary.restitution) != 0):
-            raise SimulationError("MPM supports only boundaries at rest and without restitution", reason="input")
         return collider(tuple(boundary.shapes), origin, self.grid_spacing, counts)
 
     def _particles(self, state: State, internal: object) -> Particles:

@@ -8,6 +8,7 @@ import pytest
 from gpe_pl.solvers.caution import thin_nodes, unresolved
 from gpe_pl.solvers.fem import FEM
 from gpe_pl.solvers.flip import FLIP
+from gpe_pl.solvers.mpm import MPM
 from tests.particles import block
 
 BOX = ((0.0, 1.0), (0.0, 1.0))
@@ -51,9 +52,25 @@ def test_a_thin_mesh_and_a_thin_liquid_are_named():
     cells, count = strip(20, 2)
     pos = np.random.default_rng(0).random((count, 2))
     mesh = replace(block((0.2, 0.2), (0.2, 0.2), 0.1, "elastomer"), pos=pos, rest_pos=pos, cells=cells)
-    (said,) = unresolved(FEM(bounds=BOX), {"solid": (1e6,)}, mesh)
-    assert "100 % of the nodes are where the mesh has fewer than 4 cells across" in said
+    cells, count = strip(8, 8)
+    pos = np.random.default_rng(0).random((count, 2))
+    thick = replace(block((0.2, 0.2), (0.3, 0.3), 0.1, "elastomer"), pos=pos, rest_pos=pos, cells=cells)
+    (said,) = unresolved(FEM(bounds=BOX), {"solid": (1e6,)}, [thick, mesh])
+    assert "in 1 of the first 2 scenes, up to 100 % of the nodes are where the mesh has fewer than 4 cells across" in said
+    assert not [*unresolved(FEM(bounds=BOX), {"solid": (1e6,)}, [thick])]
     liquid = FLIP(bounds=BOX, grid_spacing=0.1)
-    (said,) = unresolved(liquid, {"fluid": (2e-3, 1e-2)}, block((0.2, 0.2), (0.2, 0.2), 0.1, "fluid"))
+    (said,) = unresolved(liquid, {"fluid": (2e-3, 1e-2)}, [])
     assert said.startswith("kinematic_viscosity = 0.002 m^2/s is below 0.00855 m^2/s")
-    assert not [*unresolved(liquid, {"fluid": (1e-2,)}, block((0.2, 0.2), (0.2, 0.2), 0.1, "fluid"))]
+    assert not [*unresolved(liquid, {"fluid": (1e-2,)}, [])]
+
+
+@pytest.mark.parametrize("solver", [FLIP(bounds=BOX, grid_spacing=0.1), MPM(bounds=BOX, grid_spacing=0.1, materials=("snow", "fluid"))])
+def test_a_viscosity_below_the_grids_own_is_named_for_every_solver_of_liquids(solver):
+    own = solver.numerical_viscosity
+    (said,) = unresolved(solver, {"fluid": (0.5 * own, 2 * own)}, [])
+    assert f"below {own:.3g} m^2/s, which the grid of the solver {solver.name} adds" in said
+    assert not [*unresolved(solver, {"fluid": (2 * own,)}, [])]
+
+
+def test_sand_alone_has_no_viscosity_to_resolve():
+    assert not [*unresolved(MPM(bounds=BOX, grid_spacing=0.1, materials=("sand",)), {"sand": (30.0,)}, [])]

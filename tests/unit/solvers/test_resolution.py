@@ -106,3 +106,12 @@ def test_the_solver_at_half_the_spacing_does_nearly_the_same(domain: str) -> Non
     ballistic = state.pos + time * state.vel + state.gravity * time**2 / 2
     error = np.square(fine.restrict(refined.pos) - normal.pos).mean()
     assert error < 0.3 * np.square(ballistic - normal.pos).mean()
+
+
+def test_a_mesh_that_is_deformed_keeps_its_resolution() -> None:
+    """Dividing it would make its shape of now the undeformed one."""
+    state, spacing = scene("fem")
+    later = spec("fem").solver.step(state)
+    for other in (finer, coarser):
+        with pytest.raises(ValueError, match=r"the mesh at 0\.002 s is deformed"):
+            other(later, spacing)

@@ -1,0 +1,35 @@
+"""What surrounds particles and meshes in scenes that solvers compute: walls and obstacles at rest, known by their shapes, in space that does not repeat."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpe_pl.rollout import SimulationError
+from gpe_pl.trajectory import Boundary, State
+
+
+def check_surroundings(state: State, solver: str) -> None:
+    """Refuse what a solver would otherwise leave out without a word.
+
+    Raises:
+        SimulationError: with reason ``input``; names the solver and what it does not compute.
+    """
+    if state.periodicity:
+        axes = ", ".join("xyz"[axis] for axis in state.periodicity.axes)
+        raise SimulationError(f"{solver} does not compute periodic domains; the scene repeats along {axes}", reason="input")
+    b = state.boundary
+    if _moves(b) or np.any(np.asarray(b.restitution) != 0):
+        raise SimulationError(f"{solver} supports only boundaries at rest and without restitution", reason="input")
+    if len(b.pos) and not b.shapes:
+        raise SimulationError(
+            f"{solver} takes walls and obstacles from the shapes of the boundary, and its {len(b.pos)} nodes have none; pass shapes to Boundary.from_numpy, "
+            "or use Boundary.sample",
+            reason="input",
+        )
+
+
+def _moves(boundary: Boundary) -> bool:
+    """Whether any of its nodes moves, now or later."""
+    motion = boundary.motion
+    later = motion is not None and bool(np.any(motion.vel != 0) or np.any(motion.pos != motion.pos[:1]))
+    return later or bool(np.any(np.asarray(boundary.vel) != 0))
