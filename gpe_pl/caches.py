@@ -25,7 +25,8 @@ def prepare() -> None:
 
     Numba compiles a function again when its own file has changed, but not when another file has that defines a type, a constant or a function in it. So each
     version of ``COMPILED`` has a folder of its own: in ``NUMBA_CACHE_DIR`` if that is set, else in the package, else in the user's folder for caches, else in
-    one below the system's temporary folder. Matplotlib and Triton warn where they have no folder, and work anew in each process; what the user has set stays.
+    one below the system's temporary folder. Where none can be written, each process compiles anew. Matplotlib and Triton warn where they have no folder, and
+    work anew in each process; what the user has set stays.
     Takes effect on what is imported afterwards.
     """
     _prepare_numba()
@@ -38,6 +39,7 @@ def prepare() -> None:
 def _prepare_numba() -> None:
     parent = _parent_of_compiled()
     if parent is None:
+        _compile_without_cache()
         return
     folder = parent / (NAME + _digest())
     try:
@@ -47,6 +49,8 @@ def _prepare_numba() -> None:
         if is_new:
             _remove_unused(parent)
     except OSError:  # Numba looks for another place itself
+        if not any(map(_is_writable, _usual_places())):
+            _compile_without_cache()
         return
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     if "numba" in sys.modules:
@@ -58,11 +62,23 @@ def _parent_of_compiled() -> Path | None:
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         chosen = Path(given)
         return chosen.parent if chosen.name.startswith(NAME) else chosen  # that of the process that started this one
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
-    if own := next((place for place in (PACKAGE / "__pycache__", home / "numba") if _is_writable(place)), None):
+    if own := next(filter(_is_writable, _usual_places()), None):
         return own
     temporary = _own_folder()
     return None if temporary is None else temporary / "numba"
+
+
+def _usual_places() -> tuple[Path, Path]:
+    """Folders in the package and in the user's folder for caches."""
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+    return PACKAGE / "__pycache__", home / "numba"
+
+
+def _compile_without_cache() -> None:
+    """Numba refuses to compile a function that wants a cache where it finds no place for one: each process compiles anew, in its memory."""
+    from numba.core.dispatcher import Dispatcher
+
+    setattr(Dispatcher, "enable_caching", lambda _: None)  # noqa: B010
 
 
 def _digest() -> str:

@@ -271,7 +271,10 @@ def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
 def _written(paths: Mapping[str, str] | None = None) -> list[Path]:
     """Folders that this process writes to, its own and those of libraries."""
     own = [*_results] if paths is None else [*paths.values()]
-    return [Path(folder) for folder in (*own, os.environ.get("NUMBA_CACHE_DIR", "."), tempfile.gettempdir(), Path.cwd())]
+    temporary: list[str] = []
+    with contextlib.suppress(FileNotFoundError):  # where none can be written
+        temporary.append(tempfile.gettempdir())
+    return [Path(folder) for folder in (*own, os.environ.get("NUMBA_CACHE_DIR", "."), *temporary, Path.cwd())]
 
 
 def _fail(error: Exception) -> None:

@@ -1,11 +1,17 @@
-"""Ctrl-C while a command imports what it needs, before it can catch anything itself."""
+"""Ctrl-C while a command imports what it needs, before it can catch anything itself, and where Python ignores exceptions."""
 
 from __future__ import annotations
 
+import _thread
 import os
 import signal
 import sys
+import threading
 from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
 
 NOTICE = "interrupted"
 STATUS = 130
@@ -27,9 +33,22 @@ def catch() -> None:
 
 
 def end() -> None:
-    """Ctrl-C raises ``KeyboardInterrupt`` again."""
+    """Ctrl-C raises ``KeyboardInterrupt`` again, and a moment later once more where that is ignored, as in destructors and callbacks of weak references."""
+    sys.unraisablehook = _interrupt_again
     if signal.getsignal(signal.SIGINT) is _end_process:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+SECONDS_LATER = 0.02
+
+
+def _interrupt_again(ignored: UnraisableHookArgs) -> None:
+    if issubclass(ignored.exc_type, KeyboardInterrupt):
+        again = threading.Timer(SECONDS_LATER, _thread.interrupt_main)  # the exception would be ignored here too
+        again.daemon = True
+        again.start()
+    else:
+        sys.__unraisablehook__(ignored)
 
 
 def _end_process(number: int, frame: FrameType | None) -> None:

@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import numba
 import pytest
 
 from gpe_pl import caches
@@ -164,3 +165,20 @@ _crc32c(np.zeros(1, np.uint8), np.zeros(256, np.uint32))
     child = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, encoding="utf-8", check=False)
     assert child.returncode == 0, child.stderr
     assert list((tmp_path / "tmp" / f"gpe_pl-{os.getuid()}").glob("numba/**"))
+
+
+@pytest.mark.parametrize("given", [None, "/dev/null/cache"])
+def test_without_any_place_functions_compile_without_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str | None) -> None:
+    """As in a container whose package, home and temporary folders are read-only."""
+    from numba.core.dispatcher import Dispatcher
+
+    def refuse(_: object) -> None:
+        raise RuntimeError("cannot cache function: no locator available")
+
+    monkeypatch.setattr(Dispatcher, "enable_caching", refuse)  # is put back, and what Numba does
+    monkeypatch.setattr(caches, "_is_writable", lambda _: False)
+    monkeypatch.setattr(caches, "_own_folder", lambda: None)
+    if given:
+        monkeypatch.setenv("NUMBA_CACHE_DIR", given)
+    caches.prepare()
+    assert numba.njit(cache=True)(lambda x: x + 1)(1) == 2

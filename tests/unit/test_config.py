@@ -18,6 +18,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from pydantic import Field
 
+from gpe_pl import config as configuration
 from gpe_pl.benchmark import benchmark, without_folder
 from gpe_pl.config import CONF, ConfigError, Report, bind, construct, entry_point, explain, output_dir, quoted
 from gpe_pl.errors import GpeError
@@ -385,3 +386,11 @@ def test_a_path_with_an_equals_sign_is_taken_as_typed(tmp_path: Path) -> None:
     ):
         assert quoted(argument) == argument
     assert "a value that holds = needs quotes: 'KEY=\"VALUE\"'" in complaint("evaluate", f"checkpoint={run}0")
+
+
+def test_a_full_disk_is_named_where_there_is_no_temporary_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none() -> str:
+        raise FileNotFoundError(2, "No usable temporary directory found")
+
+    monkeypatch.setattr("tempfile.gettempdir", none)
+    assert Path("results") in configuration._written({"runs": "results"})

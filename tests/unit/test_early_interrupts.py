@@ -34,3 +34,26 @@ def test_programs_that_import_the_package_keep_their_own_answer(monkeypatch: pyt
         monkeypatch.setattr(sys, "orig_argv", orig)
         early_interrupts.begin()
         assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_interrupt_in_a_destructor_is_not_lost() -> None:
+    """Python ignores what destructors raise, and prints a traceback."""
+    program = """
+import signal, time
+from gpe_pl import early_interrupts
+early_interrupts.end()
+
+class Dying:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(0)
+
+try:
+    Dying()
+    for _ in range(1000):
+        time.sleep(0.01)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, encoding="utf-8", check=True)
+    assert (ended.stdout, ended.stderr) == ("interrupted\n", "")
