@@ -7,7 +7,6 @@ one, in which a failed rollout is infinitely wrong.
 
 from __future__ import annotations
 
-import csv
 import logging
 from collections import defaultdict
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.baselines import BASELINES
@@ -26,13 +26,12 @@ from gpe_pl.finished_runs import (
     Run,
     axes_of,
     distinct_runs,
-    finished_runs,
-    groups_of,
     replaced_data,
     rollout_errors,
     shared_table,
     shared_trajectories,
     values_by_seed,
+    with_groups,
 )
 from gpe_pl.markdown import table_row
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio, median_of_means
@@ -102,18 +101,18 @@ class Cell:
         return self.interval.estimate * NOT_LEARNED <= min(self.trivial.values())
 
 
-def compares_models(folder: Path) -> bool:
-    """Whether the runs below a folder are of several models or domains."""
-    return len({(domain_of(run), model_of(run)) for run in finished_runs(folder)}) > 1
+def compares_models(runs: list[Run]) -> bool:
+    """Whether runs are of several models or domains."""
+    return len({(domain_of(run), model_of(run)) for run in runs}) > 1
 
 
-def report_domains(folder: Path) -> None:
-    """Write table and figures of all finished runs below a folder.
+def report_domains(folder: Path, runs: list[Run]) -> None:
+    """Write table and figures of finished runs into a folder.
 
     Raises:
         TableError: runs of one model and domain differ in more than their seeds, or those of a domain were judged on different scenes.
     """
-    runs = distinct_runs(finished_runs(folder))
+    runs = distinct_runs(runs)
     if not runs:
         log.warning("%s: no finished run", folder)
         return
@@ -203,19 +202,19 @@ def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, C
 
 
 def _write_csv(path: Path, runs: Sequence[Run]) -> None:
-    """One line per domain, model, seed, split, metric and horizon: the mean over trajectories. Trivial models have no seed."""
-    lines: dict[tuple[str, ...], float] = {}
+    """A line per domain, model, seed, split and metric, a column per horizon: the mean over trajectories. Trivial models have no seed."""
+    keys = ["domain", "model", "seed", "split", "metric"]
+    tables = []
     for run in runs:
-        groups: dict[tuple[str, ...], list[float]] = defaultdict(list)
-        for row in run.rows:
-            model, seed = (model_of(run), str(run.config.get("seed"))) if row.model == LEARNED else (row.model, "")
-            for split in groups_of(row):
-                groups[domain_of(run), model, seed, split, row.metric, row.horizon].append(row.value)
-        lines |= {key: float(np.mean(values)) for key, values in groups.items()}
-    with replacing(path) as part, open(part, "w", newline="", encoding="utf-8") as handle:
-        writer = csv.writer(handle)
-        writer.writerow(["domain", "model", "seed", "split", "metric", "horizon", "value"])
-        writer.writerows([*key, value] for key, value in sorted(lines.items()))
+        rows = with_groups(run.rows)
+        is_own = rows["model"] == LEARNED
+        rows = rows.assign(domain=domain_of(run), seed=np.where(is_own, str(run.config.get("seed")), ""))
+        tables.append(rows.assign(model=rows["model"].where(~is_own, model_of(run))).groupby([*keys, "horizon"])["value"].mean())
+    means = pd.concat(tables)
+    means = means[~means.index.duplicated(keep="last")].unstack("horizon")
+    means = means[sorted(means.columns, key=lambda horizon: (horizon == "full", horizon.zfill(6)))]
+    with replacing(path) as part:
+        means.sort_index().to_csv(part, float_format="%.6g", lineterminator="\n", na_rep="")
 
 
 def _markdown(

@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
+from gpe_pl import run_archive
 from gpe_pl.evaluation import LEARNED, MetricsError, Row, read_rows
 from gpe_pl.run_folder import DATA_CHECKSUMS, RunError, config_in
 
@@ -22,14 +24,27 @@ UNSEEN_GROUPS = ("interpolated", "extrapolated")
 """Where material parameters that training did not have can lie."""
 
 
+Curve = tuple[np.ndarray, np.ndarray]
+"""Steps, and the one-step validation loss at each."""
+
+
 @dataclass(frozen=True)
 class Run:
-    """A finished run: its folder, its flattened configuration, its rows, and the checksums of its data, by key of the configuration."""
+    """A finished run.
+
+    Attributes:
+        folder: where it lies, or lay before it was archived.
+        config: flattened: values by keys such as ``training.num_steps``.
+        rows: what it was evaluated to: a table with the fields of ``evaluation.Row`` as columns.
+        data: checksums of its data, by key of the configuration.
+        curve: of an archived run; others have theirs in their folder (``validation_curve``).
+    """
 
     folder: Path
     config: dict[str, Any]
-    rows: list[Row]
+    rows: pd.DataFrame
     data: dict[str, str] = field(default_factory=dict)
+    curve: Curve | None = None
 
 
 UNSAID: dict[str, Any] = {"training.sampling": "uniform", "training.push_share": 0.0, "training.push_correction": 1.0}
@@ -42,8 +57,45 @@ TRAINED = {"data.name": str, "model._target_": str, "training.num_steps": int}
 """What the configuration of every training run says, by type."""
 
 
+def table_of(rows: Iterable[Row]) -> pd.DataFrame:
+    """Rows of ``metrics.csv`` as a table."""
+    return pd.DataFrame([[*vars(row).values()] for row in rows], columns=run_archive.COLUMNS)
+
+
+def archive(runs: list[Run], root: Path, folder: Path) -> None:
+    """Keep runs below ``root`` in the two files of ``run_archive`` in a folder."""
+    about = {}
+    for run in runs:
+        settings = {f"{CONFIG}{key}": value for key, value in run.config.items()} | {
+            f"{DATA}{key}": value for key, value in run.data.items()
+        }
+        about[_name(run, root)] = settings | dict(zip(CURVE, (array.tolist() for array in validation_curve(run)), strict=True))
+    run_archive.write_archive(folder, about, {_name(run, root): run.rows for run in runs})
+
+
+CONFIG, DATA = "config:", "data:"
+"""Begin the keys under which an archive has the configuration of a run and the checksums of its data."""
+CURVE = ("validation_steps", "validation_losses")
+
+
+def _name(run: Run, root: Path) -> str:
+    return run.folder.relative_to(root).as_posix()
+
+
+def _archived(folder: Path) -> list[Run]:
+    about, rows = run_archive.read_archive(folder)
+    runs = []
+    for name, known in about.items():
+        config, data = ({key.removeprefix(kind): value for key, value in known.items() if key.startswith(kind)} for kind in (CONFIG, DATA))
+        curve = np.array(known[CURVE[0]], int), np.array(known[CURVE[1]], float)
+        runs.append(Run(folder / name, config, rows[name], data, curve))
+    return runs
+
+
 def finished_runs(folder: Path) -> list[Run]:
-    """All finished training runs below a folder, in order of their paths; evaluations beside them are none."""
+    """All finished training runs below a folder, in order of their paths, or those that are archived in it; evaluations beside them are none."""
+    if (folder / run_archive.RUNS).exists():
+        return _archived(folder)
     runs = []
     for path in sorted(folder.rglob("metrics.csv")):
         config = path.parent / "config.json"
@@ -57,7 +109,7 @@ def finished_runs(folder: Path) -> list[Run]:
                         raise RunError(
                             f"{config}: {key} is {values[key]!r}; delete the folder {path.parent}, which this package has not written"
                         )
-                runs.append(Run(path.parent, values, list(read_rows(path)), data))
+                runs.append(Run(path.parent, values, table_of(read_rows(path)), data))
             else:
                 log.warning(
                     "%s is not of a training run (%s) and is left out of the report",
@@ -111,15 +163,23 @@ def axes_of(runs: list[Run]) -> list[str]:
     return sorted(different, key=lambda k: (k == "seed", k))
 
 
-def groups_of(row: Row) -> list[str]:
-    """Splits that a row counts for; unseen parameters also apart by where they lie."""
-    return [row.split, f"{row.split}/{row.parameter_group}"] if row.parameter_group in UNSEEN_GROUPS else [row.split]
+def with_groups(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows, and those of unseen parameters a second time, under ``split/group`` by where these lie."""
+    unseen = rows[rows["parameter_group"].isin(UNSEEN_GROUPS)]
+    return pd.concat([rows, unseen.assign(split=unseen["split"] + "/" + unseen["parameter_group"])], ignore_index=True)
 
 
-def validation_curve(run_dir: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Steps and one-step validation loss of a run, over all its starts; raises ``MetricsError`` where a log is damaged."""
+def splits_of(run: Run) -> list[str]:
+    """Splits that a run was evaluated on; unseen parameters also apart by where they lie."""
+    return sorted(with_groups(run.rows)["split"].unique())
+
+
+def validation_curve(run: Run) -> Curve:
+    """Of a run over all its starts; raises ``MetricsError`` where a log is damaged."""
+    if run.curve is not None:
+        return run.curve
     points: dict[int, float] = {}
-    logs = {path: path.parent.name.removeprefix("version_") for path in run_dir.glob("log/version_*/metrics.csv")}
+    logs = {path: path.parent.name.removeprefix("version_") for path in run.folder.glob("log/version_*/metrics.csv")}
     for path in sorted((path for path, version in logs.items() if version.isdecimal()), key=lambda path: int(logs[path])):
         with open(path, newline="", encoding="utf-8") as handle:
             reader = csv.DictReader(handle)
@@ -141,10 +201,15 @@ Values = list[dict[int, float]]
 
 def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon: str) -> Values:
     """What runs have of a metric, in order of trajectories."""
+    parent, _, group = split.partition("/")
     table = []
     for run in runs:
-        rows = [r for r in run.rows if r.model == model and r.metric == metric and r.horizon == horizon and split in groups_of(r)]
-        table.append({r.trajectory: r.value for r in sorted(rows, key=lambda r: r.trajectory)})
+        rows = run.rows
+        chosen = (rows["model"] == model) & (rows["metric"] == metric) & (rows["horizon"] == horizon) & (rows["split"] == parent)
+        if group:
+            chosen &= rows["parameter_group"] == group
+        found = rows[chosen].sort_values("trajectory")
+        table.append(dict(zip(found["trajectory"].tolist(), found["value"].tolist(), strict=True)))
     return [t for t in table if t]
 
 

@@ -38,7 +38,7 @@ def _fit(cfg: DictConfig, run_dir: Path) -> float:
     from gpe_pl.data.dataset import open_split, window_counts
     from gpe_pl.data.sampling import BatchSize
     from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
-    from gpe_pl.finished_runs import Run, rollout_errors
+    from gpe_pl.finished_runs import Run, rollout_errors, table_of
     from gpe_pl.graphs.features import GraphConfig
     from gpe_pl.learned_simulator import LearnedSimulator, model_class
     from gpe_pl.pretrained import fingerprint
@@ -124,7 +124,7 @@ def _fit(cfg: DictConfig, run_dir: Path) -> float:
         rows = evaluate(LearnedSimulator.from_checkpoint(best, device), evaluated, evaluation, run_dir)
         publish(loggers, run_dir, means(rows))
 
-    run = Run(run_dir, {}, list(read_rows(run_dir / "metrics.csv")))
+    run = Run(run_dir, {}, table_of(read_rows(run_dir / "metrics.csv")))
     values = [value for errors in rollout_errors([run], evaluation.splits[0], "full") for value in errors.values()]
     if not values:
         path = run_dir / "metrics.csv"

@@ -26,14 +26,14 @@ def parameter_curves(by_domain: dict[str, dict[str, list[Run]]]) -> Figure:
         for label, members in by_label.items():
             points = curves.setdefault(domain, {}).setdefault(label, {})
             for run in members:
-                errors: dict[str, dict[int, float]] = {}
-                for row in run.rows:
-                    if (row.model, row.metric, row.horizon) == (LEARNED, "rollout_mse", "full") and np.isfinite(row.parameter):
-                        if row.split not in errors:
-                            (errors[row.split],) = rollout_errors([run], row.split, "full")
-                        points.setdefault(row.parameter, []).append(errors[row.split][row.trajectory])
-                        if row.parameter_group == "seen":
-                            seen.setdefault(domain, set()).add(row.parameter)
+                rows = run.rows
+                rows = rows[(rows["model"] == LEARNED) & (rows["metric"] == "rollout_mse") & (rows["horizon"] == "full")]
+                rows = rows[np.isfinite(rows["parameter"])]
+                for split, of_split in rows.groupby("split"):
+                    (errors,) = rollout_errors([run], str(split), "full")
+                    for trajectory, parameter in zip(of_split["trajectory"], of_split["parameter"], strict=True):
+                        points.setdefault(float(parameter), []).append(errors[int(trajectory)])
+                seen.setdefault(domain, set()).update(rows[rows["parameter_group"] == "seen"]["parameter"].tolist())
     labels = {domain: _axis_label(next(iter(by_label.values()))[0]) for domain, by_label in by_domain.items()}
     return parameter_figure(curves, {domain: sorted(values) for domain, values in seen.items()}, "rollout MSE [m²]", labels)
 

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
 
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.baselines import BASELINES
-from gpe_pl.evaluation import LEARNED, Row, read_rows
+from gpe_pl.evaluation import LEARNED, read_rows
 from gpe_pl.finished_runs import (
     UNSEEN_GROUPS,
     Run,
@@ -21,11 +22,13 @@ from gpe_pl.finished_runs import (
     axes_of,
     distinct_runs,
     finished_runs,
-    groups_of,
     rollout_errors,
     shared_table,
+    splits_of,
+    table_of,
     validation_curve,
     values_by_seed,
+    with_groups,
 )
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.markdown import table_row
@@ -45,9 +48,9 @@ TABLE_HORIZONS = 4
 """The longest horizons, shown in the Markdown table; ``table.csv`` has all."""
 
 
-def report_sweep(folder: Path) -> None:
-    """Compare all finished runs below a folder."""
-    _report(folder, distinct_runs(finished_runs(folder)))
+def report_sweep(folder: Path, runs: list[Run]) -> None:
+    """Compare finished runs; writes into a folder."""
+    _report(folder, distinct_runs(runs))
 
 
 def report(folder: Path) -> None:
@@ -66,13 +69,14 @@ def _report(folder: Path, runs: list[Run]) -> None:
     _write_csv(folder / "table.csv", axes, runs)
     ratios = forward_time_ratios(variants)
     replace_text(folder / SWEEP_MD, _markdown(axes, variants, ratios))
-    curves = {", ".join(v) or LEARNED: [validation_curve(r.folder) for r in members] for v, members in variants.items()}
+    curves = {", ".join(v) or LEARNED: [validation_curve(r) for r in members] for v, members in variants.items()}
     curves = {k: [c for c in v if len(c[0])] for k, v in curves.items()}
     if all(curves.values()):
         from gpe_pl.viz.figures import validation_loss_figure
 
         save_figure(validation_loss_figure(curves), folder / "validation_loss.png", dpi=150)
-    if any(row.parameter_group in UNSEEN_GROUPS and np.isfinite(row.parameter) for row in runs[0].rows):
+    rows = runs[0].rows
+    if (rows["parameter_group"].isin(UNSEEN_GROUPS) & np.isfinite(rows["parameter"])).any():
         by_label = {", ".join(v) or LEARNED: members for v, members in variants.items()}
         save_figure(parameter_curves({str(runs[0].config["data.name"]): by_label}), folder / PARAMETER_FIGURE, dpi=150)
 
@@ -80,22 +84,21 @@ def _report(folder: Path, runs: list[Run]) -> None:
 def conclusion(folder: Path) -> str:
     """What a command ends with: the numbers of the run or evaluation in a folder, and what to look at next."""
     viewers = sorted(folder.glob("rollout_*_00.html"))
-    return "\n".join([summary(list(read_rows(folder / "metrics.csv"))), *(printable(f"look at {viewer}") for viewer in viewers)])
+    return "\n".join([summary(table_of(read_rows(folder / "metrics.csv"))), *(printable(f"look at {viewer}") for viewer in viewers)])
 
 
-def summary(rows: list[Row]) -> str:
+def summary(rows: pd.DataFrame) -> str:
     """Means over trajectories as plain text: a line per split, metric and model, a column per horizon. Trivial models have their rollout MSE only."""
-    groups: dict[tuple[str, str, str], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        if row.model not in BASELINES or row.metric == "rollout_mse":
-            for split in groups_of(row):
-                groups[split, row.metric, row.model][row.horizon].append(row.value)
-    horizons = sorted({row.horizon for row in rows} - {"1", "full"}, key=int)
+    shown = with_groups(rows[~rows["model"].isin(BASELINES) | (rows["metric"] == "rollout_mse")])
+    groups: dict[tuple[str, str, str], dict[str, float]] = defaultdict(dict)
+    for (split, metric, model, horizon), value in shown.groupby(["split", "metric", "model", "horizon"])["value"].mean().items():
+        groups[split, metric, model][horizon] = value
+    horizons = sorted({*rows["horizon"]} - {"1", "full"}, key=int)
     lines = [(("split", "metric", "model"), "".join(f"{h:>11}" for h in (*horizons, "full")))]
     for key, values in sorted(groups.items()):
         if "1" in values:  # of one step, or of a rollout as a whole
             values["full"] = values["1"]
-        lines.append((key, "".join(f"{np.mean(values[h]):11.4g}" if h in values else " " * 11 for h in (*horizons, "full"))))
+        lines.append((key, "".join(f"{values[h]:11.4g}" if h in values else " " * 11 for h in (*horizons, "full"))))
     widths = [max(len(key[column]) for key, _ in lines) for column in range(3)]
     return "\n".join(" ".join(f"{name:{width}}" for name, width in zip(key, widths, strict=True)) + cells for key, cells in lines)
 
@@ -109,15 +112,12 @@ def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
     lines: list[list[Any]] = []
     for run in runs:
         key = [run.config.get(a) for a in axes]
-        groups: dict[tuple[str, str, str], list[float]] = defaultdict(list)
-        for row in run.rows:
-            if row.model == LEARNED:
-                for split in groups_of(row):
-                    groups[split, row.metric, row.horizon].append(row.value)
-        steps, losses = validation_curve(run.folder)
+        rows = with_groups(run.rows[run.rows["model"] == LEARNED])
+        means = rows.groupby(["split", "metric", "horizon"])["value"].mean().to_dict()
+        steps, losses = validation_curve(run)
         if len(steps):
-            groups["val", "one_step_nmse", "1"].append(float(losses[-1]))
-        lines += [[*key, run.config.get("seed"), *group, float(np.mean(values))] for group, values in sorted(groups.items())]
+            means["val", "one_step_nmse", "1"] = float(losses[-1])
+        lines += [[*key, run.config.get("seed"), *group, value] for group, value in sorted(means.items())]
     with replacing(path) as part, open(part, "w", newline="", encoding="utf-8") as handle:
         writer = csv.writer(handle)
         writer.writerow([*(_column(a) for a in axes), "seed", "split", "metric", "horizon", "value"])
@@ -181,7 +181,7 @@ def _training_table(names: list[str], variants: dict[tuple[str, ...], list[Run]]
     lines = table_row(header), "|" + "---|" * len(header)
     rows = []
     for key, runs in variants.items():
-        losses = [loss[-1] for _, loss in (validation_curve(r.folder) for r in runs) if len(loss)]
+        losses = [loss[-1] for _, loss in (validation_curve(r) for r in runs) if len(loss)]
         rows.append(
             table_row(
                 [
@@ -204,9 +204,9 @@ def _training_table(names: list[str], variants: dict[tuple[str, ...], list[Run]]
 
 
 def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]], first: Run) -> list[str]:
-    splits = sorted({split for r in first.rows for split in groups_of(r)})
+    splits = splits_of(first)
     horizons = _horizons(first)
-    baselines = sorted({r.model for r in first.rows} - {LEARNED})
+    baselines = sorted({*first.rows["model"]} - {LEARNED})
     header = [*names, "split", *(f"@{h}" for h in horizons)]
     lines = [table_row(header), "|" + "---|" * len(header)]
     for split in splits:
@@ -235,20 +235,20 @@ def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]],
 
 
 def _horizons(run: Run) -> list[str]:
-    found = {r.horizon for r in run.rows if r.metric == "rollout_mse"}
+    found = {*run.rows[run.rows["metric"] == "rollout_mse"]["horizon"]}
     return sorted(found, key=lambda h: (h == "full", h.zfill(6)))[-TABLE_HORIZONS:]
 
 
 def _stress_table(names: list[str], variants: dict[tuple[str, ...], list[Run]]) -> list[str]:
     """Errors of displacement, velocity and stress beside each other, of models that decode a stress."""
-    stressed = {key: runs for key, runs in variants.items() if any(r.metric in STRESS_METRICS for r in runs[0].rows)}
+    stressed = {key: runs for key, runs in variants.items() if runs[0].rows["metric"].isin(STRESS_METRICS).any()}
     if not stressed:
         return []
     horizons = _horizons(next(iter(stressed.values()))[0])
     header = [*names, "split", "relative error", *(f"@{h}" for h in horizons)]
     lines = ["", table_row(header), "|" + "---|" * len(header)]
     for key, runs in stressed.items():
-        for split in sorted({r.split for r in runs[0].rows}):
+        for split in sorted({*runs[0].rows["split"]}):
             for metric in ("displacement_error", "velocity_error", *STRESS_METRICS):
                 cells = [_interval(values_by_seed(runs, LEARNED, split, metric, h)) for h in horizons]
                 lines.append(table_row([*(key or (LEARNED,)), split, metric.removesuffix("_error").replace("_", " "), *cells]))

@@ -17,18 +17,19 @@ from gpe_pl.trial_table import TRIALS_MD, compares_settings, report_trials
 
 
 def write_tables(folder: Path) -> Path:
-    """Write the tables that suit what the runs below a folder differ in.
+    """Write the tables that suit what the runs below a folder differ in, or those that are archived in it.
 
     Returns:
         The one to read, which is not there where no run has finished.
     """
-    if compares_settings(folder):
-        report_trials(folder)
+    runs = finished_runs(folder)
+    if compares_settings(runs):
+        report_trials(folder, runs)
         return folder / TRIALS_MD
-    if compares_models(folder):
-        report_domains(folder)
+    if compares_models(runs):
+        report_domains(folder, runs)
         return folder / TABLE_MD
-    report_sweep(folder)
+    report_sweep(folder, runs)
     return folder / SWEEP_MD
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.domain_table import TABLE_MD, TABLES, domain_of, model_of
 from gpe_pl.evaluation import LEARNED
-from gpe_pl.finished_runs import Run, axes_of, finished_runs, rollout_errors, shared_table, validation_curve, values_by_seed
+from gpe_pl.finished_runs import Run, axes_of, rollout_errors, shared_table, validation_curve, values_by_seed
 from gpe_pl.markdown import table_row
 from gpe_pl.metrics import BOTH, bootstrap_interval, median_of_means
 
@@ -30,21 +30,20 @@ NUM_STEPS = "training.num_steps"
 """Follows from a budget of time and the other settings; where these and the seed are equal, it was tried."""
 
 
-def compares_settings(folder: Path) -> bool:
-    """Whether the runs below a folder are of several models or domains, and one of these with several settings."""
-    groups = _by_model(finished_runs(folder))
+def compares_settings(runs: list[Run]) -> bool:
+    """Whether runs are of several models or domains, and one of these with several settings."""
+    groups = _by_model(runs)
     return len(groups) > 1 and any(_settings(runs) for runs in groups.values())
 
 
-def report_trials(folder: Path) -> None:
+def report_trials(folder: Path, runs: list[Run]) -> None:
     """Write ``trials.csv``, a line per run and split, and ``trials.md``, a line per setting with the best of each domain and model in bold.
 
     A table of models in domains that is there goes: it would not be of all runs.
     """
-    runs = finished_runs(folder)
     groups = _by_model(runs)
     settings = sorted({key for members in groups.values() for key in _settings(members)})
-    splits = sorted({row.split for run in runs for row in run.rows})
+    splits = sorted({split for run in runs for split in run.rows["split"]})
     columns = [key.rpartition(".")[2] for key in settings]
     _write_csv(folder / TRIALS_CSV, groups, settings, columns, splits)
     header = ["domain", "model", *columns, "seeds", "one-step nMSE", *splits]
@@ -57,7 +56,7 @@ def report_trials(folder: Path) -> None:
         best = {s: min(error[v][s] for v in variants) for s in splits}
         for v, runs in sorted(variants.items()):
             cells = [_cell(runs, s, error[v][s], is_best=bool(np.isfinite(error[v][s]) and error[v][s] == best[s])) for s in splits]
-            losses = [loss[-1] for _, loss in (validation_curve(r.folder) for r in runs) if len(loss)]
+            losses = [loss[-1] for _, loss in (validation_curve(r) for r in runs) if len(loss)]
             lines.append(table_row([domain, model, *v, str(len(runs)), f"{np.mean(losses):.3f}" if losses else "–", *cells]))
     note = (
         "Rollout MSE ×1e-3 [m²] over all frames: mean over the trajectories of a split, median over seeds, 95 % bootstrap interval over both (of one seed "

@@ -15,6 +15,7 @@ from gpe_pl import pretrained
 from gpe_pl.config import ConfigError
 from gpe_pl.evaluate import evaluate_checkpoint
 from gpe_pl.evaluation import Row, read_rows
+from gpe_pl.finished_runs import table_of
 from gpe_pl.fit import fit
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
@@ -153,7 +154,7 @@ def test_a_summary_has_a_line_per_metric_and_a_column_per_horizon() -> None:
         row("learned", "share_outside_uncontained", "full", 0.0),
         *(row("ballistic", metric, "full", 7.0) for metric in ("rollout_mse", "velocity_error")),
     ]
-    header, *lines = summary(rows).splitlines()
+    header, *lines = summary(table_of(rows)).splitlines()
     assert len({len(line) for line in (header, *lines)}) == 1  # aligned
     assert header.split() == ["split", "metric", "model", "20", "100", "full"]
     assert [line.split() for line in lines] == [

@@ -24,7 +24,7 @@ from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import NoiseError
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation import StartError, read_rows, write_rows
-from gpe_pl.finished_runs import validation_curve
+from gpe_pl.finished_runs import Run, finished_runs, table_of, validation_curve
 from gpe_pl.fit import fit
 from gpe_pl.learned_simulator import LearnedSimulator
 from gpe_pl.progress import Progress
@@ -116,7 +116,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     for name in ("last", "best"):
         a, b = checkpoint(whole, name), checkpoint(parts, name)
         assert_same_checkpoint(a, b)
-    curves = [[v.tolist() for v in validation_curve(tmp_path / name)] for name in ("whole", "parts")]
+    curves = [[v.tolist() for v in validation_curve(Run(tmp_path / name, {}, table_of([])))] for name in ("whole", "parts")]
     assert curves[0] == curves[1]
     assert curves[0][0] == [2, 4, 6]
     assert (tmp_path / "whole" / "metrics.csv").read_bytes() == (tmp_path / "parts" / "metrics.csv").read_bytes()
@@ -479,7 +479,7 @@ def test_a_sweep_ends_with_table_and_plot(tiny_data: Path, tmp_path: Path) -> No
             )
     folder = tmp_path / "log"  # a folder's name must not matter
     shutil.copytree(folder / "model.interaction=odd" / "seed=0", folder / "again")  # the same run once more is no further seed
-    report_sweep(folder)
+    report_sweep(folder, finished_runs(folder))
     with open(folder / "table.csv", newline="") as handle:
         reader = csv.DictReader(handle)
         assert reader.fieldnames == ["interaction", "seed", "split", "metric", "horizon", "value"]
@@ -496,7 +496,7 @@ def test_a_sweep_ends_with_table_and_plot(tiny_data: Path, tmp_path: Path) -> No
     values = [r.value for r in run if (r.model, r.split, r.metric, r.horizon) == ("learned", "test_unseen", "rollout_mse", "full")]
     assert chosen["rollout_mse"] == pytest.approx(np.mean(values))
     val = {(r["interaction"], r["seed"]): float(r["value"]) for r in rows if r["split"] == "val"}
-    assert val["negated", "0"] == validation_curve(folder / "model.interaction=negated" / "seed=0")[1][-1]
+    assert val["negated", "0"] == validation_curve(Run(folder / "model.interaction=negated" / "seed=0", {}, table_of([])))[1][-1]
     table = (folder / "table.md").read_text()
     assert all(f"| {name} |" in table for name in ("negated", "odd", "ballistic", "stops_at_walls", "constant_velocity"))
     assert (folder / "validation_loss.png").stat().st_size > 1000

@@ -70,7 +70,7 @@ def cells(text: str, domain: str) -> dict[str, str]:
 
 
 def test_the_table_judges_medians_over_seeds_on_unseen_parameters(sweep: Path) -> None:
-    report_domains(sweep)
+    report_domains(sweep, finished_runs(sweep))
     text = (sweep / "table1.md").read_text()
     sand, fem = cells(text, "sand"), cells(text, "fem")
     assert sand["GPE"].startswith("2 [")
@@ -88,7 +88,7 @@ def test_the_table_judges_medians_over_seeds_on_unseen_parameters(sweep: Path) -
 
 
 def test_a_second_table_has_the_medians_over_trajectories(sweep: Path) -> None:
-    report_domains(sweep)
+    report_domains(sweep, finished_runs(sweep))
     text = (sweep / "table1.md").read_text().partition("it judges nothing.")[2].partition("Training")[0]
     assert cells(text, "sand") == {"domain": "sand", "DPINet": "20", "GNS": "4", "GPE": "2.5", "GPE / best baseline": "0.62"}
     assert cells(text, "fem")["GPE / best baseline"] == "1.11"  # 5 over the median of 1 and ballistic flight's 8
@@ -100,7 +100,7 @@ def test_all_domains_are_judged_on_values_between_trained_ones_and_outside(
 ) -> None:
     monkeypatch.setitem(BALLISTIC, domain, 30e-3)
     write_run(tmp_path / "run", domain, "GPE", 0, [1e-3, 5e-3])
-    report_domains(tmp_path)
+    report_domains(tmp_path, finished_runs(tmp_path))
     assert cells((tmp_path / "table1.md").read_text(), domain)["GPE"] == "3 [1, 5]"
 
 
@@ -110,7 +110,7 @@ def test_a_failed_rollout_counts_as_ballistic_flight_in_its_scene(tmp_path: Path
     write_run(tmp_path / "GPE", domain, "GPE", 0, [2e-3, 3e-3], ballistic=flight)
     write_run(tmp_path / "GNS", domain, "GNS", 0, [4e-3, float("inf")], ballistic=flight)
     write_run(tmp_path / "DPINet", domain, "DPINet", 0, [12e-3, 13e-3], ballistic=flight)
-    report_domains(tmp_path)
+    report_domains(tmp_path, finished_runs(tmp_path))
     row = cells((tmp_path / "table1.md").read_text(), domain)
     assert row["GNS"] == "7 [4, 10], 1 of 2 failed"
     assert row["GPE / best baseline"] == "**0.36** [0.30, 0.50]"  # 2.5 over 7; 3 over 10 and 2 over 4
@@ -120,7 +120,7 @@ def test_a_failed_rollout_counts_as_ballistic_flight_in_its_scene(tmp_path: Path
 def test_the_best_trivial_baseline_says_what_has_learned(tmp_path: Path) -> None:
     write_run(tmp_path / "GPE", "sand", "GPE", 0, [4e-3, 4e-3], stops_at_walls=[7e-3, 7e-3])
     write_run(tmp_path / "before", "fluid", "GPE", 0, [4e-3, 4e-3])
-    report_domains(tmp_path)
+    report_domains(tmp_path, finished_runs(tmp_path))
     text = (tmp_path / "table1.md").read_text()
     row = cells(text, "sand")
     assert row["GPE"].startswith("*not learned* (4 ") and row["ballistic"] == "30" and row["stops at walls"] == "7"
@@ -128,39 +128,40 @@ def test_the_best_trivial_baseline_says_what_has_learned(tmp_path: Path) -> None
 
 
 def test_the_csv_has_every_number_once(sweep: Path) -> None:
-    report_domains(sweep)
+    report_domains(sweep, finished_runs(sweep))
     with open(sweep / "table1.csv", newline="") as handle:
         reader = csv.DictReader(handle)
-        assert reader.fieldnames == ["domain", "model", "seed", "split", "metric", "horizon", "value"]
+        assert reader.fieldnames == ["domain", "model", "seed", "split", "metric", "full"]
         rows = list(reader)
-    assert len({tuple(r.values())[:-1] for r in rows}) == len(rows)
-    found = {(r["domain"], r["model"], r["seed"], r["split"]): float(r["value"]) for r in rows}
+    keys = [tuple(r.values())[:-1] for r in rows]
+    assert len({*keys}) == len(keys)
+    found = {(r["domain"], r["model"], r["seed"], r["split"]): float(r["full"]) for r in rows}
     assert found["sand", "GPE", "0", "test_unseen/interpolated"] == pytest.approx(1e-3)
     assert found["sand", "GPE", "0", "test_unseen"] == pytest.approx((1e-3 + 3e-3) / 2)
     assert found["sand", "ballistic", "", "test_unseen/interpolated"] == pytest.approx(30e-3)
 
 
 def test_on_other_scenes_the_papers_ratios_are_left_out(sweep: Path) -> None:
-    report_domains(sweep)
+    report_domains(sweep, finished_runs(sweep))
     assert "paper" in cells((sweep / "table1.md").read_text(), "sand")
     for path in sweep.rglob("config.json"):
         config = json.loads(path.read_text())
         sealed.write(path, config | {"evaluation": {"data": {"name": "larger", "scene": {"num_particles": 9}}}})
-    report_domains(sweep)
+    report_domains(sweep, finished_runs(sweep))
     text = (sweep / "table1.md").read_text()
     assert "paper" not in text
     assert cells(text, "sand")["GPE / best baseline"] == "0.50 [0.25, 2.00]"
 
 
 def test_figures_are_drawn(sweep: Path) -> None:
-    report_domains(sweep)
+    report_domains(sweep, finished_runs(sweep))
     assert all((sweep / name).stat().st_size > 1000 for name in ("table1.png", "error_by_parameter.png"))
 
 
 def test_only_sweeps_over_models_or_domains_compare_models(sweep: Path) -> None:
-    assert compares_models(sweep)
-    assert not compares_models(sweep / "sand" / "GPE")
-    assert not compares_models(sweep / "nothing")
+    assert compares_models(finished_runs(sweep))
+    assert not compares_models(finished_runs(sweep / "sand" / "GPE"))
+    assert not compares_models(finished_runs(sweep / "nothing"))
 
 
 @pytest.mark.parametrize(
@@ -177,17 +178,17 @@ def test_only_sweeps_over_models_or_domains_compare_models(sweep: Path) -> None:
 def test_a_comparison_that_is_lost_is_said(tmp_path: Path, own: list[float], baseline: list[float], cell: str) -> None:
     write_run(tmp_path / "a", "sand", "GPE", 0, own)
     write_run(tmp_path / "b", "sand", "GNS", 0, baseline)
-    report_domains(tmp_path)
+    report_domains(tmp_path, finished_runs(tmp_path))
     assert cells((tmp_path / "table1.md").read_text(), "sand")["GPE / best baseline"] == cell
 
 
 def test_what_is_no_training_run_and_what_is_there_twice_is_left_out(sweep: Path, caplog: pytest.LogCaptureFixture) -> None:
-    report_domains(sweep)
+    report_domains(sweep, finished_runs(sweep))
     before = (sweep / "table1.md").read_text()
     shutil.copytree(sweep / "sand" / "GPE" / "0", sweep / "sand" / "GPE" / "0 copy")
     evaluation = shutil.copytree(sweep / "sand" / "GPE" / "0", sweep / "evaluated")
     sealed.write(evaluation / "config.json", {"checkpoint": "best.ckpt"})
-    report_domains(sweep)
+    report_domains(sweep, finished_runs(sweep))
     assert (sweep / "table1.md").read_text() == before
     assert "0 copy repeats" in caplog.text and "evaluated is not of a training run (data.name, model._target_" in caplog.text
 
@@ -196,7 +197,7 @@ def test_trajectories_that_a_seed_lacks_are_left_out(tmp_path: Path) -> None:
     write_run(tmp_path / "0", "sand", "GPE", 0, [1e-3, 3e-3, 50e-3])
     write_run(tmp_path / "1", "sand", "GPE", 1, [1e-3, 3e-3])
     write_run(tmp_path / "2", "sand", "GNS", 0, [2e-3, 6e-3, 1e-3])
-    report_domains(tmp_path)
+    report_domains(tmp_path, finished_runs(tmp_path))
     row = cells((tmp_path / "table1.md").read_text(), "sand")
     assert row["GPE"].startswith("2 [") and row["GPE / best baseline"] == "**0.50** [0.50, 0.50]"
 
@@ -204,7 +205,7 @@ def test_trajectories_that_a_seed_lacks_are_left_out(tmp_path: Path) -> None:
 def test_a_run_without_the_judged_split_does_not_hide_the_others(tmp_path: Path) -> None:
     write_run(tmp_path / "0", "sand", "GPE", 0, [])
     write_run(tmp_path / "1", "sand", "GPE", 1, [2e-3, 2e-3])
-    report_domains(tmp_path)
+    report_domains(tmp_path, finished_runs(tmp_path))
     assert cells((tmp_path / "table1.md").read_text(), "sand")["GPE"].startswith("2 [2, 2]")
 
 
@@ -218,7 +219,7 @@ def change(folder: Path, part: str, **values: Any) -> None:
 def test_runs_that_differ_in_more_than_the_seed_are_no_seeds(sweep: Path, part: str, key: str) -> None:
     change(sweep / "sand" / "GPE" / "1", part, **{key: 7})
     with pytest.raises(TableError, match=f"GPE on sand differ in {part}.{key}, not in the seed alone"):
-        report_domains(sweep)
+        report_domains(sweep, finished_runs(sweep))
     assert not (sweep / "table1.csv").exists()
 
 
@@ -248,16 +249,16 @@ def test_rollouts_from_different_frames_do_not_compare(sweep: Path) -> None:
     for run in finished_runs(sweep / "sand"):
         change(run.folder, "graph", history=1 if "GPE" in run.folder.parts else 5)
     with pytest.raises(TableError, match=r"models on sand start at different frames \(1, 5:"):
-        report_domains(sweep)
+        report_domains(sweep, finished_runs(sweep))
     for run in finished_runs(sweep / "sand" / "GPE"):
         change(run.folder, "evaluation", start_frame=5)
-    report_domains(sweep)
+    report_domains(sweep, finished_runs(sweep))
 
 
 def test_models_judged_on_other_scenes_do_not_compare(sweep: Path) -> None:
     change(sweep / "sand" / "GNS" / "0", "evaluation", data={"name": "sand_judged"})
     with pytest.raises(TableError, match=r"models on sand .* different data \(evaluation.data.name\)"):
-        report_domains(sweep)
+        report_domains(sweep, finished_runs(sweep))
 
 
 def test_models_are_compared_on_the_same_trajectories(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -265,7 +266,7 @@ def test_models_are_compared_on_the_same_trajectories(tmp_path: Path, caplog: py
     write_run(tmp_path / "GNS", "sand", "GNS", 0, [4e-3, 6e-3, 10e-3])
     rows = list(read_rows(tmp_path / "GNS" / "metrics.csv"))
     write_rows(tmp_path / "GNS" / "metrics.csv", [r for r in rows if r.trajectory != 1])
-    report_domains(tmp_path)
+    report_domains(tmp_path, finished_runs(tmp_path))
     row = cells((tmp_path / "table1.md").read_text(), "sand")
     assert row["GPE"].startswith("3 [") and row["GNS"].startswith("7 [") and row["GPE / best baseline"].startswith("**0.43** ")
     assert "sand: judged on the 2 of 3 trajectories" in caplog.text
@@ -274,14 +275,14 @@ def test_models_are_compared_on_the_same_trajectories(tmp_path: Path, caplog: py
 def test_a_failed_rollout_is_counted(tmp_path: Path) -> None:
     for seed, errors in enumerate([[1e-3, 1e-3], [3e-3, 3e-3], [float("inf"), 1e-3]]):
         write_run(tmp_path / str(seed), "sand", "GPE", seed, errors)
-    report_domains(tmp_path)
+    report_domains(tmp_path, finished_runs(tmp_path))
     row = cells((tmp_path / "table1.md").read_text(), "sand")
     assert row["GPE"] == "3 [1, 30], 1 of 6 failed"
 
 
 def test_runs_with_other_pictures_are_seeds_all_the_same(sweep: Path) -> None:
-    report_domains(sweep)
+    report_domains(sweep, finished_runs(sweep))
     before = (sweep / "table1.md").read_text()
     change(sweep / "sand" / "GPE" / "1", "evaluation", num_pictures=7)
-    report_domains(sweep)
+    report_domains(sweep, finished_runs(sweep))
     assert (sweep / "table1.md").read_text() == before

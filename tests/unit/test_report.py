@@ -11,6 +11,7 @@ import pytest
 
 from gpe_pl import report, sealed
 from gpe_pl.evaluation import LEARNED, MetricsError, Row, read_rows, write_rows
+from gpe_pl.finished_runs import finished_runs
 from gpe_pl.run_folder import RunError
 
 ERRORS = {  # of two test scenes; free flight has 2e-3 and 6e-3
@@ -51,7 +52,7 @@ def cells(folder: Path, interaction: str) -> list[list[str]]:
 
 
 def test_errors_are_means_and_factors_over_the_best_trivial_baseline(runs: Path) -> None:
-    report.report_sweep(runs)
+    report.report_sweep(runs, finished_runs(runs))
     training, rollout, *_ = cells(runs, "negated")
     assert training[1:3] == ["2", "0.3000 (0.2000 – 0.4000)"]
     assert rollout[1:] == ["test_unseen", "2 **2.0×**"]
@@ -65,13 +66,13 @@ def test_errors_are_means_and_factors_over_the_best_trivial_baseline(runs: Path)
 
 
 def test_failed_rollouts_are_counted(runs: Path) -> None:
-    report.report_sweep(runs)
+    report.report_sweep(runs, finished_runs(runs))
     _, rollout, *_ = cells(runs, "directed")
     assert rollout[2] == "3.5 **1.1×**, 1 of 2 failed"  # ballistic flight's 2 in the scene that failed, and 5
 
 
 def test_the_csv_has_unseen_values_also_apart(runs: Path) -> None:
-    report.report_sweep(runs)
+    report.report_sweep(runs, finished_runs(runs))
     with open(runs / "table.csv", newline="") as handle:
         lines = [line for line in csv.DictReader(handle) if line["interaction"] == "negated" and line["seed"] == "0"]
     values = {line["split"]: float(line["value"]) for line in lines if line["metric"] == "rollout_mse"}
@@ -80,7 +81,7 @@ def test_the_csv_has_unseen_values_also_apart(runs: Path) -> None:
 
 def test_a_repeated_run_counts_once(runs: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_run(runs / "again", "odd", 0)
-    report.report_sweep(runs)
+    report.report_sweep(runs, finished_runs(runs))
     assert cells(runs, "odd")[0][1] == "1"
     assert "repeats" in caplog.text
 
@@ -92,7 +93,7 @@ def test_a_damaged_configuration_is_named(runs: Path, content: bytes) -> None:
     path = runs / "negated" / "0" / "config.json"
     path.write_bytes(content)
     with pytest.raises(RunError, match=r"negated/0/config.json: .*; delete the folder"):
-        report.report_sweep(runs)
+        report.report_sweep(runs, finished_runs(runs))
 
 
 @pytest.mark.parametrize(
@@ -103,7 +104,7 @@ def test_a_configuration_of_other_types_is_named(runs: Path, change: dict[str, A
     values = sealed.read(path, "")
     sealed.write(path, values | change)
     with pytest.raises(RunError, match=r"negated/0/config.json: [a-z_.]+ is .*; delete the folder"):
-        report.report_sweep(runs)
+        report.report_sweep(runs, finished_runs(runs))
 
 
 @pytest.mark.parametrize(
@@ -112,10 +113,10 @@ def test_a_configuration_of_other_types_is_named(runs: Path, change: dict[str, A
 def test_a_damaged_log_of_the_training_is_named(runs: Path, content: bytes) -> None:
     (runs / "odd" / "0" / "log" / "version_mine").mkdir()
     (runs / "odd" / "0" / "log" / "version_mine" / "metrics.csv").touch()  # of somebody else
-    report.report_sweep(runs)
+    report.report_sweep(runs, finished_runs(runs))
     (runs / "odd" / "0" / "log" / "version_0" / "metrics.csv").write_bytes(content)
     with pytest.raises(MetricsError, match=r"odd/0/log/version_0/metrics.csv, line \d: damaged \(.*; delete the file"):
-        report.report_sweep(runs)
+        report.report_sweep(runs, finished_runs(runs))
 
 
 def test_names_of_files_that_are_shown_are_printable(runs: Path) -> None:
@@ -125,7 +126,7 @@ def test_names_of_files_that_are_shown_are_printable(runs: Path) -> None:
 
 
 def test_a_parameter_that_training_did_not_have_makes_a_figure(runs: Path) -> None:
-    report.report_sweep(runs)
+    report.report_sweep(runs, finished_runs(runs))
     assert (runs / "error_by_parameter.png").stat().st_size > 1000
 
 
@@ -134,7 +135,7 @@ def test_stress_is_reported_beside_displacement_and_velocity(runs: Path) -> None
     values = {"displacement_error": 0.25, "velocity_error": 0.5, "von_mises_error": 0.75, "stress_error": 1.25}
     rows = [Row(LEARNED, "test_unseen", 0, "interpolated", 20.0, metric, "full", value) for metric, value in values.items()]
     write_rows(path, [*read_rows(path), *rows])
-    report.report_sweep(runs)
+    report.report_sweep(runs, finished_runs(runs))
     found = {row[2]: row[3] for row in cells(runs, "negated") if len(row) == 4}
     assert found == {"displacement": "0.25", "velocity": "0.5", "von mises": "0.75", "stress": "1.25"}
     assert not [row for row in cells(runs, "odd") if len(row) == 4]
@@ -143,5 +144,5 @@ def test_stress_is_reported_beside_displacement_and_velocity(runs: Path) -> None
 def test_scenes_without_one_parameter_make_no_figure(runs: Path) -> None:
     for path in runs.glob("*/*/metrics.csv"):
         write_rows(path, [replace(row, parameter=float("nan")) for row in read_rows(path)])
-    report.report_sweep(runs)
+    report.report_sweep(runs, finished_runs(runs))
     assert (runs / "table.md").exists() and not (runs / "error_by_parameter.png").exists()

@@ -10,6 +10,7 @@ import pytest
 
 from gpe_pl import sealed
 from gpe_pl.evaluation import LEARNED, Row, write_rows
+from gpe_pl.finished_runs import finished_runs
 from gpe_pl.trial_table import compares_settings, report_trials
 
 ERRORS = {  # of two seeds, by domain, model and noise
@@ -39,7 +40,7 @@ def trials(tmp_path: Path) -> Path:
 
 
 def test_the_best_setting_of_each_model_is_bold(trials: Path) -> None:
-    report_trials(trials)
+    report_trials(trials, finished_runs(trials))
     rows = [[c.strip() for c in line.strip("|").split("|")] for line in (trials / "trials.md").read_text().splitlines() if "|" in line]
     assert rows[0] == ["domain", "model", "velocity_noise_of_change", "seeds", "one-step nMSE", "val"]
     assert rows[2:] == [
@@ -51,7 +52,7 @@ def test_the_best_setting_of_each_model_is_bold(trials: Path) -> None:
 
 
 def test_the_csv_has_a_line_per_run_and_split(trials: Path) -> None:
-    report_trials(trials)
+    report_trials(trials, finished_runs(trials))
     with open(trials / "trials.csv", newline="") as handle:
         lines = list(csv.DictReader(handle))
     assert len(lines) == 5
@@ -63,15 +64,15 @@ def test_seeds_and_steps_are_not_settings(tmp_path: Path) -> None:
     for model in ("GPE", "GNS"):
         for seed in (0, 1):
             write_run(tmp_path / model / str(seed), "sand", model, 0.3, seed, [1e-3])
-    assert not compares_settings(tmp_path)
+    assert not compares_settings(finished_runs(tmp_path))
 
 
 def test_one_model_with_several_settings_is_an_ablation(tmp_path: Path) -> None:
     for noise in (0.3, 1.0):
         write_run(tmp_path / str(noise), "sand", "GPE", noise, 0, [1e-3])
-    assert not compares_settings(tmp_path)
+    assert not compares_settings(finished_runs(tmp_path))
     write_run(tmp_path / "GNS", "sand", "GNS", 0.3, 0, [1e-3])
-    assert compares_settings(tmp_path)
+    assert compares_settings(finished_runs(tmp_path))
 
 
 def test_another_budget_alone_is_a_setting(tmp_path: Path) -> None:
@@ -82,8 +83,8 @@ def test_another_budget_alone_is_a_setting(tmp_path: Path) -> None:
     config = json.loads((longer / "config.json").read_text())
     config["training"]["num_steps"] = 9000
     sealed.write(longer / "config.json", config)
-    assert compares_settings(tmp_path)
-    report_trials(tmp_path)
+    assert compares_settings(finished_runs(tmp_path))
+    report_trials(tmp_path, finished_runs(tmp_path))
     assert "| sand | GPE | 9000 |" in (tmp_path / "trials.md").read_text()
 
 
@@ -92,6 +93,6 @@ def test_a_table_of_models_does_not_outlive_a_comparison_of_settings(tmp_path: P
         write_run(tmp_path / model, "sand", model, 0.3, 0, [1e-3])
     (tmp_path / "table1.md").write_text("of the two")
     write_run(tmp_path / "trial", "sand", "GPE", 1.0, 0, [1e-3])
-    report_trials(tmp_path)
+    report_trials(tmp_path, finished_runs(tmp_path))
     assert not (tmp_path / "table1.md").exists()
     assert "compares settings now (training.velocity_noise_of_change)" in caplog.text
