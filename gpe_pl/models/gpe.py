@@ -223,8 +223,8 @@ class GPE(nn.Module):
         others = [m for m in spec.materials if m not in self.bodies]
         if self.bodies and others and island_momentum == "ignored":
             raise IslandError(
-                f"model.decoder=contact with model.island_momentum=ignored: momentum has no exact sum where {', '.join(others)} touch "
-                f"{', '.join(self.bodies)}; choose model.island_momentum=linear or angular, or model.decoder=pair or node"
+                f"model.decoder=contact with model.island_momentum=ignored does not conserve momentum between {', '.join(self.bodies)} and "
+                f"{', '.join(others)}; choose model.island_momentum=linear or angular, or model.decoder=pair or node"
             )
         if stress and not spec.stress_channels:
             raise StressError(

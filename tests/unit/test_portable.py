@@ -87,7 +87,9 @@ def test_particles(model: Any, features: str, dim: int) -> None:
 @pytest.mark.parametrize("model", [GPE, GNS, DPINet])
 def test_meshes(model: Any, kind: Any) -> None:
     materials, dim = ("sand", "solid", "elastomer"), 3 if kind == "tetrahedra" else 2
-    settings: dict[str, Any] = {"stress": True, "level_weights": "separate", "decoder": "contact"} if model is GPE else {}
+    settings: dict[str, Any] = (
+        {"stress": True, "level_weights": "separate", "decoder": "contact", "island_momentum": "linear"} if model is GPE else {}
+    )
     learned = simulator(model, materials, dim, {"mesh": True, "num_levels": 3, "islands": model is GPE}, **settings)
     assert_same_step(PortableStep(learned), learned, scenes.mesh_state(kind, materials, num_bodies=3).to_torch())
 
