@@ -1,8 +1,9 @@
 """Copy results of runs into ``docs/results`` and the tables there into the README, so that no number is typed by hand.
 
-``python docs/embed_results.py RUN_FOLDER NAME`` takes the table, the figures and the first animation of a finished run or sweep, and of a table 1 what its
-finished runs are known by and were evaluated to, from which ``python -m gpe_pl.tables docs/results/NAME`` makes the table again.
-``python docs/embed_results.py`` only renews the README; ``--check`` fails if the README differs from ``docs/results``.
+``python docs/embed_results.py RUN_FOLDER NAME [NOTE]`` takes from a finished run, sweep or suite its tables, its figures in fewer colours, the first film, and
+where all of it comes from (``provenance.json``). It keeps the results of single rollouts in two small files (``gpe_pl.run_archive``), from which
+``python -m gpe_pl.tables docs/results/NAME`` makes the tables again. NOTE is what a reader should know besides, such as other work on the machine.
+``python docs/embed_results.py`` only renews the README and the list in ``docs/results/README.md``; ``--check`` fails if one differs from the files.
 """
 
 from __future__ import annotations
@@ -12,17 +13,31 @@ import shutil
 import sys
 from pathlib import Path
 
+from PIL import Image, ImageSequence
+
+from gpe_pl import sealed
+from gpe_pl.finished_runs import archive, finished_runs
+from gpe_pl.markdown import table_row
+from gpe_pl.provenance import ADVICE, PROVENANCE, sessions
+
 DOCS = Path(__file__).resolve().parent
+RESULTS = DOCS / "results"
 README = DOCS.parent / "README.md"
 BLOCK = re.compile(r"(<!-- begin (\S+) -->\n).*?(<!-- end -->)", re.DOTALL)
+LIST = re.compile(r"(<!-- begin list -->\n).*?(<!-- end list -->)", re.DOTALL)
 FILES = (
-    *("table.md", "table.csv", "metrics.csv", "config.json", "results.json"),
-    *("table1.md", "table1_ratios.md", "table1.csv", "table1.png", "error_by_parameter.png", "step_times.json"),
-    *("trials.md", "trials.csv"),
-    *("validation_loss.png", "error_curve_*.png", "rollout_test_*.png", "rollout_test_00.gif", "stress_*_00.png"),
-    *("long_horizon_*.png", "perturbation_*.png", "scaling.png", "cost_error_*.png"),
-    *("showcase.json", "showcase.md", "showcase.png"),
+    *("table.md", "table.csv", "config.json", "results.json", "step_times.json"),
+    *("table1.md", "table1_ratios.md", "table1.csv"),
+    *("trials.md", "trials.csv", "showcase.json", "showcase.md"),
 )
+PICTURES = (
+    *("table1.png", "error_by_parameter.png", "validation_loss.png", "scaling.png", "showcase.png"),
+    *("rollout_test_00.png", "rollout_test_unseen_00.png", "stress_test_unseen_00.png", "error_curve_test.png"),
+    *("long_horizon_*.png", "perturbation_*.png", "cost_error_*.png"),
+)
+FILM = "rollout_test_00.gif"
+MAX_WIDTH = 1400
+NUM_COLORS = 128
 
 
 def embedded(text: str) -> str:
@@ -30,34 +45,82 @@ def embedded(text: str) -> str:
     return BLOCK.sub(lambda m: m[1] + (DOCS.parent / m[2]).read_text().rstrip() + "\n" + m[3], text)
 
 
-def collect(run: Path, name: str) -> None:
+def collect(run: Path, name: str, note: str = "") -> None:
     """Copy what is worth citing of a run into ``docs/results/{name}``."""
-    target = DOCS / "results" / name
+    target = RESULTS / name
     target.mkdir(parents=True, exist_ok=True)
     is_table1 = (run / "table1.csv").exists()
     for pattern in FILES:
         for path in sorted(run.glob(pattern)):
             if not (is_table1 and path.stem == "table"):  # of all its runs at once, which says nothing
                 shutil.copy(path, target / path.name)
-    if is_table1:  # takes many hours; its rules may change
-        for metrics in sorted(run.glob("*/**/metrics.csv")):
-            if (metrics.parent / "config.json").exists():
-                kept = target / "runs" / metrics.parent.relative_to(run)
-                kept.mkdir(parents=True, exist_ok=True)
-                for file in metrics.parent.glob("metrics.csv*"):  # with its digest
-                    shutil.copy(file, kept)
-                shutil.copy(metrics.parent / "config.json", kept)
-        for picture in sorted(run.glob("data=*/model=gpe_tuned/seed=0/rollout_test_unseen_00.png")):
-            shutil.copy(picture, target / f"rollout_{picture.parts[-4].removeprefix('data=')}.png")
+    for pattern in PICTURES:
+        for path in sorted(run.glob(pattern)):
+            picture(path, target / path.name)
+    for path in sorted(run.glob("data=*/model=gpe_tuned/seed=0/rollout_test_unseen_00.png")) if is_table1 else ():
+        picture(path, target / f"rollout_{path.parts[-4].removeprefix('data=')}.png")
+    if (run / FILM).exists():
+        film(run / FILM, (target / FILM).with_suffix(".webp"))
+    runs = finished_runs(run)
+    if runs:
+        archive(runs, run, target)
+    seeds = sorted({int(found.config["seed"]) for found in runs if "seed" in found.config})
+    sealed.write(target / PROVENANCE, {"sessions": sessions(run), "seeds": seeds, "note": note})
+
+
+def picture(source: Path, target: Path) -> None:
+    """Write a figure with at most ``MAX_WIDTH`` pixels in a row and ``NUM_COLORS`` colours, which takes a third of the bytes."""
+    with Image.open(source) as image:
+        opaque = Image.new("RGB", image.size, "white")
+        opaque.paste(image, mask=image.convert("RGBA").getchannel("A"))
+    if opaque.width > MAX_WIDTH:
+        opaque = opaque.resize((MAX_WIDTH, round(opaque.height * MAX_WIDTH / opaque.width)), Image.Resampling.LANCZOS)
+    opaque.quantize(NUM_COLORS, dither=Image.Dither.NONE).save(target, optimize=True)
+
+
+def film(source: Path, target: Path) -> None:
+    """Write an animation as WebP, of every second frame."""
+    with Image.open(source) as image:
+        frames = [frame.convert("RGB") for frame in ImageSequence.Iterator(image)][::2]
+        duration = 2 * image.info.get("duration", 50)
+    frames[0].save(target, save_all=True, append_images=frames[1:], duration=duration, loop=0, quality=50, method=6)
+
+
+def listed() -> str:
+    """A line per folder of results: what made it, where and when."""
+    lines = [table_row(["folder", "command", "commit", "date", "processor", "minutes", "seeds", "note"]), "|" + "---|" * 8]
+    for path in sorted(RESULTS.glob(f"*/{PROVENANCE}")):
+        about = sealed.read(path, ADVICE)
+        every = about["sessions"]
+        seconds = [session.get("seconds") for session in every]
+        cells = [
+            f"`{path.parent.name}`",
+            "; ".join(dict.fromkeys(f"`{session['command']}`" for session in every)),
+            ", ".join(dict.fromkeys(str(session.get("commit") or "not noted") for session in every)),
+            ", ".join(dict.fromkeys(str(session.get("began") or "not noted")[:10] for session in every)),
+            ", ".join(dict.fromkeys(str(session.get("processor") or "not noted") for session in every)),
+            "not noted" if None in seconds else f"{sum(seconds) / 60:.0f}",
+            ", ".join(map(str, about.get("seeds", []))) or "–",
+            about.get("note", ""),
+        ]
+        lines.append(table_row(cells))
+    return "\n".join([*lines, ""])
+
+
+def pages() -> dict[Path, str]:
+    """What pages that hold results should say."""
+    of_results = RESULTS / "README.md"
+    return {README: embedded(README.read_text()), of_results: LIST.sub(lambda m: m[1] + listed() + m[2], of_results.read_text())}
 
 
 def main(arguments: list[str]) -> int:
     """Collect, embed or check; the exit status."""
     if arguments == ["--check"]:
-        return int(embedded(README.read_text()) != README.read_text())
+        return int(any(path.read_text() != text for path, text in pages().items()))
     if arguments:
-        collect(Path(arguments[0]), arguments[1])
-    README.write_text(embedded(README.read_text()))
+        collect(Path(arguments[0]), *arguments[1:])
+    for path, text in pages().items():
+        path.write_text(text)
     return 0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,13 +32,12 @@ def without_folder(value: Any, runs: str) -> Any:
 
 def benchmark(cfg: DictConfig) -> None:
     """Run one suite and write ``results.json``, ``table.md`` and its figures; a suite of criteria ends with exit status 1 if one that counts is not met."""
-    import sys
-
     import torch
     from omegaconf import OmegaConf
 
     from gpe_pl.locks import held
     from gpe_pl.machine import environment, keep_freed_memory
+    from gpe_pl.provenance import recorded
     from gpe_pl.simulate import dataset
     from gpe_pl.viz.saving import save_figure
 
@@ -52,13 +52,14 @@ def benchmark(cfg: DictConfig) -> None:
     keep_freed_memory()  # as trainings and evaluations do
     cases = getattr(settings, "cases", None)  # of a suite about data sets
     folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name
-    with held(folder):
+    with held(folder), recorded(folder, "benchmark", sys.argv[1:], cfg.paths.runs):
         records, table = suite.run(settings) if cases is None else suite.run(settings, {k: dataset(*c.overrides) for k, c in cases.items()})
         for name, figure in getattr(suite, "figures", lambda _: {})(records).items():
             save_figure(figure, folder / f"{name}.png", dpi=150)
-        results = {"environment": environment(), "settings": without_folder(asdict(settings), cfg.paths.runs), "records": records}
-        for name, text in (("results.json", json.dumps(results, indent=1)), ("table.md", table + "\n")):
-            replace_text(folder / name, text)
+        about = {"environment": environment(), "settings": without_folder(asdict(settings), cfg.paths.runs)}
+        lines = ",\n".join(json.dumps(record) for record in records)
+        replace_text(folder / "results.json", f'{json.dumps(about)[:-1]}, "records": [\n{lines}\n]}}\n')
+        replace_text(folder / "table.md", table + "\n")
     print(table)
     failures: list[str] = getattr(suite, "failures", lambda _: [])(records)
     if failures:

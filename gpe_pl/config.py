@@ -363,20 +363,23 @@ class Report(Callback):
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         with contextlib.suppress(OmegaConfBaseException):  # of a name that is refused; Hydra meets it again, and ends
-            self._hold(Path(config.hydra.run.dir), num_processes(config))
+            self._hold(Path(config.hydra.run.dir), config, num_processes(config))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         with contextlib.suppress(OmegaConfBaseException):
-            self._hold(Path(config.hydra.sweep.dir))
+            self._hold(Path(config.hydra.sweep.dir), config)
 
-    def _hold(self, folder: Path, num_processes: int = 1) -> None:
+    def _hold(self, folder: Path, config: DictConfig, num_processes: int = 1) -> None:
         """Until the process ends. Ends it where the folder cannot be used: Hydra turns an exception of a callback into a warning, and goes on."""
-        from gpe_pl.locks import held
+        from gpe_pl.locks import held, is_later_process
+        from gpe_pl.provenance import recorded
 
         _results.append(folder)
         try:
             refuse_links(folder)
             self._lock.enter_context(held(folder, num_processes=num_processes))
+            if num_processes == 1 or not is_later_process():
+                self._lock.enter_context(recorded(folder, config.hydra.job.name, sys.argv[1:], str(config.paths.runs)))
         except GpeError as error:
             _fail(error)
         except OSError as error:

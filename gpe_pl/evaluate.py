@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from itertools import product
 from pathlib import Path
@@ -25,6 +26,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     from gpe_pl.locks import held
     from gpe_pl.names import run_name
     from gpe_pl.pretrained import names
+    from gpe_pl.provenance import recorded
     from gpe_pl.report import conclusion
     from gpe_pl.run_folder import claim, release
     from gpe_pl.simulate import ensure_split, evaluated_config, scene_metadata
@@ -46,7 +48,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
         simulator.check_scene(scene, _own_data(simulator) or "data=… size=…")
     shown = None if cfg.data.get("showcase") is None else _showcase(cfg, simulator)
     folder = Path(cfg.paths.runs) / run_name(cfg.name)
-    with held(folder):
+    with held(folder), recorded(folder, "evaluate", sys.argv[1:], cfg.paths.runs):
         root = ensure_split(evaluated, cfg.split)
         claim(folder, _identity(evaluated, root), results=["*"])
         try:

@@ -72,7 +72,7 @@ def held(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bool
         FolderError: another command writes to the folder, the folder cannot be made, or it was deleted inside.
     """
     path = _beside(folder, "lock")
-    if num_processes > 1 and _is_later_process():
+    if num_processes > 1 and is_later_process():
         yield
         return
     if path in _held:
@@ -177,7 +177,8 @@ def _identity(folder: Path) -> tuple[int, int] | None:
     return found.st_dev, found.st_ino
 
 
-def _is_later_process() -> bool:
+def is_later_process() -> bool:
+    """Whether ``RANKS`` number this process, and not as the first."""
     return next((os.environ[key] for key in RANKS if key in os.environ), "0") != "0"
 
 

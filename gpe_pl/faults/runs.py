@@ -81,13 +81,13 @@ class Command:
 def digests(folder: Path) -> dict[str, str]:
     """SHA-256 of what must not depend on how a command was interrupted: data, metrics, tables, weights and the state of the optimiser, bit for bit.
 
-    Logs do: each start of a run has its own.
+    Logs and provenance do: each start of a run has its own.
     """
     found = {}
     for path in _final_files(folder):
         relative = path.relative_to(folder)
         name = str(relative)
-        if "log" in relative.parts or not path.is_file():
+        if "log" in relative.parts or path.name == PROVENANCE or not path.is_file():
             continue
         if path.suffix == ".ckpt":
             stored = load_checkpoint(path)

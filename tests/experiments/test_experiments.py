@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -12,18 +11,15 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from gpe_pl.config import CONF, construct
+from gpe_pl.config import CONF
 from gpe_pl.evaluation import read_rows
 from gpe_pl.fit import fit
-from gpe_pl.run_folder import config_in, differences, without_tables
-from gpe_pl.training.budget import step_time_key, within_budget
-from gpe_pl.training.run import TrainerSettings, TrainingSettings
+from gpe_pl.run_folder import without_tables
 from tests.runs import compose, first_choices, tiny
 
 EXPERIMENTS = sorted(p.stem for p in (CONF / "experiment").glob("*.yaml"))
 QUICK = {"smoke"}
 """This runs with the fast tests."""
-RESULTS = CONF.parent / "docs" / "results" / "table1_second" / "runs"
 SLOW = {
     "ablation_momentum",
     "ablation_multiscale",
@@ -141,17 +137,3 @@ def test_a_learned_stress_is_drawn_and_compared(tiny_data: Path, tmp_path: Path)
     ]
     assert len(errors) == 1
     assert 0 < errors[0] < 100
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("run", sorted(RESULTS.glob("data=*/model=*/seed=0")), ids=lambda run: "/".join(run.parts[-3:-1]))
-def test_runs_of_the_results_can_be_gone_on_with(run: Path, tmp_path: Path) -> None:
-    """What is copied from them is not trained again, further seeds get as many steps, and the canyon and larger scenes take their models."""
-    there = config_in(run / "config.json")
-    cfg = compose("fit", "experiment=table1", "size=small", *run.parts[-3:])
-    now = without_tables(dict(OmegaConf.to_container(cfg, resolve=True)))  # type: ignore[arg-type,call-overload]
-    training = construct(TrainingSettings, cfg.training, "training")
-    key = step_time_key(now, training, construct(TrainerSettings, cfg.trainer, "trainer"))
-    times = Path(shutil.copy(RESULTS.parent / "step_times.json", tmp_path))
-    now["training"] = within_budget(training, times, key, lambda _: pytest.fail(f"{key} would be measured again")).as_dict()
-    assert differences(there, {key: now[key] for key in there}) == []

@@ -1,0 +1,60 @@
+"""The folder of results: small, and every table in it says where it comes from."""
+
+from __future__ import annotations
+
+import runpy
+import subprocess
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from gpe_pl import sealed
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "docs" / "results"
+MOST_BYTES = 6_000_000
+
+
+def tracked() -> list[Path]:
+    names = subprocess.run(["git", "ls-files", "docs/results"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    return [ROOT / name for name in names]
+
+
+def test_results_are_small() -> None:
+    assert sum(path.stat().st_size for path in tracked()) <= MOST_BYTES
+
+
+def test_every_folder_says_where_it_comes_from() -> None:
+    folders = {path.parent for path in tracked()} - {RESULTS}
+    assert folders
+    for folder in folders:
+        about = sealed.read(folder / "provenance.json", "")
+        assert about["sessions"] and all(session["command"] and session["commit"] for session in about["sessions"]), folder
+
+
+def test_a_packed_folder_can_be_checked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pack = runpy.run_path(str(ROOT / "docs" / "pack_results.py"))["main"]
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "run" / "metrics.csv").write_text("numbers")
+    (tmp_path / "run" / "checkpoints" / "best.ckpt").write_bytes(b"weights")
+    assert pack([str(tmp_path / "run"), str(tmp_path / "a.tar.xz")]) == pack([str(tmp_path / "run"), str(tmp_path / "b.tar.xz")]) == 0
+    assert (tmp_path / "a.tar.xz").read_bytes() == (tmp_path / "b.tar.xz").read_bytes()
+    assert pack(["--check", str(tmp_path / "a.tar.xz")]) == 0
+    assert "1 file" in capsys.readouterr().out
+    (tmp_path / "b.tar.xz").write_bytes((tmp_path / "a.tar.xz").read_bytes()[:100])
+    assert pack(["--check", str(tmp_path / "b.tar.xz")]) == 2
+    assert pack([str(tmp_path / "nothing"), str(tmp_path / "c.tar.xz")]) == 2
+
+
+def test_pictures_are_smaller_and_look_the_same(tmp_path: Path) -> None:
+    picture = runpy.run_path(str(ROOT / "docs" / "embed_results.py"))["picture"]
+    image = Image.effect_noise((2000, 100), 3).convert("RGB")
+    image.save(tmp_path / "before.png")
+    picture(tmp_path / "before.png", tmp_path / "after.png")
+    with Image.open(tmp_path / "after.png") as after:
+        assert after.size == (1400, 70)
+        assert after.convert("L").resize((1, 1)).getpixel((0, 0)) == pytest.approx(
+            image.convert("L").resize((1, 1)).getpixel((0, 0)), abs=3
+        )
+    assert (tmp_path / "after.png").stat().st_size < (tmp_path / "before.png").stat().st_size / 2
