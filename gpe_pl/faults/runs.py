@@ -25,6 +25,7 @@ from gpe_pl.errors import GpeError
 from gpe_pl.faults import isolation, stores
 from gpe_pl.faults.verdict import MAX_DETAIL, Fault, Verdict
 from gpe_pl.learned_simulator import load_checkpoint
+from gpe_pl.provenance import PROVENANCE
 
 SAVED = (
     "state_dict",
