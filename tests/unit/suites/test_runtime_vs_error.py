@@ -10,7 +10,7 @@ import pytest
 
 from gpe_pl import sealed
 from gpe_pl.baselines import ConstantVelocity
-from gpe_pl.finished_runs import Run
+from gpe_pl.finished_runs import Run, table_of
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.ground_truth import generate_trajectory, initial_state, trajectory_metadata
@@ -127,7 +127,7 @@ def test_training_took_its_steps_at_the_step_time_of_its_sweep(tmp_path: Path) -
     config |= {"size.comparison.budget_minutes": 1}
     sweep = tmp_path / "sweep"
     sweep.mkdir()
-    trained = Run(sweep / "seed=0", config, [])
+    trained = Run(sweep / "seed=0", config, table_of([]))
     assert math.isnan(training_seconds(trained))
     times = {"sand tiny GPE 1": 0.5, "sand tiny GPE 2": 0.1, "sand tiny GPE 3": 0.7, "sand small GPE 1": 0.55, "sand tiny GNS 1": 0.58}
     sealed.write(sweep / "step_times.json", times)
