@@ -1,8 +1,8 @@
 """Copy results of runs into ``docs/results`` and the tables there into the README, so that no number is typed by hand.
 
 ``python docs/embed_results.py RUN_FOLDER NAME [NOTE]`` takes from a finished run, sweep or suite its tables, its figures in fewer colours, the first film, and
-where all of it comes from (``provenance.json``). It keeps the results of single rollouts in two small files (``gpe_pl.run_archive``), from which
-``python -m gpe_pl.tables docs/results/NAME`` makes the tables again. NOTE is what a reader should know besides, such as other work on the machine.
+where all of it comes from (``provenance.json``). It keeps the results of single rollouts in two small files (``gpe_pl.reports.run_archive``), from which
+``python -m gpe_pl.reports docs/results/NAME`` makes the tables again. NOTE is what a reader should know besides, such as other work on the machine.
 ``python docs/embed_results.py`` only renews the README and the list in ``docs/results/README.md``; ``--check`` fails if one differs from the files.
 """
 
@@ -15,10 +15,10 @@ from pathlib import Path
 
 from PIL import Image, ImageSequence
 
-from gpe_pl import sealed
-from gpe_pl.finished_runs import archive, finished_runs
-from gpe_pl.markdown import table_row
-from gpe_pl.provenance import ADVICE, PROVENANCE, sessions
+from gpe_pl.files import sealed
+from gpe_pl.files.markdown import table_row
+from gpe_pl.reports.finished_runs import archive, finished_runs
+from gpe_pl.system.provenance import ADVICE, PROVENANCE, sessions
 
 DOCS = Path(__file__).resolve().parent
 RESULTS = DOCS / "results"

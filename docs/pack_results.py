@@ -14,7 +14,7 @@ import sys
 import tarfile
 from pathlib import Path
 
-from gpe_pl.atomic import replacing
+from gpe_pl.files.atomic import replacing
 
 SUMS = "SHA256SUMS"
 

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gpe_pl.atomic import replacing
-from gpe_pl.ground_truth import DatasetSpec, initial_state, parameter_values, trajectory_metadata
-from gpe_pl.rollout import rollout
+from gpe_pl.data.ground_truth import DatasetSpec, initial_state, parameter_values, trajectory_metadata
+from gpe_pl.files.atomic import replacing
+from gpe_pl.rollout.loop import rollout
 from gpe_pl.simulate import dataset
-from gpe_pl.trajectory import State
+from gpe_pl.trajectory.trajectory import State
 
 HORIZONS = (20, 50, 100)
 SHIFTS = (1e-4, 1e-3)

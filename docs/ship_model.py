@@ -1,7 +1,7 @@
 """Make a trained run one of the models that come with the package.
 
 ``python docs/ship_model.py RUN_FOLDER NAME COMMIT 'COMMAND'`` writes weights without the optimiser's state, and a model card whose numbers are the run's
-own, to ``gpe_pl/pretrained``. COMMAND is what trained it, with the code of COMMIT.
+own, to ``gpe_pl/learned/pretrained``. COMMAND is what trained it, with the code of COMMIT.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gpe_pl.domain_table import JUDGED, NOT_LEARNED
-from gpe_pl.evaluation import LEARNED, Row, read_rows
-from gpe_pl.finished_runs import groups_of
-from gpe_pl.learned_simulator import LearnedSimulator
-from gpe_pl.pretrained import FOLDER
-from gpe_pl.report import summary
+from gpe_pl.evaluation.rollouts import LEARNED, Row, read_rows
+from gpe_pl.learned.pretrained import FOLDER
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.reports.domain_table import JUDGED, NOT_LEARNED
+from gpe_pl.reports.finished_runs import groups_of
+from gpe_pl.reports.sweep_table import summary
 
 
 def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows: list[Row], settings: dict[str, object]) -> str:

@@ -17,28 +17,28 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from gpe_pl import early_interrupts
-from gpe_pl.caches import prepare
+from gpe_pl.system import early_interrupts
+from gpe_pl.system.caches import prepare
 
 if TYPE_CHECKING:
-    from gpe_pl.containment import Contained as Contained
+    from gpe_pl.data.ground_truth import generate_trajectory as generate_trajectory
     from gpe_pl.data.importers.assemble import save_dataset as save_dataset
     from gpe_pl.errors import GpeError as GpeError
-    from gpe_pl.export import write_npz as write_npz
-    from gpe_pl.export import write_vtk as write_vtk
-    from gpe_pl.geometry import domain_walls as domain_walls
-    from gpe_pl.ground_truth import generate_trajectory as generate_trajectory
-    from gpe_pl.learned_simulator import LearnedSimulator as LearnedSimulator
+    from gpe_pl.export.program import export_model as export_model
+    from gpe_pl.export.trajectories import write_npz as write_npz
+    from gpe_pl.export.trajectories import write_vtk as write_vtk
+    from gpe_pl.geometry.shapes import domain_walls as domain_walls
+    from gpe_pl.learned.simulator import LearnedSimulator as LearnedSimulator
     from gpe_pl.metrics import rollout_metrics as rollout_metrics
-    from gpe_pl.portable import export_model as export_model
-    from gpe_pl.rollout import rollout as roll_out  # noqa: F401
+    from gpe_pl.rollout.containment import Contained as Contained
+    from gpe_pl.rollout.loop import rollout as roll_out  # noqa: F401
     from gpe_pl.simulate import dataset as dataset
-    from gpe_pl.store import iter_trajectories as iter_trajectories
-    from gpe_pl.store import read_trajectory as read_trajectory
-    from gpe_pl.trajectory import Boundary as Boundary
-    from gpe_pl.trajectory import Metadata as Metadata
-    from gpe_pl.trajectory import State as State
-    from gpe_pl.trajectory import Trajectory as Trajectory
+    from gpe_pl.trajectory.store import iter_trajectories as iter_trajectories
+    from gpe_pl.trajectory.store import read_trajectory as read_trajectory
+    from gpe_pl.trajectory.trajectory import Boundary as Boundary
+    from gpe_pl.trajectory.trajectory import Metadata as Metadata
+    from gpe_pl.trajectory.trajectory import State as State
+    from gpe_pl.trajectory.trajectory import Trajectory as Trajectory
     from gpe_pl.viz.figures import rollout_figure as rollout_figure
     from gpe_pl.viz.video import write_animation as write_animation
     from gpe_pl.viz.viewer import write_viewer as write_viewer
@@ -47,27 +47,27 @@ early_interrupts.begin()
 prepare()  # before Numba and Matplotlib are imported
 
 _MODULES = {
-    "Boundary": "trajectory",
-    "Contained": "containment",
+    "Boundary": "trajectory.trajectory",
+    "Contained": "rollout.containment",
     "GpeError": "errors",
-    "LearnedSimulator": "learned_simulator",
-    "Metadata": "trajectory",
-    "State": "trajectory",
-    "Trajectory": "trajectory",
+    "LearnedSimulator": "learned.simulator",
+    "Metadata": "trajectory.trajectory",
+    "State": "trajectory.trajectory",
+    "Trajectory": "trajectory.trajectory",
     "dataset": "simulate",
-    "domain_walls": "geometry",
-    "export_model": "portable",
-    "generate_trajectory": "ground_truth",
-    "iter_trajectories": "store",
-    "read_trajectory": "store",
-    "roll_out": "rollout",
+    "domain_walls": "geometry.shapes",
+    "export_model": "export.program",
+    "generate_trajectory": "data.ground_truth",
+    "iter_trajectories": "trajectory.store",
+    "read_trajectory": "trajectory.store",
+    "roll_out": "rollout.loop",
     "rollout_figure": "viz.figures",
     "rollout_metrics": "metrics",
     "save_dataset": "data.importers.assemble",
     "write_animation": "viz.video",
-    "write_npz": "export",
+    "write_npz": "export.trajectories",
     "write_viewer": "viz.viewer",
-    "write_vtk": "export",
+    "write_vtk": "export.trajectories",
 }
 _NAMES_THERE = {"roll_out": "rollout"}
 

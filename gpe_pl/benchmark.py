@@ -9,8 +9,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpe_pl.atomic import replace_text
-from gpe_pl.config import CONF, ConfigError, construct, entry_point
+from gpe_pl.config.entry_point import ConfigError, construct, entry_point
+from gpe_pl.config.folder import CONF
+from gpe_pl.files.atomic import replace_text
 from gpe_pl.printable import one_line
 
 if TYPE_CHECKING:
@@ -30,21 +31,27 @@ def without_folder(value: Any, runs: str) -> Any:
     return value.replace(runs, "paths.runs", 1) if isinstance(value, str) and Path(value).is_relative_to(runs) else value
 
 
+def _suite(name: str) -> Any:
+    """The module of a suite, which lies in a folder of its own where it has several."""
+    package = importlib.import_module(f"gpe_pl.benchmarks.{name}")
+    return importlib.import_module(f"{package.__name__}.suite") if hasattr(package, "__path__") else package
+
+
 def benchmark(cfg: DictConfig) -> None:
     """Run one suite and write ``results.json``, ``table.md`` and its figures; a suite of criteria ends with exit status 1 if one that counts is not met."""
     import torch
     from omegaconf import OmegaConf
 
-    from gpe_pl.locks import held
-    from gpe_pl.machine import environment, keep_freed_memory
-    from gpe_pl.provenance import recorded
     from gpe_pl.simulate import dataset
+    from gpe_pl.system.locks import held
+    from gpe_pl.system.machine import environment, keep_freed_memory
+    from gpe_pl.system.provenance import recorded
     from gpe_pl.viz.saving import save_figure
 
     suites = sorted(path.stem for path in (CONF / "suite").glob("*.yaml"))
     if cfg.suite.name not in suites:
         raise ConfigError(f"suite.name={cfg.suite.name!r}: must be one of {', '.join(suites)}")
-    suite = importlib.import_module(f"gpe_pl.suites.{cfg.suite.name}")
+    suite = _suite(cfg.suite.name)
     values: Any = OmegaConf.to_container(cfg.suite, resolve=True)
     settings = construct(suite.Settings, {k: v for k, v in values.items() if k != "name"}, "suite")
     if getattr(settings, "accelerator", "cpu") == "gpu" and not torch.cuda.is_available():

@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpe_pl.config import construct, entry_point
+from gpe_pl.config.entry_point import construct, entry_point
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def convert(cfg: DictConfig) -> None:
     """Import one data set and print the report."""
     from gpe_pl.data.importers import CONTACT_SHEET_FILE, PAGE_FILE, ImportSettings, import_dataset
-    from gpe_pl.progress import progress_bar
+    from gpe_pl.system.progress import progress_bar
 
     settings = construct(ImportSettings, {str(key): value for key, value in cfg.items() if key != "paths"}, "")
     with progress_bar(f"{settings.format} {settings.name or ''}") as on_progress:

@@ -8,7 +8,8 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpe_pl.config import CONF, ConfigError, construct, construct_target, entry_point
+from gpe_pl.config.entry_point import ConfigError, construct, construct_target, entry_point
+from gpe_pl.config.folder import CONF
 from gpe_pl.errors import GpeError
 
 if TYPE_CHECKING:
@@ -16,21 +17,21 @@ if TYPE_CHECKING:
 
     from omegaconf import DictConfig
 
-    from gpe_pl.learned_simulator import LearnedSimulator
+    from gpe_pl.learned.simulator import LearnedSimulator
 
 
 def evaluate_checkpoint(cfg: DictConfig) -> None:
     """Roll a trained model out on one split of a data set, and in the scene's showcase if it has one; numbers and pictures go to ``{paths.runs}/{name}``."""
-    from gpe_pl.evaluation import EvaluationSettings, evaluate
-    from gpe_pl.learned_simulator import LearnedSimulator
-    from gpe_pl.locks import held
-    from gpe_pl.names import run_name
-    from gpe_pl.pretrained import names
-    from gpe_pl.provenance import recorded
-    from gpe_pl.report import conclusion
-    from gpe_pl.run_folder import claim, release
+    from gpe_pl.evaluation.rollouts import EvaluationSettings, evaluate
+    from gpe_pl.files.names import run_name
+    from gpe_pl.files.run_folder import claim, release
+    from gpe_pl.learned.pretrained import names
+    from gpe_pl.learned.simulator import LearnedSimulator
+    from gpe_pl.reports.sweep_table import conclusion
+    from gpe_pl.rollout.skips import Skips
     from gpe_pl.simulate import ensure_split, evaluated_config, scene_metadata
-    from gpe_pl.skips import Skips
+    from gpe_pl.system.locks import held
+    from gpe_pl.system.provenance import recorded
     from gpe_pl.training.run import TrainerSettings, set_up
 
     if not isinstance(cfg.checkpoint, str):
@@ -66,8 +67,8 @@ def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
     from omegaconf import OmegaConf
 
     from gpe_pl.data.checksum import split_checksum
-    from gpe_pl.pretrained import fingerprint
-    from gpe_pl.run_folder import DATA_CHECKSUMS
+    from gpe_pl.files.run_folder import DATA_CHECKSUMS
+    from gpe_pl.learned.pretrained import fingerprint
 
     values: Any = OmegaConf.to_container(cfg, resolve=True)
     without = ("splits", "data", "num_pictures", "export")  # more pictures may be asked for later
@@ -83,7 +84,7 @@ def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
 
 def _own_data(simulator: LearnedSimulator) -> str:
     """Overrides that choose data like those of the training; empty where none do."""
-    from gpe_pl.ground_truth import trajectory_metadata
+    from gpe_pl.data.ground_truth import trajectory_metadata
     from gpe_pl.simulate import IMPORTED, dataset
 
     own = simulator.builder.metadata
@@ -99,8 +100,8 @@ def _own_data(simulator: LearnedSimulator) -> str:
 
 def _showcase(cfg: DictConfig, simulator: LearnedSimulator) -> Callable[[Path], None]:
     """Rolls the simulator out in the showcase's scene, which is made first: what is wrong with it is said before the evaluation, not after it."""
-    from gpe_pl import showcase
-    from gpe_pl.progress import progress_bar
+    from gpe_pl.evaluation import showcase
+    from gpe_pl.system.progress import progress_bar
 
     if not isinstance(cfg.data.showcase, Mapping):
         raise ConfigError(f"data.showcase={cfg.data.showcase!r}: must be a table with a scene, or null")

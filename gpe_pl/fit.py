@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpe_pl.config import ConfigError, bind, construct, entry_point, num_processes, output_dir
+from gpe_pl.config.entry_point import ConfigError, bind, construct, entry_point, num_processes, output_dir
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -17,8 +17,8 @@ def fit(cfg: DictConfig) -> float:
     Returns:
         The mean full-length rollout MSE [m²] on the first split evaluated; failed rollouts count as in tables (``finished_runs.rollout_errors``).
     """
-    from gpe_pl.locks import held
-    from gpe_pl.names import data_name, run_name
+    from gpe_pl.files.names import data_name, run_name
+    from gpe_pl.system.locks import held
 
     data_name(cfg.data.name, "data.name")
     if cfg.reuse is not None:
@@ -37,12 +37,12 @@ def _fit(cfg: DictConfig, run_dir: Path) -> float:
     from gpe_pl.data.datamodule import TrajectoryDataModule
     from gpe_pl.data.dataset import open_split, window_counts
     from gpe_pl.data.sampling import BatchSize
-    from gpe_pl.evaluation import LEARNED, EvaluationSettings, evaluate, means, read_rows
-    from gpe_pl.finished_runs import Run, rollout_errors, table_of
+    from gpe_pl.evaluation.rollouts import LEARNED, EvaluationSettings, evaluate, means, read_rows
+    from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError, claim, without_tables
     from gpe_pl.graphs.features import GraphConfig
-    from gpe_pl.learned_simulator import LearnedSimulator, model_class
-    from gpe_pl.pretrained import fingerprint
-    from gpe_pl.run_folder import DATA_CHECKSUMS, RunError, claim, without_tables
+    from gpe_pl.learned.pretrained import fingerprint
+    from gpe_pl.learned.simulator import LearnedSimulator, model_class
+    from gpe_pl.reports.finished_runs import Run, rollout_errors, table_of
     from gpe_pl.simulate import IMPORTED, ensure_data, evaluated_config, scene_metadata
     from gpe_pl.training.budget import PauseForMeasurements, mean_step_time, step_time_key, within_budget
     from gpe_pl.training.module import TrainingModule

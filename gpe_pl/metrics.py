@@ -22,9 +22,9 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics import Metric
 
-from gpe_pl import integrators
-from gpe_pl.rollout import share_outside
-from gpe_pl.trajectory import Metadata, Trajectory, von_mises
+from gpe_pl.rollout.loop import share_outside
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory, von_mises
 
 Horizon = int | Literal["full"]
 

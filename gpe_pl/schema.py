@@ -135,7 +135,7 @@ Values = Literal[
     "nodes of cells",  # rows of nodes, as many different ones as a kind of cell has corners
     "dimension of cells",  # 2 or 3, and at most that of space
 ]
-"""What a stored array may hold; ``gpe_pl.values`` compares."""
+"""What a stored array may hold; ``gpe_pl.trajectory.values`` compares."""
 
 
 @dataclass(frozen=True)

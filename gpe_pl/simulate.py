@@ -10,15 +10,15 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpe_pl.config import ConfigError, compose, construct, construct_target, entry_point
-from gpe_pl.names import data_name
+from gpe_pl.config.entry_point import ConfigError, compose, construct, construct_target, entry_point
+from gpe_pl.files.names import data_name
 from gpe_pl.schema import SPLITS
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-    from gpe_pl.ground_truth import DatasetSpec
-    from gpe_pl.trajectory import Metadata
+    from gpe_pl.data.ground_truth import DatasetSpec
+    from gpe_pl.trajectory.trajectory import Metadata
 
 IMPORTED = "imported"
 """Where data that are generated have their size, those that ``convert`` made have this."""
@@ -31,7 +31,7 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     """The data set that a config describes; raises ``ConfigError`` that names key and value."""
     from omegaconf import OmegaConf
 
-    from gpe_pl.ground_truth import DatasetSpec
+    from gpe_pl.data.ground_truth import DatasetSpec
 
     if cfg.size.name not in cfg.data.sizes:
         raise ConfigError(f"size={cfg.size.name}: data={cfg.data.name} has the sizes {', '.join(cfg.data.sizes)}")
@@ -64,8 +64,8 @@ def imported_data(cfg: DictConfig) -> Path:
 
 def ensure_data(cfg: DictConfig) -> Path:
     """Folder of the config's data set; generates what is missing if the data set is small."""
-    from gpe_pl.generation import dataset_bytes, generate
-    from gpe_pl.progress import progress_bar
+    from gpe_pl.data.generation import dataset_bytes, generate
+    from gpe_pl.system.progress import progress_bar
 
     if cfg.data.size == IMPORTED:  # used as they are
         return imported_data(cfg)
@@ -79,8 +79,8 @@ def ensure_data(cfg: DictConfig) -> Path:
 
 def scene_metadata(cfg: DictConfig, split: str) -> Metadata:
     """What is known of the scenes of a split before any is generated."""
-    from gpe_pl.ground_truth import trajectory_metadata
-    from gpe_pl.store import iter_trajectories
+    from gpe_pl.data.ground_truth import trajectory_metadata
+    from gpe_pl.trajectory.store import iter_trajectories
 
     if cfg.data.size == IMPORTED:
         return next(iter_trajectories(imported_data(cfg), split)).metadata
@@ -91,7 +91,7 @@ def ensure_split(cfg: DictConfig, split: str) -> Path:
     """Folder of the config's data set; where it does not exist, of one that has nothing but this split and a single training trajectory."""
     from omegaconf import OmegaConf
 
-    from gpe_pl.generation import SPEC_FILE
+    from gpe_pl.data.generation import SPEC_FILE
 
     if (
         cfg.data.size != IMPORTED
@@ -113,7 +113,7 @@ def evaluated_config(cfg: DictConfig) -> DictConfig:
 
 def simulate(cfg: DictConfig) -> None:
     """Generate a data set, or what is missing of it or damaged, and say beforehand what a large one takes."""
-    from gpe_pl.generation import CONTACT_SHEET_FILE, is_complete, written
+    from gpe_pl.data.generation import CONTACT_SHEET_FILE, is_complete, written
 
     if not (cfg.num_workers is None or (isinstance(cfg.num_workers, int) and cfg.num_workers >= 1)):
         raise ConfigError(f"num_workers={cfg.num_workers!r}: must be null (one per core) or an integer of at least 1")
@@ -129,8 +129,8 @@ def simulate(cfg: DictConfig) -> None:
 
 
 def _simulate(root: str, spec: DatasetSpec, part: tuple[int, int], num_workers: int) -> Path:
-    from gpe_pl.generation import discard_damaged, generate, plan, seconds_per_trajectory
-    from gpe_pl.progress import progress_bar
+    from gpe_pl.data.generation import discard_damaged, generate, plan, seconds_per_trajectory
+    from gpe_pl.system.progress import progress_bar
 
     there = sum(path.stat().st_size for path in (Path(root) / spec.name / spec.size).glob("*/shard-*.h5"))
     if there > AUTOMATIC_BYTES:

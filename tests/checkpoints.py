@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from gpe_pl.faults.runs import SAVED
+from gpe_pl.benchmarks.faults.runs import SAVED
 
 
 def assert_same_checkpoint(a: dict[str, Any], b: dict[str, Any]) -> None:

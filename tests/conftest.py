@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from gpe_pl.geometry import Box, domain_walls
+from gpe_pl.geometry.shapes import Box, domain_walls
 from gpe_pl.schema import node_code
-from gpe_pl.store import write_shard
-from gpe_pl.trajectory import Boundary, Metadata, Trajectory
+from gpe_pl.trajectory.store import write_shard
+from gpe_pl.trajectory.trajectory import Boundary, Metadata, Trajectory
 
 settings.register_profile("fast", max_examples=20, deadline=None, derandomize=True, database=None)
 settings.register_profile("fuzz", max_examples=2000, deadline=None, print_blob=True)  # make fuzz
@@ -138,7 +138,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small GPE, as it is shipped."""
     import torch
 
-    from gpe_pl.learned_simulator import LearnedSimulator
+    from gpe_pl.learned.simulator import LearnedSimulator
     from gpe_pl.models.gpe import GPE
     from tests.scenes import builder
 

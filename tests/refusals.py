@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gpe_pl.arrays import ArrayError
 from gpe_pl.data.importers import ImportFailure, ImportSettings, Refusal, Report, import_dataset
 from gpe_pl.data.importers.report import Event
+from gpe_pl.trajectory.arrays import ArrayError
 from tests import sources
 from tests.sources import motion
 

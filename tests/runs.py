@@ -10,8 +10,8 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
-from gpe_pl.config import CONF
-from gpe_pl.generation import generate
+from gpe_pl.config.folder import CONF
+from gpe_pl.data.generation import generate
 from gpe_pl.simulate import dataset_spec
 
 DATA = [

@@ -9,13 +9,13 @@ import torch
 from scipy.spatial import Delaunay
 from torch_geometric.data import HeteroData
 
-from gpe_pl.geometry import domain_walls
+from gpe_pl.benchmarks.stability.subject import permuted as permuted
+from gpe_pl.benchmarks.stability.subject import to_dtype as to_dtype
+from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.schema import MESH_MATERIALS, STICKY, node_code, param_names
-from gpe_pl.stability.subject import permuted as permuted
-from gpe_pl.stability.subject import to_dtype as to_dtype
-from gpe_pl.trajectory import Boundary, Metadata, State
+from gpe_pl.trajectory.trajectory import Boundary, Metadata, State
 
 SPACING = 0.05
 

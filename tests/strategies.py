@@ -11,13 +11,13 @@ import numpy as np
 from hypothesis import strategies as st
 from torch_geometric.data import HeteroData
 
-from gpe_pl.faults.stores import flipped, overwritten, truncated
-from gpe_pl.geometry import domain_walls
+from gpe_pl.benchmarks.faults.stores import flipped, overwritten, truncated
+from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.schema import MATERIALS, STICKY, node_code, param_names
 from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.scenes import BodyScene
-from gpe_pl.trajectory import Boundary, Metadata, State, Trajectory
+from gpe_pl.trajectory.trajectory import Boundary, Metadata, State, Trajectory
 from tests.scenes import SPACING, builder, metadata
 
 PARTICLES = ("sand", "snow", "fluid")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from gpe_pl.store import ATTRIBUTES, open_group, open_shard, read_text, shards
+from gpe_pl.trajectory.store import ATTRIBUTES, open_group, open_shard, read_text, shards
 
 LENGTH = 16
 """Hexadecimal digits that are kept: enough to tell apart all data that anyone will have."""

@@ -13,19 +13,20 @@ import torch
 from torch.utils.data import DataLoader
 from torch_geometric.data import HeteroData
 
-from gpe_pl import ranks, sealed
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.dataset import HeldGraphs, StoredTrajectory, WindowDataset, collated, long_enough, open_split, usable
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling, probabilities
 from gpe_pl.data.statistics import acceleration_std
+from gpe_pl.files import sealed
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.standardizer import StatisticsSample
-from gpe_pl.scene_ranges import scene_range, united
 from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES, EdgeType, grid, node_code, role
-from gpe_pl.store import StoreError
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.system import ranks
+from gpe_pl.trajectory.scene_ranges import scene_range, united
+from gpe_pl.trajectory.store import StoreError
+from gpe_pl.trajectory.trajectory import Trajectory
 
 NUM_VAL_GRAPHS = 8
 """In a validation batch, where no number of nodes limits it. The error is a quotient of sums over all nodes, whatever the batches."""

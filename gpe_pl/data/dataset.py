@@ -18,13 +18,13 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from torch_geometric.data import HeteroData
 
-from gpe_pl import integrators
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.statistics import FRAMES_AT_ONCE
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
-from gpe_pl.store import StoreError, UnsoundError, open_field, open_group, open_shard, read_trajectory, shards, trajectory_names
-from gpe_pl.trajectory import State, Trajectory
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.store import StoreError, UnsoundError, open_field, open_group, open_shard, read_trajectory, shards, trajectory_names
+from gpe_pl.trajectory.trajectory import State, Trajectory
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpe_pl.graphs.islands import Islands, free_since, islands_within
-from gpe_pl.trajectory import Metadata
+from gpe_pl.trajectory.trajectory import Metadata
 
 TOLERANCE = 1e-3
 """A free group accelerates with gravity up to this fraction of it; without gravity, of the rms acceleration of all nodes."""

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpe_pl import integrators
-from gpe_pl.arrays import FRAMES_AT_ONCE
-from gpe_pl.trajectory import Metadata
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.arrays import FRAMES_AT_ONCE
+from gpe_pl.trajectory.trajectory import Metadata
 
 Precision = type[np.float16] | type[np.float32] | type[np.float64]
 PRECISIONS: tuple[Precision, ...] = (np.float16, np.float32, np.float64)

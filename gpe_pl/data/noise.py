@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from pydantic import Field
 
 from gpe_pl.errors import GpeError
-from gpe_pl.trajectory import Metadata
+from gpe_pl.trajectory.trajectory import Metadata
 
 MAX_SPACINGS = 0.5
 """Largest standard deviation of noise in rest spacings: beyond it, nodes change places with their neighbours."""

@@ -11,9 +11,9 @@ import numpy as np
 from pydantic import Field
 from torch.utils.data import Sampler
 
-from gpe_pl import ranks
 from gpe_pl.data.dataset import Key, StartKey, WindowDataset
-from gpe_pl.store import StoreError
+from gpe_pl.system import ranks
+from gpe_pl.trajectory.store import StoreError
 
 Sampling = Literal["uniform", "activity"]
 """How often each window is drawn: all alike, or the more often the more happens in it."""

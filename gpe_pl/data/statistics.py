@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl import integrators
 from gpe_pl.schema import MATERIALS
-from gpe_pl.store import read_trajectory, trajectory_names
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.store import read_trajectory, trajectory_names
+from gpe_pl.trajectory.trajectory import Trajectory
 
 STATISTICS_FILE = "statistics.json"
 

@@ -3,7 +3,7 @@
     python -m gpe_pl.data.validate PATH [PATH ...]     shards, or folders of shards; exit status 1 when anything is violated
     python -m gpe_pl.data.validate --format-page       Markdown, kept in data/README.md
 
-The reader in ``gpe_pl.store`` refuses what it cannot read; this module also looks at the meaning: units, ranges, completeness. Each
+The reader in ``gpe_pl.trajectory.store`` refuses what it cannot read; this module also looks at the meaning: units, ranges, completeness. Each
 check reports its first offender with frame and node, and how many more there are.
 """
 
@@ -24,14 +24,14 @@ import numpy as np
 
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.motion import motion_of, rounding_fault
-from gpe_pl.geometry import Shape
-from gpe_pl.hdf5_arrays import attribute, is_named
-from gpe_pl.json_text import parsed
+from gpe_pl.files.hdf5_arrays import attribute, is_named
+from gpe_pl.files.json_text import parsed
+from gpe_pl.geometry.shape_values import shapes_fault
+from gpe_pl.geometry.shapes import Shape
 from gpe_pl.printable import printable, speak_utf8
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup
-from gpe_pl.shape_values import shapes_fault
 from gpe_pl.solvers.materials import LIMITS
-from gpe_pl.store import (
+from gpe_pl.trajectory.store import (
     StoreError,
     digest,
     metadata_of,
@@ -42,8 +42,8 @@ from gpe_pl.store import (
     read_text,
     shapes_of,
 )
-from gpe_pl.trajectory import Metadata
-from gpe_pl.values import faults, size_conflicts
+from gpe_pl.trajectory.trajectory import Metadata
+from gpe_pl.trajectory.values import faults, size_conflicts
 
 Finding = tuple[str, str]
 """Name of the field or attribute, and what is wrong with it."""
@@ -400,7 +400,7 @@ Values are finite and at most 1.8e19 in magnitude. The reader refuses others, an
 |---|---|
 {metadata}
 
-`shapes` holds the geometry that the boundary nodes were sampled from; `gpe_pl.shape_values` rebuilds it.
+`shapes` holds the geometry that the boundary nodes were sampled from; `gpe_pl.geometry.shape_values` rebuilds it.
 """
 
 

@@ -31,10 +31,10 @@ from gpe_pl.graphs.features import (
 from gpe_pl.graphs.islands import find_islands, unwrapped
 from gpe_pl.graphs.multiscale import MultiscaleGraph, multiscale_graph
 from gpe_pl.graphs.neighbors import check_crowding, radius_between, radius_pairs
-from gpe_pl.rollout import SimulationError
+from gpe_pl.rollout.loop import SimulationError
+from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of, node_code
-from gpe_pl.skips import Skips
-from gpe_pl.trajectory import Boundary, Metadata, State
+from gpe_pl.trajectory.trajectory import Boundary, Metadata, State
 
 
 class GraphError(GpeError, ValueError):

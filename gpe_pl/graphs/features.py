@@ -26,7 +26,7 @@ from gpe_pl.schema import (
     param_names,
     radius_relations,
 )
-from gpe_pl.trajectory import Boundary, Metadata, State
+from gpe_pl.trajectory.trajectory import Boundary, Metadata, State
 
 Features = Literal["paper", "contact"]
 

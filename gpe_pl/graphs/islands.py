@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float64, Int64
 from numba import njit
 from scipy.spatial import cKDTree
 
+from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
-from gpe_pl.periodicity import NOWHERE, Periodicity
 
 
 @dataclass(frozen=True)

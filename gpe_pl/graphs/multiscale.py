@@ -21,8 +21,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from gpe_pl.errors import GpeError
+from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.graphs.islands import unwrapped
-from gpe_pl.periodicity import NOWHERE, Periodicity
 
 SNAP = 1e-3
 """Nodes this near (in rest spacings) below the face of a box count as on it, so that rounding does not tear the rows of a lattice apart."""

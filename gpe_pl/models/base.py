@@ -6,8 +6,8 @@ from typing import Any, Protocol
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
+from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import FeatureSpec
-from gpe_pl.skips import Skips
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ from gpe_pl.nn.blocks import MLP
 from gpe_pl.nn.connected import Edges, order_of_edges, renumbered, reordered, touched
 from gpe_pl.nn.island_momentum import IslandMomentum, conserve, rigid_part
 from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction, MomentumConv, orient
+from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import CELL, DOWN, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
-from gpe_pl.skips import Skips
 
 Decoder = Literal["node", "pair", "contact"]
 LevelWeights = Literal["shared", "separate"]

@@ -14,13 +14,13 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 from scipy.spatial import cKDTree
 
-from gpe_pl.canyon import canyon
-from gpe_pl.geometry import Bowl, Box, DistanceGrid, Shape, domain_walls, signed_distance
-from gpe_pl.grid_distance import Bounds, Solid
+from gpe_pl.geometry.canyon import canyon
+from gpe_pl.geometry.grid_distance import Bounds, Solid
+from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Shape, domain_walls, signed_distance
+from gpe_pl.geometry.terrain import Fit, Up, read_terrain
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers.scenes import CLEARANCE, MAX_ATTEMPTS, check_domain, check_ranges, draw_velocity, filled_box, floats, jittered_lattice
-from gpe_pl.terrain import Fit, Up, read_terrain
-from gpe_pl.trajectory import Boundary, State
+from gpe_pl.trajectory.trajectory import Boundary, State
 
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegativeFloat = Annotated[float, Field(ge=0, allow_inf_nan=False)]

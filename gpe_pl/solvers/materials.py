@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from gpe_pl.rollout import SimulationError
+from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import MATERIALS
 
 SAND, SNOW, ELASTOMER = 0, 1, 2

@@ -24,11 +24,11 @@ from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gpe_pl.errors import GpeError
-from gpe_pl.geometry import Shape, domain_walls, signed_distance
+from gpe_pl.geometry.shapes import Shape, domain_walls, signed_distance
+from gpe_pl.geometry.terrain import ground_of
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers.scenes import CLEARANCE, filled_box
-from gpe_pl.terrain import ground_of
-from gpe_pl.trajectory import Boundary, State
+from gpe_pl.trajectory.trajectory import Boundary, State
 
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
-from gpe_pl.meshing import triangulate
-from gpe_pl.trajectory import State, Stress
+from gpe_pl.geometry.meshing import triangulate
+from gpe_pl.trajectory.trajectory import State, Stress
 
 Positions = Float[np.ndarray, "node dim"]
 

@@ -16,9 +16,9 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from gpe_pl.geometry import Box, Polygon, Shape, Sphere, check_bounds, domain_walls, signed_distance
+from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, check_bounds, domain_walls, signed_distance
 from gpe_pl.schema import MATERIALS, STICKY, node_code, param_names
-from gpe_pl.trajectory import Boundary, Metadata, State
+from gpe_pl.trajectory.trajectory import Boundary, Metadata, State
 
 PositiveFloat = Annotated[float, Field(gt=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]

@@ -13,9 +13,9 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from gpe_pl.bodies import random_outline, random_solid
-from gpe_pl.geometry import Box, Polygon, Shape, Sphere, signed_distance
-from gpe_pl.meshing import TETRAHEDRA_PER_CUBE, MeshingError, quadrangulate, tetrahedralise, triangulate
+from gpe_pl.geometry.bodies import random_outline, random_solid
+from gpe_pl.geometry.meshing import TETRAHEDRA_PER_CUBE, MeshingError, quadrangulate, tetrahedralise, triangulate
+from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, signed_distance
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.scenes import (
     MAX_ATTEMPTS,
@@ -30,7 +30,7 @@ from gpe_pl.solvers.scenes import (
     draw_walls,
     floats,
 )
-from gpe_pl.trajectory import Boundary, State, Stress
+from gpe_pl.trajectory.trajectory import Boundary, State, Stress
 
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegativeFloat = Annotated[float, Field(ge=0, allow_inf_nan=False)]

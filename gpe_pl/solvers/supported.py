@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gpe_pl.rollout import SimulationError
-from gpe_pl.trajectory import Boundary, State
+from gpe_pl.rollout.loop import SimulationError
+from gpe_pl.trajectory.trajectory import Boundary, State
 
 
 def check_surroundings(state: State, solver: str) -> None:

@@ -21,11 +21,11 @@ import torch
 from filelock import FileLock
 from pydantic import Field, TypeAdapter, ValidationError
 
-from gpe_pl import sealed
 from gpe_pl.data.dataset import Samples, WindowDataset, collated
 from gpe_pl.data.sampling import NUM_LANES, BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
-from gpe_pl.machine import gemm_rate
+from gpe_pl.files import sealed
+from gpe_pl.system.machine import gemm_rate
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule, clipped_norm
 from gpe_pl.training.run import TrainerSettings, TrainingSettings
 

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, WeightAveraging
 
-from gpe_pl import ranks
-from gpe_pl.containment import Contained
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import per_frame_mse
-from gpe_pl.progress import progress_bar
-from gpe_pl.rollout import Guard, Start, rollouts
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.loop import Guard, Start, rollouts
+from gpe_pl.system import ranks
+from gpe_pl.system.progress import progress_bar
+from gpe_pl.trajectory.trajectory import Trajectory
 
 
 class WarmAverage(WeightAveraging):

@@ -15,10 +15,10 @@ import torch
 from lightning.fabric.plugins.io import TorchCheckpointIO
 from lightning.pytorch.callbacks import Checkpoint
 
-from gpe_pl import ranks
-from gpe_pl.atomic import replace_bytes
 from gpe_pl.errors import GpeError
-from gpe_pl.learned_simulator import CheckpointError, load_checkpoint, reason
+from gpe_pl.files.atomic import replace_bytes
+from gpe_pl.learned.simulator import CheckpointError, load_checkpoint, reason
+from gpe_pl.system import ranks
 from gpe_pl.training.interruption import Interruption
 
 SCORE = "val/rollout_mse"

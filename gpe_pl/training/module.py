@@ -16,12 +16,12 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 from torch_geometric.data import HeteroData
 
-from gpe_pl import ranks
 from gpe_pl.data.dataset import Samples
 from gpe_pl.errors import GpeError
-from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator
-from gpe_pl.machine import has_cpp_compiler
+from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE
+from gpe_pl.system import ranks
+from gpe_pl.system.machine import has_cpp_compiler
 from gpe_pl.training.push_forward import Excursions
 
 Schedule = Literal["cosine", "exponential"]

@@ -21,12 +21,12 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from pydantic import Field
 
-from gpe_pl.atomic import replacing
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import PushForward, Sampling
-from gpe_pl.machine import keep_freed_memory
-from gpe_pl.run_folder import CONFIG, RunError, config_in, differences
+from gpe_pl.files.atomic import replacing
+from gpe_pl.files.run_folder import CONFIG, RunError, config_in, differences
+from gpe_pl.system.machine import keep_freed_memory
 from gpe_pl.training.callbacks import RolloutValidation, StepProgress, WarmAverage
 from gpe_pl.training.checkpoints import AtomicCheckpoints, Checkpoints
 from gpe_pl.training.interruption import Interruption

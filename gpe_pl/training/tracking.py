@@ -16,8 +16,8 @@ from urllib.parse import urlparse
 from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.utilities import rank_zero_only
 
-from gpe_pl.atomic import replace_text, replacing
 from gpe_pl.errors import GpeError
+from gpe_pl.files.atomic import replace_text, replacing
 
 log = logging.getLogger(__name__)
 

@@ -5,8 +5,8 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from gpe_pl.geometry import Bowl
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.geometry.shapes import Bowl
+from gpe_pl.trajectory.trajectory import Trajectory
 
 ELEVATION, AZIMUTH = math.radians(24), math.radians(-60)
 """Direction from a 3D scene to the viewer: angle above the ground, and angle around the vertical."""

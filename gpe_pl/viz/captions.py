@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gpe_pl.schema import MATERIALS, node_code
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 
 UNITS = {"1": "", "deg": "°", "m^2/s": " m²/s"}
 PREFIXES = (("G", 1e9), ("M", 1e6), ("k", 1e3))

@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.colors import Colormap, LinearSegmentedColormap, ListedColormap, Normalize
 
-from gpe_pl.cells import mean_over_corners
 from gpe_pl.metrics import displacement
 from gpe_pl.schema import BOUNDARY, MATERIALS, node_code
-from gpe_pl.trajectory import Trajectory, von_mises
+from gpe_pl.trajectory.cells import mean_over_corners
+from gpe_pl.trajectory.trajectory import Trajectory, von_mises
 from gpe_pl.viz.camera import vertical_axis
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

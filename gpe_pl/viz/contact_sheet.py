@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from matplotlib.figure import Figure
 
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.coloring import ColorBy, Coloring
 from gpe_pl.viz.film_strip import evenly_spaced_frames, film_strip
 

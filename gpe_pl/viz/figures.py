@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.captions import with_heading
 from gpe_pl.viz.coloring import PALETTE, ColorBy, Coloring
 from gpe_pl.viz.film_strip import evenly_spaced_frames, film_strip, new_figure

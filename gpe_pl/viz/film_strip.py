@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import EngFormatter
 
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
 from gpe_pl.viz.captions import in_common
 from gpe_pl.viz.coloring import Coloring

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from gpe_pl.graphs.islands import unwrapped
 from gpe_pl.graphs.multiscale import levels_of, multiscale_graph
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.captions import describe
 from gpe_pl.viz.coloring import PALETTE
 from gpe_pl.viz.film_strip import CHARACTER, new_figure

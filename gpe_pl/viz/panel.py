@@ -7,9 +7,9 @@ from jaxtyping import Float
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 
-from gpe_pl.cells import kinds_of, stacked
 from gpe_pl.schema import CELL_KINDS
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.cells import kinds_of, stacked
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
 from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.scenery import INK, LIGHT, draw_scenery

@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from gpe_pl.atomic import replacing
+from gpe_pl.files.atomic import replacing
 
 
 def save_figure(figure: Figure, path: Path, **options: Any) -> None:

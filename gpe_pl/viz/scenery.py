@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 
-from gpe_pl.geometry import Shape, signed_distance
-from gpe_pl.trajectory import Boundary, Trajectory
+from gpe_pl.geometry.shapes import Shape, signed_distance
+from gpe_pl.trajectory.trajectory import Boundary, Trajectory
 from gpe_pl.viz.camera import Camera
 
 INK = "0.15"

@@ -11,9 +11,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
-from gpe_pl.atomic import replacing
 from gpe_pl.errors import GpeError
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.files.atomic import replacing
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
 from gpe_pl.viz.captions import in_common, with_heading
 from gpe_pl.viz.coloring import COLOR_MAPS, REFERENCE, ColorBy, Coloring

@@ -24,11 +24,11 @@ import numpy as np
 from jaxtyping import Float, UInt16
 from matplotlib.colors import to_rgb
 
-from gpe_pl.atomic import replace_text
 from gpe_pl.errors import GpeError
-from gpe_pl.geometry import Bowl, signed_distance
+from gpe_pl.files.atomic import replace_text
+from gpe_pl.geometry.shapes import Bowl, signed_distance
 from gpe_pl.schema import BOUNDARY, NODE_TYPES, node_code
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import AZIMUTH, ELEVATION, vertical_axis
 from gpe_pl.viz.captions import describe, heading, with_heading
 from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, ColorBy, Coloring, position_error

@@ -12,8 +12,8 @@ import yaml
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from gpe_pl.config import _groups as groups
-from gpe_pl.config import compose
+from gpe_pl.config.entry_point import _groups as groups
+from gpe_pl.config.entry_point import compose
 from gpe_pl.data.importers import Format
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,15 +10,15 @@ import pytest
 import torch
 from torch_geometric.data import HeteroData
 
+from gpe_pl.export.program import EVERYTHING, PortableStep, scene_of
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.multiscale import multiscale_graph
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE, IslandError
-from gpe_pl.portable import EVERYTHING, PortableStep, scene_of
+from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import node_code
-from gpe_pl.skips import Skips
-from gpe_pl.trajectory import State
+from gpe_pl.trajectory.trajectory import State
 from tests import scenes
 
 BOTH = ("sand", "elastomer")

@@ -16,17 +16,17 @@ import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
-from gpe_pl import integrators
-from gpe_pl.containment import Contained
 from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.graphs.builder import GraphBuilder, GraphError
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned_simulator import CHECKPOINT_FORMAT, CheckpointError, LearnedSimulator, SceneError, UnknownModelError, model_class
+from gpe_pl.learned.simulator import CHECKPOINT_FORMAT, CheckpointError, LearnedSimulator, SceneError, UnknownModelError, model_class
 from gpe_pl.models.gpe import GPE
-from gpe_pl.rollout import Guard, SimulationError, rollout
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.loop import Guard, SimulationError, rollout
 from gpe_pl.schema import param_names
-from gpe_pl.store import iter_trajectories, write_shard
-from gpe_pl.trajectory import State, Trajectory
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.store import iter_trajectories, write_shard
+from gpe_pl.trajectory.trajectory import State, Trajectory
 from tests import scenes
 
 HISTORIES = (1, 2, 5)

@@ -12,16 +12,16 @@ import pytest
 import torch
 from torch_geometric.data import Batch, HeteroData
 
+from gpe_pl.benchmarks.stability.invariances import turned
+from gpe_pl.benchmarks.stability.subject import in_order
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.standardizer import GraphStandardizer
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import FeatureSpec
-from gpe_pl.stability.invariances import turned
-from gpe_pl.stability.subject import in_order
 from tests import scenes
 
 Factory = Callable[[FeatureSpec], Any]

@@ -17,19 +17,19 @@ from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.statistics import combined, shard_moments
 from gpe_pl.data.validate import validate
+from gpe_pl.export.program import scene_of
+from gpe_pl.geometry.periodicity import NOWHERE, Periodicity, PeriodicityError
 from gpe_pl.graphs.builder import GraphBuilder, GraphError
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.islands import unwrapped
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import per_frame_mse, rollout_metrics
 from gpe_pl.models.gpe import GPE
-from gpe_pl.periodicity import NOWHERE, Periodicity, PeriodicityError
-from gpe_pl.portable import scene_of
-from gpe_pl.rollout import rollout
+from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import BOUNDARY
-from gpe_pl.store import iter_trajectories, write_shard
-from gpe_pl.trajectory import Boundary, State, Trajectory
+from gpe_pl.trajectory.store import iter_trajectories, write_shard
+from gpe_pl.trajectory.trajectory import Boundary, State, Trajectory
 from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.panel import Panel
 from tests import scenes

@@ -11,23 +11,23 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl import sealed
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.importers.source import joined
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
-from gpe_pl.geometry import Sphere, domain_walls
+from gpe_pl.files import sealed
+from gpe_pl.geometry.periodicity import NOWHERE
+from gpe_pl.geometry.shapes import Sphere, domain_walls
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator
+from gpe_pl.learned.pretrained import names
+from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.models.gpe import GPE
-from gpe_pl.periodicity import NOWHERE
-from gpe_pl.pretrained import names
-from gpe_pl.scene_ranges import described, scene_range, united
 from gpe_pl.schema import STICKY
-from gpe_pl.store import read_trajectory, trajectory_names, write_shard
-from gpe_pl.trajectory import Boundary, Motion, State, Trajectory
+from gpe_pl.trajectory.scene_ranges import described, scene_range, united
+from gpe_pl.trajectory.store import read_trajectory, trajectory_names, write_shard
+from gpe_pl.trajectory.trajectory import Boundary, Motion, State, Trajectory
 from tests import scenes
 
 GRAVITY = (0.0, -9.81)

@@ -14,18 +14,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from gpe_pl.arrays import ArrayError
-from gpe_pl.containment import contain
 from gpe_pl.data.importers import ImportSettings, import_dataset
 from gpe_pl.data.validate import validate
-from gpe_pl.geometry import Bowl, Box, DistanceGrid, Polygon, Shape, Sphere, domain_walls, outward_normal
+from gpe_pl.geometry.periodicity import Periodicity
+from gpe_pl.geometry.repeated_shapes import Repeated, repeated
+from gpe_pl.geometry.shape_values import moved, shape_from_dict, shape_to_dict
+from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Polygon, Shape, Sphere, domain_walls, outward_normal
 from gpe_pl.graphs.neighbors import radius_pairs
-from gpe_pl.periodicity import Periodicity
-from gpe_pl.repeated_shapes import Repeated, repeated
-from gpe_pl.rollout import share_outside
-from gpe_pl.shape_values import moved, shape_from_dict, shape_to_dict
-from gpe_pl.store import iter_trajectories
-from gpe_pl.trajectory import Boundary, State, Trajectory
+from gpe_pl.rollout.containment import contain
+from gpe_pl.rollout.loop import share_outside
+from gpe_pl.trajectory.arrays import ArrayError
+from gpe_pl.trajectory.store import iter_trajectories
+from gpe_pl.trajectory.trajectory import Boundary, State, Trajectory
 
 SPACING = 0.05
 CHANNEL = Periodicity(((0.1, 0.9), (0.0, 0.4)), (True, False))

@@ -11,18 +11,18 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from gpe_pl.baselines import Ballistic
-from gpe_pl.geometry import Shape, Sphere, domain_walls
-from gpe_pl.periodicity import Periodicity
-from gpe_pl.rollout import SimulationError, Simulator, rollout
+from gpe_pl.geometry.periodicity import Periodicity
+from gpe_pl.geometry.shapes import Shape, Sphere, domain_walls
+from gpe_pl.rollout.baselines import Ballistic
+from gpe_pl.rollout.loop import SimulationError, Simulator, rollout
 from gpe_pl.schema import MATERIALS, NODE_TYPES, param_names
 from gpe_pl.solvers.fem import FEM
 from gpe_pl.solvers.flip import FLIP
 from gpe_pl.solvers.materials import LIMITS, check_limits
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.solid_scenes import SolidScene
-from gpe_pl.store import read_trajectory, write_shard
-from gpe_pl.trajectory import Boundary, State, Stress
+from gpe_pl.trajectory.store import read_trajectory, write_shard
+from gpe_pl.trajectory.trajectory import Boundary, State, Stress
 from tests.particles import block, run, together
 from tests.scenes import metadata
 

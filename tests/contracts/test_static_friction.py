@@ -11,12 +11,12 @@ import pytest
 import torch
 from torch_geometric.data import HeteroData
 
-from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator, SceneError
+from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator, SceneError
 from gpe_pl.models.base import Prediction
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.static_friction import supported
-from gpe_pl.rollout import rollout
-from gpe_pl.trajectory import State
+from gpe_pl.rollout.loop import rollout
+from gpe_pl.trajectory.trajectory import State
 from tests import scenes
 
 NET = 0.4

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from gpe_pl.config import CONF
-from gpe_pl.evaluation import read_rows
+from gpe_pl.config.folder import CONF
+from gpe_pl.evaluation.rollouts import read_rows
+from gpe_pl.files.run_folder import without_tables
 from gpe_pl.fit import fit
-from gpe_pl.run_folder import without_tables
 from tests.runs import compose, first_choices, tiny
 
 EXPERIMENTS = sorted(p.stem for p in (CONF / "experiment").glob("*.yaml"))

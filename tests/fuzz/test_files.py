@@ -9,11 +9,11 @@ from pathlib import Path
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gpe_pl.faults.checkpoints import PAYLOADS, PLACES, load_damaged, load_hostile
-from gpe_pl.faults.stores import content, read_damaged
-from gpe_pl.faults.verdict import GOOD
-from gpe_pl.store import read_trajectory, write_shard
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.benchmarks.faults.checkpoints import PAYLOADS, PLACES, load_damaged, load_hostile
+from gpe_pl.benchmarks.faults.stores import content, read_damaged
+from gpe_pl.benchmarks.faults.verdict import GOOD
+from gpe_pl.trajectory.store import read_trajectory, write_shard
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests.strategies import damages, trajectories
 
 same_file = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])

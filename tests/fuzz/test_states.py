@@ -12,15 +12,15 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from torch_geometric.data import Batch, HeteroData
 
-from gpe_pl.containment import Contained
+from gpe_pl.benchmarks.stability.subject import in_order, permuted
 from gpe_pl.graphs.builder import GraphBuilder
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
-from gpe_pl.rollout import Guard, SimulationError, crowding, rollout
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.loop import Guard, SimulationError, crowding, rollout
 from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.scenes import BodyScene
-from gpe_pl.stability.subject import in_order, permuted
-from gpe_pl.trajectory import State
+from gpe_pl.trajectory.trajectory import State
 from tests.scenes import builder, metadata
 from tests.strategies import PARTICLES, body_scenes, graphs, seeds, states
 

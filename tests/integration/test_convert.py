@@ -15,16 +15,17 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
-from gpe_pl.config import CONF, ConfigError, explain
+from gpe_pl.config.entry_point import ConfigError, explain
+from gpe_pl.config.folder import CONF
 from gpe_pl.convert import convert
 from gpe_pl.data.importers import ImportFailure, save_dataset
 from gpe_pl.evaluate import evaluate_checkpoint
-from gpe_pl.evaluation import read_rows
+from gpe_pl.evaluation.rollouts import read_rows
 from gpe_pl.fit import fit
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.simulate import ensure_data
-from gpe_pl.store import StoreError
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.store import StoreError
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests import sources
 from tests.runs import RUN, compose
 from tests.sources import DT, motion

@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl import pretrained
-from gpe_pl.config import ConfigError
+from gpe_pl.config.entry_point import ConfigError
+from gpe_pl.data.ground_truth import trajectory_metadata
 from gpe_pl.evaluate import evaluate_checkpoint
-from gpe_pl.evaluation import Row, read_rows
-from gpe_pl.finished_runs import table_of
+from gpe_pl.evaluation.rollouts import Row, read_rows
+from gpe_pl.files.run_folder import RunError
 from gpe_pl.fit import fit
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.ground_truth import trajectory_metadata
-from gpe_pl.learned_simulator import LearnedSimulator, SceneError
+from gpe_pl.learned import pretrained
+from gpe_pl.learned.simulator import LearnedSimulator, SceneError
 from gpe_pl.models.gpe import GPE
-from gpe_pl.report import summary
-from gpe_pl.run_folder import RunError
+from gpe_pl.reports.finished_runs import table_of
+from gpe_pl.reports.sweep_table import summary
 from gpe_pl.simulate import dataset_spec
-from gpe_pl.store import StoreError
+from gpe_pl.trajectory.store import StoreError
 from tests.runs import DATA, compose, tiny
 
 

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from gpe_pl.config import CONF
-from gpe_pl.faults import isolation, outside, pairs, runs
-from gpe_pl.faults.runs import Command
-from gpe_pl.faults.verdict import GOOD, Fault, Verdict
+from gpe_pl.benchmarks.faults import isolation, outside, pairs, runs
+from gpe_pl.benchmarks.faults.runs import Command
+from gpe_pl.benchmarks.faults.verdict import GOOD, Fault, Verdict
+from gpe_pl.config.folder import CONF
 from gpe_pl.training.checkpoints import AtomicCheckpoints
 
 pytestmark = pytest.mark.long

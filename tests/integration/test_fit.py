@@ -23,16 +23,16 @@ from gpe_pl.data import sampling
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import NoiseError
 from gpe_pl.errors import GpeError
-from gpe_pl.evaluation import StartError, read_rows, write_rows
-from gpe_pl.finished_runs import Run, finished_runs, table_of, validation_curve
+from gpe_pl.evaluation.rollouts import StartError, read_rows, write_rows
+from gpe_pl.files.run_folder import RunError, claim
 from gpe_pl.fit import fit
-from gpe_pl.learned_simulator import LearnedSimulator
-from gpe_pl.progress import Progress
-from gpe_pl.report import report_sweep
-from gpe_pl.run_folder import RunError, claim
-from gpe_pl.store import StoreError, write_shard
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.reports.finished_runs import Run, finished_runs, table_of, validation_curve
+from gpe_pl.reports.sweep_table import report_sweep
+from gpe_pl.system.progress import Progress
 from gpe_pl.training import callbacks
 from gpe_pl.training.module import TrainingError, TrainingModule
+from gpe_pl.trajectory.store import StoreError, write_shard
 from tests.checkpoints import assert_equal, assert_same_checkpoint
 from tests.runs import tiny
 

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl.containment import Contained
 from gpe_pl.fit import fit
-from gpe_pl.learned_simulator import LearnedSimulator
-from gpe_pl.machine import resident_bytes
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
-from gpe_pl.rollout import Start, frames
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.loop import Start, frames
+from gpe_pl.system.machine import resident_bytes
 from gpe_pl.training.module import TrainingModule
-from gpe_pl.trajectory import State
+from gpe_pl.trajectory.trajectory import State
 from tests import scenes
 from tests.runs import tiny
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import gpe_pl
-from gpe_pl.config import ConfigError
+from gpe_pl.config.entry_point import ConfigError
 
 
 def example() -> str:

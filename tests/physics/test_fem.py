@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gpe_pl.geometry import Bowl, Box, Polygon, Shape, Sphere, domain_walls, signed_distance
-from gpe_pl.meshing import triangulate
+from gpe_pl.geometry.meshing import triangulate
+from gpe_pl.geometry.shapes import Bowl, Box, Polygon, Shape, Sphere, domain_walls, signed_distance
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers.fem import FEM
 from gpe_pl.solvers.fem.elements import build_mesh
 from gpe_pl.solvers.materials import lame_parameters
 from gpe_pl.solvers.solid_scenes import SolidScene
-from gpe_pl.trajectory import Boundary, State, von_mises
+from gpe_pl.trajectory.trajectory import Boundary, State, von_mises
 
 pytestmark = pytest.mark.slow
 

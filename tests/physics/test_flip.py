@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gpe_pl.geometry import Bowl, Box, Polygon, Sphere, Wall, domain_walls
+from gpe_pl.geometry.shapes import Bowl, Box, Polygon, Sphere, Wall, domain_walls
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.flip import FLIP
 from gpe_pl.solvers.flip.solver import Fields
 from gpe_pl.solvers.flip.transfer import add_impulse, scatter
 from gpe_pl.solvers.fluid_scenes import FluidScene
-from gpe_pl.trajectory import Boundary, State
+from gpe_pl.trajectory.trajectory import Boundary, State
 
 pytestmark = pytest.mark.slow
 

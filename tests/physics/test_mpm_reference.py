@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gpe_pl.geometry import domain_walls
+from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.materials import Elastomer, Snow
 from gpe_pl.solvers.mpm import MPM
-from gpe_pl.trajectory import Boundary, State
+from gpe_pl.trajectory.trajectory import Boundary, State
 
 pytestmark = pytest.mark.slow
 

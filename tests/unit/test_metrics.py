@@ -6,7 +6,7 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from gpe_pl.geometry import domain_walls
+from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.metrics import (
     UNITS,
     OneStepNMSE,
@@ -17,7 +17,7 @@ from gpe_pl.metrics import (
     per_frame_mse,
     rollout_metrics,
 )
-from gpe_pl.trajectory import Boundary, Metadata, Stress, Termination, Trajectory
+from gpe_pl.trajectory.trajectory import Boundary, Metadata, Stress, Termination, Trajectory
 
 DT = 0.1
 

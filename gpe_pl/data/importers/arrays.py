@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl.arrays import estimated_normals, flags, numbers
 from gpe_pl.data.importers import npz
 from gpe_pl.data.importers.source import (
     Facts,
@@ -35,8 +34,9 @@ from gpe_pl.data.importers.source import (
     split_folders,
     walls_at_bounds,
 )
-from gpe_pl.periodicity import NOWHERE, Periodicity
-from gpe_pl.trajectory import Boundary, Trajectory
+from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
+from gpe_pl.trajectory.arrays import estimated_normals, flags, numbers
+from gpe_pl.trajectory.trajectory import Boundary, Trajectory
 
 KEYS = (
     *(

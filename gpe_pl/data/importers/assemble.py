@@ -13,9 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl import integrators, sealed
-from gpe_pl.arrays import ArrayError, nearest_distances
-from gpe_pl.atomic import free_bytes, replacing
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
@@ -23,15 +20,19 @@ from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, I
 from gpe_pl.data.motion import ROUNDING_SHARE, MotionSummary, better_origin, motion_of, rounding_fault
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.errors import GpeError
+from gpe_pl.files import sealed
+from gpe_pl.files.atomic import free_bytes, replacing
+from gpe_pl.files.names import NameRefused, data_name
+from gpe_pl.geometry.periodicity import PeriodicityError
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
-from gpe_pl.locks import held
-from gpe_pl.names import NameRefused, data_name
-from gpe_pl.periodicity import PeriodicityError
-from gpe_pl.progress import Progress
 from gpe_pl.schema import HISTORY, MATERIALS, NODE_TYPES, SPLITS, ParameterGroup, node_code, param_names
-from gpe_pl.store import iter_trajectories, stored_arrays, write_shard
-from gpe_pl.trajectory import Metadata, Trajectory
-from gpe_pl.values import faults, size_conflicts
+from gpe_pl.system.locks import held
+from gpe_pl.system.progress import Progress
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.arrays import ArrayError, nearest_distances
+from gpe_pl.trajectory.store import iter_trajectories, stored_arrays, write_shard
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+from gpe_pl.trajectory.values import faults, size_conflicts
 
 FOLDER = "imported"
 """Folder of imported data in that of a data set, where generated data have their size."""

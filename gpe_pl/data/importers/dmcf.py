@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl import regular_files
 from gpe_pl.data.importers.source import (
     Facts,
     ImportFailure,
@@ -36,7 +35,8 @@ from gpe_pl.data.importers.source import (
     natural,
     split_folders,
 )
-from gpe_pl.hdf5_arrays import most_unpacked
+from gpe_pl.files import regular_files
+from gpe_pl.files.hdf5_arrays import most_unpacked
 
 ENDING = ".msgpack.zst"
 PART = re.compile(r"(_\d+)_(\d+)$")

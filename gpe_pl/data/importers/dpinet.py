@@ -31,7 +31,7 @@ from gpe_pl.data.importers.source import (
     natural,
     split_folders,
 )
-from gpe_pl.hdf5_arrays import is_named
+from gpe_pl.files.hdf5_arrays import is_named
 
 FRAME_DT = 1 / 60
 GRAVITY = (0.0, -9.8, 0.0)

@@ -44,7 +44,7 @@ from gpe_pl.data.importers.source import (
     split_files,
     typed,
 )
-from gpe_pl.hdf5_arrays import is_named
+from gpe_pl.files.hdf5_arrays import is_named
 
 TYPES = {0: "solid", 3: "boundary", 5: "fluid", 6: "sand", 7: "snow"}
 PACKED = "gns_data"

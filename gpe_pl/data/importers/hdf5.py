@@ -11,7 +11,7 @@ import numpy as np
 
 from gpe_pl.data.importers.source import MAX_TRAJECTORIES, ImportFailure, Refusal, natural
 from gpe_pl.errors import GpeError
-from gpe_pl.hdf5_arrays import dataset_in, is_named, is_own, obstacle
+from gpe_pl.files.hdf5_arrays import dataset_in, is_named, is_own, obstacle
 
 
 @contextmanager

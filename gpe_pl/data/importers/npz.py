@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from gpe_pl import regular_files
 from gpe_pl.data.importers.source import MAX_TRAJECTORIES, ImportFailure, Refusal
-from gpe_pl.hdf5_arrays import LARGEST_DEFLATE_RATIO, most_unpacked
-from gpe_pl.zip_members import num_members
+from gpe_pl.files import regular_files
+from gpe_pl.files.hdf5_arrays import LARGEST_DEFLATE_RATIO, most_unpacked
+from gpe_pl.files.zip_members import num_members
 
 HEADERS: dict[tuple[int, int], Any] = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gpe_pl.atomic import replace_text
+from gpe_pl.files.atomic import replace_text
 from gpe_pl.printable import printable
 from gpe_pl.schema import MATERIALS
 

@@ -12,15 +12,15 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from gpe_pl import regular_files
-from gpe_pl.arrays import estimated_normals, numbers
 from gpe_pl.errors import GpeError
-from gpe_pl.geometry import domain_walls
-from gpe_pl.json_text import parsed
-from gpe_pl.names import DataName
-from gpe_pl.periodicity import NOWHERE, Periodicity
+from gpe_pl.files import regular_files
+from gpe_pl.files.json_text import parsed
+from gpe_pl.files.names import DataName
+from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
+from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES
-from gpe_pl.trajectory import Boundary, Motion, Trajectory
+from gpe_pl.trajectory.arrays import estimated_normals, numbers
+from gpe_pl.trajectory.trajectory import Boundary, Motion, Trajectory
 
 Format = Literal["gns", "lagrangebench", "meshgraphnets", "dpinet", "dmcf", "arrays"]
 

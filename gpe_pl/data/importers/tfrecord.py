@@ -19,8 +19,8 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from gpe_pl import regular_files
 from gpe_pl.data.importers.source import MAX_TRAJECTORIES, ImportFailure, Refusal
+from gpe_pl.files import regular_files
 
 Feature = list[bytes] | np.ndarray
 """Byte strings, or numbers as float32 or int64."""

@@ -20,8 +20,8 @@ from numba import njit
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
-from gpe_pl.geometry import check_bounds
-from gpe_pl.rollout import SimulationError
+from gpe_pl.geometry.shapes import check_bounds
+from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.fem.contact import Obstacles, collect, push_out_corners, push_out_nodes, resist_corners, resist_nodes
 from gpe_pl.solvers.fem.elements import (
@@ -35,7 +35,7 @@ from gpe_pl.solvers.fem.elements import (
 )
 from gpe_pl.solvers.materials import LIMITS, check_limits, lame_parameters
 from gpe_pl.solvers.supported import check_surroundings
-from gpe_pl.trajectory import Boundary, State
+from gpe_pl.trajectory.trajectory import Boundary, State
 
 OK, NOT_FINITE, ESCAPE, TOO_MANY_SUBSTEPS = 0, 1, 2, 3
 KINDS = {"triangle": 0, "quad": 1, "tetrahedron": 2}

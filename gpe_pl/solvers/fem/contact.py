@@ -17,7 +17,7 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from numba import njit
 
-from gpe_pl.geometry import Box, Polygon, Shape, Sphere, Wall
+from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, Wall
 from gpe_pl.schema import STICKY
 
 FIELD_CELLS = 64

@@ -24,8 +24,8 @@ from numba import njit
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import eigsh
 
-from gpe_pl.rollout import SimulationError
-from gpe_pl.trajectory import Stress
+from gpe_pl.rollout.loop import SimulationError
+from gpe_pl.trajectory.trajectory import Stress
 
 SMALLEST_RATIO = 0.2
 """Volume ratio J below which the logarithm is continued by its tangent."""

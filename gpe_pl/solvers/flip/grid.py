@@ -13,7 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from gpe_pl.geometry import Shape, signed_distance
+from gpe_pl.geometry.shapes import Shape, signed_distance
 from gpe_pl.solvers.flip import transfer
 
 PADDING = 3

@@ -10,15 +10,15 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as validated_dataclass
 
-from gpe_pl.geometry import Wall, check_whole_cells, domain_walls, outward_normal, signed_distance, thickness
-from gpe_pl.rollout import SimulationError
+from gpe_pl.geometry.shapes import Wall, check_whole_cells, domain_walls, outward_normal, signed_distance, thickness
+from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import NODE_TYPES, node_code, param_names
 from gpe_pl.solvers.flip import islands, pressure, transfer, viscosity
 from gpe_pl.solvers.flip.grid import HALF, Grid, Solids, make_grid, make_solids
 from gpe_pl.solvers.flip.linear import conjugate_gradients, incomplete_cholesky
 from gpe_pl.solvers.materials import check_limits
 from gpe_pl.solvers.supported import check_surroundings
-from gpe_pl.trajectory import Boundary, State
+from gpe_pl.trajectory.trajectory import Boundary, State
 
 MATERIAL = "fluid"
 

@@ -11,15 +11,15 @@ import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass as validated_dataclass
 
-from gpe_pl.geometry import check_whole_cells
-from gpe_pl.rollout import SimulationError
+from gpe_pl.geometry.shapes import check_whole_cells
+from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import MATERIALS, NODE_TYPES, node_code, param_names
 from gpe_pl.solvers.materials import LIMITS, MEMORY, NUM_CONSTANTS, Elastomer, Fluid, Sand, Snow, check_limits
 from gpe_pl.solvers.mpm.collider import Collider, collider
 from gpe_pl.solvers.mpm.frame import ESCAPE, NOT_FINITE, OK, advance
 from gpe_pl.solvers.mpm.particles import Particles
 from gpe_pl.solvers.supported import check_surroundings
-from gpe_pl.trajectory import Boundary, State
+from gpe_pl.trajectory.trajectory import Boundary, State
 
 PADDING = 3
 """Cells between the domain and the edge of the grid: room for the kernel of a particle on a wall, or one cell behind it."""

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl import sealed
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.dataset import HeldGraphs, WindowDataset
@@ -22,11 +21,12 @@ from gpe_pl.data.importers import save_dataset
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
 from gpe_pl.data.statistics import motion
+from gpe_pl.files import sealed
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
-from gpe_pl.store import StoreError, read_trajectory, trajectory_names, write_shard
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.store import StoreError, read_trajectory, trajectory_names, write_shard
+from gpe_pl.trajectory.trajectory import Trajectory
 
 
 @pytest.fixture
@@ -97,10 +97,10 @@ def test_validation_batches_keep_the_budget_of_nodes_and_change_no_value(root: P
 
 
 def test_the_nodes_of_a_validation_batch_are_shared_by_the_ranks(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gpe_pl.ranks.num_ranks", lambda: 2)
+    monkeypatch.setattr("gpe_pl.system.ranks.num_ranks", lambda: 2)
     module = datamodule(root, batch_size=BatchSize(2, 24))
     assert [b.frame.tolist() for b in module.val_dataloader()] == [[2], [4]]
-    monkeypatch.setattr("gpe_pl.ranks.rank", lambda: 1)
+    monkeypatch.setattr("gpe_pl.system.ranks.rank", lambda: 1)
     assert [b.frame.tolist() for b in module.val_dataloader()] == [[3]]
 
 

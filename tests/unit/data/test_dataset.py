@@ -19,15 +19,15 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl import integrators
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.dataset import CACHE_BYTES, StartKey, StoredTrajectory, WindowDataset, collated, long_enough, open_split, usable
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import NUM_LANES, UNIFORM_SHARE, BatchSampler, BatchSize, PushForward, StepSampler, probabilities
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.store import StoreError, read_trajectory, write_shard
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.store import StoreError, read_trajectory, write_shard
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests.scenes import assert_equal_graphs
 
 NOISE = Noise(0.0, 0.5)

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gpe_pl import integrators
 from gpe_pl.data.noise import Noise, NoiseError
+from gpe_pl.trajectory import integrators
 from tests import scenes
 
 DT, UNIT, SIDE = 0.01, 0.3, 4.0

@@ -16,10 +16,10 @@ import pytest
 
 from gpe_pl.data.free_flight import free_flights
 from gpe_pl.data.validate import format_page, main, validate
-from gpe_pl.geometry import Sphere
+from gpe_pl.geometry.shapes import Sphere
 from gpe_pl.schema import node_code
-from gpe_pl.store import read_trajectory, write_shard
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.store import read_trajectory, write_shard
+from gpe_pl.trajectory.trajectory import Trajectory
 
 ROOT = Path(__file__).parents[3]
 Edit = Callable[[Trajectory], Trajectory]
@@ -297,7 +297,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from gpe_pl.data.validate import validate
-from gpe_pl.store import read_trajectory
+from gpe_pl.trajectory.store import read_trajectory
 
 content, damaged, rng = Path(sys.argv[1]).read_bytes(), Path(sys.argv[2]), np.random.default_rng(int(sys.argv[3]))
 for _ in range(40):
@@ -326,7 +326,7 @@ def test_format_page_is_up_to_date() -> None:
 
 def test_format_page_names_everything() -> None:
     from gpe_pl.schema import FIELDS, MATERIALS
-    from gpe_pl.trajectory import Metadata
+    from gpe_pl.trajectory.trajectory import Metadata
 
     page = format_page()
     for name in (*FIELDS, *MATERIALS, *Metadata.__dataclass_fields__):

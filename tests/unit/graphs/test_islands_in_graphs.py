@@ -13,9 +13,9 @@ from scipy.sparse.csgraph import connected_components
 from torch_geometric.data import Batch
 
 from gpe_pl.graphs.islands import islands_within
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE, IslandError
-from gpe_pl.trajectory import State
+from gpe_pl.trajectory.trajectory import State
 from tests import scenes
 
 TWO = ("sand", "snow")

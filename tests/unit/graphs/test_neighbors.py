@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.graphs import neighbors
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
-from gpe_pl.periodicity import NOWHERE, Periodicity
-from gpe_pl.rollout import SimulationError
+from gpe_pl.rollout.loop import SimulationError
 
 
 @pytest.mark.parametrize("periodicity", [NOWHERE, Periodicity(((0.0, 1.0), (0.0, 1.0)), (True, False))])

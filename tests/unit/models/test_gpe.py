@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
 from gpe_pl.models.gpe import GPE, MaterialEmbedding, StressError
+from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import is_symmetric
-from gpe_pl.skips import Skips
 from tests import scenes
 
 DOUBLE = torch.float64

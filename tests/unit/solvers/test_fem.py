@@ -6,15 +6,15 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from gpe_pl.geometry import Box, Polygon, Sphere, domain_walls
-from gpe_pl.rollout import SimulationError, Simulator
+from gpe_pl.geometry.shapes import Box, Polygon, Sphere, domain_walls
+from gpe_pl.rollout.loop import SimulationError, Simulator
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers import fem as fem_package
 from gpe_pl.solvers.fem import FEM
 from gpe_pl.solvers.fem.elements import SMALLEST_RATIO, build_mesh, cauchy_stress, elastic_energy
 from gpe_pl.solvers.materials import lame_parameters
 from gpe_pl.solvers.solid_scenes import SolidScene
-from gpe_pl.trajectory import Boundary
+from gpe_pl.trajectory.trajectory import Boundary
 
 SQUARE = ((0.0, 1.0), (0.0, 1.0))
 SCENES = {

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gpe_pl.geometry import Box, Sphere, domain_walls
-from gpe_pl.rollout import SimulationError
+from gpe_pl.geometry.shapes import Box, Sphere, domain_walls
+from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.flip import FLIP
 from gpe_pl.solvers.flip.grid import PADDING, make_grid, make_solids
 from gpe_pl.solvers.flip.linear import conjugate_gradients, incomplete_cholesky
 from gpe_pl.solvers.flip.pressure import surface_distance
 from gpe_pl.solvers.flip.solver import Fields
-from gpe_pl.trajectory import Boundary, State
+from gpe_pl.trajectory.trajectory import Boundary, State
 
 
 def liquid(dim=2, count=200, boundary=None, seed=0):

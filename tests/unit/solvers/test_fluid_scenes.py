@@ -14,12 +14,12 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 from scipy.spatial import cKDTree
 
-from gpe_pl.geometry import Bowl, Box, DistanceGrid, domain_walls, signed_distance
+from gpe_pl.geometry.shape_values import shape_from_dict, shape_to_dict
+from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, domain_walls, signed_distance
+from gpe_pl.geometry.terrain_files import TerrainError
 from gpe_pl.schema import STICKY, node_code
-from gpe_pl.shape_values import shape_from_dict, shape_to_dict
 from gpe_pl.solvers.fluid_scenes import CLEARANCE, FluidScene, TerrainOptions
-from gpe_pl.terrain_files import TerrainError
-from gpe_pl.trajectory import State
+from gpe_pl.trajectory.trajectory import State
 
 EARTH_2D = (0.0, -9.81)
 

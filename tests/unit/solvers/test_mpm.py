@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gpe_pl.geometry import Box, Polygon, Sphere, domain_walls
-from gpe_pl.rollout import SimulationError
+from gpe_pl.geometry.shapes import Box, Polygon, Sphere, domain_walls
+from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.mpm import MPM, MPMInternal
-from gpe_pl.trajectory import Boundary
+from gpe_pl.trajectory.trajectory import Boundary
 from tests.particles import VALUE, block, run, together
 
 ALL = ("sand", "snow", "elastomer", "fluid")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gpe_pl.geometry import signed_distance
+from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.solvers.recorded_scene import RecordedScene, RecordingError, read_recording
 from gpe_pl.solvers.scenes import Scene, describe
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gpe_pl.geometry import signed_distance
+from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.schema import NODE_TYPES, STICKY, node_code
 from gpe_pl.solvers.scenes import BodyScene, Scene, describe
 

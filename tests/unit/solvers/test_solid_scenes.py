@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gpe_pl.geometry import Sphere, signed_distance
-from gpe_pl.rollout import rollout
+from gpe_pl.geometry.shapes import Sphere, signed_distance
+from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import MATERIALS, STICKY, node_code
 from gpe_pl.solvers.fem import FEM
 from gpe_pl.solvers.scenes import Scene, describe

@@ -12,15 +12,15 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from gpe_pl import sealed
-from gpe_pl.config import construct
+from gpe_pl.config.entry_point import construct
 from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.data.sampling import BatchSize, PushForward
+from gpe_pl.files import sealed
+from gpe_pl.files.run_folder import without_tables
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
-from gpe_pl.run_folder import without_tables
 from gpe_pl.training import budget
 from gpe_pl.training.budget import BudgetError, PauseForMeasurements, step_time, step_time_key, within_budget
 from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule

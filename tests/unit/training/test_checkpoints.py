@@ -18,23 +18,23 @@ import pytest
 import torch
 from lightning.pytorch.loggers import CSVLogger
 
-from gpe_pl import sealed
 from gpe_pl.data import sampling
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
+from gpe_pl.files import sealed
+from gpe_pl.files.run_folder import RunError, claim
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned_simulator import CheckpointError, LearnedSimulator
+from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.models.gpe import GPE
-from gpe_pl.run_folder import RunError, claim
-from gpe_pl.store import write_shard
 from gpe_pl.training.callbacks import RolloutValidation
 from gpe_pl.training.checkpoints import Checkpoints
 from gpe_pl.training.interruption import Interruption
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, train
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.store import write_shard
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests.checkpoints import assert_same_checkpoint
 
 STEPS, INTERVAL = 9, 3

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 from torch_geometric.data import Batch, HeteroData
 
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.training.callbacks import WarmAverage
 from gpe_pl.training.module import TrainingError, TrainingModule

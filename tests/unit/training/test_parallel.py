@@ -18,23 +18,24 @@ from lightning.pytorch.loggers import CSVLogger
 from torch import nn
 from torch_geometric.data import Batch, HeteroData
 
-from gpe_pl import ranks, sealed
 from gpe_pl.data import sampling
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.dataset import Samples
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize, Sampling
+from gpe_pl.files import sealed
+from gpe_pl.files.run_folder import RunError
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
-from gpe_pl.run_folder import RunError
 from gpe_pl.schema import node_code, param_names
-from gpe_pl.store import StoreError, write_shard
+from gpe_pl.system import ranks
 from gpe_pl.training.module import MAX_IN_ROW, TrainingError, TrainingModule
 from gpe_pl.training.parallel import sum_gradients
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, train
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.store import StoreError, write_shard
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests import scenes
 from tests.ranks import as_launched, on_ranks
 

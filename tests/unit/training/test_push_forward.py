@@ -14,18 +14,18 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.data.dataset import Start, StartKey, WindowDataset, open_split
 from gpe_pl.data.sampling import PushForward
-from gpe_pl.finished_runs import UNSAID
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
-from gpe_pl.rollout import SimulationError
-from gpe_pl.store import write_shard
+from gpe_pl.reports.finished_runs import UNSAID
+from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.push_forward import walked
 from gpe_pl.training.run import TrainingSettings
-from gpe_pl.trajectory import Motion, State, Trajectory
+from gpe_pl.trajectory.store import write_shard
+from gpe_pl.trajectory.trajectory import Motion, State, Trajectory
 from tests.scenes import assert_equal_graphs
 
 

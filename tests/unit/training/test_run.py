@@ -9,8 +9,8 @@ import pytest
 import torch
 from lightning.pytorch.utilities import rank_zero_only
 
-from gpe_pl import sealed
-from gpe_pl.run_folder import RunError, claim, without_tables
+from gpe_pl.files import sealed
+from gpe_pl.files.run_folder import RunError, claim, without_tables
 from gpe_pl.training.run import TrainerSettings, adopt, set_up
 
 CONFIG: dict[str, Any] = {"seed": 0, "model": {"depth": 3}, "training": {"batch_size": 2}}

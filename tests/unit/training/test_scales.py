@@ -14,17 +14,17 @@ import pytest
 import torch
 from lightning.pytorch.loggers import CSVLogger
 
-from gpe_pl import evaluation
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.dataset import collated
 from gpe_pl.data.importers import ImportFailure, save_dataset
 from gpe_pl.data.importers.source import SMALLEST, number
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
-from gpe_pl.evaluation import EvaluationSettings, Row, evaluate
-from gpe_pl.geometry import Box, Shape, Sphere, domain_walls
+from gpe_pl.evaluation import rollouts
+from gpe_pl.evaluation.rollouts import EvaluationSettings, Row, evaluate
+from gpe_pl.geometry.shapes import Box, Shape, Sphere, domain_walls
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned_simulator import LearnedSimulator
+from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import UNITS
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
@@ -32,7 +32,7 @@ from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, train
-from gpe_pl.trajectory import Boundary, Trajectory
+from gpe_pl.trajectory.trajectory import Boundary, Trajectory
 from tests import scenes
 
 NUM_FRAMES, FRAME_DT, SPACING = 16, 0.01, 0.1
@@ -134,7 +134,7 @@ def in_metres(folder: Path) -> tuple[list[float], int, list[Row]]:
 
 @pytest.fixture(autouse=True)
 def _without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(evaluation, "_error_curve", lambda *_: None)
+    monkeypatch.setattr(rollouts, "_error_curve", lambda *_: None)
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +208,7 @@ def test_limits_of_evaluated_rollouts_follow_the_scene(still: bool, tmp_path: Pa
         if still:
             trajectory = replace(trajectory, pos=np.repeat(trajectory.pos[:1], NUM_FRAMES, axis=0), vel=np.zeros_like(trajectory.vel))
         simulator = new_module(datamodule, "GPE").simulator
-        guard = evaluation._start(simulator, 2, trajectory, trajectory.frames(2)).guard
+        guard = rollouts._start(simulator, 2, trajectory, trajectory.frames(2)).guard
         assert guard is not None
         guards.append(guard)
     usual, scaled = guards

@@ -13,7 +13,7 @@ import wandb
 from lightning.pytorch import loggers as lightning_loggers
 from lightning.pytorch.loggers import Logger
 
-from gpe_pl.atomic import FullDiskError
+from gpe_pl.files.atomic import FullDiskError
 from gpe_pl.training import tracking
 from gpe_pl.training.tracking import LoggerSettings, TrackingError, publish, run_id
 

@@ -4,9 +4,9 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from gpe_pl.geometry import Box, Polygon, Shape, Sphere, domain_walls
+from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, domain_walls
 from gpe_pl.schema import node_code
-from gpe_pl.trajectory import Boundary, Metadata, Stress, Termination, Trajectory
+from gpe_pl.trajectory.trajectory import Boundary, Metadata, Stress, Termination, Trajectory
 
 
 def falling(dim: int, num_frames: int = 12, noise: float = 0.0) -> Trajectory:

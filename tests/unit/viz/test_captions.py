@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from gpe_pl.baselines import Ballistic
 from gpe_pl.data.importers import draw_contact_sheet, save_dataset
-from gpe_pl.rollout import rollout
+from gpe_pl.rollout.baselines import Ballistic
+from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import node_code
-from gpe_pl.store import read_trajectory, write_shard
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.store import read_trajectory, write_shard
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz import contact_sheet as sheets
 from gpe_pl.viz import video
 from gpe_pl.viz.captions import describe, parameter_value, row_label

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from gpe_pl.schema import node_code
-from gpe_pl.trajectory import Termination
+from gpe_pl.trajectory.trajectory import Termination
 from gpe_pl.viz.contact_sheet import contact_sheet
 
 

@@ -15,8 +15,8 @@ from gpe_pl.data.importers import ImportFailure, ImportSettings, Report, import_
 from gpe_pl.data.importers.source import natural
 from gpe_pl.data.validate import validate
 from gpe_pl.schema import STICKY, node_code
-from gpe_pl.store import iter_trajectories
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.trajectory.store import iter_trajectories
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests import sources
 from tests.sources import DT, SPACING, motion
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from gpe_pl.atomic import FullDiskError
 from gpe_pl.data.importers import CONTACT_SHEET_FILE, ImportFailure, ImportSettings, Report, import_dataset, save_dataset
-from gpe_pl.trajectory import Trajectory
+from gpe_pl.files.atomic import FullDiskError
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests import sources
 from tests.sources import motion
 
@@ -62,7 +62,7 @@ def test_one_during_which_the_disk_fills(raw: Path, monkeypatch: pytest.MonkeyPa
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patched:
-        patched.setattr("gpe_pl.late_failure.os.write", full)
+        patched.setattr("gpe_pl.system.late_failure.os.write", full)
         with pytest.raises(FullDiskError, match=r"data/set/imported: cannot be written, there is no room"):
             converted(raw)
     assert left(raw) == []

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gpe_pl import integrators
-from gpe_pl.arrays import ArrayError
 from gpe_pl.data.importers import ImportFailure, ImportSettings, Report, import_dataset, save_dataset
 from gpe_pl.data.motion import motion_of
 from gpe_pl.data.validate import validate
-from gpe_pl.geometry import Shape, Sphere, domain_walls
-from gpe_pl.store import iter_trajectories
-from gpe_pl.trajectory import Boundary, Trajectory
+from gpe_pl.geometry.shapes import Shape, Sphere, domain_walls
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.arrays import ArrayError
+from gpe_pl.trajectory.store import iter_trajectories
+from gpe_pl.trajectory.trajectory import Boundary, Trajectory
 from tests import sources
 from tests.sources import DT, SPACING
 

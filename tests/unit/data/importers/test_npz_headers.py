@@ -9,9 +9,9 @@ from pathlib import Path
 import h5py
 import pytest
 
+from gpe_pl.benchmarks.faults.side_files import raw_arrays
 from gpe_pl.data.importers import hdf5, npz
 from gpe_pl.data.importers.source import ImportFailure, Refusal
-from gpe_pl.faults.side_files import raw_arrays
 from tests.refusals import convert, only_refusal
 
 HEADERS = {

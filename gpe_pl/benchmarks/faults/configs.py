@@ -1,0 +1,107 @@
+"""Configurations with wrong types, missing and misspelt keys, and absurd values, as overrides of a command."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from gpe_pl.benchmarks.faults.isolation import run
+from gpe_pl.benchmarks.faults.verdict import Fault, Verdict
+from gpe_pl.errors import GpeError
+
+PLACES = (
+    "paths",
+    "hydra",
+    "size",
+    "data.comparison",
+    "data.dimensions",
+    "data.sizes",
+    "data.showcase",
+    "data.larger",
+    "logger.project",
+)
+"""Keys that are not drawn: where things lie, and tables that other keys are taken from, of which most entries do not matter."""
+UNBOUNDED = ("training.num_steps", "training.val_interval", "seed", "data.seed", "num_workers")
+"""Integers that may be as large as anybody likes."""
+
+
+class NoConfigError(GpeError):
+    """A command does not show its configuration; the message says what it printed."""
+
+
+def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Keys of a configuration with what is neither a mapping nor a list of mappings."""
+    if isinstance(values, dict) and values:
+        for key, value in values.items():
+            yield from leaves(value, f"{path}.{key}" if path else str(key))
+    elif not str(path).startswith(PLACES):
+        yield path, values
+
+
+def mutations(key: str, value: Any) -> Iterator[tuple[str, str, bool]]:
+    """Kind and override of what may be typed instead of a value, and whether nothing but a refusal will do."""
+    parent, _, leaf = key.rpartition(".")
+    yield "unknown key", f"+{parent + '.' if parent else ''}{leaf}_typo=1", True
+    yield "missing key", f"~{key}", False  # defaults of signatures count
+    if isinstance(value, bool):
+        wrong, absurd = ["banana", "7", "[true]", "{a:1}", "0.5"], []
+    elif isinstance(value, int):
+        wrong, absurd = ["banana", "[1]", "{a:1}", "0.123", "nan", "inf"], ["-7", *([] if key in UNBOUNDED else [str(10**30)])]
+    elif isinstance(value, float):
+        wrong, absurd = ["banana", "[[1]]", "{a:1}", "nan", "inf"], ["-1e300", "1e300", "-1"]
+    elif isinstance(value, str):
+        wrong, absurd = ["[1]", "{a:1}"], ["''", "no_such_thing", "'../../outside'", "'\\x00'"]
+    elif isinstance(value, list):
+        wrong, absurd = ["banana", "{a:1}", "[banana]", "[[[1]]]", "[nan]"], ["[]", "[-1e300]", "[-7]"]
+    else:
+        wrong, absurd = ["{a:{b:1}}"], []
+    for text in wrong:
+        yield "wrong type", f"{key}={text}", True
+    for text in absurd:
+        yield "absurd value", f"{key}={text}", False
+
+
+def started(command: str, arguments: Sequence[str], override: str, must_fail: bool, limit: float, folder: Path) -> Verdict:
+    """Start a command with one override more."""
+    ended = run(command, [*arguments, f"paths.runs={folder}", override], limit)
+    verdict = ended.verdict("accepted" if must_fail else "harmless")
+    if verdict.status in ("refused", "harmless") and list(folder.rglob("*.part*")):
+        return Verdict("half-written", verdict.detail)
+    return verdict
+
+
+def faults(command: str, arguments: Sequence[str], count: int, seed: int = 0, limit: float = 120.0, seconds: float = 0.0) -> list[Fault]:
+    """Mutations of the configuration that a command gets with some arguments.
+
+    Args:
+        command: ``fit`` and so on.
+        arguments: of the command where nothing is wrong.
+        count: of the mutations, equally many of each kind.
+        seed: of their choice.
+        limit: seconds after which a command is stopped.
+        seconds: that the command takes where nothing is wrong. Some mutations change nothing, and the command runs to its end.
+
+    Raises:
+        NoConfigError: the arguments themselves do not fit.
+    """
+    shown = run(command, [*arguments, "--cfg", "job", "--resolve"])
+    if shown.code != 0:
+        raise NoConfigError(f"{command} {' '.join(arguments)}: {shown.output}")
+    rng = np.random.default_rng(seed)
+    by_kind: dict[str, list[tuple[str, bool]]] = {}
+    for key, value in leaves(yaml.safe_load(shown.output)):
+        for kind, override, must_fail in mutations(key, value):
+            by_kind.setdefault(kind, []).append((override, must_fail))
+    found = []
+    for kind, every in by_kind.items():
+        chosen = rng.permutation(len(every))[: math.ceil(count / len(by_kind))]
+        for override, must_fail in (every[k] for k in sorted(chosen)):
+            attack = partial(started, command, tuple(arguments), override, must_fail, limit)
+            found.append(Fault(f"configuration, {kind}", f"{command} {override}", attack, seconds))
+    return found

@@ -1,0 +1,226 @@
+"""Values in stored arrays that break the rules of their fields, brought in by every way that data come in."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from gpe_pl.benchmarks.faults.scenes import small_model
+from gpe_pl.benchmarks.faults.verdict import MAX_DETAIL, Fault, Verdict
+from gpe_pl.data.dataset import long_enough, open_split, usable
+from gpe_pl.data.generation import shard_path
+from gpe_pl.data.ground_truth import DatasetSpec, generate_trajectory
+from gpe_pl.data.importers import save_dataset
+from gpe_pl.data.validate import validate
+from gpe_pl.errors import GpeError
+from gpe_pl.rollout.loop import rollout
+from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, Values, node_code
+from gpe_pl.trajectory.store import digest, read_trajectory, stored_arrays, write_shard
+from gpe_pl.trajectory.trajectory import Boundary, Motion, State, Trajectory
+
+NUM_FRAMES = 6
+NOT_NUMBERS = (np.nan, np.inf, -np.inf, -1e30)
+OFFENDERS: dict[Values, tuple[float, ...]] = {
+    "finite": (*NOT_NUMBERS, 1e30),
+    "positive": (*NOT_NUMBERS, -1.0, 0.0),
+    "at least 0": (*NOT_NUMBERS, -1.0),
+    "0 to 1": (*NOT_NUMBERS, -0.5, 1.5),
+    "unit vectors": (*NOT_NUMBERS, 0.5, 3.0),
+    "node types": (255, len(NODE_TYPES), node_code("boundary")),
+    "parameters": NOT_NUMBERS,
+    "nodes of cells": (-1, 2**31 - 1),
+    "dimension of cells": (0, 1, 7),
+}
+"""Values that break each rule, in whichever element they stand."""
+Value = int | float | str
+LONGER = "a row more"
+FIRST = "00000"
+
+
+def spoilt(arrays: dict[str, np.ndarray], key: str, value: Value, seed: int) -> dict[str, np.ndarray]:
+    """The arrays with a wrong value in one of them, at a random place, or with a row more than the others."""
+    array = arrays[key].copy()
+    if value == LONGER:
+        axis = int(FIELDS[key].dims[0] in ("frame", MOTION))  # of nodes, or cells
+        array = np.concatenate([array, array.take([0], axis)], axis)
+    else:
+        array[np.unravel_index(int(np.random.default_rng(seed).integers(array.size)), array.shape)] = value
+    return {**arrays, key: array}
+
+
+# --- ways in --------------------------------------------------------------------------------------------------------------------------------
+
+
+def train(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
+    """As training reads it: what it says of a trajectory that it leaves out, or of the whole split."""
+    _store(shard, key, value, seed, folder)
+    return _left_out(lambda: [stored.name for stored in usable(open_split(folder, "train"))])
+
+
+def evaluate(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
+    """As evaluation reads it: the same."""
+    _store(shard, key, value, seed, folder)
+    return _left_out(lambda: [trajectory.metadata.dataset for trajectory in long_enough(folder, "train", 2)])
+
+
+def check(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
+    """What the validator says of it."""
+    found = validate([_store(shard, key, value, seed, folder)]).violations
+    return "; ".join(str(v) for v in found if v.trajectory == FIRST)
+
+
+def convert(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
+    """What a data set made of it and of a sound one says of the one that it refuses."""
+    sound, arrays = _sound(shard)
+    report = save_dataset(folder, "own", train=[_trajectory(sound, spoilt(arrays, key, value, seed)), sound, sound, sound])
+    return "; ".join(event.what for event in report.refusals if event.trajectory == "train[0]")
+
+
+def roll_out(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
+    """Why a learned simulator does not start from it."""
+    sound, arrays = _sound(shard)
+    trajectory = _trajectory(sound, spoilt(arrays, key, value, seed))
+    simulator = small_model(sound.metadata)
+    result = rollout(simulator, _last_state(trajectory), 2, sound.metadata)
+    return "" if result.termination is None else f"{result.termination.reason}: {result.termination.message}"
+
+
+WAYS: dict[str, Callable[[Path, str, float | str, int, Path], str]] = {
+    "training": train,
+    "evaluation": evaluate,
+    "validation": check,
+    "conversion": convert,
+    "rollout": roll_out,
+}
+OF_STATES = ("node_type", "mass", "material_params", "boundary_", "rest_pos", "cells")
+"""Beginnings of the fields that a rollout starts from, besides positions, which it takes of several frames."""
+
+
+def brought_in(way: str, shard: Path, key: str, value: Value, seed: int, folder: Path) -> Verdict:
+    """Bring a wrong value in; whatever is said must name the field."""
+    try:
+        text = WAYS[way](shard, key, value, seed, folder)
+    except GpeError as error:
+        text = " ".join(str(error).split())
+    except Exception as error:
+        return Verdict("traceback", f"{type(error).__name__}: {error}")
+    if not text:
+        return Verdict("accepted", "no error, and nothing was left out")
+    is_named = any(name in text for name in _names(shard, key, value))
+    return Verdict("refused", text[:MAX_DETAIL]) if is_named else Verdict("accepted", f"does not name the field: {text}"[:MAX_DETAIL])
+
+
+def _names(shard: Path, key: str, value: Value) -> tuple[str, ...]:
+    """What messages may call the culprit: parameters by their column, positions by the velocity that they give, two sizes by either."""
+    if value == LONGER:
+        return ("has size",)
+    return {"material_params": read_trajectory(shard, FIRST).metadata.param_names, "pos": ("pos", "vel")}.get(key, (key,))
+
+
+# --- how ------------------------------------------------------------------------------------------------------------------------------------
+
+
+def _sound(shard: Path) -> tuple[Trajectory, dict[str, np.ndarray]]:
+    trajectory = read_trajectory(shard, FIRST)
+    return trajectory, stored_arrays(trajectory)
+
+
+def _store(shard: Path, key: str, value: Value, seed: int, folder: Path) -> Path:
+    """A data set whose first trajectory is spoilt, with checksums that fit."""
+    path = shard_path(folder, "train", 0)
+    path.parent.mkdir()
+    shutil.copy(shard, path)
+    with h5py.File(path, "r+") as file:
+        group = file[FIRST]
+        arrays = spoilt({name: group[name][()] for name in group}, key, value, seed)
+        del group[key]
+        group[key] = arrays[key]
+        texts = {name: group.attrs[name].decode() for name in ("metadata", "shapes", "node_types")}
+        group.attrs["sha256"] = np.bytes_(digest(arrays, texts))
+    return path
+
+
+def _left_out(read: Callable[[], list[str]]) -> str:
+    """What reading says in warnings and in its error."""
+    with _warnings() as said:
+        try:
+            read()
+        except GpeError as error:
+            said.append(" ".join(str(error).split()))
+    return "; ".join(said)
+
+
+@contextmanager
+def _warnings() -> Iterator[list[str]]:
+    """What is logged inside as a warning."""
+    said: list[str] = []
+
+    class Listener(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            said.append(record.getMessage())
+
+    logger, listener = logging.getLogger("gpe_pl"), Listener(logging.WARNING)
+    logger.addHandler(listener)
+    try:
+        yield said
+    finally:
+        logger.removeHandler(listener)
+
+
+def _trajectory(sound: Trajectory, arrays: dict[str, np.ndarray]) -> Trajectory:
+    """A trajectory of arrays that nobody has looked at."""
+    wall: dict[str, Any] = {name: arrays[f"boundary_{name}"] for name in ("pos", "vel", "normal")}
+    moves = sound.boundary.motion is not None
+    fixed: dict[str, Any] = {name: arrays[f"boundary_{name}"] for name in ("friction", "restitution")}
+    motion = Motion(wall["pos"], wall["vel"], wall["normal"]) if moves else None
+    boundary: Boundary = replace(sound.boundary, **({name: array[0] for name, array in wall.items()} | fixed), motion=motion)
+    names = ("pos", "vel", "node_type", "mass", "material_params", "rest_pos", "cells")
+    values: dict[str, Any] = {name: arrays[name] for name in names if name in arrays}
+    return replace(sound, **values, boundary=boundary)
+
+
+def _last_state(trajectory: Trajectory) -> State:
+    """The last frame, with a history."""
+    return trajectory.state(trajectory.num_frames - 1, history=2)
+
+
+def _applies(way: str, key: str) -> bool:
+    """Whether a field comes in by a way: a rollout takes no velocities of frames, and neither it nor an import of trajectories the stress."""
+    if way == "rollout":
+        return key.startswith(OF_STATES) or key == "pos"
+    return way != "conversion" or not ("stress" in key or "mises" in key or key == "cell_dim")
+
+
+def shards(specs: dict[str, DatasetSpec], folder: Path) -> dict[str, Path]:
+    """A shard of a few short trajectories of each data set."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = {}
+    for name, spec in specs.items():
+        found[name] = folder / f"{name}.h5"
+        write_shard(found[name], [generate_trajectory(spec, "train", k, num_frames=NUM_FRAMES) for k in range(2)])
+    return found
+
+
+def faults(sound: dict[str, Path], seed: int = 0) -> list[Fault]:
+    """Every wrong value in every field of one shard of each data set, by every way."""
+    found = []
+    for domain, shard in sound.items():
+        fields = sorted(_sound(shard)[1])
+        for way in WAYS:
+            for key in fields:
+                if not _applies(way, key):
+                    continue
+                values = (*OFFENDERS[FIELDS[key].values], *((LONGER,) if key not in ("cell_dim", "cells") else ()))
+                for number, value in enumerate(values):
+                    attack = partial(brought_in, way, shard, key, value, seed + number)
+                    found.append(Fault(f"value, {way}", f"{domain}, {key}: {value}", attack))
+    return found

@@ -1,0 +1,212 @@
+"""Faults and commands in processes of their own, forked from one that has imported everything: what hangs or dies costs only itself, and no start-up."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import runpy
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from gpe_pl.benchmarks.faults.verdict import GOOD, MAX_DETAIL, Fault, Verdict
+from gpe_pl.errors import GpeError
+from gpe_pl.system import early_interrupts
+
+PRELOADED = [
+    "torch",
+    "lightning",
+    "torch_geometric",
+    "hydra",
+    "h5py",
+    "matplotlib.figure",
+    "numba",
+    "gpe_pl.data.datamodule",
+    "gpe_pl.training.run",
+    "gpe_pl.evaluation.rollouts",
+    "gpe_pl.data.generation",
+    "gpe_pl.solvers.scenes",
+    "gpe_pl.solvers.mpm",
+    "gpe_pl.models.gpe",
+    "gpe_pl.reports.sweep_table",
+]
+
+
+HANG = 10.0
+"""Seconds beyond what something takes where nothing is wrong, after which it hangs."""
+CANARY = "canary"
+"""Folder beside those that are attacked, which none of them may change."""
+
+
+class IsolationError(GpeError):
+    """This system cannot isolate faults."""
+
+
+def forks() -> Any:
+    """A multiprocessing context whose processes start with everything imported.
+
+    Raises:
+        IsolationError: the system has no such processes (Windows).
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        raise IsolationError("suite=faults needs processes that are forked, which this system does not have; run it on Linux")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(PRELOADED)
+    return context
+
+
+# --- faults -------------------------------------------------------------------------------------------------------------------------------
+
+
+def verdicts(faults: Sequence[Fault], limit: float = 60.0) -> Iterator[Verdict]:
+    """What comes of each fault, in order.
+
+    Args:
+        faults: each attacks in a folder of its own, which is removed afterwards.
+        limit: seconds after which a fault counts as hung.
+    """
+    context = forks()
+    first = 0
+    while first < len(faults):
+        ours, theirs = context.Pipe(duplex=False)
+        folder = tempfile.mkdtemp(prefix="faults-")
+        worker = context.Process(target=_attack, args=(faults[first:], theirs, folder))
+        worker.start()
+        theirs.close()
+        try:
+            for verdict in _received(ours, limit, len(faults) - first):
+                first += 1
+                yield verdict
+            if first < len(faults):  # the worker did not survive this one
+                worker.join(0.5)
+                hung = worker.is_alive()
+                worker.kill()
+                worker.join()
+                first += 1
+                yield Verdict("hung", f"longer than {limit:g} s") if hung else Verdict("died", f"exit code {worker.exitcode}")
+        finally:
+            worker.kill()
+            worker.join()
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _received(connection: Connection, limit: float, count: int) -> Iterator[Verdict]:
+    for _ in range(count):
+        try:
+            if not connection.poll(limit):
+                return
+            yield connection.recv()
+        except EOFError:
+            return
+
+
+def _attack(faults: Sequence[Fault], answers: Connection, folder: str) -> None:
+    with open(os.devnull, "wb") as null:  # what a fault prints is of no interest
+        os.dup2(null.fileno(), 1)
+        os.dup2(null.fileno(), 2)
+    canary = Path(folder) / CANARY
+    for number, fault in enumerate(faults):
+        verdict = _watched(fault, Path(folder) / str(number), canary)
+        if verdict.status == "hung":  # or the machine was busy: what hangs does so again
+            verdict = _watched(fault, Path(folder) / str(number), canary)
+        answers.send(verdict)
+
+
+def _watched(fault: Fault, own: Path, canary: Path) -> Verdict:
+    """Attack in a new folder with another one beside it; takes too long, or changes the other one: that is what came of it."""
+    own.mkdir()
+    shutil.rmtree(canary, ignore_errors=True)
+    (canary / "checkpoints").mkdir(parents=True)
+    for name in ("metrics.csv", "checkpoints/best.ckpt", "checkpoints/last.ckpt"):
+        (canary / name).write_text("somebody else's", encoding="utf-8")
+    before, started = _contents(canary), time.monotonic()
+    try:
+        verdict = fault.attack(own)
+    except Exception as error:
+        verdict = Verdict("traceback", f"{type(error).__name__}: {error}"[:MAX_DETAIL])
+    seconds = time.monotonic() - started
+    shutil.rmtree(own, ignore_errors=True)
+    if (after := _contents(canary)) != before:
+        return Verdict("outside", f"changed: {', '.join(sorted(str(name) for name, _ in before ^ after))}; {verdict.detail}"[:MAX_DETAIL])
+    if verdict.status in GOOD and seconds > fault.seconds + HANG:
+        return Verdict("hung", f"{seconds:.0f} s, where nothing is wrong {fault.seconds:.0f} s; {verdict.detail}"[:MAX_DETAIL])
+    return verdict
+
+
+def _contents(folder: Path) -> set[tuple[Path, bytes]]:
+    return {(path.relative_to(folder), path.read_bytes() if path.is_file() else b"") for path in folder.rglob("*")}
+
+
+# --- commands -----------------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended: its exit code, negative for a signal, None if it was stopped at its time limit, and what it printed."""
+
+    code: int | None
+    output: str
+
+    def verdict(self, on_success: str = "harmless") -> Verdict:
+        """Refused with one line of error, or as good as the caller says that success is."""
+        lines = [line for line in self.output.splitlines() if line.strip()]
+        last = lines[-1][:MAX_DETAIL] if lines else ""
+        if self.code is None:
+            return Verdict("hung", last)
+        if self.code == 0:
+            return Verdict(on_success, last)  # type: ignore[arg-type]
+        if self.code < 0:
+            return Verdict("died", f"signal {-self.code}")
+        is_readable = "Traceback (most recent call last)" not in self.output and any(line.startswith("error: ") for line in lines)
+        return Verdict("refused" if is_readable else "traceback", last)
+
+
+def start(command: str, arguments: Sequence[str], output: Path, prepare: Callable[[], Any] | None = None) -> Any:
+    """``python -m gpe_pl.{command} {arguments}`` as a process that prints into a file; ``prepare`` is called in it first."""
+    output.touch()  # also where it is killed before it prints
+    process = forks().Process(target=_run_command, args=(command, list(arguments), str(output), prepare))
+    process.start()
+    return process
+
+
+def run(command: str, arguments: Sequence[str], limit: float = 600.0, prepare: Callable[[], Any] | None = None) -> Ended:
+    """The same to its end, or to a time limit [s]."""
+    with tempfile.TemporaryDirectory(prefix="faults-") as folder:
+        output = Path(folder) / "output"
+        process = start(command, arguments, output, prepare)
+        process.join(limit)
+        code = process.exitcode
+        end(process)
+        return Ended(code, output.read_text(encoding="utf-8", errors="replace"))
+
+
+def end(process: Any) -> None:
+    """Kill a process, and wait until it is gone."""
+    with contextlib.suppress(ProcessLookupError):
+        process.kill()
+    process.join()
+
+
+def _run_command(command: str, arguments: list[str], output: str, prepare: Callable[[], Any] | None) -> None:
+    early_interrupts.catch()  # as `python -m` does
+    with open(output, "wb", buffering=0) as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    os.environ.pop("HYDRA_FULL_ERROR", None)  # of the command that attacks: it would show tracebacks
+    if prepare is not None:
+        prepare()
+    sys.argv = [command, *arguments]
+    runpy.run_module(f"gpe_pl.{command}", run_name="__main__", alter_sys=True)
+
+
+def waited(process: Any, seconds: float) -> bool:
+    """Wait; whether the process has ended meanwhile."""
+    process.join(seconds)
+    return process.exitcode is not None

@@ -1,0 +1,376 @@
+"""Commands that are killed, run out of disk, or meet what a disk has done to their files; and the same command again."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gpe_pl.benchmarks.faults import isolation, stores
+from gpe_pl.benchmarks.faults.verdict import MAX_DETAIL, Fault, Verdict
+from gpe_pl.errors import GpeError
+from gpe_pl.learned.simulator import load_checkpoint
+from gpe_pl.system.provenance import PROVENANCE
+
+SAVED = (
+    "state_dict",
+    "current_model_state",
+    "averaging_state",
+    "optimizer_states",
+    "lr_schedulers",
+    "global_step",
+    "simulator",
+    "excursions",
+    "skipped",
+)
+"""What of a training checkpoint does not depend on where it lies."""
+
+
+MEASURED = "results.json"
+"""Of benchmarks: times are never the same, so their number and the settings are compared."""
+ONCE = ("convert",)
+"""Commands that refuse to do again what is done."""
+TRACEBACK = re.compile(r".*\n?Traceback \(most recent call last\)[^\n]*(\n .*)*(\n.*)?")
+"""With the line before, which says whether it was ignored, and the one after, which names the error."""
+LOCKS = (".*.lock", ".*.holder")
+"""Files of locks."""
+MESSAGE_BYTES = 1000
+"""What a command prints goes to a file, too: with less room in it the error would be cut off."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command, and how it is told where its data and results go.
+
+    Attributes:
+        name: row of the matrix.
+        module: ``python -m gpe_pl.{module}``.
+        arguments: all but the folders.
+        data: folder of the data, or None if the command makes them in its own.
+        seconds: that it takes undisturbed.
+    """
+
+    name: str
+    module: str
+    arguments: tuple[str, ...]
+    data: str | None = None
+    seconds: float = math.inf
+
+    def given(self, folder: Path) -> list[str]:
+        """The arguments with the folders."""
+        return [*self.arguments, f"paths.data={self.data or folder / 'data'}", f"paths.runs={folder / 'runs'}"]
+
+
+# --- what a command leaves ----------------------------------------------------------------------------------------------------------------
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """SHA-256 of what must not depend on how a command was interrupted: data, metrics, tables, weights and the state of the optimiser, bit for bit.
+
+    Logs and provenance do: each start of a run has its own.
+    """
+    found = {}
+    for path in _final_files(folder):
+        relative = path.relative_to(folder)
+        name = str(relative)
+        if "log" in relative.parts or path.name == PROVENANCE or not path.is_file():
+            continue
+        if path.suffix == ".ckpt":
+            stored = load_checkpoint(path)
+            found[name] = _digest({key: stored[key] for key in SAVED})
+        elif path.name == MEASURED:
+            values = json.loads(path.read_text(encoding="utf-8"))
+            found[name] = _digest([values["settings"], len(values["records"])])
+        elif path.suffix == ".json":
+            values = json.loads(path.read_text(encoding="utf-8"))
+            found[name] = _digest({k: v for k, v in values.items() if k != "folder"} if path.name == "report.json" else values)
+        elif path.with_name(MEASURED).exists():
+            found[name] = "of what was measured"
+        elif path.suffix == ".h5" or path.name in ("metrics.csv", "table.csv", "table.md"):
+            found[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
+
+
+def _digest(value: Any) -> str:
+    sha = hashlib.sha256()
+
+    def add(value: Any) -> None:
+        if isinstance(value, dict):
+            for key in sorted(value, key=str):
+                sha.update(f"{key}:".encode())
+                add(value[key])
+        elif isinstance(value, (list, tuple)):
+            for each in value:
+                add(each)
+        elif isinstance(value, torch.Tensor):
+            sha.update(
+                f"{value.dtype}{tuple(value.shape)}".encode() + value.detach().contiguous().view(-1).view(torch.uint8).numpy().tobytes()
+            )
+        else:
+            sha.update(repr(value).encode())
+
+    add(value)
+    return sha.hexdigest()
+
+
+def incomplete(folder: Path) -> list[str]:
+    """Files in their final place that cannot be read."""
+    found = []
+    for path in _final_files(folder):
+        try:
+            if path.suffix == ".h5":
+                stores.contents(path)
+            elif path.suffix == ".ckpt":
+                load_checkpoint(path)
+            elif path.suffix == ".json":
+                json.loads(path.read_text(encoding="utf-8"))
+        except Exception as error:
+            found.append(f"{path.name}: {error}")
+    return found
+
+
+def leftovers(folder: Path) -> list[str]:
+    """Temporary files, and the files of locks, which a command removes unless it is killed."""
+    return sorted(path.name for pattern in ("*.part*", *LOCKS) for path in folder.rglob(pattern))
+
+
+def released(folder: Path) -> frozenset[str]:
+    """Files of locks that killed commands have left: the operating system has released them, and the next command that needs one removes it."""
+    return frozenset(path.name for pattern in LOCKS for path in folder.rglob(pattern))
+
+
+def _final_files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if not path.name.startswith("."))
+
+
+def finished(command: Command, folder: Path, expected: dict[str, str], limit: float, stays: frozenset[str] = frozenset()) -> Verdict:
+    """Run a command to its end, and compare what it leaves; names in ``stays`` may be left over."""
+    ended = isolation.run(command.module, command.given(folder), limit)
+    verdict = ended.verdict()
+    may_be_done = command.module in ONCE and verdict.status == "refused"
+    if ended.code != 0 and not may_be_done:
+        return Verdict("different", f"does not resume: {verdict.status}: {verdict.detail}")
+    if broken := incomplete(folder):
+        return Verdict("half-written", "; ".join(broken))
+    found = digests(folder)
+    wrong = sorted(name for name in found.keys() | expected.keys() if found.get(name) != expected.get(name))
+    if wrong:
+        return Verdict("different", f"{', '.join(wrong)}; {verdict.detail}")
+    left = [name for name in leftovers(folder) if name not in stays]
+    return Verdict("half-written", f"left behind: {', '.join(left)}") if left else Verdict("harmless", "equal bit for bit")
+
+
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
+"""What ends a command before its time."""
+
+
+# --- kills --------------------------------------------------------------------------------------------------------------------------------
+
+
+def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: int = 0, limit: float = 600.0) -> Iterator[Verdict]:
+    """Kill a command at random moments, with SIGKILL, SIGTERM and SIGINT in turn, start it again, and after some kills let it finish.
+
+    What it then leaves is compared with an undisturbed run. Yields a verdict per kill, which names the moment.
+    """
+    rng = np.random.default_rng(seed)
+    whole = folder / "whole"
+    started = time.monotonic()
+    ended = isolation.run(command.module, command.given(whole), limit)
+    duration = time.monotonic() - started
+    if ended.code != 0:
+        yield ended.verdict()
+        return
+    expected, number = digests(whole), 0
+    while number < count:
+        own = folder / f"killed-{number}"
+        moments: list[str] = []
+        problem: Verdict | None = None
+        while len(moments) < min(in_a_row, count - number):
+            kind = SIGNALS[(number + len(moments)) % len(SIGNALS)]
+            moment = float(rng.uniform(0.0, duration))
+            process = isolation.start(command.module, command.given(own), folder / "output")
+            try:
+                if isolation.waited(process, moment):  # it was faster; from the start again
+                    if process.exitcode != 0:
+                        problem = (
+                            problem
+                            or isolation.Ended(
+                                process.exitcode, (folder / "output").read_text(encoding="utf-8", errors="replace")
+                            ).verdict()
+                        )
+                    if moments:
+                        break
+                    duration *= 0.9
+                    shutil.rmtree(own, ignore_errors=True)
+                    continue
+                os.kill(process.pid, kind)
+                if not isolation.waited(process, min(limit, command.seconds + isolation.HANG)):
+                    problem = Verdict("hung", f"after {kind.name}")
+            finally:
+                isolation.end(process)
+            moments.append(f"{kind.name} after {moment:.2f} s")
+            output = (folder / "output").read_text(encoding="utf-8", errors="replace")
+            if kind is not signal.SIGKILL and (said := TRACEBACK.search(output)):
+                problem = problem or Verdict("traceback", " ".join(said.group().split())[-MAX_DETAIL:])
+            if broken := incomplete(own):
+                problem = problem or Verdict("half-written", "; ".join(broken))
+        number += len(moments)
+        verdict = problem or finished(command, own, expected, limit, released(own))
+        for text in moments:
+            yield Verdict(verdict.status, f"{text}; {verdict.detail}")
+        shutil.rmtree(own, ignore_errors=True)
+
+
+# --- damaged files of a run ---------------------------------------------------------------------------------------------------------------
+
+
+def damaged_file(command: Command, sound: Path, name: str, damage: Callable[[bytes], bytes], limit: float, folder: Path) -> Verdict:
+    """Damage a file that a command has left, and give the command again: it refuses, or what it leaves is sound."""
+    return changed_file(command, sound, name, partial(_damaged_bytes, damage), limit, folder)
+
+
+def _damaged_bytes(damage: Callable[[bytes], bytes], path: Path) -> None:
+    path.write_bytes(damage(path.read_bytes()))
+
+
+def changed_file(command: Command, sound: Path, name: str, change: Callable[[Path], None], limit: float, folder: Path) -> Verdict:
+    """Change a file that a command has left, or what lies in its place, and give the command again: the same."""
+    for part in sound.iterdir():
+        (shutil.copytree if part.is_dir() else shutil.copy)(part, folder / part.name)
+    change(folder / name)
+    ended = isolation.run(command.module, command.given(folder), limit)
+    if ended.code != 0:
+        return ended.verdict()
+    try:
+        expected, found = digests(sound), digests(folder)
+        wrong = sorted(k for k in expected if found.get(k) != expected[k] and not _hold_the_same(sound / k, folder / k))
+    except GpeError as error:  # the command had no need of the file; whoever has is refused
+        return Verdict("refused", str(error)[:MAX_DETAIL])
+    return Verdict("accepted", f"no error, but {', '.join(wrong)} differ") if wrong else Verdict("harmless")
+
+
+def _hold_the_same(sound: Path, damaged: Path) -> bool:
+    """Whether two files are shards with the same content in different bytes: some bytes have no meaning."""
+    return sound.suffix == ".h5" and damaged.exists() and stores.contents(sound) == stores.contents(damaged)
+
+
+def damage_faults(command: Command, sound: Path, count: int, seed: int, limit: float) -> list[Fault]:
+    """So many damages to files that a command has left in a folder, other than pictures and logs."""
+    rng = np.random.default_rng(seed)
+    names = sorted(digests(sound))
+    kinds = list(stores.damages(4 * count, seed))
+    found = []
+    for _ in range(count if names else 0):
+        name, (kind, what, damage) = names[int(rng.integers(len(names)))], kinds[int(rng.integers(len(kinds)))]
+        attack = partial(damaged_file, command, sound, name, damage, limit)
+        found.append(Fault(f"file of a run, {kind}", f"{command.name}: {name}, {what}", attack, command.seconds))
+    return found
+
+
+# --- disks --------------------------------------------------------------------------------------------------------------------------------
+
+
+def limit_file_size(size: int) -> None:
+    """From now on no file of this process grows beyond a size: what a full disk does to a write, with another number of error."""
+    import resource  # Windows has none
+
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+@contextlib.contextmanager
+def small_disk(folder: Path, size: int) -> Iterator[bool]:
+    """A file system of so many bytes in a folder; yields whether there is one, which needs the right to mount."""
+    folder.mkdir(parents=True)
+    done = (
+        subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)], capture_output=True, check=False).returncode
+        == 0
+    )
+    try:
+        yield done
+    finally:
+        if done:
+            subprocess.run(["umount", "-l", str(folder)], capture_output=True, check=False)
+
+
+def full_disk(command: Command, size: int, expected: dict[str, str], limit: float, folder: Path) -> Verdict:
+    """Run a command on a disk that fills up; then there is room again, and the same command finishes."""
+    with small_disk(folder / "disk", size) as is_mounted:
+        own = folder / "disk"
+        prepare = None if is_mounted else partial(limit_file_size, size)
+        ended = isolation.run(command.module, command.given(own), limit, prepare)
+        verdict = ended.verdict()
+        if verdict.status != "refused":
+            return verdict
+        if broken := incomplete(own):
+            return Verdict("half-written", "; ".join(broken))
+        if is_mounted:
+            subprocess.run(["mount", "-o", f"remount,size={2**28}", str(own)], check=True, capture_output=True)
+        again = finished(command, own, expected, limit)
+        how = f"{size} bytes" if is_mounted else f"{size} bytes per file, for want of the right to mount"
+        return again if again.status != "harmless" else Verdict("refused", f"{how}: {verdict.detail}; then {again.detail}")
+
+
+def file_limit(command: Command, size: int, expected: dict[str, str], limit: float, folder: Path) -> Verdict:
+    """The same where no file may grow beyond a size."""
+    verdict = isolation.run(command.module, command.given(folder), limit, partial(limit_file_size, size)).verdict()
+    if verdict.status != "refused":
+        return verdict
+    if broken := incomplete(folder):
+        return Verdict("half-written", "; ".join(broken))
+    again = finished(command, folder, expected, limit)
+    return again if again.status != "harmless" else Verdict("refused", f"{verdict.detail}; then {again.detail}")
+
+
+def read_only(command: Command, limit: float, folder: Path) -> Verdict:
+    """Run a command in a folder that cannot be written."""
+    with small_disk(folder / "disk", 2**20) as is_mounted:
+        own = folder / "disk"
+        if is_mounted:
+            subprocess.run(["mount", "-o", "remount,ro", str(own)], check=True, capture_output=True)
+        elif os.geteuid() == 0:  # permissions do not bind
+            return Verdict("harmless", "not done, for want of the right to mount")
+        else:
+            own.chmod(0o555)
+        verdict = isolation.run(command.module, command.given(own), limit).verdict("accepted")
+        if not is_mounted:
+            own.chmod(0o777)
+        return verdict
+
+
+def file_in_the_way(command: Command, limit: float, folder: Path) -> Verdict:
+    """Run a command where a file lies in place of the folder that it writes to."""
+    (folder / ("data" if command.data is None else "runs")).write_text("a file", encoding="utf-8")
+    return isolation.run(command.module, command.given(folder), limit).verdict("accepted")
+
+
+def disk_faults(command: Command, sizes: Sequence[int], expected: dict[str, str], limit: float) -> list[Fault]:
+    """Full disks and files of so many bytes, and folders that cannot be written."""
+    found = []
+    for size in sizes:
+        found.append(
+            Fault("disk full", f"{command.name}, {size} bytes", partial(full_disk, command, size, expected, limit), 2 * command.seconds)
+        )
+        if size >= MESSAGE_BYTES:
+            attack = partial(file_limit, command, size, expected, limit)
+            found.append(Fault("file too large", f"{command.name}, {size} bytes", attack, 2 * command.seconds))
+    found.append(Fault("folder not writable", f"{command.name}, read-only", partial(read_only, command, limit), command.seconds))
+    found.append(
+        Fault("folder not writable", f"{command.name}, a file in the way", partial(file_in_the_way, command, limit), command.seconds)
+    )
+    return found

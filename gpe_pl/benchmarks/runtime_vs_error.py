@@ -1,0 +1,544 @@
+"""Run time against error for solvers and learned models on the same axes: who is more accurate at equal cost, and cheaper at equal accuracy.
+
+The reference is the solver at half the spacing between nodes, and thereby at a substep at most half as long, with its observed order of convergence.
+Everything is compared with it, the solver that made the training data too: its error is the floor of what can be learned from them. Protocol after McGreivy
+and Hakim 2024 (arXiv 2407.07218): a solver always has a resolution to turn down, and only equal cost or equal accuracy may be compared.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from gpe_pl.benchmarks.trained import Case, runs_in, trained_on
+from gpe_pl.data.ground_truth import DatasetSpec, generate_trajectory, initial_state
+from gpe_pl.errors import GpeError
+from gpe_pl.files.markdown import table_row
+from gpe_pl.learned.approximate import approximate
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.metrics import bootstrap_interval, energy_distance
+from gpe_pl.reports.finished_runs import Run
+from gpe_pl.rollout.baselines import BASELINES
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.loop import SimulationError, Simulator
+from gpe_pl.schema import Split
+from gpe_pl.solvers.resolution import Resolved, coarser, finer
+from gpe_pl.training.budget import read_times
+from gpe_pl.trajectory.trajectory import State, Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+log = logging.getLogger(__name__)
+
+Family = Literal["solver", "learned", "trivial"]
+Frame = tuple[np.ndarray, np.ndarray]
+"""Positions [node, dim] in m and velocities [node, dim] in m/s."""
+
+DATA = "solver, as for the data"
+SPACING, STEPS = "spacing × ", "steps × "
+BALLISTIC = "ballistic"
+HELD = ", held predictions"
+
+
+class ComparisonError(GpeError, ValueError):
+    """Nothing can be compared; the message says what is missing."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is compared.
+
+    Attributes:
+        cases: data sets, by name.
+        runs: folders of finished runs; the models among them that were trained on a case's data set take part.
+        factors: how many times coarser than the data the solver is also run.
+        step_factors: how many times longer its steps may also be, at the spacing of the data.
+        holds: frames for which a prediction is held, in further rungs of every model (``Skips.hold``).
+        split, num_trajectories: scenes.
+        horizons: frames over which errors are averaged; the full length is always added.
+        num_threads: of PyTorch; the solvers use one.
+        accelerator: where models run; the solvers run on the CPU.
+    """
+
+    cases: Annotated[dict[str, Case], Field(min_length=1)]
+    runs: list[str]
+    factors: list[Annotated[float, Field(gt=1)]] = field(default_factory=lambda: [1.5, 2.0, 3.0])
+    step_factors: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
+    holds: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
+    split: Split = "test_unseen"
+    num_trajectories: Annotated[int, Field(ge=1)] = 5
+    horizons: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [20, 50, 100])
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
+    accelerator: Literal["cpu", "gpu"] = "cpu"
+
+    @property
+    def device(self) -> str:
+        return "cuda" if self.accelerator == "gpu" else "cpu"
+
+
+@dataclass
+class Point:
+    """A simulator on the two axes.
+
+    Attributes:
+        name: of the simulator.
+        family: what kind it is.
+        seconds: wall time over simulated time, of each scene.
+        mse: [m²] over the frames up to each horizon, of each scene; infinite where it failed.
+        distance: energy distance [m] to the reference in the last frame, of each scene: a difference of distributions, for when the error of single nodes
+            says nothing any more.
+        overhead: seconds of training and of generating its data.
+    """
+
+    name: str
+    family: Family
+    seconds: list[float] = field(default_factory=list)
+    mse: dict[str, list[float]] = field(default_factory=dict)
+    distance: list[float] = field(default_factory=list)
+    overhead: float = 0.0
+
+    def error(self, horizon: str) -> float:
+        return float(np.mean(self.mse[horizon]))
+
+    @property
+    def cost(self) -> float:
+        return float(np.median(self.seconds))
+
+
+def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
+    """Records of every simulator in every case, and a Markdown table per case with a section on where learning loses."""
+    torch.set_num_threads(settings.num_threads)
+    records: list[dict[str, Any]] = []
+    parts = []
+    finished = runs_in(settings.runs)
+    for name, spec in specs.items():
+        models = _models(finished, spec, settings)
+        if not models:
+            raise ComparisonError(
+                f"{' and '.join(settings.runs)}: no finished run that was trained on the data set {spec.name!r} of size {spec.size!r}; train with "
+                f"`python -m gpe_pl.fit experiment=table1 size={spec.size}` or set suite.runs"
+            )
+        log.info("%s: %d models", name, len(models))
+        points, order = compare(spec, models, settings)
+        records += [{**record, "seed": spec.seed} for record in _records(name, points, order)]
+        parts.append(_section(name, points, order, settings.num_trajectories))
+    return records, "\n\n".join(parts)
+
+
+def _models(runs: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[str, tuple[LearnedSimulator, float]]:
+    """Trained simulators, also with predictions held for some frames, and the seconds of their training, by label."""
+    found = {}
+    for label, (simulator, run) in trained_on(spec, runs).items():
+        seconds = training_seconds(run)
+        found[label] = simulator.to(settings.device), seconds
+        for hold in settings.holds:
+            holding = copy.copy(simulator)
+            holding.skips = replace(simulator.skips, hold=hold)
+            found[f"{label}{HELD} × {hold}"] = holding, seconds
+    return found
+
+
+def training_seconds(run: Run) -> float:
+    """Steps of a run times the step time that its sweep measured, for which its budget was enough; NaN where none was measured."""
+    path = next((p for folder in run.folder.parents if (p := folder / "step_times.json").exists()), None)
+    model = str(run.config["model._target_"]).rpartition(".")[2]
+    about = f"{run.config['data.name']} {run.config['size.name']} {model} "
+    steps, budget = float(run.config["training.num_steps"]), 60 * float(run.config.get("size.comparison.budget_minutes") or math.inf)
+    times = {} if path is None else read_times(path)
+    return max((steps * t for key, t in times.items() if key.startswith(about) and steps * t <= budget), default=math.nan)
+
+
+def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]], settings: Settings) -> tuple[list[Point], float]:
+    """All simulators on the same scenes, and the solver's observed order of convergence."""
+    history = max(simulator.builder.config.history for simulator, _ in models.values())
+    points: dict[str, Point] = {}
+    orders = []
+    for index in range(settings.num_trajectories):
+        data = generate_trajectory(spec, settings.split, index)
+        start = initial_state(spec, settings.split, index)
+        reference = _reference(spec, start, data)
+        orders.append(_order(spec, start, data, reference))
+        truth = reference.frames(history)
+        for name, family, simulator, at in _simulators(spec, start, data, models, history, settings):
+            point = points.setdefault(name, Point(name, family))
+            prediction, seconds = _timed(simulator, at, data, history)
+            point.seconds.append(seconds)
+            error = _squared_error(prediction, truth)[1:]
+            for horizon in (*(h for h in settings.horizons if h <= len(error)), None):
+                point.mse.setdefault("full" if horizon is None else str(horizon), []).append(float(np.mean(error[:horizon])))
+            point.distance.append(_distance(prediction, truth))
+    generation = points[DATA].cost * spec.num_train * (spec.num_frames - 1) * spec.solver.frame_dt
+    for label, (_, training) in models.items():
+        points[label].overhead = training + generation
+    return [*points.values()], float(np.nanmedian(orders))
+
+
+# --- simulators -------------------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Restricted:
+    """Where a simulator starts, how the positions of its nodes become those of the scene's, and for how many frames a step of it is."""
+
+    resolved: Resolved
+    from_start: bool
+    frames_per_step: int = 1
+
+
+def _simulators(
+    spec: DatasetSpec,
+    start: State,
+    data: Trajectory,
+    models: dict[str, tuple[LearnedSimulator, float]],
+    history: int,
+    settings: Settings,
+) -> Iterator[tuple[str, Family, Simulator, _Restricted]]:
+    """Solvers start with the scene, the others where learned models have the history they need."""
+    same = Resolved(start, lambda pos: pos)
+    yield DATA, "solver", spec.solver, _Restricted(same, True)
+    for factor in settings.factors:
+        solver = _solver(spec, factor)
+        try:
+            resolved = coarser(start, spec.scene.spacing, factor)
+        except ValueError as error:
+            log.info("%s: no scene %g times coarser (%s)", spec.name, factor, error)
+            continue
+        if solver is not None:
+            yield f"solver, {SPACING}{factor:g}", "solver", solver, _Restricted(resolved, True)
+    for steps in settings.step_factors:
+        if (solver := _with_longer_steps(spec, steps)) is not None:
+            yield f"solver, {STEPS}{steps}", "solver", solver, _Restricted(same, True, steps)
+    dt = spec.solver.frame_dt
+    for label, (simulator, _) in models.items():
+        at = _Restricted(Resolved(simulator.initial_state(data, history), lambda pos: pos), False)
+        yield label, "learned", Contained(approximate(simulator), dt), at
+    for name, baseline in BASELINES.items():
+        state = data.state(history, history)
+        yield name.replace("_", " "), "trivial", baseline(dt), _Restricted(Resolved(state, lambda pos: pos), False)
+
+
+def _solver(spec: DatasetSpec, factor: float) -> Any | None:
+    """The solver for nodes so many times farther apart: on a grid as much coarser, if it has one; None where that does not fit the domain."""
+    solver: Any = spec.solver
+    spacing = getattr(solver, "grid_spacing", None)
+    if spacing is None:
+        return solver
+    cells = [max(1, round((high - low) / (factor * spacing))) for low, high in solver.bounds]
+    wanted = (solver.bounds[0][1] - solver.bounds[0][0]) / cells[0]
+    try:
+        return replace(solver, grid_spacing=wanted)
+    except ValueError as error:
+        log.info("%s: no grid %g times coarser (%s)", spec.name, factor, error)
+        return None
+
+
+def _with_longer_steps(spec: DatasetSpec, factor: int) -> Any | None:
+    """The solver with frames, and by its own criterion substeps, so many times as long, up to one cell; None for one without a grid, whose substeps are as long
+    as is stable.
+    """
+    solver: Any = spec.solver
+    if getattr(solver, "grid_spacing", None) is None:
+        return None
+    return replace(solver, frame_dt=factor * solver.frame_dt, cfl=min(1.0, factor * solver.cfl))
+
+
+def _reference(spec: DatasetSpec, start: State, data: Trajectory) -> Trajectory:
+    """The solver at half the spacing, seen at the nodes of the scene."""
+    resolved = finer(start, spec.scene.spacing)
+    prediction, _ = _timed(_solver(spec, 0.5), _Restricted(resolved, True), data, 0)
+    if prediction.num_frames < data.num_frames:
+        raise ComparisonError(f"{spec.name}: the reference solution failed after {prediction.num_frames - 1} frames")
+    return prediction
+
+
+def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Trajectory, num_frames: int = 20) -> float:
+    """P = log₂ |u_h − u_{h/2}| / |u_2h − u_h| over the first frames, while solutions still are close to each other; NaN where 2h does not fit."""
+    solver = _solver(spec, 2.0)
+    try:
+        resolved = coarser(start, spec.scene.spacing, 2.0)
+    except ValueError:
+        return float("nan")
+    if solver is None:
+        return float("nan")
+    few = data.frames(0, min(num_frames, data.num_frames - 1) + 1)
+    coarse, _ = _timed(solver, _Restricted(resolved, True), few, 0)
+    if coarse.num_frames < few.num_frames:
+        return float("nan")
+    first = np.sqrt(np.mean(np.square(few.pos.astype(np.float64) - reference.pos[: few.num_frames])))
+    second = np.sqrt(np.mean(np.square(coarse.pos - few.pos)))
+    return float(np.log2(second / first))
+
+
+def _timed(simulator: Any, at: _Restricted, data: Trajectory, history: int) -> tuple[Trajectory, float]:
+    """A rollout from frame ``history`` to the end of the data, at the nodes of the scene, and its wall time over its simulated time.
+
+    The first step is taken twice and timed once: compilation and first use of memory are not part of it. A rollout that fails ends there. Frames within a step
+    are interpolated.
+    """
+    state: Any = at.resolved.state
+    dt = data.metadata.frame_dt
+    first, every = 0 if at.from_start else history, at.frames_per_step
+    wanted = data.num_frames - first
+    frames, seconds, steps = [_numpy(state)], 0.0, 0
+    try:
+        simulator.step(state)
+        for _ in range(-(-(wanted - 1) // every)):
+            begun = time.perf_counter()
+            state = simulator.step(state)
+            if isinstance(state.pos, torch.Tensor) and state.pos.is_cuda:
+                torch.cuda.synchronize()
+            seconds += time.perf_counter() - begun
+            steps += 1
+            pos, vel = _numpy(state)
+            if not np.isfinite(pos).all():
+                break
+            frames += [_between(frames[-1], (pos, vel), k / every) for k in range(1, every)] + [(pos, vel)]
+    except SimulationError as error:
+        log.info("%s stopped: %s", type(simulator).__name__, error)
+    pos = np.stack([at.resolved.restrict(p) for p, _ in frames[:wanted]])
+    vel = np.stack([(at.resolved.restrict(p + dt * v) - at.resolved.restrict(p)) / dt for p, v in frames[:wanted]])
+    trajectory = replace(data, pos=pos, vel=vel, stress=None).frames(history - first)
+    return trajectory, seconds / max(1, steps) / (every * dt)
+
+
+def _between(before: Frame, after: Frame, share: float) -> Frame:
+    return before[0] + share * (after[0] - before[0]), before[1] + share * (after[1] - before[1])
+
+
+def _numpy(state: State) -> Frame:
+    pos, vel = (x.detach().cpu().numpy() if isinstance(x, torch.Tensor) else x for x in (state.pos, state.vel))
+    return np.array(pos, dtype=np.float64), np.array(vel, dtype=np.float64)
+
+
+def _squared_error(prediction: Trajectory, truth: Trajectory) -> np.ndarray:
+    """Mean over nodes and axes [m²] of every frame; infinite in those that the prediction lacks. Frame 0 need not be the same: another resolution made it."""
+    error = np.full(truth.num_frames, np.inf)
+    count = prediction.num_frames
+    error[:count] = np.square(prediction.pos.astype(np.float64) - truth.pos[:count]).mean(axis=(1, 2))
+    return error
+
+
+def _distance(prediction: Trajectory, truth: Trajectory) -> float:
+    if prediction.num_frames < truth.num_frames:
+        return float("inf")
+    return energy_distance(prediction.pos[-1], truth.pos[-1], prediction.mass, truth.mass)
+
+
+# --- what follows from the points -------------------------------------------------------------------------------------------------------------
+
+
+def front(points: Sequence[Point], horizon: str) -> list[Point]:
+    """Those that no other one beats in both cost and error, from the cheapest on."""
+    best: list[Point] = []
+    for point in sorted(points, key=lambda p: (p.cost, p.error(horizon))):
+        if np.isfinite(point.error(horizon)) and (not best or point.error(horizon) < best[-1].error(horizon)):
+            best.append(point)
+    return best
+
+
+def hypervolume(points: Sequence[Point], horizon: str, worst: tuple[float, float]) -> float:
+    """Area in decades² that the points dominate, up to the worst cost and error: larger is better."""
+    area, limit = 0.0, worst[1]
+    for point in front(points, horizon):
+        if point.cost < worst[0] and point.error(horizon) < limit:
+            area += float(np.log10(worst[0] / point.cost) * np.log10(limit / point.error(horizon)))
+            limit = point.error(horizon)
+    return area
+
+
+def cost_at_error(points: Sequence[Point], error: float, horizon: str) -> float:
+    """Cost of a solver of that error: interpolated along the front on logarithmic axes; that of the cheapest for larger errors, infinite for smaller ones."""
+    best = front(points, horizon)
+    if not best or error < best[-1].error(horizon):
+        return float("inf")
+    if error >= best[0].error(horizon):
+        return best[0].cost
+    errors = np.log([p.error(horizon) for p in best[::-1]])
+    costs = np.log([p.cost for p in best[::-1]])
+    return float(np.exp(np.interp(np.log(error), errors, costs)))
+
+
+def error_at_cost(points: Sequence[Point], cost: float, horizon: str) -> float:
+    """Error of a solver of that cost, the other way round: that of the most accurate for larger costs, infinite for smaller ones."""
+    best = front(points, horizon)
+    if not best or cost < best[0].cost:
+        return float("inf")
+    return float(np.exp(np.interp(np.log(cost), np.log([p.cost for p in best]), np.log([p.error(horizon) for p in best]))))
+
+
+def break_even(point: Point, solvers: Sequence[Point], horizon: str, duration: float) -> float:
+    """Rollouts of a duration [s] after which training has paid off against an error-equivalent solver; infinite if never."""
+    saved = (cost_at_error(solvers, point.error(horizon), horizon) - point.cost) * duration
+    if saved <= 0:
+        return float("inf")
+    return 0.0 if np.isinf(saved) else point.overhead / saved
+
+
+def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[str, Any]]:
+    yield {"metric": "observed_order", "case": case, "value": order, "unit": "1"}
+    solvers = [p for p in points if p.family == "solver"]
+    for point in points:
+        about = {"case": case, "simulator": point.name, "family": point.family}
+        yield {"metric": "time_per_simulated_second", **about, "value": point.cost, "values": point.seconds, "unit": "1"}
+        yield {"metric": "energy_distance", **about, "value": float(np.mean(point.distance)), "values": point.distance, "unit": "m"}
+        for horizon, values in point.mse.items():
+            yield {"metric": "rollout_mse", **about, "horizon": horizon, "value": float(np.mean(values)), "values": values, "unit": "m²"}
+        yield {"metric": "overhead", **about, "value": point.overhead, "unit": "s"}
+        for horizon in point.mse if point.family == "learned" else ():
+            ratio = cost_at_error(solvers, point.error(horizon), horizon) / point.cost
+            yield {"metric": "time_ratio_at_equal_error", **about, "horizon": horizon, "value": ratio, "unit": "1"}
+            yield {
+                "metric": "break_even",
+                **about,
+                "horizon": horizon,
+                "value": break_even(point, solvers, horizon, duration=1.0),
+                "unit": "s",
+            }
+    for horizon in points[0].mse:
+        worst = max(p.cost for p in points), max(p.error(horizon) for p in points if p.name == BALLISTIC)
+        for family in ("solver", "learned"):
+            value = hypervolume([p for p in points if p.family == family], horizon, worst)
+            yield {"metric": "hypervolume", "case": case, "family": family, "horizon": horizon, "value": value, "unit": "decade²"}
+
+
+def _points(records: Sequence[dict[str, Any]], case: str) -> list[Point]:
+    """The points that ``_records`` wrote."""
+    points: dict[str, Point] = {}
+    for r in records:
+        if r["case"] == case and "simulator" in r:
+            point = points.setdefault(r["simulator"], Point(r["simulator"], r["family"]))
+            if r["metric"] == "time_per_simulated_second":
+                point.seconds = r["values"]
+            elif r["metric"] == "rollout_mse":
+                point.mse[r["horizon"]] = r["values"]
+            elif r["metric"] == "energy_distance":
+                point.distance = r["values"]
+            elif r["metric"] == "overhead":
+                point.overhead = r["value"]
+    return [*points.values()]
+
+
+def _section(case: str, points: Sequence[Point], order: float, num_trajectories: int) -> str:
+    horizons = [*points[0].mse]
+    solvers = [p for p in points if p.family == "solver"]
+    header = ["", "time per simulated second", *(f"MSE @{h}" for h in horizons), "energy distance [mm]"]
+    lines = [table_row(header), "|" + "---|" * len(header)]
+    for point in sorted(points, key=lambda p: (("solver", "learned", "trivial").index(p.family), -p.cost)):
+        cells = [_interval(point.mse[h], 1e3) for h in horizons]
+        lines.append(table_row([point.name, f"{point.cost:.3g}", *cells, f"{1e3 * np.mean(point.distance):.3g}"]))
+    note = (
+        f"{num_trajectories} scenes. MSE ×1e-3 [m²] to the solver at half the spacing between nodes, whose observed order of convergence is "
+        f"{order:.1f} (positions, first 20 frames): mean and 95 % interval over scenes. `{DATA}` is the error in the "
+        "training data. Times: one core, warm, neighbour search and features included."
+    )
+    lost = ["", "**Where the learned models lose**: time of a solver of the same error over theirs", ""]
+    lost += [table_row(["", *(f"@{h}" for h in horizons)]), "|" + "---|" * (1 + len(horizons))]
+    for point in (p for p in points if p.family == "learned"):
+        lost.append(table_row([point.name, *(_against(point, solvers, h) for h in horizons)]))
+    lost += [
+        "",
+        "**Break-even**: seconds of simulation after which training and its data have paid off, against a solver of the same error",
+        "",
+    ]
+    after = {p.name: [break_even(p, solvers, h, duration=1.0) for h in horizons] for p in points if p.family == "learned"}
+    if np.isinf([*after.values()]).all():
+        lost.append("Never, for any of the models.")
+    else:
+        lost += [table_row(["", *(f"@{h}" for h in horizons)]), "|" + "---|" * (1 + len(horizons))]
+        lost += [table_row([name, *map(_pays_off, values)]) for name, values in after.items()]
+    return "\n".join([f"### {case}", "", *lines, "", note, "", "**At equal error**", "", *verdicts(points, horizons), *lost])
+
+
+def _pays_off(seconds: float) -> str:
+    return "never" if math.isinf(seconds) else "not known" if math.isnan(seconds) else f"{seconds:.3g}"
+
+
+def _against(point: Point, solvers: Sequence[Point], horizon: str) -> str:
+    """A model's cell: below 1 it loses."""
+    needed = cost_at_error(solvers, point.error(horizon), horizon)
+    if needed <= point.cost:
+        return f"{needed / point.cost:.2g}"
+    if np.isinf(needed):
+        return "**more accurate than every solver that was run**"
+    if point.error(horizon) > front(solvers, horizon)[0].error(horizon):
+        return "cheaper and less accurate than every solver that was run"
+    return f"**{needed / point.cost:.2g}**"
+
+
+def verdicts(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:
+    """Of every horizon, whether a learned model passes below the solvers' front; if none does, what the nearest one lacks."""
+    solvers = [p for p in points if p.family == "solver"]
+    learned = [p for p in points if p.family == "learned"]
+    for horizon in horizons:
+        comparable = [p for p in learned if p.error(horizon) <= front(solvers, horizon)[0].error(horizon)]
+        gain = {p.name: cost_at_error(solvers, p.error(horizon), horizon) / p.cost for p in comparable}
+        if not gain:
+            yield f"- @{horizon}: {_none_as_accurate(learned, front(solvers, horizon)[0], horizon)}"
+            continue
+        nearest = max(comparable, key=lambda p: gain[p.name])
+        if gain[nearest.name] > 1:
+            ahead = [name for name, value in gain.items() if value > 1]
+            yield f"- @{horizon}: **below the solver's curve**: {', '.join(ahead)}."
+            continue
+        error = error_at_cost(solvers, nearest.cost, horizon)
+        yield (
+            f"- @{horizon}: no learned model passes below the solver's curve. Nearest is {nearest.name}: it would have to be "
+            f"{_rounded(1 / gain[nearest.name])} times faster, or {_rounded(nearest.error(horizon) / error)} times more accurate at its cost."
+        )
+
+
+def _none_as_accurate(learned: Sequence[Point], cheapest: Point, horizon: str) -> str:
+    nearest = min(learned, key=lambda p: p.error(horizon))
+    return (
+        f"no learned model is as accurate as the cheapest of the solvers ({cheapest.name}). Nearest is {nearest.name}: it would have to be "
+        f"{_rounded(nearest.error(horizon) / cheapest.error(horizon))} times more accurate and {_rounded(nearest.cost / cheapest.cost)} times faster."
+    )
+
+
+def _rounded(factor: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{float(f'{factor:.2g}'):g}"
+
+
+def _interval(values: list[float], scale: float) -> str:
+    if not np.isfinite(values).all():
+        return f"{int((~np.isfinite(values)).sum())} of {len(values)} failed"
+    i = bootstrap_interval(np.array([values]) * scale, statistic=np.mean)
+    return f"{i.estimate:.3g} [{i.low:.3g}, {i.high:.3g}]"
+
+
+def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
+    """Cost against error, a figure per case."""
+    from gpe_pl.viz.comparison import CostAndError, cost_error_figure
+
+    found = {}
+    for case in dict.fromkeys(r["case"] for r in records):
+        points = _points(records, case)
+        panels = {}
+        for horizon in points[0].mse:
+            lines: dict[str, list[tuple[float, float]]] = {"solver, coarser to the left": [], "solver, longer steps": []}
+            marks: dict[str, list[tuple[float, float]]] = {}
+            for point in points:
+                place = point.cost, point.error(horizon)
+                if point.family == "solver":
+                    for label, others in zip(lines, (STEPS, SPACING), strict=True):
+                        if others not in point.name:
+                            lines[label].append(place)
+                elif point.family == "learned":
+                    marks.setdefault(point.name.partition(" ")[0] + (HELD if HELD in point.name else ""), []).append(place)
+            levels = {p.name: p.error(horizon) for p in points if p.family == "trivial"}
+            panels[f"frames 1 – {horizon}" if horizon != "full" else "all frames"] = CostAndError(
+                {label: places for label, places in lines.items() if len(places) > 1}, marks, levels
+            )
+        found[f"cost_error_{case}".replace(" ", "_")] = cost_error_figure(panels, "wall time per simulated second", "rollout MSE [m²]")
+    return found

@@ -1,0 +1,291 @@
+"""What a step costs when a scene grows by what does not matter: distant walls, falling particles, materials that others have, piles that have come to rest."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from gpe_pl.files.markdown import table_row
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.graphs.lattice import lattice_scene
+from gpe_pl.learned.approximate import approximate
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
+from gpe_pl.nn.momentum_conv import EdgeState
+from gpe_pl.rollout.loop import Simulator
+from gpe_pl.rollout.skips import Skips
+from gpe_pl.schema import param_names
+from gpe_pl.system.machine import synchronized
+from gpe_pl.system.timing import paired_ratio, paired_times
+from gpe_pl.trajectory.trajectory import Boundary, State
+
+MATERIALS = ("sand", "snow", "fluid")
+FAR = 5.0
+"""Where things are put that the scene, of unit size, does not reach."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The scene that matters, and how much of what does not is added.
+
+    Attributes:
+        num_boundary: boundary nodes out of reach.
+        num_falling: particles in free fall without neighbours.
+        num_settled: copies of the scene at rest, far from each other.
+        holds: frames for which one prediction is held.
+        seed: of the weights.
+    """
+
+    num_nodes: Annotated[int, Field(ge=10)] = 2500
+    num_edges: Annotated[int, Field(ge=10)] = 24000
+    num_message_passing_steps: Annotated[int, Field(ge=1, le=64)] = 12
+    hidden_channels: Annotated[int, Field(ge=1, le=4096)] = 128
+    edge_states: Annotated[list[EdgeState], Field(min_length=1)] = field(default_factory=lambda: ["latent", "geometry"])
+    num_boundary: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [5000, 50000])
+    num_falling: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)] = field(default_factory=lambda: [2500, 10000])
+    num_settled: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [1, 4])
+    holds: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
+    num_rounds: Annotated[int, Field(ge=1)] = 11
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
+    accelerator: Literal["cpu", "gpu"] = "cpu"
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @property
+    def device(self) -> str:
+        return "cuda" if self.accelerator == "gpu" else "cpu"
+
+
+@dataclass(frozen=True)
+class Growth:
+    """A scene that has grown.
+
+    Attributes:
+        metric: name of the share that a step takes longer.
+        amount: of what was added.
+        state: of the grown scene.
+        builder: of its graphs.
+        on, off: with the level that skips it, and without.
+    """
+
+    metric: str
+    amount: str
+    state: State
+    builder: GraphBuilder
+    on: Skips
+    off: Skips
+
+
+def scene_of(settings: Settings) -> tuple[GraphBuilder, State]:
+    """What matters: a moving lattice without gravity, so that what is put beside it can rest."""
+    builder, scene = lattice_scene(settings.num_nodes, settings.num_edges, GraphConfig())
+    return builder, replace(scene, gravity=torch.zeros_like(scene.gravity)).to_torch(settings.device)
+
+
+def growths(settings: Settings, builder: GraphBuilder, scene: State) -> list[Growth]:
+    """All that a scene is grown by."""
+    found = []
+    for n in settings.num_boundary:
+        found.append(
+            Growth(
+                "distant_boundary_overhead", f"{n:,} boundary nodes", _with_walls(scene, n), builder, Skips(), Skips(static_boundary=False)
+            )
+        )
+    for n in settings.num_falling:
+        found.append(
+            Growth("falling_overhead", f"{n:,} falling nodes", _with_falling(scene, n), builder, Skips(), Skips(isolated_nodes=False))
+        )
+    others, state = _with_absent_materials(builder, scene)
+    found.append(Growth("absent_materials_overhead", "2 absent materials", state, others, Skips(), Skips(absent_types=False)))
+    for n in settings.num_settled:
+        found.append(Growth("settled_overhead", f"{n} settled piles", _with_settled(scene, n), builder, Skips(sleep_after=1), Skips()))
+    return found
+
+
+def simulator(settings: Settings, edge_state: EdgeState, builder: GraphBuilder, skips: Skips) -> LearnedSimulator:
+    """A model with random weights; its accelerations are so small that what rests stays at rest."""
+    torch.manual_seed(settings.seed)
+    model = GPE(
+        builder.spec,
+        edge_state=edge_state,
+        num_message_passing_steps=settings.num_message_passing_steps,
+        hidden_channels=settings.hidden_channels,
+    )
+    made = LearnedSimulator(model, copy.copy(builder)).to(settings.device).eval()
+    made.acceleration_std.fill_(1e-9)
+    made.skips = skips
+    return made
+
+
+def absent_material_calls(settings: Settings, skips: Skips) -> int:
+    """Calls of what belongs to a material that the scene has none of, in a step of a model that knows it."""
+    builder, state = _with_absent_materials(*scene_of(settings))
+    made = simulator(settings, settings.edge_states[0], builder, skips)
+    absent, count = MATERIALS[1:], 0
+
+    def see(*_: Any) -> None:
+        nonlocal count
+        count += 1
+
+    for path, module in made.named_modules():
+        if any(material in part.split("__") for material in absent for part in path.split(".")) and not any(module.children()):
+            module.register_forward_pre_hook(see)
+    made.step(state)
+    return count
+
+
+def message_passing_calls(settings: Settings, builder: GraphBuilder, scene: State, skips: Skips) -> int:
+    """Calls of message-passing layers, and node updates of more than one row, in a step of nothing but falling nodes."""
+    made = simulator(settings, settings.edge_states[0], builder, skips)
+    count = 0
+
+    def see(_: Any, inputs: tuple[Any, ...]) -> None:
+        nonlocal count
+        count += inputs[0].shape[0] > 1
+
+    model: Any = made.model
+    for layers in (*model.convs, *model.updates):
+        for layer in layers.values():
+            layer.register_forward_pre_hook(see)
+    made.step(_falling(scene, settings.num_falling[0]))
+    return count
+
+
+def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
+    """Records of step times [s] and of the share by which each growth makes a step longer, with its level on and off, and a Markdown table."""
+    torch.set_num_threads(settings.num_threads)
+    builder, scene = scene_of(settings)
+    records: list[dict[str, Any]] = []
+    lines = []
+    for edge_state in settings.edge_states:
+        for growth in growths(settings, builder, scene):
+            small = simulator(settings, edge_state, builder, Skips())
+            alternatives = {"small": synchronized(_step(small, scene), settings.device)}
+            for level in ("on", "off"):
+                runner = simulator(settings, edge_state, growth.builder, getattr(growth, level))
+                alternatives[level] = synchronized(_step(approximate(runner), growth.state), settings.device)
+            times = paired_times(alternatives, settings.num_rounds, what=f"{edge_state}, {growth.amount}")
+            cells = [edge_state, growth.amount]
+            for level in ("on", "off"):
+                case = f"{growth.amount}, {level}, {edge_state}"
+                overhead = paired_ratio(times, level, "small") - 1
+                records.append({"metric": "step_time", "case": case, "value": float(np.median(times[level])), "unit": "s"})
+                records.append({"metric": growth.metric, "case": case, "value": overhead, "unit": "1"})
+                cells += [f"{1e3 * np.median(times[level]):.1f}", f"{100 * overhead:+.1f} %"]
+            cells.insert(2, f"{1e3 * np.median(times['small']):.1f}")
+            lines.append(table_row(cells))
+        for hold in settings.holds:
+            ratio = _hold_time_ratio(settings, edge_state, builder, scene, hold)
+            records.append({"metric": "hold_time_ratio", "case": f"{hold} frames, {edge_state}", "value": ratio, "unit": "1"})
+    for level, skips in (("on", Skips()), ("off", Skips(isolated_nodes=False))):
+        calls = message_passing_calls(settings, builder, scene, skips)
+        records.append({"metric": "falling_message_passing_calls", "case": level, "value": calls, "unit": "1"})
+    for level, skips in (("on", Skips()), ("off", Skips(absent_types=False))):
+        calls = absent_material_calls(settings, skips)
+        records.append({"metric": "absent_material_calls", "case": level, "value": calls, "unit": "1"})
+    graph = builder(scene)
+    num_edges = sum(graph[r].edge_index.shape[1] for r in builder.spec.relations)
+    return records, _table(settings, num_edges, lines, records)
+
+
+def _hold_time_ratio(settings: Settings, edge_state: EdgeState, builder: GraphBuilder, scene: State, hold: int) -> float:
+    """Time of ``hold`` frames with one prediction over that with a prediction for each."""
+
+    def frames(skips: Skips) -> Callable[[], State]:
+        runner = approximate(simulator(settings, edge_state, builder, skips))
+
+        def call() -> State:
+            state = scene
+            for _ in range(hold):
+                state = runner.step(state)
+            return state
+
+        return synchronized(call, settings.device)
+
+    times = paired_times({"held": frames(Skips(hold=hold)), "exact": frames(Skips())}, settings.num_rounds)
+    return paired_ratio(times, "held", "exact")
+
+
+def _table(settings: Settings, num_edges: int, lines: list[str], records: list[dict[str, Any]]) -> str:
+    calls = {(r["metric"], r["case"]): r["value"] for r in records if r["metric"].endswith("_calls")}
+    shares = [f"{r['case']} {100 * r['value']:.0f} %" for r in records if r["metric"] == "hold_time_ratio"]
+    held = f" Frames for which one prediction is held, another approximate level, take of the time: {', '.join(shares)}." if shares else ""
+    header = ["edge state", "added", "without it [ms]", "level on [ms]", "longer by", "level off [ms]", "longer by"]
+    return "\n".join(
+        [
+            f"A step of {settings.num_nodes} nodes with {num_edges} edges, GPE {settings.num_message_passing_steps} × {settings.hidden_channels}, "
+            f"{settings.num_threads} thread(s), and of the same with what does not matter added; medians, and medians of paired ratios.",
+            "",
+            table_row(header),
+            "|" + "---|" * len(header),
+            *lines,
+            "",
+            f"A step of {settings.num_falling[0]} falling nodes alone calls {calls['falling_message_passing_calls', 'on']} layers with more than one row, "
+            f"with the level off {calls['falling_message_passing_calls', 'off']}; a step without snow and liquid calls "
+            f"{calls['absent_material_calls', 'on']} modules of theirs, with the level off {calls['absent_material_calls', 'off']}. Settled piles are at "
+            "perfect rest here, without gravity and with accelerations next to nothing; they are left alone by an approximate level, which evaluation measures "
+            f"the error of. All others are exact.{held}",
+        ]
+    )
+
+
+def _step(runner: Simulator, state: State) -> Callable[[], State]:
+    """A step of a state, from which the level has come into effect."""
+    for _ in range(2):
+        state = replace(runner.step(state), pos=state.pos, vel=state.vel, velocity_history=state.velocity_history)
+    return lambda: runner.step(state)
+
+
+NODE_FIELDS = ("pos", "vel", "velocity_history", "node_type", "mass", "material_params")
+
+
+def _joined(scene: State, pos: torch.Tensor, vel: torch.Tensor) -> State:
+    """The scene and further nodes of sand, which have always moved as they do."""
+    assert scene.velocity_history is not None
+    rows = torch.zeros(len(pos), dtype=torch.int64, device=pos.device)
+    more = {name: getattr(scene, name)[rows] for name in NODE_FIELDS}
+    more |= {"pos": pos, "vel": vel, "velocity_history": vel[:, None].expand(-1, scene.velocity_history.shape[1], -1)}
+    joined: dict[str, Any] = {name: torch.cat([getattr(scene, name), values]) for name, values in more.items()}
+    return replace(scene, **joined)
+
+
+def _with_walls(scene: State, count: int) -> State:
+    rng = np.random.default_rng(0)
+    pos = torch.from_numpy(rng.uniform(FAR, FAR + 1, (count, scene.dim))).to(scene.pos.device)
+    normal = torch.zeros_like(pos)
+    normal[:, 1] = 1.0
+    return replace(scene, boundary=Boundary(pos, torch.zeros_like(pos), normal, pos.new_ones(count), pos.new_zeros(count)))
+
+
+def _falling(scene: State, count: int) -> State:
+    """Nothing but nodes in free fall, one spacing of the unit apart."""
+    side = int(np.ceil(count ** (1 / scene.dim)))
+    lattice = np.stack(np.unravel_index(np.arange(count), (side,) * scene.dim), axis=-1)
+    pos = FAR + torch.from_numpy(lattice.astype(float)).to(scene.pos.device)
+    joined = _joined(scene, pos, torch.zeros_like(pos))
+    last: dict[str, Any] = {name: getattr(joined, name)[scene.num_nodes :] for name in NODE_FIELDS}
+    return replace(joined, **last)
+
+
+def _with_falling(scene: State, count: int) -> State:
+    falling = _falling(scene, count)
+    return _joined(scene, falling.pos, falling.vel)
+
+
+def _with_absent_materials(builder: GraphBuilder, scene: State) -> tuple[GraphBuilder, State]:
+    names = param_names(MATERIALS)
+    params = torch.full((scene.num_nodes, len(names)), torch.nan, dtype=torch.float64, device=scene.pos.device)
+    params[:, :1] = scene.material_params
+    metadata = replace(builder.metadata, materials=MATERIALS, param_names=names)
+    return GraphBuilder(builder.config, metadata), replace(scene, material_params=params)
+
+
+def _with_settled(scene: State, count: int) -> State:
+    pos = torch.cat([scene.pos + (k + 1) * FAR for k in range(count)])
+    return _joined(scene, pos, torch.zeros_like(pos))

@@ -1,0 +1,329 @@
+"""How long a forward pass and a training step take: every interaction, plain and fast, and the baselines, on the same nodes, edges, width and depth.
+
+The floor of a case is the time of its own matrix products, counted operation by operation, at the rate that the machine reaches in them; beside it stands the
+time of moving every edge state in and out once per layer.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
+from torch_geometric.data import HeteroData
+
+from gpe_pl.files.markdown import table_row
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.graphs.lattice import lattice_graph, lattice_scene
+from gpe_pl.graphs.neighbors import radius_pairs
+from gpe_pl.models.cconv import ContinuousConvNet
+from gpe_pl.models.dpinet import DPINet
+from gpe_pl.models.gns import GNS
+from gpe_pl.models.gpe import GPE
+from gpe_pl.nn.fused import unfused
+from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction
+from gpe_pl.schema import FeatureSpec
+from gpe_pl.system.machine import copy_rate, gemm_rate, has_cpp_compiler, peak_memory, peak_on_gpu, reduces_precision, synchronized
+from gpe_pl.system.timing import apart, paired_ratio, paired_times
+
+log = logging.getLogger(__name__)
+
+INTERACTIONS: tuple[Interaction, ...] = ("directed", "negated", "odd", "odd_even")
+REFERENCE = "directed, plain"
+"""Concatenated features, one product per directed edge: how message passing is usually written."""
+SAND = "sand"
+MEDIUM = ", medium"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Size of the problem."""
+
+    num_nodes: Annotated[int, Field(ge=10)] = 2500
+    num_edges: Annotated[int, Field(ge=10)] = 24000
+    num_message_passing_steps: Annotated[int, Field(ge=1, le=64)] = 12
+    hidden_channels: Annotated[int, Field(ge=1, le=4096)] = 128
+    num_rounds: Annotated[int, Field(ge=1)] = 7
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
+    accelerator: Literal["cpu", "gpu"] = "cpu"
+    compile: bool = True
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @property
+    def device(self) -> str:
+        return "cuda" if self.accelerator == "gpu" else "cpu"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A model to time: one of GPE's variants, or a baseline."""
+
+    model: Literal["GPE", "GNS", "DPINet", "ContinuousConvNet"] = "GPE"
+    interaction: Interaction = "negated"
+    implementation: Implementation = "factored"
+    edge_state: EdgeState = "latent"
+    is_fused: bool = True
+    compiled: bool = False
+    precision: Literal["highest", "medium"] = "highest"
+
+    def runs(self, function: Callable[[], Any]) -> Callable[[], Any]:
+        """The function as this case has it: with its precision of single-precision products (``medium`` allows bfloat16 inside), and without fused passes
+        where it has none.
+        """
+
+        def call() -> Any:
+            before = torch.get_float32_matmul_precision()
+            torch.set_float32_matmul_precision(self.precision)
+            try:
+                with nullcontext() if self.is_fused else unfused():
+                    return function()
+            finally:
+                torch.set_float32_matmul_precision(before)
+
+        return call
+
+    @property
+    def saves_against(self) -> str | None:
+        """The case which computes both directions of an edge in the same way otherwise."""
+        if self.model != "GPE" or self.edge_state != "latent" or self.compiled or self.precision != "highest":
+            return None
+        if self.implementation == "plain":
+            return "directed, plain"
+        return None if self.is_fused else "directed, factored"
+
+    def build(self, spec: FeatureSpec, num_steps: int, hidden: int, seed: int = 0) -> nn.Module:
+        """The model, with the same weights for the same parameters."""
+        torch.manual_seed(seed)
+        if self.model == "GNS":
+            return GNS(spec, num_steps, hidden)
+        if self.model == "DPINet":
+            return DPINet(spec, num_steps, hidden)
+        if self.model == "ContinuousConvNet":
+            return ContinuousConvNet(spec, num_steps, hidden)
+        return GPE(
+            spec,
+            interaction=self.interaction,
+            edge_state=self.edge_state,
+            num_message_passing_steps=num_steps,
+            hidden_channels=hidden,
+            implementation=self.implementation,
+        )
+
+
+def cases(compiled: bool, reduced: bool) -> dict[str, Case]:
+    """All that is timed, by name, the reference first; with ``torch.compile``, and with products of reduced precision, where the machine has them."""
+    found = {f"{i}, plain": Case(interaction=i, implementation="plain") for i in INTERACTIONS}
+    found |= {f"{i}, factored": Case(interaction=i, is_fused=False) for i in INTERACTIONS}
+    found |= {i: Case(interaction=i) for i in ("negated", "odd")}
+    if compiled:
+        found |= {f"{i}, compiled": Case(interaction=i, compiled=True) for i in ("negated", "odd")}
+    if reduced:
+        found |= {f"directed, plain{MEDIUM}": Case(interaction="directed", implementation="plain", precision="medium")}
+        found |= {f"{i}{MEDIUM}": Case(interaction=i, precision="medium") for i in ("negated", "odd")}
+    found |= {f"{i}, geometry": Case(interaction=i, edge_state="geometry") for i in ("negated", "odd")}
+    return found | {name: Case(model=name) for name in ("GNS", "DPINet", "ContinuousConvNet")}
+
+
+def flop(model: nn.Module, graph: HeteroData) -> int:
+    """Floating-point operations of the matrix products of a forward pass. On the meta device, where fused passes step aside and every product is seen."""
+    with torch.inference_mode(), FlopCounterMode(display=False) as counter:
+        model.to("meta")(graph.clone().to("meta"))
+    return int(counter.get_total_flops())
+
+
+def edge_bytes(case: Case, spec: FeatureSpec, graph: HeteroData, settings: Settings) -> int:
+    """Bytes of edge states that a forward pass of GPE reads and writes at least: latent ones in and out in all layers but the last, which only reads."""
+    edges = sum(graph[r].edge_index.shape[1] * (2 if case.interaction == "directed" else 1) for r in spec.relations)
+    if case.edge_state == "geometry":
+        channels = next(spec.odd_channels[r] + spec.even_channels[r] for r in spec.relations)
+        return 4 * edges * channels * settings.num_message_passing_steps
+    return 4 * edges * settings.hidden_channels * 2 * settings.num_message_passing_steps
+
+
+def forward_pass(case: Case, settings: Settings) -> Callable[[], Any]:
+    """A forward pass in inference, its graph and model built."""
+    model, graph = _built(case, settings)
+    return synchronized(case.runs(torch.inference_mode()(lambda: model(graph))), settings.device)
+
+
+def training_pass(case: Case, settings: Settings) -> Callable[[], Any]:
+    """A training step, its graph and model built."""
+    return synchronized(case.runs(training_step(*_built(case, settings))), settings.device)
+
+
+def _built(case: Case, settings: Settings) -> tuple[nn.Module, HeteroData]:
+    torch.set_num_threads(settings.num_threads)
+    builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
+    model = case.build(builder.spec, settings.num_message_passing_steps, settings.hidden_channels, settings.seed).to(settings.device)
+    return _compiled(model, settings.device) if case.compiled else model, graph.to(settings.device)
+
+
+def training_step(model: nn.Module, graph: HeteroData) -> Callable[[], Any]:
+    """Forward and backward pass, clipping and Adam with learning rate zero."""
+    optimizer = torch.optim.Adam(model.parameters(), lr=0.0, fused=True)
+
+    def step() -> Tensor:
+        optimizer.zero_grad()
+        loss = model(graph).acceleration[SAND].square().mean()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+        return loss
+
+    return step
+
+
+def _compiled(model: nn.Module, device: str) -> nn.Module:
+    fast: Any = model
+    mode = "reduce-overhead" if device == "cuda" else None  # CUDA graphs
+    fast.compute = torch.compile(fast.compute, dynamic=device != "cuda", mode=mode)
+    return model
+
+
+def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
+    """Records of times [s], paired ratios, floors and memory, and a Markdown table."""
+    torch.set_num_threads(settings.num_threads)
+    device = settings.device
+    builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
+    spec, size = builder.spec, (settings.num_message_passing_steps, settings.hidden_channels, settings.seed)
+    num_edges = sum(graph[r].edge_index.shape[1] for r in spec.relations)
+    compiles = settings.compile and (device != "cpu" or has_cpp_compiler())
+    if settings.compile and not compiles:
+        log.warning("suite.compile: no C++ compiler here, so nothing is timed with torch.compile")
+    todo = cases(compiles, reduces_precision(device))
+    forward = _beside_the_reference(forward_pass, todo, settings, settings.num_rounds, "forward passes")
+    training = _beside_the_reference(training_pass, todo, settings, max(1, settings.num_rounds // 2), "training steps")
+
+    gemm, copy = gemm_rate(num_edges, settings.hidden_channels, device), copy_rate(device)
+    records: list[dict[str, Any]] = [
+        {"metric": "gemm_rate", "case": device, "value": gemm, "unit": "FLOP/s"},
+        {"metric": "copy_rate", "case": device, "value": copy, "unit": "B/s"},
+    ]
+    for name, case in todo.items():
+        values: dict[str, tuple[float, str]] = {
+            "forward_time": (forward[name].seconds, "s"),
+            "training_time": (training[name].seconds, "s"),
+            "forward_speedup": (1 / forward[name].ratio, "1"),
+            "forward_speedup_vs_gns": (forward["GNS"].ratio / forward[name].ratio, "1"),
+            "training_speedup": (1 / training[name].ratio, "1"),
+        }
+        if case.precision != "highest":
+            found, expected = (forward_pass(todo[n], settings)().acceleration[SAND] for n in (name, name.removesuffix(MEDIUM)))
+            values["forward_difference"] = (float((found - expected).norm() / expected.norm()), "1")
+        elif case.model == "GPE":
+            if case.saves_against is not None:
+                values["forward_time_saved"] = (1 - forward[name].ratio / forward[case.saves_against].ratio, "1")
+            values["flop"] = (flop(case.build(spec, *size), graph), "FLOP")
+            values["flop_floor"] = (values["flop"][0] / gemm, "s")
+            values["byte_floor"] = (edge_bytes(case, spec, graph, settings) / copy, "s")
+            values["floor_ratio"] = (values["forward_time"][0] / values["flop_floor"][0], "1")
+        if device != "cpu":
+            values["peak_memory"] = (peak_on_gpu(forward_pass(case, settings)), "B")
+            values["training_peak_memory"] = (peak_on_gpu(training_pass(case, settings)), "B")
+        elif not case.compiled and case.precision == "highest":
+            values["peak_memory"] = (peak_memory(forward_pass, case, settings), "B")
+            values["training_peak_memory"] = (peak_memory(training_pass, case, settings), "B")
+        records += [{"metric": metric, "case": name, "value": value, "unit": unit} for metric, (value, unit) in values.items()]
+    records += _graph_records(settings)
+    return records, table(settings, num_edges, records)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Median time of a case [s], and median of its paired ratios to the reference."""
+
+    seconds: float
+    ratio: float
+
+
+def _beside_the_reference(
+    make: Callable[[Case, Settings], Callable[[], Any]], todo: dict[str, Case], settings: Settings, num_rounds: int, what: str
+) -> dict[str, Timing]:
+    """Every case in turns with the reference, either in a process of its own. Only these two are there at a time, as a training step may keep gigabytes."""
+    found = {}
+    with apart({REFERENCE: partial(make, todo[REFERENCE], settings)}) as reference:
+        for name, case in todo.items():
+            with apart({} if name == REFERENCE else {name: partial(make, case, settings)}) as other:
+                times = paired_times(reference | other, num_rounds, num_warmups=3)
+            found[name] = Timing(float(np.median(times[name])), paired_ratio(times, name, REFERENCE))
+            log.info("%s, %s: %.3f s", what, name, found[name].seconds)
+    return found
+
+
+def _graph_records(settings: Settings) -> list[dict[str, Any]]:
+    """Neighbour search, and the whole graph with its features, apart from the model."""
+    builder, state = lattice_scene(settings.num_nodes, settings.num_edges, GraphConfig())
+    pos = state.pos.numpy()
+    functions: dict[str, Callable[[], Any]] = {
+        "neighbor_time": lambda: radius_pairs(pos, builder.scales.radius),
+        "graph_time": lambda: builder(state),
+    }
+    times = paired_times(functions, settings.num_rounds)
+    return [{"metric": name, "case": "cpu", "value": float(np.median(t)), "unit": "s"} for name, t in times.items()]
+
+
+def _cells(values: dict[str, float]) -> list[str]:
+    def text(metric: str, scale: float, form: str) -> str:
+        return format(values[metric] * scale, form) if metric in values else "–"
+
+    return [
+        text("forward_time", 1e3, ".0f"),
+        text("forward_speedup", 1.0, ".1f"),
+        text("forward_speedup_vs_gns", 1.0, ".1f"),
+        text("forward_time_saved", 100.0, ".0f"),
+        text("flop_floor", 1e3, ".0f"),
+        text("byte_floor", 1e3, ".0f"),
+        text("floor_ratio", 1.0, ".2f"),
+        text("training_time", 1e3, ".0f"),
+        text("training_speedup", 1.0, ".1f"),
+        text("peak_memory", 1e-6, ".0f"),
+        text("training_peak_memory", 1e-6, ".0f"),
+    ]
+
+
+def table(settings: Settings, num_edges: int, records: list[dict[str, Any]]) -> str:
+    """Markdown of the records of a run."""
+    header = [
+        *("model", "forward [ms]", "faster", "than GNS", "saved [%]", "product floor [ms]", "byte floor [ms]", "over floor"),
+        *("training [ms]", "faster", "memory [MB]", "training [MB]"),
+    ]
+    of_case: dict[str, dict[str, float]] = {}
+    for record in records:
+        of_case.setdefault(record["case"], {})[record["metric"]] = record["value"]
+    machine = {r["metric"]: r["value"] for r in records if r["metric"] in ("gemm_rate", "copy_rate", "neighbor_time", "graph_time")}
+    lines = [table_row([name, *_cells(values)]) for name, values in of_case.items() if "forward_time" in values]
+    reduced = {name.removesuffix(MEDIUM): v["forward_difference"] for name, v in of_case.items() if "forward_difference" in v}
+    medium = (
+        "which changes the "
+        + ", ".join(f"{name} output by {100 * change:.1g} %" for name, change in reduced.items())
+        + " (untrained weights, relative L2)."
+        if reduced
+        else "but do not on this machine, so it is not timed."
+    )
+    return "\n".join(
+        [
+            f"{settings.num_nodes:,} nodes, {num_edges:,} undirected edges, {settings.num_message_passing_steps} × {settings.hidden_channels}, "
+            f"{settings.accelerator}, {settings.num_threads} thread(s); measured: {machine['gemm_rate'] / 1e9:.0f} GFLOP/s in products, "
+            f"{machine['copy_rate'] / 1e9:.1f} GB/s in copies. Neighbour search {1e3 * machine['neighbor_time']:.1f} ms, "
+            f"whole graph with features {1e3 * machine['graph_time']:.1f} ms.",
+            "",
+            table_row(header),
+            "|" + "---|" * len(header),
+            *lines,
+            "",
+            f"Times: medians, each model in a process of its own that keeps its memory. Faster: median of ratios to `{REFERENCE}`, in turns, which multiplies "
+            "the concatenated features of every directed edge. Factored: node features are multiplied before they go to the edges, by PyTorch's operations; "
+            "below, by passes of our own where a name has no addition. Saved: time saved against `directed` of the same implementation; the paper reports 37 % "
+            "for `negated`. Product floor: the case's own matrix products at the measured rate; byte floor: its edge states in and out once per layer at the "
+            "copy rate. Geometry: raw edge features instead of latent edge states. Memory: beyond weights and graph. Medium: products may use bfloat16 inside "
+            "(`trainer.matmul_precision=medium`), " + medium,
+        ]
+    )

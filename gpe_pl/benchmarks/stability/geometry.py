@@ -1,0 +1,123 @@
+"""Degenerate arrangements: nodes on top of each other, alone, too many in one place, and at the edge of the neighbour radius."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, inapplicable, no_boundary, permuted, shifted, stress_test
+from gpe_pl.errors import GpeError
+from gpe_pl.graphs.neighbors import radius_pairs
+from gpe_pl.rollout.loop import SimulationError
+from gpe_pl.trajectory.trajectory import State
+
+NUM_MOVES = 1000
+NUM_CROWDED = 20_000
+
+
+def has_finite_gradients(subject: Subject, state: State) -> bool:
+    """Whether outputs, and the gradients of their squares by all weights, are finite."""
+    model = subject.simulator.model
+    with torch.enable_grad():
+        values = [*subject.simulator(subject.simulator.builder(state)).acceleration.values()]
+        loss = torch.stack([v.square().sum() for v in values]).sum()
+        finite = bool(torch.isfinite(loss))
+        if loss.requires_grad:
+            found = torch.autograd.grad(loss, [*model.parameters()], allow_unused=True)
+            finite = finite and all(bool(torch.isfinite(g).all()) for g in found if g is not None)
+    return finite
+
+
+@stress_test(12, "coincident particles", "4 nodes in one place: outputs and gradients are finite")
+def coincident(subject: Subject) -> Outcome:
+    state = subject.state()
+    pos = state.pos.clone()
+    pos[1:4] = pos[0]
+    return Outcome(has_finite_gradients(subject, replace(state, pos=pos)), "")
+
+
+@stress_test(13, "isolated, one and no particle", "no crash, ballistic: |a − g| < 1e-6 of the acceleration scale")
+def isolated(subject: Subject) -> Outcome:
+    simulator = subject.simulator
+    state = replace(subject.state(), boundary=no_boundary(subject.state()))
+    far = torch.zeros_like(state.pos)
+    far[0] = 32 * simulator.builder.scales.radius
+    alone = permuted(replace(state, pos=state.pos + far, cells=None, rest_pos=None), torch.arange(state.num_nodes))
+    one = permuted(state, torch.arange(1))
+    none = permuted(state, torch.arange(0))
+    values = [float(acceleration(simulator, s)[0].abs().max()) / subject.acceleration_std for s in (alone, one)]
+    after = simulator.step(none)
+    return Outcome(max(values) < 1e-6 and after.num_nodes == 0, f"isolated {values[0]:.1e}, single {values[1]:.1e}; no particle: no crash")
+
+
+@stress_test(
+    14,
+    "density spike",
+    "half the distances: finite; 20,000 particles in one place: refused with a clear error before their edges are listed",
+)
+def density_spike(subject: Subject) -> Outcome:
+    state = subject.free_state()
+    centre = state.pos.mean(dim=0)
+
+    def compressed(factor: float) -> State:
+        return replace(state, pos=centre + factor * (state.pos - centre))
+
+    before, after = (len(radius_pairs(compressed(f).pos.numpy(), subject.simulator.builder.scales.radius).T) for f in (1.0, 0.5))
+    try:
+        dense = bool(torch.isfinite(subject.simulator.step(compressed(0.5)).pos).all())
+    except GpeError as error:
+        return Outcome(False, f"refused at half the distances: {error}")
+    crowd = permuted(state, torch.zeros(NUM_CROWDED, dtype=torch.int64))
+    try:
+        subject.simulator.step(crowd)
+        refused, text = False, "not refused"
+    except SimulationError as error:
+        refused, text = error.reason == "clustering" and error.node >= 0, f"refused: {error.reason}, node {error.node}"
+    return Outcome(
+        dense and refused, f"{after / max(before, 1):.1f} times the edges: {'finite' if dense else 'not finite'}; in one place: {text}"
+    )
+
+
+@stress_test(15, "crossing the radius", "a node comes within R of a cloud: no acceleration jumps by more than the one-step RMSE")
+def cutoff(subject: Subject) -> Outcome:
+    state, radius = subject.free_state(), subject.simulator.builder.scales.radius
+    if state.cells is not None:
+        state = permuted(state, torch.arange(state.num_nodes - 1))  # particles: a node of a mesh cannot come from outside
+    first = int(torch.argmax(state.pos[:, 0]))
+    visitor = permuted(state, torch.tensor([first]))
+    outputs = []
+    for distance in (radius * (1 + 1e-9), radius * (1 - 1e-9)):
+        offset = torch.zeros(state.dim, dtype=torch.float64)
+        offset[0] = distance
+        both = _with_visitor(state, shifted(visitor, offset))
+        if len(radius_pairs(both.pos.numpy(), radius).T) == 0:
+            return inapplicable("no two nodes of the scene are within the radius")
+        outputs.append(acceleration(subject.simulator, both))
+    jump = float((outputs[1] - outputs[0]).abs().max())
+    return Outcome(jump < subject.one_step_rmse, f"{jump / subject.one_step_rmse:.2g} one-step RMSE")
+
+
+def _with_visitor(state: State, visitor: State) -> State:
+    names = ("pos", "vel", "node_type", "mass", "material_params", "velocity_history")
+    values: dict[str, Any] = {n: torch.cat([getattr(state, n), getattr(visitor, n)]) for n in names}
+    return replace(state, **values, cells=None, rest_pos=None)
+
+
+@stress_test(16, "neighbour list", "equal to brute force for 1,000 random moves; pairs are unordered")
+def neighbour_list(subject: Subject) -> Outcome:
+    rng = np.random.default_rng(0)
+    radius, state = subject.simulator.builder.scales.radius, subject.state()
+    pos = state.pos.numpy()[rng.permutation(state.num_nodes)[:64]].copy()
+    wrong = 0
+    for _ in range(NUM_MOVES):
+        pos += rng.normal(scale=0.1 * radius, size=pos.shape)
+        pairs = {(min(a, b), max(a, b)) for a, b in radius_pairs(pos, radius).T.tolist()}
+        distance = np.sqrt(np.square(pos[:, None] - pos[None]).sum(axis=-1))
+        wrong += len(pairs ^ {(int(a), int(b)) for a, b in np.argwhere(np.triu(distance <= radius, 1))})
+    return Outcome(wrong == 0, f"{wrong} pairs differ; there is no skin: every step searches anew")
+
+
+TESTS = (coincident, isolated, density_spike, cutoff, neighbour_list)

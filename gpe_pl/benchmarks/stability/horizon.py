@@ -1,0 +1,241 @@
+"""Long rollouts: whether they stay bounded, stay at rest, how fast they forget where they started, and whether they can be resumed."""
+
+from __future__ import annotations
+
+import copy
+import math
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gpe_pl.benchmarks.stability.subject import Outcome, Subject, inapplicable, stress_test
+from gpe_pl.data.ground_truth import initial_state
+from gpe_pl.graphs.features import history_of
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.metrics import displacement
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.loop import Simulator, Start, rollout, rollouts
+from gpe_pl.trajectory.trajectory import State, Trajectory
+
+MAX_CORRECTED = 0.01
+"""Share of particle-steps beyond which containment does the model's work."""
+VALID_ERROR = 0.5
+"""Of a spacing: root mean square displacement until which a prediction is valid."""
+PERTURBATION = 1e-6
+"""Of the domain's longest side."""
+STATIC_FRICTION = 0.5
+"""Share of gravity, of the rollout that is only reported."""
+AT_REST = 0.01
+"""Of a spacing per frame: largest speed of a pile at rest."""
+
+
+# --- staying bounded ------------------------------------------------------------------------------------------------------------------------
+
+
+@stress_test(
+    21,
+    "10 times the trained horizon",
+    "contained, nothing skipped: no NaN, no node farther than R outside, speed < 3 × training, E ≤ 2 E₀, < 1 % of particle-steps corrected",
+)
+def long_horizon(subject: Subject) -> Outcome:
+    num_steps = round(max(subject.horizon_factors) * (subject.scenes[0].num_frames - 1))
+    starts = [
+        Start(subject.simulator.initial_state(truth, subject.history), num_steps, truth.metadata, subject.guard())
+        for truth in subject.scenes
+    ]
+    num_corrected = 0
+
+    def count(_: int, __: int, state: State) -> None:
+        nonlocal num_corrected
+        num_corrected += state.num_corrected
+
+    results = rollouts(Contained(subject.simulator, subject.dt), starts, count)
+    share = num_corrected / max(1, sum((r.num_frames - 1) * r.num_nodes for r in results))
+    energies = [energy(r, subject) for r in results]
+    growth = max(float(e.max() / max(e[0], 1e-300)) for e in energies)
+    stops = [r.termination for r in results if r.termination is not None]
+    valid = [valid_steps(r, truth.frames(subject.history), subject.spacing) for r, truth in zip(results, subject.scenes, strict=True)]
+    survived = {f: np.mean([r.num_frames - 1 >= f * (t.num_frames - 1) for r, t in zip(results, subject.scenes, strict=True)])
+                for f in subject.horizon_factors}  # fmt: skip
+    text = [
+        f"alive at {', '.join(f'{f:g}×: {100 * s:.0f} %' for f, s in survived.items())} of {len(results)} scenes",
+        f"E ≤ {growth:.3g} E₀",
+        f"{100 * share:.2g} % corrected",
+        f"valid for {np.median(valid):.0f} of {subject.scenes[0].num_frames - 1 - subject.history} frames",
+    ]
+    text += [f"stopped at frame {s.frame}: {s.reason}" for s in stops[:1]]
+    curves = {
+        "energy": _middle([e / e[0] for e in energies], num_steps),
+        "momentum": _middle([momentum(r) for r in results], num_steps),
+        "valid_steps": [float(v) for v in valid],
+        "steps_to_failure": [float(r.num_frames) if r.termination is not None else math.inf for r in results],
+        "horizons": [float(round(f * (subject.scenes[0].num_frames - 1))) for f in subject.horizon_factors],
+    }
+    return Outcome(bool(not stops and growth <= 2 and share <= MAX_CORRECTED), "; ".join(text), curves)
+
+
+def energy(trajectory: Trajectory, subject: Subject) -> np.ndarray:
+    """Kinetic energy and that of height above the lowest corner of the domain [J], in every frame."""
+    mass, gravity = trajectory.mass.astype(np.float64), np.asarray(trajectory.metadata.gravity)
+    low = np.array([a for a, _ in trajectory.metadata.bounds])
+    high = np.array([b for _, b in trajectory.metadata.bounds])
+    bottom = np.where(gravity > 0, high, low)  # where all potential energy is spent
+    height = -((trajectory.pos.astype(np.float64) - bottom) @ gravity)
+    return (mass * (0.5 * np.square(trajectory.vel.astype(np.float64)).sum(axis=-1) + height)).sum(axis=-1)
+
+
+def momentum(trajectory: Trajectory) -> np.ndarray:
+    """|Σ m v| / Σ m [m/s] in every frame."""
+    mass = trajectory.mass.astype(np.float64)
+    return np.linalg.norm(np.einsum("n,fnd->fd", mass / mass.sum(), trajectory.vel.astype(np.float64)), axis=-1)
+
+
+def valid_steps(prediction: Trajectory, truth: Trajectory, spacing: float) -> int:
+    """Frames before the root mean square displacement from the ground truth exceeds ``VALID_ERROR`` spacings; all of them if it never does."""
+    count = min(prediction.num_frames, truth.num_frames)
+    error = np.square(displacement(prediction.pos[:count], truth.pos[:count], truth.metadata)).sum(axis=-1).mean(axis=-1)
+    beyond = np.flatnonzero(~(np.sqrt(error) <= VALID_ERROR * spacing))
+    return int(beyond[0]) - 1 if len(beyond) else count - 1
+
+
+def _middle(curves: list[np.ndarray], num_steps: int, count: int = 200) -> list[float]:
+    """Median over scenes at evenly spaced frames; infinite where most have failed."""
+    padded = [np.concatenate([c, np.full(num_steps + 1 - len(c), np.inf)]) for c in curves]
+    frames = np.unique(np.linspace(0, num_steps, count).astype(int))
+    return np.quantile(np.stack(padded)[:, frames], 0.5, axis=0, method="inverted_cdf").tolist()
+
+
+# --- staying at rest ------------------------------------------------------------------------------------------------------------------------
+
+
+@stress_test(
+    22,
+    "a pile at rest",
+    "from equilibrium, 1,000 steps: no node drifts by 0.1 spacings, height changes by < 5 %; with static friction: reported",
+)
+def rest(subject: Subject) -> Outcome:
+    settled = settle(subject)
+    if isinstance(settled, str):
+        return inapplicable(settled)
+    outcome = stays(subject, settled)
+    if not subject.simulator.builder.spec.islands:
+        return outcome
+    simulator = copy.deepcopy(subject.simulator)
+    simulator.static_friction = STATIC_FRICTION
+    held = stays(replace(subject, simulator=simulator), settled)
+    return replace(outcome, measured=f"{outcome.measured}; with static friction {STATIC_FRICTION:g}: {held.measured}")
+
+
+def stays(subject: Subject, settled: State) -> Outcome:
+    """Whether a state in which the solver has come to rest stays as it is."""
+    metadata, guard = subject.scenes[0].metadata, subject.guard()
+    result = rollout(Contained(subject.simulator, subject.dt), settled, subject.num_rest_steps, metadata, guard)
+    moved = np.linalg.norm(result.pos - result.pos[0], axis=-1).max(axis=1) / subject.spacing
+    up = int(np.argmax(np.abs(metadata.gravity)))
+    low = metadata.bounds[up][0]
+    height = result.pos[..., up].max(axis=1) - low
+    change = float(np.abs(height / height[0] - 1).max())
+    rms = float(np.sqrt(np.square(result.pos[-1] - result.pos[0]).sum(axis=-1).mean())) / subject.spacing
+    text = f"farthest {moved.max():.2g}, rms at the end {rms:.2g} spacings, height {100 * change:.2g} %"
+    if result.termination is not None:
+        return Outcome(False, f"{text}; stopped at frame {result.termination.frame}: {result.termination.reason}")
+    return Outcome(bool(moved.max() < 0.1 and change < 0.05), text)
+
+
+def settle(subject: Subject) -> State | str:
+    """A state in which the solver has come to rest, with no velocity at all; or why there is none."""
+    length = max(subject.horizon_factors) * subject.spec.num_frames
+    fastest = math.inf
+    for index in range(len(subject.scenes)):
+        state = initial_state(subject.spec, "test", index)
+        for frame in range(round(min(length, 5 * subject.spec.num_frames))):
+            state = subject.spec.solver.step(state)
+            speed = float(np.linalg.norm(state.vel, axis=-1).max()) * subject.dt / subject.spacing
+            fastest = min(fastest, speed)
+            if speed < AT_REST and frame > subject.spec.num_frames // 2:
+                still = np.zeros((state.num_nodes, subject.history, state.dim))
+                return replace(state, vel=still[:, -1], velocity_history=still, internal=None, stress=None).to_torch()
+    return f"the solver's scenes do not come to rest: at best {fastest:.2g} spacings per frame within 5 times the trained horizon"
+
+
+# --- forgetting the start -------------------------------------------------------------------------------------------------------------------
+
+
+@stress_test(23, "growth of a perturbation", "twin rollouts 1e-6 of the domain apart: growth rate ≤ 1.5 times the solver's own")
+def perturbation(subject: Subject) -> Outcome:
+    num_steps = subject.scenes[0].num_frames - 1 - subject.history
+    size = subject.simulator.builder.metadata.longest_side
+    own = separation(Contained(subject.simulator, subject.dt), subject.state(0, 0.0), num_steps, subject.spacing, size)
+    solver = separation(subject.spec.solver, initial_state(subject.spec, "test", 0), num_steps, subject.spacing, size)
+    rate, reference = growth_rate(own, subject.spacing), growth_rate(solver, subject.spacing)
+    limit = 1.5 * reference if reference > 0 else reference / 1.5
+    text = f"{rate:.3g} per frame, solver {reference:.3g}"
+    return Outcome(bool(rate <= limit), text, {"model": own.tolist(), "solver": solver.tolist()})
+
+
+def separation(simulator: Simulator, state: State, num_steps: int, spacing: float, size: float, seed: int = 0) -> np.ndarray:
+    """Root mean square distance [spacings] of two rollouts whose positions differ by ``PERTURBATION`` times ``size`` [m] at the start, per frame."""
+    noise: Any = np.random.default_rng(seed).normal(size=tuple(state.pos.shape))
+    noise *= PERTURBATION * size / np.sqrt(np.square(noise).sum(axis=-1).mean())
+    is_torch = isinstance(state.pos, torch.Tensor)
+    a, b = state, replace(state, pos=state.pos + (torch.from_numpy(noise) if is_torch else noise))
+    found = [PERTURBATION * size / spacing]
+    for _ in range(num_steps):
+        a, b = simulator.step(a), simulator.step(b)
+        distance = np.asarray(a.pos) - np.asarray(b.pos)
+        found.append(float(np.sqrt(np.square(distance).sum(axis=-1).mean())) / spacing)
+        if not math.isfinite(found[-1]):
+            break
+    return np.array(found)
+
+
+def growth_rate(separations: np.ndarray, spacing: float, saturated: float = 0.1) -> float:
+    """Slope of log separation over frames, by least squares, until it first exceeds ``saturated`` spacings."""
+    beyond = np.flatnonzero(~(separations < saturated))
+    count = int(beyond[0]) if len(beyond) else len(separations)
+    logs = np.log(np.maximum(separations[: max(count, 2)], 1e-300))
+    return float(np.polyfit(np.arange(len(logs)), np.where(np.isfinite(logs), logs, 700.0), 1)[0])
+
+
+# --- resuming -------------------------------------------------------------------------------------------------------------------------------
+
+
+@stress_test(24, "resuming", "200 steps = 100, stored, loaded, 100 more: bit for bit; two runs too")
+def resuming(subject: Subject) -> Outcome:
+    start = subject.state(0, 0.0)
+    simulator = Contained(subject.simulator, subject.dt)
+    whole = _advanced(simulator, start, 200)
+    again = _advanced(simulator, start, 200)
+    half = _advanced(simulator, start, 100)
+    with tempfile.TemporaryDirectory() as folder:
+        subject.simulator.save(Path(folder) / "model.ckpt")
+        np.savez(Path(folder) / "state.npz", pos=half.pos, vel=half.vel, history=history_of(half))
+        loaded = np.load(Path(folder) / "state.npz")
+        pos, vel, history = (torch.from_numpy(loaded[name]) for name in ("pos", "vel", "history"))
+        resumed = Contained(LearnedSimulator.from_checkpoint(Path(folder) / "model.ckpt"), subject.dt)
+    rest = _advanced(resumed, replace(half, pos=pos, vel=vel, velocity_history=history), 100)
+    equal = {"resumed": torch.equal(rest.pos, whole.pos), "repeated": torch.equal(again.pos, whole.pos)}
+    finite = bool(torch.isfinite(whole.pos).all())
+    text = ", ".join(f"{name} {'equal' if is_equal else 'different'}" for name, is_equal in equal.items())
+    return Outcome(all(equal.values()) and finite, text)
+
+
+def _advanced(simulator: Simulator, state: State, num_steps: int) -> State:
+    for _ in range(num_steps):
+        state = simulator.step(state)
+    return state
+
+
+def max_speed(spec: Any, generate: Callable[..., Trajectory], num_trajectories: int) -> float:
+    """Largest speed [m/s] in some training trajectories, as differences of positions over a frame."""
+    dt = spec.solver.frame_dt
+    found = [generate(spec, "train", k).pos.astype(np.float64) for k in range(min(num_trajectories, spec.num_train))]
+    return max(float(np.linalg.norm(np.diff(pos, axis=0), axis=-1).max()) / dt for pos in found)
+
+
+TESTS = (long_horizon, rest, perturbation, resuming)

@@ -1,0 +1,299 @@
+"""Rounding, equal implementations, memory, training under attack, and the guard."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch_geometric.data import HeteroData
+
+from gpe_pl.benchmarks.stability.horizon import PERTURBATION, separation
+from gpe_pl.benchmarks.stability.inputs import Spoiled
+from gpe_pl.benchmarks.stability.subject import (
+    Outcome,
+    Subject,
+    acceleration,
+    in_double,
+    in_order,
+    inapplicable,
+    output,
+    permuted,
+    relative_change,
+    stress_test,
+    to_dtype,
+)
+from gpe_pl.geometry.shapes import Box, Sphere
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.learned.approximate import approximate
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.metrics import per_frame_mse
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.loop import Guard, rollout
+from gpe_pl.rollout.skips import Skips
+from gpe_pl.system.machine import resident_bytes
+from gpe_pl.training.module import TrainingModule
+from gpe_pl.trajectory.trajectory import State
+
+NUM_STEPS = 100
+
+
+@stress_test(25, "single precision", "100 steps in float32 and float64 differ by no more than twins 1e-6 of the domain apart do")
+def single_precision(subject: Subject) -> Outcome:
+    start = subject.state(0, 0.0)
+    single, double = Contained(subject.simulator, subject.dt), Contained(in_double(subject.simulator), subject.dt)
+    a = b = start
+    for _ in range(NUM_STEPS):
+        a, b = single.step(a), double.step(b)
+    difference = float((a.pos - b.pos).square().sum(dim=1).mean().sqrt()) / subject.spacing
+    twin = float(separation(single, start, NUM_STEPS, subject.spacing, subject.simulator.builder.metadata.longest_side)[-1])
+    text = f"{difference:.2g} spacings, twins {PERTURBATION:g} of the domain apart {twin:.2g}"
+    return Outcome(bool(difference <= twin < math.inf), text)
+
+
+@stress_test(26, "equal implementations", "fused = plain: change < 1e-5")
+def implementations(subject: Subject) -> Outcome:
+    settings = subject.simulator.description()["settings"]
+    if "implementation" not in settings:
+        return inapplicable("the model has one implementation; compilation is used in training only, and tested there")
+    other = "plain" if settings["implementation"] == "factored" else "factored"
+    model = type(subject.simulator.model)(subject.simulator.builder.spec, **{**settings, "implementation": other})
+    twin = LearnedSimulator(model, subject.simulator.builder)
+    twin.load_state_dict(subject.simulator.state_dict())
+    state = subject.state()
+    change = relative_change(acceleration(twin.eval(), state), acceleration(subject.simulator, state))
+    return Outcome(change < 1e-5, f"{change:.1e} between factored and plain")
+
+
+@stress_test(27, "memory and recompilation", "200 steps with changing edges: resident memory grows by < 1 % after 50; ≤ 3 recompilations")
+def memory(subject: Subject) -> Outcome:
+    simulator, state = Contained(subject.simulator, subject.dt), subject.state(0, 0.0)
+    used, edges, num_compiled = [], set(), compilations()
+    for _ in range(200):
+        state = simulator.step(state)
+        used.append(resident_bytes())
+        graph = subject.simulator.builder(state)
+        edges.add(sum(graph[r].edge_index.shape[1] for r in subject.simulator.builder.spec.relations))
+    growth, num_compiled = max(used[50:]) / max(used[:50]) - 1, compilations() - num_compiled
+    text = f"{100 * growth:.2g} %, {num_compiled} compilations, {len(edges)} numbers of edges"
+    return Outcome(growth < 0.01 and num_compiled <= 3 and len(edges) > 1, text)
+
+
+def compilations() -> int:
+    """Graphs that ``torch.compile`` has made in this process."""
+    return int(torch._dynamo.utils.counters["stats"]["unique_graphs"])
+
+
+@stress_test(28, "skipped work", "exact levels: change < 1e-6; sleeping: error after 20 steps ≤ 1.05 times that of computing everything")
+def skipping(subject: Subject) -> Outcome:
+    changes = []
+    for share in (0.1, 0.5, 0.9):
+        state = subject.state(0, share)
+        everything = acceleration(_skipping(subject, NOTHING), state)
+        changes += [relative_change(acceleration(_skipping(subject, skips), state), everything) for skips in EXACT]
+        builder = subject.simulator.builder
+        other = GraphBuilder(replace(builder.config, trim_boundary=not builder.config.trim_boundary), builder.metadata, NOTHING)
+        untrimmed = output(subject.simulator, other(state), state.num_nodes).double() * subject.acceleration_std
+        changes.append(relative_change(untrimmed, everything))
+    ratio, speed_up, share = sleeping(subject)
+    slept = f"sleeping {ratio:.3f} times the error, {speed_up:.2f} times as fast, {100 * share:.2g} % asleep"
+    text = f"exact levels {max(changes):.1e}; {slept if share > 0 else 'nothing fell asleep'}"
+    return Outcome(max(changes) < 1e-6 and ratio <= 1.05, text)
+
+
+NOTHING = Skips(absent_types=False, static_boundary=False, isolated_nodes=False, edges_at_once=None)
+EXACT = (
+    Skips(),
+    *(replace(NOTHING, **{name: True}) for name in ("absent_types", "static_boundary", "isolated_nodes")),
+    replace(NOTHING, edges_at_once=64),
+)
+ASLEEP = Skips(sleep_after=5)
+
+
+def _skipping(subject: Subject, skips: Skips) -> LearnedSimulator:
+    simulator = copy.deepcopy(subject.simulator)
+    simulator.skips = skips
+    return simulator
+
+
+def sleeping(subject: Subject, num_steps: int = 20) -> tuple[float, float, float]:
+    """What sleeping costs: the ratio of mean square errors over rollouts that start all along the scenes; the ratio of times; and the share asleep."""
+    runners = {"asleep": approximate(_skipping(subject, ASLEEP)), "awake": subject.simulator}
+    errors, seconds, num_asleep, num_steps_of_nodes = dict.fromkeys(runners, 0.0), dict.fromkeys(runners, 0.0), 0, 0
+
+    def count(_: int, state: State) -> None:
+        nonlocal num_asleep, num_steps_of_nodes
+        num_asleep, num_steps_of_nodes = num_asleep + state.num_asleep, num_steps_of_nodes + state.num_nodes
+
+    for truth in subject.scenes:
+        for frame in np.unique(
+            np.linspace(subject.history, max(subject.history, truth.num_frames - 1 - num_steps), 4).astype(int)
+        ).tolist():
+            start, known = subject.simulator.initial_state(truth, frame), truth.frames(frame, frame + num_steps + 1)
+            for name, runner in runners.items():
+                began = time.perf_counter()
+                result = rollout(
+                    Contained(runner, subject.dt), start, known.num_frames - 1, known.metadata, None, count if name == "asleep" else None
+                )
+                seconds[name] += time.perf_counter() - began
+                errors[name] += float(per_frame_mse(result, known)[1:].mean())
+    return errors["asleep"] / max(errors["awake"], 1e-300), seconds["awake"] / seconds["asleep"], num_asleep / max(1, num_steps_of_nodes)
+
+
+# --- training -------------------------------------------------------------------------------------------------------------------------------
+
+
+@stress_test(
+    29,
+    "training under attack",
+    "learning rate × 4, a batch with targets of 1e6 scales: loss finite; one batch learned to nMSE < 1e-2 in 300 steps; gradcheck on 5 nodes",
+)
+def training(subject: Subject) -> Outcome:
+    graph = training_graph(subject)
+    spoiled = graph.clone()
+    for material in subject.simulator.builder.spec.materials:
+        spoiled[material].target = torch.full_like(spoiled[material].target, 1e6 * subject.acceleration_std)
+    attacked = trained(subject, [graph] * 20 + [spoiled] + [graph] * 79, 4e-3)
+    learned = trained(subject, [graph] * 300, 1e-3)
+    nmse = learned[-1] / target_power(subject, graph)
+    correct = gradients_are_correct(subject)
+    text = f"loss {attacked[-1]:.2g} after the attack, nMSE {nmse:.2g}, gradients {'correct' if correct else 'wrong'}"
+    return Outcome(bool(np.isfinite(attacked).all() and nmse < 1e-2 and correct), text)
+
+
+def training_graph(subject: Subject) -> HeteroData:
+    """A graph of the first scene with its target."""
+    truth, builder = subject.scenes[0], subject.simulator.builder
+    frame = truth.num_frames // 2
+    state = subject.simulator.initial_state(truth, frame)
+    graph = builder(state)
+    target = torch.from_numpy(subject.truth_acceleration(0, frame)) - state.gravity
+    for material in builder.spec.materials:
+        graph[material].target = target[graph[material].node_id].float()
+    return graph
+
+
+def target_power(subject: Subject, graph: HeteroData) -> float:
+    """Mean square of a graph's normalised target: the loss of predicting zero."""
+    values = torch.cat([graph[m].target for m in subject.simulator.builder.spec.materials]) / subject.acceleration_std
+    return float(values.square().mean())
+
+
+def trained(subject: Subject, graphs: list[HeteroData], learning_rate: float) -> list[float]:
+    """Losses of fresh weights over a list of graphs, gradients clipped as in training."""
+    torch.manual_seed(0)
+    simulator = copy.deepcopy(subject.simulator).train()
+    settings = simulator.description()["settings"]
+    simulator.model = type(subject.simulator.model)(
+        simulator.builder.spec, **{**settings, **({"stress": False} if "stress" in settings else {})}
+    )
+    module = TrainingModule(simulator, len(graphs), learning_rate, compile="off")
+    optimizer = torch.optim.Adam(simulator.parameters(), lr=learning_rate)
+    losses = []
+    for graph in graphs:
+        optimizer.zero_grad()
+        loss = module.loss(graph)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(simulator.parameters(), 1.0)
+        optimizer.step()
+        losses.append(loss.item())
+    return losses
+
+
+def gradients_are_correct(subject: Subject) -> bool:
+    """Gradients by node features against finite differences in double precision, on 5 nodes."""
+    simulator = in_double(subject.simulator)
+    state = subject.state()
+    near = torch.argsort((state.pos - state.pos[0]).norm(dim=1))[:5]
+    few = permuted(state, near)
+    graph = to_dtype(simulator.builder(few), torch.float64)
+    material = next(m for m in simulator.builder.spec.materials if graph[m].num_nodes)
+
+    def f(x: torch.Tensor) -> torch.Tensor:
+        changed = graph.clone()
+        changed[material].x = x
+        return in_order(simulator(changed), graph, few.num_nodes, few.dim)
+
+    x = graph[material].x.clone().requires_grad_()
+    return bool(torch.autograd.gradcheck(f, (x,), eps=1e-6, atol=1e-5, rtol=1e-3, raise_exception=False))
+
+
+# --- the guard ------------------------------------------------------------------------------------------------------------------------------
+
+
+@stress_test(
+    30,
+    "guard",
+    "NaN, explosion, escape, tunnelling, clustering: stopped at that frame with reason, node and good frames; impossible material: at once",
+)
+def guard(subject: Subject) -> Outcome:
+    state = subject.state(0, 0.0)
+    radius, size = subject.simulator.builder.scales.radius, 1e3 * subject.spacing
+    limits = Guard(1e3 * subject.max_speed, ((-size, size),) * state.dim, radius, subject.spacing)
+    found = {}
+    for reason, spoil in attacks(subject, limits).items():
+        simulator = Spoiled(subject.simulator, 3, state.num_nodes, spoil, subject.dt, state.time)
+        result = rollout(simulator, state, 5, subject.scenes[0].metadata, limits)
+        stop = result.termination
+        found[reason] = stop is not None and (stop.reason, stop.frame) == (reason, 3) and stop.node >= 0 and result.num_frames == 3
+    obstructed = replace(state, boundary=replace(state.boundary, shapes=(obstacle(state, subject.spacing),)))
+    before, behind = (replace(obstructed, pos=torch.cat([place[None], state.pos[1:]])) for place in _beside(obstructed, subject.spacing))
+    stop = limits.check(behind, 3, before)  # a model that sees an obstacle need not go through it, so the two states are made
+    found["tunnelling"] = stop is not None and (stop.reason, stop.frame, stop.node) == ("tunnelling", 3, 0)
+    inside = replace(obstructed, boundary=replace(state.boundary, shapes=(ball(state, 2 * radius),)))
+    stop = limits.check(inside, 3)
+    found["deep inside"] = stop is not None and (stop.reason, stop.frame, stop.node) == ("tunnelling", 3, 0)
+    params = state.material_params.clone()
+    params[1] = -1.0
+    result = rollout(subject.simulator, replace(state, material_params=params), 5, subject.scenes[0].metadata, limits)
+    stop = result.termination
+    found["material"] = stop is not None and (stop.reason, stop.frame, stop.node) == ("material", 0, 1)
+    bad = [reason for reason, is_found in found.items() if not is_found]
+    return Outcome(not bad, f"not found: {', '.join(bad)}" if bad else f"{len(found)} of {len(found)} found")
+
+
+def attacks(subject: Subject, limits: Guard) -> dict[str, Callable[[State, State], State]]:
+    """What is done to a new state, by the reason that the guard must give."""
+
+    def placed(new: State, rows: slice, to: torch.Tensor) -> State:
+        pos = new.pos.clone()
+        pos[rows] = to
+        return replace(new, pos=pos)
+
+    found: dict[str, Callable[[State, State], State]] = {
+        "nan": lambda _, new: placed(new, slice(1, 2), torch.full((new.dim,), torch.nan).double()),
+        "explosion": lambda _, new: replace(new, vel=new.vel + 2 * limits.max_speed),
+        "escape": lambda _, new: placed(new, slice(1, 2), torch.full((new.dim,), 2 * limits.bounds[0][1]).double()),
+    }
+    if subject.state().num_nodes > 40:
+        found["clustering"] = lambda _, new: placed(new, slice(0, 40), new.pos[0])
+    return found
+
+
+def obstacle(state: State, spacing: float) -> Box:
+    """A plate, two spacings thick, right above all nodes."""
+    middle, top = state.pos.mean(dim=0), state.pos.max(dim=0).values
+    low, high = middle - 4 * spacing, middle + 4 * spacing
+    low[-1], high[-1] = top[-1] + 2 * spacing, top[-1] + 4 * spacing
+    return Box(tuple(low.tolist()), tuple(high.tolist()), friction=0.0)
+
+
+def ball(state: State, radius: float) -> Sphere:
+    """An obstacle around the first node."""
+    return Sphere(tuple(state.pos[0].tolist()), radius, friction=0.0)
+
+
+def _beside(state: State, spacing: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """A place below the plate, and one above it."""
+    plate = state.boundary.shapes[-1]
+    assert isinstance(plate, Box)
+    below, above = torch.tensor([plate.low, plate.high], dtype=torch.float64)
+    below[:-1] = above[:-1] = 0.5 * (below + above)[:-1]
+    return below - spacing * (torch.arange(state.dim) == state.dim - 1), above + spacing * (torch.arange(state.dim) == state.dim - 1)
+
+
+TESTS = (single_precision, implementations, memory, skipping, training, guard)

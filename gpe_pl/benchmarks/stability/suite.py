@@ -1,0 +1,254 @@
+"""Stress tests of trained models in the domains that they were trained in: thirty criteria, fixed before they were measured, one table."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import multiprocessing
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from gpe_pl.benchmarks.stability import conservation, geometry, horizon, inputs, invariances, precision
+from gpe_pl.benchmarks.stability.subject import Outcome, StressTest, Subject
+from gpe_pl.benchmarks.trained import Case, runs_in, trained_on
+from gpe_pl.data.ground_truth import DatasetSpec, generate_trajectory
+from gpe_pl.errors import GpeError
+from gpe_pl.files.markdown import table_row
+from gpe_pl.learned.simulator import LearnedSimulator
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+log = logging.getLogger(__name__)
+
+GROUPS = {
+    "invariances": invariances.TESTS,
+    "conservation": conservation.TESTS,
+    "degenerate geometry": geometry.TESTS,
+    "inputs": inputs.TESTS,
+    "long horizon": horizon.TESTS,
+    "precision and performance": precision.TESTS,
+}
+
+
+class NothingToTestError(GpeError, ValueError):
+    """No model for a data set, or several of one name; the message says where they were looked for."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is tested.
+
+    Attributes:
+        cases: data sets, by name.
+        runs: folders of finished runs; the models among them that were trained on a case's data set take part, the first seed of each.
+        checkpoints: further ones, as files or as names of shipped models; they take part in the case whose data set they were trained on.
+        gating: settings of the models that must pass: those of the configuration that is shipped.
+        num_scenes: of ``test``, per data set.
+        horizon_factors: lengths of long rollouts over the trained horizon.
+        num_rest_steps: frames that a pile at rest is watched.
+        tests: numbers of the tests to run; none runs all.
+        num_workers: processes, each with data sets of its own.
+        num_threads: of PyTorch in each; the solvers use one.
+    """
+
+    cases: dict[str, Case]
+    runs: list[str] = field(default_factory=list)
+    checkpoints: list[str] = field(default_factory=list)
+    gating: dict[str, str] = field(default_factory=dict)
+    num_scenes: Annotated[int, Field(ge=1)] = 5
+    horizon_factors: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=1)] = field(default_factory=lambda: [1.0, 3.0, 10.0])
+    num_rest_steps: Annotated[int, Field(ge=1)] = 1000
+    tests: list[Annotated[int, Field(ge=1, le=30)]] = field(default_factory=list)
+    num_workers: Annotated[int, Field(ge=1)] = 2
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
+
+
+def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
+    """A record per test and model, and a Markdown table per domain."""
+    records: list[dict[str, Any]] = []
+    untested = [name for name, spec in specs.items() if not any(_models(spec, settings))]
+    tested = {name: spec for name, spec in specs.items() if name not in untested}
+    if min(settings.num_workers, len(tested)) > 1:
+        with ProcessPoolExecutor(settings.num_workers, multiprocessing.get_context("spawn"), _show_progress) as pool:
+            for found in pool.map(_test_domain, tested, tested.values(), [settings] * len(tested)):
+                records += found
+    else:
+        for name, spec in tested.items():
+            records += _test_domain(name, spec, settings)
+    if not records:
+        raise NothingToTestError(
+            f"{', '.join([*settings.runs, *settings.checkpoints]) or 'suite.runs and suite.checkpoints are empty'}: no model that was trained on one of "
+            f"{', '.join(f'{s.name} {s.size}' for s in specs.values())}; train with `python -m gpe_pl.fit data={untested[0]} model=gpe_tuned` or set "
+            "suite.runs or suite.checkpoints"
+        )
+    return records, _report(records, untested)
+
+
+def _show_progress() -> None:
+    """What a process logs goes to the terminal; it knows nothing of the settings of the one that made it."""
+    logging.basicConfig(level=logging.INFO, format="[%(asctime)s][%(name)s][%(levelname)s] - %(message)s")
+
+
+def _test_domain(name: str, spec: DatasetSpec, settings: Settings) -> list[dict[str, Any]]:
+    """Records of all models of a data set."""
+    torch.set_num_threads(settings.num_threads)
+    models: dict[str, LearnedSimulator] = {}
+    for label, simulator in _models(spec, settings):
+        if label in models:
+            raise NothingToTestError(f"two models of {spec.name} are called {label}; copy one of the checkpoints to a file of another name")
+        models[label] = simulator
+    return [record for subject in subjects(name, spec, models, settings) for record in test(subject, settings.tests)]
+
+
+def test(subject: Subject, numbers: Sequence[int] = ()) -> Iterator[dict[str, Any]]:
+    """Records of all tests, or of those with these numbers, of one model; a test that crashes has failed."""
+    for group, tests in GROUPS.items():
+        for stress_test in tests:
+            if not numbers or stress_test.number in numbers:
+                started = time.perf_counter()
+                outcome = _outcome(stress_test, subject)
+                seconds = time.perf_counter() - started
+                log.info("%s, %s: test %d took %.1f s", subject.domain, subject.name, stress_test.number, seconds)
+                yield {
+                    "test": f"{stress_test.number} {stress_test.name}",
+                    "group": group,
+                    "model": subject.name,
+                    "domain": subject.domain,
+                    "criterion": stress_test.criterion,
+                    "measured": outcome.measured,
+                    "status": {True: "passed", False: "failed", None: "not_applicable"}[outcome.passed],
+                    "gating": subject.is_gating,
+                    "curves": {k: [v if math.isfinite(v) else None for v in values] for k, values in outcome.curves.items()},
+                }
+
+
+test.__test__ = False  # type: ignore[attr-defined]
+
+
+def _outcome(stress_test: StressTest, subject: Subject) -> Outcome:
+    try:
+        return stress_test(subject)
+    except Exception as error:
+        log.warning("%s, %s: test %d crashed", subject.domain, subject.name, stress_test.number, exc_info=not isinstance(error, GpeError))
+        return Outcome(False, f"crashed: {type(error).__name__}: {' '.join(str(error).split())[:200]}")
+
+
+# --- what is tested -------------------------------------------------------------------------------------------------------------------------
+
+
+def subjects(domain: str, spec: DatasetSpec, models: dict[str, LearnedSimulator], settings: Settings) -> list[Subject]:
+    """The models of a data set with what they are tested on, the gating ones first."""
+    scenes = [generate_trajectory(spec, "test", k) for k in range(settings.num_scenes)]
+    speed = horizon.max_speed(spec, generate_trajectory, settings.num_scenes)
+    for simulator in models.values():
+        simulator.static_friction = 0.0  # what a network does by itself
+    found = [
+        Subject(
+            name,
+            domain,
+            simulator,
+            spec,
+            scenes,
+            speed,
+            is_gating(simulator, settings.gating),
+            models,
+            settings.horizon_factors,
+            settings.num_rest_steps,
+        )
+        for name, simulator in models.items()
+    ]
+    return sorted(found, key=lambda s: not s.is_gating)
+
+
+def is_gating(simulator: LearnedSimulator, gating: dict[str, str]) -> bool:
+    """Whether a model has all of these settings."""
+    own = simulator.description()["settings"]
+    return bool(gating) and all(own.get(key) == value for key, value in gating.items())
+
+
+def _models(spec: DatasetSpec, settings: Settings) -> Iterator[tuple[str, LearnedSimulator]]:
+    """Simulators with their names."""
+    yield from ((name, simulator) for name, (simulator, _) in trained_on(spec, runs_in(settings.runs)).items())
+    for checkpoint in settings.checkpoints:
+        simulator = LearnedSimulator.from_checkpoint(checkpoint)
+        metadata = simulator.builder.metadata
+        if (metadata.dataset, metadata.spacing) == (spec.name, spec.scene.spacing):
+            path = Path(checkpoint)
+            yield path.parent.parent.name if path.parent.name == "checkpoints" else path.stem, simulator
+
+
+def failures(records: Sequence[dict[str, Any]]) -> list[str]:
+    """What gating models failed, which is what the suite fails by."""
+    return [f"{r['domain']}, {r['model']}: {r['test']}" for r in records if r["gating"] and r["status"] == "failed"]
+
+
+# --- the table ------------------------------------------------------------------------------------------------------------------------------
+
+
+MARKS = {"passed": "passed", "failed": "**failed**", "not_applicable": "–"}
+
+
+def _report(records: Sequence[dict[str, Any]], untested: Sequence[str] = ()) -> str:
+    """Counts, of every model too, and a table per domain: a row per test, a column per model."""
+    gating = [r for r in records if r["gating"]]
+    lines = [
+        f"Gating configurations: {sum(r['status'] == 'passed' for r in gating)} passed, {len(failures(records))} failed, "
+        f"{sum(r['status'] == 'not_applicable' for r in gating)} do not apply. Criteria were fixed before they were measured.",
+    ]
+    if untested:
+        lines += ["", f"Not tested, for want of a model: {', '.join(untested)}."]
+    lines += ["", table_row(["domain", "model", "passed", "failed", "do not apply"]), "|" + "---|" * 5]
+    for domain, model in dict.fromkeys((r["domain"], r["model"]) for r in records):
+        counts = Counter(r["status"] for r in records if (r["domain"], r["model"]) == (domain, model))
+        lines.append(table_row([domain, model, *(str(counts[status]) for status in MARKS)]))
+    for domain in dict.fromkeys(r["domain"] for r in records):
+        own = [r for r in records if r["domain"] == domain]
+        models = {r["model"]: r["gating"] for r in own}
+        header = ["test", "criterion", *(f"{m}{' (gating)' if is_gating else ''}" for m, is_gating in models.items())]
+        lines += ["", f"### {domain}", "", table_row(header), "|" + "---|" * len(header)]
+        for name in dict.fromkeys(r["test"] for r in own):
+            row = {r["model"]: r for r in own if r["test"] == name}
+            first = next(iter(row.values()))
+            cells = [f"{MARKS[row[m]['status']]}: {row[m]['measured']}".rstrip(": ") if m in row else "" for m in models]
+            lines.append(table_row([_cell(c) for c in (name, first["criterion"], *cells)]))
+    return "\n".join(lines)
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
+    """Per domain: energy and momentum over a long rollout, how long predictions are valid and rollouts alive, and growth of a perturbation."""
+    from gpe_pl.benchmarks.stability.figures import long_horizon_figure, perturbation_figure
+
+    found = {}
+    for domain in dict.fromkeys(r["domain"] for r in records):
+        curves = {
+            number: {
+                r["model"]: _with_infinities(r["curves"])
+                for r in records
+                if r["domain"] == domain and r["test"].startswith(f"{number} ") and r["curves"]
+            }
+            for number in (21, 23)
+        }
+        if curves[21]:
+            found[f"long_horizon_{domain}"] = long_horizon_figure(curves[21])
+        if curves[23]:
+            found[f"perturbation_{domain}"] = perturbation_figure(curves[23])
+    return found
+
+
+def _with_infinities(curves: dict[str, list[float | None]]) -> dict[str, np.ndarray]:
+    return {k: np.array([np.inf if v is None else v for v in values]) for k, values in json.loads(json.dumps(curves)).items()}

@@ -1,0 +1,60 @@
+"""What suites are given: data sets, and folders of runs whose models were trained on them."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+from gpe_pl.data.ground_truth import DatasetSpec
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.reports.finished_runs import Run, axes_of, finished_runs
+
+DEPTHS = ("num_message_passing_steps", "num_propagation_steps", "num_convolutions")
+"""What models call the number of their layers."""
+
+
+LENGTHS = ("training.num_steps", "training.val_interval", "training.budget_minutes")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A data set: what ``python -m gpe_pl.simulate`` would be given."""
+
+    overrides: list[str]
+
+
+def runs_in(folders: Sequence[str]) -> list[Run]:
+    """The finished runs in all these folders."""
+    return [run for folder in folders for run in finished_runs(Path(folder))]
+
+
+def trained_on(spec: DatasetSpec, runs: Iterable[Run]) -> dict[str, tuple[LearnedSimulator, Run]]:
+    """Simulators that were trained on a data set, and their runs, by label: the model's, and what else differs between runs of the same model. Of several
+    seeds, and of runs that differ in their length alone, the first.
+    """
+    same: dict[str, list[tuple[LearnedSimulator, Run]]] = defaultdict(list)
+    for run in runs:
+        if (run.config["data.name"], run.config["size.name"]) == (spec.name, spec.size):
+            simulator = LearnedSimulator.from_checkpoint(run.folder / "checkpoints" / "best.ckpt")
+            same[model_label(simulator)].append((simulator, run))
+    found: dict[str, tuple[LearnedSimulator, Run]] = {}
+    for label, members in same.items():
+        these = [run for _, run in members]
+        axes = [axis for axis in axes_of(these) if axis.startswith(("training.", "graph.")) and axis not in LENGTHS]
+        axes = [axis for axis in axes if all(run.config.get(axis) is not None for run in these)]  # others follow from another setting
+        for simulator, run in members:
+            differences = [f"{axis.rpartition('.')[2]}={run.config.get(axis)}" for axis in axes]
+            found.setdefault(", ".join([label, *differences]), (simulator, run))
+    return found
+
+
+def model_label(simulator: LearnedSimulator) -> str:
+    """Class, depth, width, and what else is not at its default."""
+    cls, settings = type(simulator.model), dict(simulator.description()["settings"])
+    depth = next((settings.pop(k) for k in DEPTHS if k in settings), "")
+    plain = cast(Any, cls)(simulator.builder.spec).settings
+    other = [str(v) for k, v in settings.items() if k != "hidden_channels" and v != plain.get(k)]
+    return " ".join([f"{cls.__name__} {depth} × {settings['hidden_channels']}", *other])

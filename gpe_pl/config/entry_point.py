@@ -1,0 +1,421 @@
+"""Configuration: Hydra entry points with readable errors, and construction of checked objects from config nodes.
+
+Hydra composes; nothing else in the package knows it. A misspelt key, group or choice is refused at composition with the valid ones; a value of the wrong
+type or out of range is refused by the signature of the class or function that takes it.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import importlib
+import json
+import math
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import InterpolationKeyError, OmegaConfBaseException
+from pydantic import ValidationError
+
+from gpe_pl.config import plugins
+from gpe_pl.config.folder import CONF
+from gpe_pl.config.launcher import RESULT, USAGE_ERROR, SweepError, end_with_sweep
+from gpe_pl.config.typed_keys import without_effect
+from gpe_pl.errors import GpeError
+from gpe_pl.files.atomic import replace_text, unnamed
+from gpe_pl.files.names import NameRefused, run_name, sweep_name
+from gpe_pl.files.run_folder import refuse_links
+from gpe_pl.learned.pretrained import model_name
+from gpe_pl.printable import clean_messages, one_line, speak_utf8
+from gpe_pl.system import early_interrupts
+from gpe_pl.system.signatures import checked, parameters
+
+WITHOUT_KEY = {"comparison", "experiment", "recipe", "scene", "solver"}
+"""Config groups that fill other keys than one of their own."""
+
+plugins.register()  # conf/ names them
+OmegaConf.register_new_resolver("times", lambda a, b: a * b, replace=True)  # ${times:a,b} in conf/
+
+
+def _for_model(values: Mapping[str, Any], target: str) -> Any:
+    """``${for_model:values,target}`` in conf/: what a table holds for a model's class, or its ``default``."""
+    return values.get(target.rpartition(".")[2], values["default"])
+
+
+OmegaConf.register_new_resolver("for_model", _for_model, replace=True)
+OmegaConf.register_new_resolver("model_name", model_name, replace=True)  # ${model_name:checkpoint,runs}
+
+OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # ${run_name:name}: of a folder of results in conf/
+OmegaConf.register_new_resolver("sweep_name", sweep_name, replace=True)
+
+T = TypeVar("T")
+
+
+class ConfigError(GpeError, ValueError):
+    """A config value is not allowed; the message names key, value and what is allowed."""
+
+
+_results: list[Path] = []
+"""Folder of the results of this process, where a ``Report`` knows it."""
+
+LARGEST_INTEGER = 2**63 - 1
+"""Of settings: what NumPy, PyTorch and ``range`` can count with."""
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Folders, relative to the current one: generated and imported data sets, and results."""
+
+    data: str
+    runs: str
+
+
+def construct(target: Callable[..., T], settings: Mapping[str, Any], path: str, **given: Any) -> T:
+    """Call ``target(**settings, **given)`` after checking ``settings`` against the types and ranges of its signature.
+
+    Args:
+        target: class or function whose parameters are annotated; ranges as ``Annotated[int, pydantic.Field(ge=1)]``.
+        settings: a config node.
+        path: of the node in the config, for messages.
+        given: arguments that do not come from the config, passed unchecked.
+
+    Raises:
+        ConfigError: unknown or missing key, wrong type or value out of range.
+    """
+    return bind(target, settings, path, *given)(**given)
+
+
+def construct_target(settings: Any, path: str, package: str) -> Any:
+    """``construct`` of the class that ``_target_`` names; it must lie below ``package``.
+
+    Raises:
+        ConfigError: no such class there, or settings that do not fit it.
+    """
+    if not isinstance(settings, Mapping):
+        raise ConfigError(f"{path}={settings!r}: must be a table with a _target_, a class of {package.rstrip('.')}")
+    values = dict(settings)
+    target = str(values.pop("_target_", None))
+    module, _, name = target.rpartition(".")
+    try:
+        if not f"{module}.".startswith(package):
+            raise ImportError
+        cls = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError):
+        raise ConfigError(f"{path}._target_={target!r}: must be a class of {package.rstrip('.')}") from None
+    return construct(cls, values, path)
+
+
+def bind(target: Callable[..., T], settings: Mapping[str, Any], path: str, *later: str) -> Callable[..., T]:
+    """``construct`` in two steps: checks the settings now, calls the target when the arguments ``later`` are known."""
+    values: Any = OmegaConf.to_container(settings, resolve=True) if isinstance(settings, DictConfig) else dict(settings)
+    valid = parameters(target, *later)
+    unknown = set(values) - set(valid)
+    if unknown:
+        raise ConfigError(f"{path}.{min(unknown)}: unknown key; valid keys: {', '.join(valid)}")
+    for key, number in _integers(values, path):
+        if abs(number) > LARGEST_INTEGER:
+            raise ConfigError(f"{key}={number}: must be within ±{LARGEST_INTEGER}")
+    try:
+        arguments = checked(target, values, *later)
+    except ValidationError as error:
+        raise ConfigError(_one_line(error, path)) from None
+
+    def call(**given: Any) -> T:
+        try:
+            return target(**arguments, **given)
+        except ValidationError as error:  # of a class that checks how its values fit together
+            raise ConfigError(_one_line(error, path)) from None
+        except ValueError as error:
+            if isinstance(error, GpeError):
+                raise
+            raise ConfigError(f"{path}: {error}") from error
+
+    return call
+
+
+def _integers(value: Any, path: str) -> Iterator[tuple[str, int]]:
+    """All integers in nested settings, with their paths."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _integers(item, f"{path}.{key}")
+    elif isinstance(value, list):
+        for k, item in enumerate(value):
+            yield from _integers(item, f"{path}.{k}")
+    elif isinstance(value, int):
+        yield path, value
+
+
+def _one_line(error: ValidationError, path: str) -> str:
+    parts = []
+    for e in error.errors():
+        key = ".".join([*([path] if path else []), *(str(k) for k in e["loc"] if isinstance(k, (str, int)))])
+        value = f"={e['input']!r}" if e["loc"] and e["type"] != "missing" and not isinstance(e["input"], dict) else ""
+        message = e["msg"].removeprefix("Value error, ")
+        message = message if message[:2].isupper() else message[0].lower() + message[1:]
+        parts.append(f"{key}{value}: {message}")
+    return "; ".join(dict.fromkeys(parts))
+
+
+def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], Any]]:
+    """``hydra.main`` for one of the files in ``conf/``, with one-line errors: ``GpeError`` and configuration errors exit with 2 and no traceback.
+
+    Set HYDRA_FULL_ERROR=1 to see tracebacks.
+    """
+
+    def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], Any]:
+        verbose, is_composed = os.environ.get("HYDRA_FULL_ERROR") == "1", False
+
+        def run(cfg: DictConfig) -> Any:
+            nonlocal is_composed
+            is_composed = True
+            if RESULT in os.environ:
+                end_with_sweep()
+            try:
+                if "dimension" in list(cfg) and cfg.dimension not in (2, 3):
+                    raise ConfigError(f"dimension={cfg.dimension}: must be 2 or 3")
+                if unread := without_effect(cfg, HydraConfig.get().overrides.task):
+                    raise ConfigError(unread)
+                OmegaConf.resolve(cfg)
+                construct(Paths, cfg.paths, "paths")
+                _check_top_level(cfg, config_name)
+                value = task(cfg)
+                if RESULT in os.environ:
+                    replace_text(Path(os.environ[RESULT]), json.dumps(value))
+                return value
+            except InterpolationKeyError as error:
+                if verbose:
+                    raise
+                hint = "; data, scene and dimension do not fit together" if "'data." in str(error) else ""
+                _fail(ConfigError(f"{' '.join(str(error).split())}{hint}"))
+            except (
+                GpeError,
+                OmegaConfBaseException,
+                OSError,
+            ) as error:  # OSError: full disks, folders that cannot be written, files that are gone
+                if verbose:
+                    raise
+                _fail(unnamed(error, _written(cfg.paths)) if isinstance(error, OSError) else error)
+
+        def main() -> Any:
+            if not CONF.is_dir():
+                _fail(ConfigError(f"{CONF} not found: install gpe_pl again"))
+            early_interrupts.end()
+            speak_utf8()
+            clean_messages()
+            sys.argv[1:] = [quoted(argument) for argument in sys.argv[1:]]
+            os.environ["HYDRA_FULL_ERROR"] = "1"  # let exceptions reach us instead of Hydra's own report
+            try:
+                return hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
+            except KeyboardInterrupt:
+                print(early_interrupts.NOTICE, file=sys.stderr)
+                sys.exit(early_interrupts.STATUS)
+            except SweepError as error:
+                _fail(error)
+            except (HydraException, OmegaConfBaseException, ValueError) as error:  # some of Hydra's are an OSError too
+                if verbose or (is_composed and isinstance(error, ValueError)):
+                    raise
+                _fail(ConfigError(explain(error, config_name, sys.argv[1:])))
+            except OSError as error:  # before the command itself begins: Hydra makes the folder of the results
+                if verbose:
+                    raise
+                if error.filename is None:
+                    _fail(unnamed(error, _written()))
+                _fail(
+                    OSError(
+                        f"{error.filename}: cannot be made or written ({error.strerror}); choose another folder with paths.runs=… or paths.data=…"
+                    )
+                )
+
+        return main
+
+    return decorate
+
+
+def quoted(argument: str) -> str:
+    """An override whose value is a path that exists and holds ``=``, as folders of sweeps do, in the quotes that Hydra wants around it."""
+    key, _, value = argument.partition("=")
+    is_path = "=" in value and value[0] not in "\"'[{" and os.path.exists(value)  # Path.exists fails on names that are too long
+    return f'{key}="{value}"' if is_path else argument
+
+
+def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
+    """The resolved config of a command, without running it: what ``python -m gpe_pl.{config_name} {overrides}`` would get.
+
+    Raises:
+        ConfigError: an override does not fit; the message names the valid keys.
+    """
+    try:
+        if GlobalHydra.instance().is_initialized():
+            cfg = hydra.compose(config_name, [*overrides])
+        else:
+            with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+                cfg = hydra.compose(config_name, [*overrides])
+        OmegaConf.resolve(cfg)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(explain(error, config_name, [*overrides])) from None
+    return cfg
+
+
+def _written(paths: Mapping[str, str] | None = None) -> list[Path]:
+    """Folders that this process writes to, its own and those of libraries."""
+    own = [*_results] if paths is None else [*paths.values()]
+    temporary: list[str] = []
+    with contextlib.suppress(FileNotFoundError):  # where none can be written
+        temporary.append(tempfile.gettempdir())
+    return [Path(folder) for folder in (*own, os.environ.get("NUMBA_CACHE_DIR", "."), *temporary, Path.cwd())]
+
+
+def _fail(error: Exception) -> None:
+    with contextlib.suppress(OSError):  # into a file on a full disk
+        print(f"error: {one_line(str(error))}", file=sys.stderr)
+    sys.exit(USAGE_ERROR if RESULT in os.environ and isinstance(error, (ConfigError, NameRefused)) else 2)
+
+
+def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
+    """One line for a composition error, with the valid keys or choices."""
+    text = " ".join(str(error).split())
+    if f"{NameRefused.__name__} raised" in text:
+        return re.sub(r"^.*? raised while resolving interpolation: | full_key: .*", "", text)
+    if "'data/imported'" in text:
+        return f"data=imported: {config_name} takes data that it simulates; fit and evaluate take imported ones"
+    match = re.search(r"Could not override '([^']+)'", text)
+    if match is None:
+        override = getattr(error, "override", None)  # of a syntax error
+        text = re.sub(r" ?Config search path:.*| ?Set the environment variable.*| See https://.*", "", text)
+        text = f"{override}: {text}" if override and override not in text else text
+        return f"{text}; a value that holds = needs quotes: 'KEY=\"VALUE\"'" if override and override.count("=") > 1 else text
+    key = match.group(1).partition("@")[0].lstrip("+~")
+    parent, _, leaf = key.rpartition(".")
+    if key.startswith("hydra."):
+        return text
+    others = [
+        _first_choice(o) for o in overrides if "=" in o and not o.startswith(("-", "hydra")) and o.partition("=")[0].lstrip("+~") != key
+    ]
+    GlobalHydra.instance().clear()
+    try:
+        with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+            node: Any = hydra.compose(config_name, others)
+            while parent and not isinstance(OmegaConf.select(node, parent), DictConfig):
+                parent = parent.rpartition(".")[0]  # the misspelling is higher up
+                leaf = key.removeprefix(f"{parent}.").partition(".")[0]
+            node = OmegaConf.select(node, parent) if parent else node
+            keys = ", ".join(sorted({*map(str, node), *(() if parent else _groups(config_name))}))
+    except (HydraException, OmegaConfBaseException):
+        return text
+    return f"{key}: unknown key {leaf!r}; valid keys{f' of {parent}' if parent else ''}: {keys}"
+
+
+def _check_top_level(cfg: DictConfig, config_name: str) -> None:
+    file = OmegaConf.load(CONF / f"{config_name}.yaml")
+    known = {*_groups(config_name), *map(str, file)} - {"defaults", "hydra"}
+    wrong = {str(k) for k in cfg} ^ (known - WITHOUT_KEY)
+    if wrong:
+        raise ConfigError(f"{min(wrong)}: unknown or missing key; valid keys: {', '.join(sorted(known))}")
+    if "name" in cfg and OmegaConf.to_container(file)["name"] is not None:  # type: ignore[call-overload,index]
+        try:
+            run_name(cfg.name)
+        except NameRefused as error:
+            raise ConfigError(str(error)) from None
+
+
+def _first_choice(override: str) -> str:
+    """The first of the values that an override sweeps over."""
+    parsed = OverridesParser.create().parse_override(override)
+    return f"{override.partition('=')[0]}={next(parsed.sweep_string_iterator())}" if parsed.is_sweep_override() else override
+
+
+def _groups(config_name: str) -> set[str]:
+    """The config groups that a command takes."""
+    defaults = OmegaConf.load(CONF / f"{config_name}.yaml").defaults
+    return {str(group) for entry in defaults if isinstance(entry, DictConfig) for group in entry if "/" not in str(group)}
+
+
+def output_dir(cfg: DictConfig) -> Path:
+    """Folder of the running job; without one, as in a notebook, that of a single run."""
+    return Path(HydraConfig.get().runtime.output_dir) if HydraConfig.initialized() else Path(cfg.paths.runs) / run_name(cfg.name)
+
+
+def num_processes(cfg: DictConfig) -> int:
+    """How many processes a training is to have, as Lightning starts or finds them; 1 where the setting is not one that ``fit`` accepts."""
+    counts = [OmegaConf.select(cfg, f"trainer.{key}") for key in ("devices", "num_nodes")]
+    return math.prod(count if type(count) is int else 1 for count in counts)
+
+
+class Report(Callback):
+    """Holds the folder of the results of a command, a single run or a sweep, from before anything is written to it, and writes tables and figures when the
+    command ends.
+    """
+
+    def __init__(self) -> None:
+        self._lock = contextlib.ExitStack()
+
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        with contextlib.suppress(OmegaConfBaseException):  # of a name that is refused; Hydra meets it again, and ends
+            self._hold(Path(config.hydra.run.dir), config, num_processes(config))
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        with contextlib.suppress(OmegaConfBaseException):
+            self._hold(Path(config.hydra.sweep.dir), config)
+
+    def _hold(self, folder: Path, config: DictConfig, num_processes: int = 1) -> None:
+        """Until the process ends. Ends it where the folder cannot be used: Hydra turns an exception of a callback into a warning, and goes on."""
+        from gpe_pl.system.locks import held, is_later_process
+        from gpe_pl.system.provenance import recorded
+
+        _results.append(folder)
+        try:
+            refuse_links(folder)
+            self._lock.enter_context(held(folder, num_processes=num_processes))
+            if num_processes == 1 or not is_later_process():
+                self._lock.enter_context(recorded(folder, config.hydra.job.name, sys.argv[1:], str(config.paths.runs)))
+        except GpeError as error:
+            _fail(error)
+        except OSError as error:
+            _fail(ConfigError(f"{folder}: cannot be read or written ({error.strerror}); choose another folder with paths.runs=…"))
+        atexit.register(self._release)
+
+    def _release(self) -> None:
+        with contextlib.suppress(GpeError):  # of a folder that was deleted meanwhile; the command has ended with it
+            self._lock.close()
+
+    def on_run_end(self, config: DictConfig, **_: Any) -> None:
+        self._report(Path(config.hydra.run.dir), is_sweep=False)
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        self._report(Path(config.hydra.sweep.dir), is_sweep=True)
+
+    def _report(self, folder: Path, is_sweep: bool) -> None:
+        """Ends the process on failure: Hydra turns an exception of a callback into a warning, and the command would seem to have succeeded."""
+        try:
+            if is_sweep:
+                from gpe_pl.reports.tables import write_tables
+
+                table = write_tables(folder)
+                if table.exists():  # not where no run has finished
+                    print(table.read_text(encoding="utf-8"))
+            else:
+                from gpe_pl.reports.sweep_table import conclusion, report
+
+                report(folder)
+                if (folder / "metrics.csv").exists():
+                    print(conclusion(folder))
+            print(folder)
+            self._lock.close()  # refuses a folder that was deleted meanwhile
+        except GpeError as error:
+            _fail(error)
+        except Exception as error:
+            sys.excepthook(type(error), error, error.__traceback__)
+            sys.exit(1)

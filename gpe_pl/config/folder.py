@@ -1,0 +1,14 @@
+"""Where the files of ``conf/`` are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+def conf_folder(package: Path) -> Path:
+    """The copy of ``conf/`` in an installed package, or the folder beside the package in a clone."""
+    copy = package / "conf"
+    return copy if copy.is_dir() else package.parent / "conf"
+
+
+CONF = conf_folder(Path(__file__).resolve().parents[1])

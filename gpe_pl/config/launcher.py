@@ -1,0 +1,318 @@
+"""Hydra launchers that run each job of a sweep as the plain command that would run it alone, with a log file in its own folder.
+
+``hydra/launcher=processes``  side by side on this machine
+``hydra/launcher=ray``        on the machines of a Ray cluster
+``hydra/launcher=slurm``      as jobs of Slurm, through submitit
+
+All of them need nothing of a job but its command, so a run is the same wherever it ran, and the same sweep started again, by whichever launcher, runs only
+what is not finished. Machines share a disk and have the same environment.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import JobReturn, JobStatus, setup_globals
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from gpe_pl.errors import GpeError
+from gpe_pl.files.run_folder import RunError, refuse_links
+from gpe_pl.printable import one_line
+
+LOG = "output.log"
+RESULT = "GPE_PL_RESULT"
+"""Environment variable: the file in which a command leaves the value that it returns."""
+USAGE_ERROR = 64
+"""Exit status of a run whose configuration is wrong: the rest of the sweep is not started."""
+GRACE_SECONDS = 30.0
+"""That a run has to save its training when its sweep is gone, as Slurm and Kubernetes give."""
+REPORT = "hydra.callbacks.report"
+"""Belongs to the sweep as a whole."""
+
+
+class SweepError(GpeError, RuntimeError):
+    """Runs of a sweep failed; names them, their errors and their logs."""
+
+
+class UsageError(SweepError):
+    """The configuration of a run is wrong."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a sweep: what the command line gets, where it is run, and where its results go."""
+
+    overrides: list[str]
+    sweep_folder: Path
+    name: str
+    directory: Path = field(default_factory=Path.cwd)
+    settings: tuple[str, ...] = ()
+
+    @property
+    def folder(self) -> Path:
+        return self.directory / self.sweep_folder / self.name
+
+    def run(self, module: str) -> JobReturn:
+        """Run ``python -m module`` for this job and wait for its end."""
+        try:
+            refuse_links(self.folder)
+        except RunError as error:
+            return self.failed(SweepError(str(error)))
+        self.folder.mkdir(parents=True, exist_ok=True)
+        result = self.folder / ".result"
+        here = [f"hydra.run.dir={json.dumps(str(self.folder))}", "hydra.mode=RUN", *self.settings]
+        with open(self.folder / LOG, "ab") as log:
+            command = [sys.executable, "-m", module, *self.overrides, *here]
+            environment = {k: v for k, v in os.environ.items() if k != "HYDRA_FULL_ERROR"} | {RESULT: str(result)}
+            with subprocess.Popen(command, stdout=log, stderr=log, stdin=subprocess.PIPE, env=environment, cwd=self.directory) as process:
+                code = process.wait()
+        if code:
+            return self.failed((UsageError if code == USAGE_ERROR else SweepError)(self._last_words(code)))
+        value = json.loads(result.read_text(encoding="utf-8"))
+        result.unlink()
+        return JobReturn(self.overrides, status=JobStatus.COMPLETED, _return_value=value)
+
+    def failed(self, error: Exception) -> JobReturn:
+        """What is returned for a job that failed."""
+        return JobReturn(self.overrides, status=JobStatus.FAILED, _return_value=error)
+
+    def outcome(self, get: Callable[[], JobReturn]) -> JobReturn:
+        """What a cluster returns; where it lost the job, the failure."""
+        try:
+            return get()
+        except Exception as error:  # of each cluster its own
+            lines = str(error).strip().splitlines() or [""]
+            return self.failed(SweepError(f"{type(error).__name__}: {lines[-1]} (see {self.folder / LOG})"))
+
+    def _last_words(self, code: int) -> str:
+        lines = (self.folder / LOG).read_text(encoding="utf-8", errors="replace").splitlines()
+        last = next((line for line in reversed(lines) if line.strip()), f"ended with code {code}")
+        return f"{last.removeprefix('error: ')} (see {self.folder / LOG})"
+
+
+def end_with_sweep() -> None:
+    """End this run when the sweep that started it is gone, however it ended: the pipe that is its standard input then closes.
+
+    Otherwise the same command, given again, would meet the run in its folder. A training has ``GRACE_SECONDS`` to save a checkpoint.
+    """
+
+    def watch() -> None:
+        while os.read(0, 1):
+            pass
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(GRACE_SECONDS)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+class CommandLauncher(Launcher):
+    """Runs jobs as commands; where, is for the subclass to say."""
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        self.hydra_context, self.config = hydra_context, config
+
+    @abstractmethod
+    def run(self, jobs: Sequence[Job], module: str) -> Iterator[tuple[int, JobReturn]]:
+        """Number and outcome of each job, as they end."""
+
+    @abstractmethod
+    def place(self, jobs: Sequence[Job]) -> str:
+        """Where the jobs run, for the message at the start."""
+
+    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> list[JobReturn]:
+        """Run all jobs.
+
+        Returns:
+            What they return, in order. A job that failed holds a ``SweepError`` about all that failed, which is raised when its value is asked for.
+
+        Raises:
+            UsageError: a run's configuration is wrong; the rest are not run.
+        """
+        from rich.console import Console
+
+        setup_globals()
+        jobs = [self._job(initial_job_idx + k, overrides) for k, overrides in enumerate(job_overrides)]
+        module = sys.modules["__main__"].__spec__
+        assert module is not None, "a sweep is started by python -m"
+        console = Console(highlight=False, soft_wrap=True, markup=False)
+        console.print(f"{len(jobs)} runs, {self.place(jobs)}; each has its {LOG} below {one_line(str(self.config.hydra.sweep.dir))}")
+        returns: dict[int, JobReturn] = {}
+        try:
+            for k, outcome in self.run(jobs, module.name):
+                returns[k] = outcome
+                if isinstance(outcome._return_value, UsageError):
+                    raise outcome._return_value
+                failed = outcome.status is JobStatus.FAILED
+                console.print(f"{len(returns)}/{len(jobs)} {'failed' if failed else 'done'}: {one_line(jobs[k].name)}")
+        except KeyboardInterrupt:
+            num_done = sum(r.status is JobStatus.COMPLETED for r in returns.values())
+            raise SweepError(
+                f"interrupted with {num_done} of {len(jobs)} runs done; the same command goes on with the others, each {LOG} says from where"
+            ) from None
+        errors = [f"{jobs[k].name}: {r._return_value}" for k, r in sorted(returns.items()) if r.status is JobStatus.FAILED]
+        if errors:
+            error = SweepError(f"{len(errors)} of {len(jobs)} runs failed; the same command runs only those again. {'; '.join(errors[:3])}")
+            returns = {k: jobs[k].failed(error) if r.status is JobStatus.FAILED else r for k, r in returns.items()}
+        return [returns[k] for k in sorted(returns)]
+
+    def _job(self, number: int, overrides: Sequence[str]) -> Job:
+        config: Any = self.hydra_context.config_loader.load_sweep_config(self.config, list(overrides))
+        with open_dict(config):
+            config.hydra.job.id = config.hydra.job.num = number
+        HydraConfig.instance().set_config(config)  # the folder's name is resolved against it
+        settings = (f"~{REPORT}",) if OmegaConf.select(config, REPORT) is not None else ()
+        return Job(list(overrides), Path(str(config.hydra.sweep.dir)), str(config.hydra.sweep.subdir), settings=settings)
+
+
+class ProcessLauncher(CommandLauncher):
+    """Runs jobs side by side on this machine.
+
+    Args:
+        num_processes: jobs at once; None: as many as there are cores, at ``trainer.num_threads`` (None: all) for each of ``trainer.devices``.
+    """
+
+    def __init__(self, num_processes: int | None = None) -> None:
+        if num_processes is not None and not (type(num_processes) is int and num_processes >= 1):
+            raise ValueError(f"hydra.launcher.num_processes={num_processes!r}: must be null or an integer of at least 1")
+        self.num_processes = num_processes
+
+    def place(self, jobs: Sequence[Job]) -> str:
+        return f"{self._number(jobs)} at a time"
+
+    def run(self, jobs: Sequence[Job], module: str) -> Iterator[tuple[int, JobReturn]]:
+        pool = ThreadPoolExecutor(self._number(jobs))
+        try:
+            waiting = {pool.submit(job.run, module): k for k, job in enumerate(jobs)}
+            for future in as_completed(waiting):
+                yield waiting[future], future.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)  # a Ctrl-C reaches the runs too: they save, nothing new starts
+
+    def _number(self, jobs: Sequence[Job]) -> int:
+        num_threads, devices = (OmegaConf.select(self.config, f"trainer.{key}") for key in ("num_threads", "devices"))
+        return min(len(jobs), self.num_processes or default_processes(num_threads, devices or 1))
+
+
+def default_processes(num_threads: int | None, devices: int = 1) -> int:
+    """Jobs that this machine has cores for."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, cores // ((num_threads or cores) * devices))
+
+
+class RayLauncher(CommandLauncher):
+    """Runs jobs on the machines of a Ray cluster.
+
+    Args:
+        address: of the cluster; None: that of ``RAY_ADDRESS``, or else this machine alone.
+        num_cpus, num_gpus: that a job takes, and waits for.
+    """
+
+    def __init__(self, address: str | None = None, num_cpus: float = 1.0, num_gpus: float = 0.0) -> None:
+        self.address, self.num_cpus, self.num_gpus = address, num_cpus, num_gpus
+
+    def place(self, jobs: Sequence[Job]) -> str:
+        return f"on {self.address or os.environ.get('RAY_ADDRESS', 'a Ray cluster of this machine')}"
+
+    def run(self, jobs: Sequence[Job], module: str) -> Iterator[tuple[int, JobReturn]]:
+        ray = _imported("ray", "ray")
+        try:
+            ray.init(address=self.address, log_to_driver=False)
+        except Exception as error:  # bare ones too
+            raise UsageError(
+                f"hydra/launcher=ray: the cluster does not start or cannot be reached ({' '.join(str(error).split())})"
+            ) from None
+        try:
+            task = ray.remote(num_cpus=self.num_cpus, num_gpus=self.num_gpus)(Job.run)
+            waiting = {task.remote(job, module): k for k, job in enumerate(jobs)}
+            while waiting:
+                (reference, *_), _ = ray.wait([*waiting], num_returns=1)
+                k = waiting.pop(reference)
+                yield k, jobs[k].outcome(partial(ray.get, reference))
+        finally:
+            ray.shutdown()  # ends the jobs that are left
+
+
+class SlurmLauncher(CommandLauncher):
+    """Submits jobs to Slurm, as one array, and waits for them.
+
+    Args:
+        cluster: ``slurm``; to try it without one, ``local`` (processes on this machine) or ``debug`` (this process).
+        parameters: of ``submitit.AutoExecutor.update_parameters``, such as ``timeout_min``, ``cpus_per_task``, ``gpus_per_node``, ``slurm_partition``.
+    """
+
+    def __init__(self, cluster: str = "slurm", parameters: Mapping[str, Any] | None = None) -> None:
+        if cluster not in ("slurm", "local", "debug"):
+            raise ValueError(f"hydra.launcher.cluster={cluster!r}: must be slurm, local or debug")
+        self.cluster, self.parameters = cluster, dict(parameters or {})
+
+    def place(self, jobs: Sequence[Job]) -> str:
+        return "submitted to Slurm" if self.cluster == "slurm" else f"by submitit's {self.cluster} executor"
+
+    def run(self, jobs: Sequence[Job], module: str) -> Iterator[tuple[int, JobReturn]]:
+        submitit = _imported("submitit", "slurm")
+        folder = jobs[0].directory / jobs[0].sweep_folder / ".submitit"
+        executor = submitit.AutoExecutor(folder=folder, cluster=self.cluster)
+        try:
+            executor.update_parameters(**self.parameters)
+        except (NameError, TypeError) as error:
+            raise UsageError(f"hydra.launcher.parameters: {' '.join(str(error).split())}") from None
+        with executor.batch():
+            submitted = [executor.submit(job.run, module) for job in jobs]
+        numbers = {id(job): k for k, job in enumerate(submitted)}
+        try:
+            for job in submitit.helpers.as_completed(submitted, poll_frequency=1):
+                k = numbers.pop(id(job))
+                yield k, jobs[k].outcome(job.result)
+        finally:
+            for job in submitted:
+                if id(job) in numbers:
+                    job.cancel()
+
+
+def _imported(module: str, extra: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise UsageError(f"hydra/launcher={extra} needs {module}: `pip install {module}`, or gpe_pl with its extra [{extra}]") from None
+
+
+@dataclass
+class ProcessLauncherConfig:
+    """Configuration node of ``hydra/launcher=processes``."""
+
+    num_processes: int | None = None
+
+
+@dataclass
+class RayLauncherConfig:
+    """Configuration node of ``hydra/launcher=ray``."""
+
+    address: str | None = None
+    num_cpus: float = 1.0
+    num_gpus: float = 0.0
+
+
+@dataclass
+class SlurmLauncherConfig:
+    """Configuration node of ``hydra/launcher=slurm``."""
+
+    cluster: str = "slurm"
+    parameters: dict[str, Any] = field(default_factory=lambda: {"timeout_min": 24 * 60})

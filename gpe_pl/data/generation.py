@@ -1,0 +1,407 @@
+"""Parallel, resumable generation of data sets.
+
+Every trajectory is a pure function (see ``ground_truth``) and every shard appears atomically, so a run that was killed resumes where it stopped and
+leaves the same bytes as one that was not. A shard that can be opened counts as complete; ``discard_damaged`` looks at every byte. Layout::
+
+    {root}/{name}/{size}/dataset.json            the spec and its hash, written first
+    {root}/{name}/{size}/{split}/shard-00000.h5
+    {root}/{name}/{size}/statistics.json         of the train split, written when all its shards are there
+    {root}/{name}/{size}/contact_sheet.png       one scene under several parameter values, to look at
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import math
+import threading
+import time
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpe_pl.data.checksum import split_checksum
+from gpe_pl.data.ground_truth import DatasetSpec, GenerationError, generate_trajectory, initial_state
+from gpe_pl.data.motion import ROUNDING_SHARE, motion_of, rounding_fault, rounding_of
+from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
+from gpe_pl.files import sealed
+from gpe_pl.files.atomic import free_bytes, replace_text
+from gpe_pl.files.run_folder import refuse_links
+from gpe_pl.rollout.loop import SimulationError
+from gpe_pl.solvers.caution import unresolved
+from gpe_pl.system.locks import held
+from gpe_pl.system.progress import Progress
+from gpe_pl.system.workers import pool, results
+from gpe_pl.trajectory.store import StoreError, read_trajectory, trajectory_names, write_shard
+from gpe_pl.trajectory.trajectory import Trajectory
+
+log = logging.getLogger(__name__)
+
+SPEC_FILE = "dataset.json"
+CONTACT_SHEET_FILE = "contact_sheet.png"
+SHEET_ROWS = 5
+
+SCENES_LOOKED_AT = 8
+"""For meshes that are too thin: bodies of one data set differ."""
+
+ROUNDING_REFUSED = 0.5
+"""Fraction of the accelerations that rounding of stored positions must not exceed; above ``ROUNDING_SHARE`` there is a warning."""
+
+# --- shards --------------------------------------------------------------------------------------------------------------------------------
+
+
+def shard_path(folder: Path, split: str, shard: int) -> Path:
+    """Path of a shard inside the folder of a data set."""
+    return folder / split / f"shard-{shard:05d}.h5"
+
+
+def _shard_indices(spec: DatasetSpec, split: str, shard: int) -> range:
+    start = shard * spec.trajectories_per_shard
+    return range(start, min(start + spec.trajectories_per_shard, spec.counts[split]))
+
+
+def _shards(spec: DatasetSpec, part: tuple[int, int] = (0, 1)) -> list[tuple[str, int]]:
+    """Split and number of each shard, or of every n-th from the k-th on."""
+    if not 0 <= part[0] < part[1]:
+        raise ValueError(f"part must be (k, n) with 0 <= k < n, got {part}")
+    every = [(split, k) for split, count in spec.counts.items() for k in range(math.ceil(count / spec.trajectories_per_shard))]
+    return every[part[0] :: part[1]]
+
+
+def _is_complete(spec: DatasetSpec, folder: Path, split: str, shard: int) -> bool:
+    """A shard that is there and readable is complete, because it is written atomically."""
+    try:
+        return trajectory_names(shard_path(folder, split, shard)) == [f"{i:05d}" for i in _shard_indices(spec, split, shard)]
+    except StoreError:
+        return False
+
+
+def _fault(path: Path) -> tuple[Path, str]:
+    """Why a shard cannot be used, or nothing where all that it holds agrees with its checksums."""
+    try:
+        for name in trajectory_names(path):
+            read_trajectory(path, name, verify=True)
+    except StoreError as error:
+        return path, str(error).partition("; ")[0]  # without the advice, which is about to be followed
+    return path, ""
+
+
+def _write_shard(spec: DatasetSpec, folder: Path, split: str, shard: int) -> int:
+    """Generate one shard; returns the number of its trajectories."""
+    indices = _shard_indices(spec, split, shard)
+    write_shard(shard_path(folder, split, shard), (generate_trajectory(spec, split, i) for i in indices), (f"{i:05d}" for i in indices))
+    return len(indices)
+
+
+def _bytes_per_trajectory(spec: DatasetSpec) -> int:
+    """Uncompressed; nodes and cells at most as many as the scene says, boundary nodes of the first scene."""
+    dim = len(spec.scene.bounds)
+    per_frame = 2 * dim * spec.scene.max_nodes
+    if spec.solver.stores_stress:
+        per_frame += (5 if dim == 2 else 7) * (spec.scene.max_nodes + spec.scene.max_cells)
+    boundary = initial_state(spec, "train", 0).boundary
+    return 4 * per_frame * spec.num_frames + 16 * (dim + 1) * len(boundary.pos) + 2**13
+
+
+def dataset_bytes(spec: DatasetSpec) -> int:
+    """Estimate of what a complete data set takes on disk at most: compression saves a part of it."""
+    return sum(spec.counts.values()) * _bytes_per_trajectory(spec)
+
+
+# --- the data set --------------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is missing of a data set, and what it takes to generate it.
+
+    Attributes:
+        missing: split and number of each shard that is not there.
+        num_done, num_missing: trajectories that are there and that are not.
+        bytes_needed: on disk, at most.
+        bytes_free: on the disk.
+    """
+
+    missing: tuple[tuple[str, int], ...]
+    num_done: int
+    num_missing: int
+    bytes_needed: int
+    bytes_free: int
+
+    @property
+    def fits(self) -> bool:
+        """Whether the disk has enough room."""
+        return self.bytes_needed <= 0.95 * self.bytes_free
+
+
+def plan(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1)) -> Plan:
+    """What ``generate`` does with the same arguments."""
+    folder = Path(root) / spec.name / spec.size
+    own = _shards(spec, part)
+    missing = tuple((split, k) for split, k in own if not _is_complete(spec, folder, split, k))
+    total, num_missing = (sum(len(_shard_indices(spec, split, k)) for split, k in shards) for shards in (own, missing))
+    return Plan(missing, total - num_missing, num_missing, num_missing * _bytes_per_trajectory(spec), free_bytes(folder))
+
+
+def discard_damaged(root: Path | str, spec: DatasetSpec, num_workers: int = 1, part: tuple[int, int] = (0, 1)) -> None:
+    """Read all shards and statistics that are there and delete those whose content disagrees with their checksums, so that ``generate`` makes them again.
+
+    Each of them is logged. This takes about a twentieth of the time to generate them. Where nothing is damaged, nothing is written. Arguments and errors are
+    those of ``generate``.
+    """
+    folder = Path(root) / spec.name / spec.size
+    paths = [path for shard in _shards(spec, part) if (path := shard_path(folder, *shard)).is_file()]
+    if not paths:
+        return
+    _claim(folder, spec)
+    damaged = []
+    with pool(num_workers) as workers:
+        for path, fault in results(workers, _fault, [(path,) for path in paths]):
+            if fault:
+                log.warning("generating a shard again: %s", fault)
+                damaged.append(path)
+    statistics = folder / STATISTICS_FILE
+    if statistics.is_file() and not _has_intact_statistics(statistics):
+        log.warning("computing the statistics again: %s is damaged", statistics)
+        damaged.append(statistics)
+    if damaged:
+        with written(root, spec, part):
+            for path in damaged:
+                path.unlink(missing_ok=True)
+
+
+def is_complete(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1)) -> bool:
+    """Whether ``generate`` with the same arguments would only read."""
+    return not plan(root, spec, part).missing and _is_described(Path(root) / spec.name / spec.size, part)
+
+
+def _is_described(folder: Path, part: tuple[int, int]) -> bool:
+    needed = [SPEC_FILE, *([] if part[0] else [CONTACT_SHEET_FILE])]
+    return all((folder / name).is_file() for name in needed) and _has_statistics(folder)
+
+
+def _has_intact_statistics(path: Path) -> bool:
+    try:
+        sealed.read(path, "")
+    except sealed.SealError:
+        return False
+    return True
+
+
+def _has_statistics(folder: Path) -> bool:
+    """Whether the statistics in a folder are of the training shards that are there, and not of earlier ones."""
+    try:
+        return bool(sealed.read(folder / STATISTICS_FILE, "")["data_sha256"] == split_checksum(folder, "train"))
+    except (OSError, ValueError, KeyError):
+        return False
+
+
+def _compile(spec: DatasetSpec) -> None:
+    """Compile the solver, or load what was compiled before, which is too quick to be spoken of."""
+    notice = threading.Timer(3.0, log.info, ["compiling the solver, once on this machine: about a minute"])
+    notice.daemon = True
+    notice.start()
+    try:
+        with contextlib.suppress(SimulationError):  # settings that cannot work are reported by the first trajectory, with its seed
+            spec.solver.compile_kernels()
+    finally:
+        notice.cancel()
+
+
+def seconds_per_trajectory(spec: DatasetSpec, budget: float = 10.0) -> float:
+    """Estimate [s] on one core: the mean over random training trajectories, as many as take ``budget`` seconds and at least one."""
+    _compile(spec)
+    order = np.random.default_rng(0).permutation(spec.num_train).tolist()
+    started, count = time.perf_counter(), 0
+    while count == 0 or (count < len(order) and time.perf_counter() - started < budget):
+        generate_trajectory(spec, "train", order[count])
+        count += 1
+    return (time.perf_counter() - started) / count
+
+
+def check_rounding(spec: DatasetSpec) -> None:
+    """Refuse a frame interval so short that stored accelerations would be rounding, and warn of one that is nearly so short.
+
+    Where the bounds alone do not exclude it, a training trajectory is simulated and measured.
+
+    Raises:
+        GenerationError: rounding of float32 positions is more than ``ROUNDING_REFUSED`` of the accelerations, or the trajectory failed.
+    """
+    dt = spec.solver.frame_dt
+    rounding = float(rounding_of(np.abs(np.array(spec.scene.bounds)).max(axis=1), dt).max())
+    if rounding <= ROUNDING_SHARE * float(np.linalg.norm(spec.scene.gravity)):  # what meets a wall accelerates by this much at least
+        return
+    trajectory = generate_trajectory(spec, "train", 0)
+    acceleration = motion_of(trajectory.metadata, trajectory.pos).acceleration
+    if fault := rounding_fault(rounding, acceleration):
+        message = f"frame_dt = {dt:g} s: {fault}; choose a longer frame_dt (data.solver.frame_dt=…), or bounds nearer to 0"
+        if rounding > ROUNDING_REFUSED * acceleration:
+            raise GenerationError(message)
+        log.warning(message)
+
+
+def generate(
+    root: Path | str, spec: DatasetSpec, num_workers: int = 1, on_progress: Progress | None = None, part: tuple[int, int] = (0, 1)
+) -> Path:
+    """Generate what is missing of a data set.
+
+    Args:
+        root: folder of all data sets.
+        spec: the data set.
+        num_workers: processes; 1 simulates in this process.
+        on_progress: called with the trajectories done and their total, once at the start and after each shard.
+        part: ``(k, n)`` does every n-th shard from the k-th on, so that n machines with one disk share the work. Whoever finds all training shards
+            in place writes the statistics.
+
+    Returns:
+        The folder of the data set, ``root/name/size``.
+
+    Waits while another process generates the same data. A data set that is complete is only read.
+
+    Raises:
+        GenerationError: the folder holds a data set of another spec, the disk is too small, or a trajectory failed.
+        WorkerError: a process died.
+        FolderError: the folder cannot be made or written.
+    """
+    if num_workers < 1:
+        raise ValueError(f"num_workers must be at least 1, got {num_workers}")
+    folder = Path(root) / spec.name / spec.size
+    to_do = plan(root, spec, part)
+    if not to_do.missing and _is_described(folder, part):
+        _claim(folder, spec)
+        if on_progress is not None:
+            on_progress(to_do.num_done, to_do.num_done)
+        return folder
+    if to_do.missing:
+        check_rounding(spec)
+        every = {name: sorted({*v.seen, *v.interpolated, *v.extrapolated}) for name, v in spec.parameters.items()}
+        for caution in unresolved(
+            spec.solver, every, (initial_state(spec, "train", k) for k in range(min(SCENES_LOOKED_AT, spec.num_train)))
+        ):
+            log.warning("%s %s: %s", spec.name, spec.size, caution)
+    with written(root, spec, part, waits=True):
+        _generate(folder, plan(root, spec, part), spec, num_workers, on_progress, part)
+    return folder
+
+
+def written(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1), waits: bool = False) -> AbstractContextManager[None]:
+    """Inside, no other process writes the data set, or the same part of it; arguments and errors are those of ``locks.held``."""
+    folder = Path(root) / spec.name / spec.size
+    if part[1] == 1:
+        return held(folder, "paths.data", waits)
+    return held(folder.with_name(f"{spec.size}-part-{part[0]}-of-{part[1]}"), "paths.data", waits, makes=False)
+
+
+def _generate(folder: Path, to_do: Plan, spec: DatasetSpec, num_workers: int, on_progress: Progress | None, part: tuple[int, int]) -> None:
+    with held(folder, "paths.data", waits=True):  # where parts are generated at once, one of them says what the data are
+        _claim(folder, spec)
+    if not to_do.fits:
+        raise GenerationError(
+            f"{folder}: {to_do.num_missing} trajectories need up to {to_do.bytes_needed / 2**30:.3g} GiB, the disk has "
+            f"{to_do.bytes_free / 2**30:.3g} GiB free; choose another folder with paths.data, or a smaller size"
+        )
+    statistics, sheet = folder / STATISTICS_FILE, folder / CONTACT_SHEET_FILE
+    if any(split == "train" for split, _ in to_do.missing):
+        statistics.unlink(missing_ok=True)
+    done, total = to_do.num_done, to_do.num_done + to_do.num_missing
+    if on_progress is not None:
+        on_progress(done, total)
+    draws_sheet = part[0] == 0 and not sheet.is_file()
+    if to_do.missing or draws_sheet:
+        _compile(spec)  # once, here: the workers load the compiled kernels from disk
+    with pool(num_workers) as workers:
+        if draws_sheet:  # first, so that hours of wrong data are seen within a minute
+            _draw_contact_sheet(spec, sheet, workers)
+        for count in results(workers, _write_shard, [(spec, folder, split, k) for split, k in to_do.missing]):
+            done += count
+            if on_progress is not None:
+                on_progress(done, total)
+        train = [(split, k) for split, k in _shards(spec) if split == "train"]
+        if all(_is_complete(spec, folder, *shard) for shard in train) and not _has_statistics(folder):
+            paths = [shard_path(folder, *shard) for shard in train]
+            moments = {str(path): sums for path, sums in results(workers, shard_moments, [(path,) for path in paths])}
+            sealed.write(statistics, {**combined([moments[str(path)] for path in paths]), "data_sha256": split_checksum(folder, "train")})
+
+
+def _draw_contact_sheet(spec: DatasetSpec, path: Path, workers: Executor | None) -> None:
+    """A training scene with as many of the materials as possible, under parameter values from the smallest to the largest."""
+    from gpe_pl.viz.captions import row_label
+    from gpe_pl.viz.contact_sheet import contact_sheet
+    from gpe_pl.viz.saving import save_figure
+
+    rows: dict[str, dict[str, float]] = {}
+    for share in np.linspace(0.0, 1.0, SHEET_ROWS):
+        values = {}
+        for material, choices in spec.parameters.items():
+            every = sorted({*choices.seen, *choices.interpolated, *choices.extrapolated})
+            values[material] = every[round(share * (len(every) - 1))]
+        rows[row_label(values)] = values
+    index = _most_varied_scene(spec)
+    arguments = [(spec, index, label, values) for label, values in rows.items()]
+    trajectories = dict(results(workers, _labelled_trajectory, arguments))
+    save_figure(contact_sheet({label: trajectories[label] for label in rows}), path)
+
+
+def _most_varied_scene(spec: DatasetSpec) -> int:
+    """Index of the training scene with the most materials, among the first ones."""
+    best, most = 0, 1
+    for index in range(min(spec.num_train, 32)):
+        if most == len(spec.scene.materials):  # also where there is but one
+            break
+        number = len(np.unique(initial_state(spec, "train", index).node_type))
+        if number > most:
+            best, most = index, number
+    return best
+
+
+def _labelled_trajectory(spec: DatasetSpec, index: int, label: str, values: dict[str, float]) -> tuple[str, Trajectory]:
+    return label, generate_trajectory(spec, "train", index, values)
+
+
+def _claim(folder: Path, spec: DatasetSpec) -> None:
+    """Write the spec into the folder, or check that the one there is the same, and that nothing in it leads elsewhere."""
+    refuse_links(folder)
+    path, values = folder / SPEC_FILE, spec.as_dict()
+    if not path.is_file():
+        if any(folder.glob("*/shard-*.h5")):
+            raise GenerationError(f"{folder}: holds shards but no {SPEC_FILE}; delete the folder, or choose another name or size")
+        _write_json(path, {"spec": values, "sha256": sealed.checksum(values)})
+        return
+    advice = f"delete the folder {folder} and run simulate again"
+    try:
+        stored = sealed.parsed(path, advice)
+    except sealed.SealError as error:
+        raise GenerationError(str(error)) from None
+    if not (isinstance(stored, dict) and isinstance(stored.get("spec"), dict)):
+        raise GenerationError(f"{path}: unreadable, as it describes no data set; {advice}")
+    differing = _differences(stored["spec"], values)
+    if not differing and stored.get("sha256") != sealed.checksum(values):
+        raise GenerationError(f"{path}: was changed or damaged since it was written (checksum mismatch); {advice}")
+    made_by, now = (spec["solver"] if isinstance(spec.get("solver"), dict) else {} for spec in (stored["spec"], values))
+    if made_by.get("name") == now.get("name") and made_by.get("version") != now.get("version"):
+        raise GenerationError(
+            f"{folder}: holds data of version {made_by.get('version')} of the solver {now['name']}; this is version {now['version']}, whose trajectories are "
+            "others. Delete the folder to generate the data again, or choose another data set name"
+        )
+    if differing:
+        raise GenerationError(
+            f"{folder}: holds a data set with other settings: {'; '.join(differing[:5])}. Delete the folder, choose another data set name or size, "
+            "or restore these settings"
+        )
+
+
+def _differences(stored: Any, wanted: Any, key: str = "") -> list[str]:
+    """Leaves in which two nested mappings differ, as ``key: stored, now wanted``."""
+    if isinstance(stored, dict) and isinstance(wanted, dict):
+        names = sorted(stored.keys() | wanted.keys())
+        return [d for n in names for d in _differences(stored.get(n), wanted.get(n), f"{key}.{n}" if key else n)]
+    return [] if stored == wanted else [f"{key} is {json.dumps(stored)}, now {json.dumps(wanted)}"]
+
+
+def _write_json(path: Path, values: dict[str, Any]) -> None:
+    replace_text(path, json.dumps(values, indent=2, sort_keys=True) + "\n")

@@ -1,0 +1,229 @@
+"""Ground truth of one scene: what a data set is made of, and any of its trajectories by split and index.
+
+Every trajectory is a pure function of ``(spec, split, index)``; ``generation`` stores them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Protocol, cast, runtime_checkable
+
+import numpy as np
+from pydantic import Field, InstanceOf
+from pydantic.dataclasses import dataclass
+
+from gpe_pl.errors import GpeError
+from gpe_pl.files.names import DataName
+from gpe_pl.geometry.shapes import ON_SURFACE
+from gpe_pl.rollout.loop import Guard, Simulator, rollout
+from gpe_pl.schema import SPLITS, ParameterGroup
+from gpe_pl.solvers.materials import limits_fault
+from gpe_pl.solvers.scenes import Scene, describe
+from gpe_pl.trajectory.trajectory import Metadata, State, Trajectory
+
+MOST = 1_000_000
+"""Trajectories of a split, and frames of a trajectory: far more than anyone needs, and few enough to be listed."""
+
+Count = Annotated[int, Field(ge=0, le=MOST)]
+
+
+class GenerationError(GpeError):
+    """Data could not be generated. Names split, index and seed of the trajectory that failed, where there is one."""
+
+    def __init__(self, message: str, split: str = "", index: int = -1, seed: int = -1) -> None:
+        super().__init__(message)
+        self.split, self.index, self.seed = split, index, seed
+
+    def __reduce__(self) -> tuple[Any, ...]:  # crosses process boundaries
+        return type(self), (str(self), self.split, self.index, self.seed)
+
+
+@runtime_checkable
+class Solver(Simulator, Protocol):
+    """A simulator whose results depend on nothing but its settings, name and version."""
+
+    name: ClassVar[str]
+    version: ClassVar[str]
+    stores_stress: ClassVar[bool]
+
+    @property
+    def frame_dt(self) -> float: ...
+
+    @property
+    def solver_dt(self) -> float: ...
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], ...]: ...
+
+    @property
+    def materials(self) -> tuple[str, ...]: ...
+
+    def compile_kernels(self) -> None: ...
+
+
+@dataclass(frozen=True, config={"extra": "forbid"})
+class ParameterValues:
+    """Values of a material's parameter.
+
+    Attributes:
+        seen: in ``train``, ``val`` and ``test``, dealt in turn.
+        interpolated, extrapolated: in even and in odd trajectories of ``test_unseen``: inside and outside the range of ``seen``.
+    """
+
+    seen: Annotated[tuple[float, ...], Field(min_length=1)]
+    interpolated: tuple[float, ...] = ()
+    extrapolated: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        unseen = {*self.interpolated, *self.extrapolated}
+        if unseen & set(self.seen):
+            raise ValueError(f"unseen values {sorted(unseen & set(self.seen))} are among the seen ones")
+        low, high = min(self.seen), max(self.seen)
+        if any(not low < v < high for v in self.interpolated) or any(low <= v <= high for v in self.extrapolated):
+            raise ValueError(
+                f"interpolated values must lie inside and extrapolated ones outside the range [{low}, {high}] of the seen ones"
+            )
+
+
+@dataclass(frozen=True, config={"extra": "forbid", "arbitrary_types_allowed": True})
+class DatasetSpec:
+    """Everything that determines the bytes of a data set.
+
+    Attributes:
+        name, size: folder names.
+        parameters: values of each material's parameter.
+        num_train, num_val, num_test, num_test_unseen: trajectories per split.
+        num_frames: stored frames per trajectory, the initial one included.
+        trajectories_per_shard: the unit of work and of resuming.
+        seed: of the data set.
+        scene: distribution of scenes.
+        solver: what simulates them.
+    """
+
+    name: DataName
+    size: DataName
+    parameters: dict[str, ParameterValues]
+    scene: InstanceOf[Scene]
+    solver: InstanceOf[Solver]
+    num_train: Annotated[int, Field(ge=1, le=MOST)]
+    num_frames: Annotated[int, Field(ge=3, le=MOST)]
+    num_val: Count = 0
+    num_test: Count = 0
+    num_test_unseen: Count = 0
+    trajectories_per_shard: Annotated[int, Field(ge=1)] = 8
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    def __post_init__(self) -> None:
+        scene, solver = asdict(cast(Any, self.scene)), asdict(cast(Any, self.solver))
+        for key in sorted(scene.keys() & solver.keys()):
+            if scene[key] != solver[key]:
+                raise ValueError(f"scene.{key} = {scene[key]} and solver.{key} = {solver[key]} must be equal")
+        if set(self.parameters) != set(self.scene.materials):
+            raise ValueError(
+                f"parameters are for {', '.join(self.parameters)}, the scene has {', '.join(self.scene.materials)}; "
+                "leave out others with ~data.parameters.MATERIAL"
+            )
+        for material, values in self.parameters.items():
+            for key, group in asdict(cast(Any, values)).items():
+                for value in group:
+                    if fault := limits_fault(material, value):
+                        raise ValueError(f"parameters.{material}.{key}: {fault}")
+            if self.num_test_unseen and not (values.interpolated and values.extrapolated):
+                raise ValueError(f"num_test_unseen > 0 needs parameters.{material}.interpolated and .extrapolated")
+        for key, path in self.scene.input_files.items():
+            try:
+                Path(path).open("rb").close()
+            except OSError as error:
+                raise ValueError(f"scene.{key} = {path}: {error.strerror} (searched from {Path.cwd()})") from None
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Trajectories per split."""
+        return dict(zip(SPLITS, (self.num_train, self.num_val, self.num_test, self.num_test_unseen), strict=True))
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Settings of scene and solver, with the solver's name, version and largest substep."""
+        scene, solver = asdict(cast(Any, self.scene)), asdict(cast(Any, self.solver))
+        return {
+            "scene": {"kind": type(self.scene).__name__, **scene},
+            "solver": {**solver, "name": self.solver.name, "version": self.solver.version, "solver_dt": self.solver.solver_dt},
+        }
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain JSON values; includes what else the bytes depend on: the solver's name, version and largest substep, and the content of the scene's files."""
+        files = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in self.scene.input_files.values()}
+        return json.loads(json.dumps({**asdict(self), **self.provenance, "input_files": files}))  # type: ignore[call-overload]
+
+
+def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:
+    """Seed of one scene: different for every data set seed, split and index."""
+    words = np.random.SeedSequence((spec.seed, SPLITS.index(split), index)).generate_state(2, np.uint32)
+    return int(words[0]) << 32 | int(words[1])
+
+
+def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[str, float], ParameterGroup]:
+    """Value of each material's parameter in one trajectory, and the group that they belong to.
+
+    A first material's values are dealt in turn. Every other one's are too, but each round of them in an order of its own, so that no material's
+    parameter tells another's.
+    """
+    group: ParameterGroup = "seen"
+    if split == "test_unseen":
+        group, index = ("interpolated", "extrapolated")[index % 2], index // 2  # type: ignore[assignment]
+    values = {}
+    for k, (material, choices) in enumerate(spec.parameters.items()):
+        dealt = getattr(choices, group)
+        number, place = divmod(index, len(dealt))
+        shuffled = np.random.default_rng((spec.seed, SPLITS.index(split), k, number)).permutation(len(dealt))
+        values[material] = dealt[place if k == 0 else int(shuffled[place])]
+    return values, group
+
+
+def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
+    """Metadata of one trajectory."""
+    return describe(
+        spec.scene,
+        spec.solver.frame_dt,
+        dataset=spec.name,
+        solver_dt=spec.solver.solver_dt,
+        seed=scene_seed(spec, split, index),
+        split=split,
+        parameter_group=parameter_values(spec, split, index)[1],
+        solver=spec.solver.name,
+        solver_version=spec.solver.version,
+        config=json.dumps(spec.provenance, sort_keys=True),
+    )
+
+
+def initial_state(spec: DatasetSpec, split: str, index: int, values: Mapping[str, float] | None = None) -> State:
+    """The scene of one trajectory, on request with other parameter values; raises ``GenerationError`` if it is impossible."""
+    seed = scene_seed(spec, split, index)
+    try:
+        return spec.scene.sample(values or parameter_values(spec, split, index)[0], seed)
+    except ValueError as error:
+        raise GenerationError(f"split {split}, index {index}, seed {seed}: {error}", split, index, seed) from None
+
+
+def generate_trajectory(
+    spec: DatasetSpec, split: str, index: int, values: Mapping[str, float] | None = None, num_frames: int | None = None
+) -> Trajectory:
+    """Simulate one trajectory, on request with other parameter values or fewer frames.
+
+    Raises:
+        GenerationError: the scene is impossible or the solver gives up.
+    """
+    metadata = trajectory_metadata(spec, split, index)
+    label = f"split {split}, index {index}, seed {metadata.seed}"
+    state = initial_state(spec, split, index, values)
+    guard = Guard(bounds=spec.scene.bounds, margin=ON_SURFACE * max(high - low for low, high in spec.scene.bounds))
+    trajectory = rollout(spec.solver, state, (num_frames or spec.num_frames) - 1, metadata, guard)
+    if trajectory.termination is not None:
+        stop = trajectory.termination
+        advice = "raise the solver's max_substeps or lower" if stop.reason == "explosion" else "lower the solver's cfl or"
+        raise GenerationError(f"{label}: {stop.reason}: {stop.message}; {advice} the scene's max_speed", split, index, metadata.seed)
+    return trajectory

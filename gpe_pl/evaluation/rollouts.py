@@ -1,0 +1,353 @@
+"""Rollouts of a learned simulator and of the trivial baselines over whole splits: one table of numbers, figures and animations."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import importlib.util
+import io
+import logging
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from gpe_pl.data.dataset import WindowDataset, long_enough, open_split, usable
+from gpe_pl.errors import GpeError
+from gpe_pl.export.program import export_model
+from gpe_pl.files import regular_files
+from gpe_pl.files.atomic import replace_text, replacing
+from gpe_pl.geometry.shapes import surface_tolerance
+from gpe_pl.graphs.batching import batched
+from gpe_pl.learned.approximate import approximate
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
+from gpe_pl.rollout.baselines import BASELINES
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.loop import Guard, Simulator, Start, rollout, rollouts, share_outside
+from gpe_pl.schema import SPLITS, ParameterGroup, Split
+from gpe_pl.trajectory.trajectory import State, Trajectory
+from gpe_pl.viz.saving import save_figure
+
+log = logging.getLogger(__name__)
+
+LEARNED = "learned"
+EXACT = "learned, exact"
+"""The same model without the approximate levels of ``Skips``, where a rollout has some."""
+Export = Literal["vtk", "npz", "mp4", "model"]
+MAX_SPEED_FACTOR = 20.0
+"""A learned rollout has exploded when it is so many times faster than the fastest particle of the ground truth and than what crosses the domain in its time."""
+ONE_STEP_WINDOWS = 256
+VIEWER_BYTES = 2**26
+"""A viewer's arrays before compression; longer rollouts show every so many frames."""
+SCENES_AT_ONCE = 16
+"""Scenes, or windows, that one pass of the model takes together."""
+
+
+class StartError(GpeError, ValueError):
+    """Rollouts were asked to start before a model has seen enough frames."""
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """What is evaluated.
+
+    Attributes:
+        splits: of the data set.
+        horizons: in frames; the full length is always added.
+        num_trajectories: per split, from its start; None takes all.
+        containment: put particles that cross a wall back on its surface.
+        start_frame: that rollouts start at, so that models with different histories are judged on the same frames; None takes the first with enough history.
+        num_uncontained: trajectories per split that are also rolled out without containment, to see what it corrects; None takes all.
+        hold_parameters: takes material parameters outside the trained range for the nearest trained value.
+        static_friction: share of gravity within a frame below which what lies on a wall stays where it is; None takes the model's own.
+        num_pictures: trajectories per split that get a figure, an animation and a viewer.
+        export: what to write for other programs: those trajectories as ``vtk`` series, ``npz`` and ``mp4``, and the ``model`` (see ``portable``).
+    """
+
+    splits: Annotated[list[Split], Field(min_length=1)] = field(default_factory=lambda: ["test", "test_unseen"])
+    horizons: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [5, 20, 50, 100])
+    num_trajectories: Annotated[int, Field(ge=1)] | None = None
+    start_frame: Annotated[int, Field(ge=1)] | None = None
+    containment: bool = True
+    num_uncontained: Annotated[int, Field(ge=0)] | None = None
+    hold_parameters: bool = True
+    static_friction: Annotated[float, Field(ge=0, lt=1)] | None = None
+    num_pictures: Annotated[int, Field(ge=0)] = 2
+    export: list[Export] = field(default_factory=list)
+
+    def first_frame(self, history: int) -> int:
+        """The frame that rollouts of a model with so much history start at.
+
+        Raises:
+            StartError: ``start_frame`` leaves too little history.
+        """
+        if self.start_frame is not None and self.start_frame < history:
+            raise StartError(f"evaluation.start_frame={self.start_frame}: graph.history={history} needs as many frames before it")
+        return history if self.start_frame is None else self.start_frame
+
+
+class ExportError(GpeError):
+    """Something that was asked for cannot be written; the message says what is missing."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number of ``metrics.csv``."""
+
+    model: str
+    split: str
+    trajectory: int
+    parameter_group: str
+    parameter: float
+    metric: str
+    horizon: str
+    value: float
+
+
+def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettings, run_dir: Path, label: str = LEARNED) -> list[Row]:
+    """Roll out every trajectory of the splits; writes ``metrics.csv``, ``error_curve_*.png``, ``rollout_*.png``, ``rollout_*.gif``
+    and ``rollout_*.html`` (a viewer) of some, and their ``stress_*.png`` where the model decodes a stress.
+
+    All rollouts start at ``settings.start_frame`` and run to the end of the ground truth; ``simulator`` is left with ``settings.hold_parameters`` and
+    ``settings.static_friction``. Share outside with containment off is reported as
+    ``share_outside_uncontained``, where it was asked for, the share of corrected particle-steps as ``share_corrected``; neither where a boundary is known by
+    its nodes only.
+
+    Where ``simulator.skips`` has approximate levels, the rollout without them is evaluated beside, and what they cost is reported: ``skipping_mse`` [m²] is
+    the distance between the two rollouts, as far as the exact one came, ``share_asleep`` that of particle-steps that were not computed, ``lost_impulse``
+    [kg m/s] the momentum that falling asleep took away.
+
+    Raises:
+        StartError: ``settings.start_frame`` leaves too little history.
+        ExportError: a format in ``settings.export`` needs a package that is not installed.
+    """
+    start_frame = settings.first_frame(simulator.builder.config.history)
+    if "mp4" in settings.export and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ExportError(
+            "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
+        )
+    simulator.holds_parameters = settings.hold_parameters
+    if settings.static_friction is not None:
+        simulator.static_friction = settings.static_friction
+    run_dir.mkdir(parents=True, exist_ok=True)
+    rows: list[Row] = []
+    for split in settings.splits:
+        curves: dict[str, list[np.ndarray]] = {}
+        rows += [Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split))]
+        trajectories = islice(long_enough(root, split, start_frame), settings.num_trajectories)
+        number, truth = 0, None
+        while batch := list(islice(trajectories, SCENES_AT_ONCE)):
+            left = len(batch) if settings.num_uncontained is None else max(0, settings.num_uncontained - number)
+            for trajectory, (predictions, extra) in zip(
+                batch, _predict(simulator, batch, start_frame, settings.containment, left, label), strict=True
+            ):
+                truth = trajectory.frames(start_frame)
+                stop = predictions[label].termination
+                if stop is not None:
+                    log.warning("%s %d stopped: %s, %s", split, number, stop.reason, stop.message)
+                about = (split, number, truth.metadata.parameter_group, _parameter(trajectory))
+                for model, prediction in predictions.items():
+                    curves.setdefault(model, []).append(per_frame_mse(prediction, truth))
+                    for record in rollout_metrics(prediction, truth, [*settings.horizons, "full"]):
+                        rows.append(Row(model, *about, record.metric, str(record.horizon), record.value))
+                rows += [Row(label, *about, metric, "full", value) for metric, value in extra.items()]
+                if number < settings.num_pictures:
+                    _pictures(run_dir, split, number, truth, {label: predictions[label]})
+                    _exports(run_dir, split, number, truth, predictions[label], settings.export)
+                number += 1
+        if truth is not None:
+            _error_curve(run_dir / f"error_curve_{split}.png", curves, truth.metadata.frame_dt)
+    if "model" in settings.export:
+        export_model(simulator, run_dir / "model.pt2")
+    write_rows(run_dir / "metrics.csv", rows)
+    return rows
+
+
+def _predict(
+    simulator: LearnedSimulator, trajectories: list[Trajectory], start_frame: int, containment: bool, num_uncontained: int, label: str
+) -> Iterator[tuple[dict[str, Trajectory], dict[str, float]]]:
+    """Predictions of all models, and further numbers of the learned one, for each trajectory."""
+    truths = [trajectory.frames(start_frame) for trajectory in trajectories]
+    starts = [_start(simulator, start_frame, *pair) for pair in zip(trajectories, truths, strict=True)]
+    totals = [{"num_corrected": 0.0, "num_asleep": 0.0, "lost_impulse": 0.0} for _ in starts]
+
+    def count(scene: int, _: int, state: State) -> None:
+        for name in totals[scene]:
+            totals[scene][name] += getattr(state, name)
+
+    runner = approximate(simulator)
+
+    def within_walls(inner: Simulator) -> Simulator:
+        return Contained(inner, truths[0].metadata.frame_dt) if containment else inner
+
+    predicted = rollouts(within_walls(runner), starts, count)
+    free = rollouts(runner, starts[:num_uncontained]) if containment else predicted
+    exact = None if runner is simulator else rollouts(within_walls(simulator), starts)
+    for scene, (trajectory, truth) in enumerate(zip(trajectories, truths, strict=True)):
+        dt, steps, spacing = truth.metadata.frame_dt, truth.num_frames - 1, truth.metadata.spacing
+        prediction = predicted[scene]
+        predictions = {label: prediction} if exact is None else {label: prediction, EXACT: exact[scene]}
+        for name, baseline in BASELINES.items():
+            predictions[name] = rollout(baseline(dt), trajectory.state(start_frame, start_frame), steps, truth.metadata)
+        num_steps = truth.num_nodes * max(1, prediction.num_frames - 1)
+        extra = {"num_good_frames": float(prediction.num_frames - 1)}
+        if truth.boundary.shapes:  # nodes alone have no inside
+            extra["share_outside_at_end"] = _share_outside(prediction, steps, steps, tolerance=surface_tolerance(truth.boundary.shapes))
+            extra["share_corrected"] = totals[scene]["num_corrected"] / num_steps
+            if scene < len(free):
+                extra["share_outside_uncontained"] = _share_outside(free[scene], 1, steps, tolerance=1e-3 * spacing)
+        if exact is not None:
+            shared = prediction.frames(0, min(prediction.num_frames, exact[scene].num_frames))
+            extra["skipping_mse"] = float(per_frame_mse(shared, exact[scene])[1:].mean())
+            extra["share_asleep"], extra["lost_impulse"] = totals[scene]["num_asleep"] / num_steps, totals[scene]["lost_impulse"]
+        yield predictions, extra
+
+
+def _parameter(trajectory: Trajectory) -> float:
+    """The material parameter of a scene, or NaN where it has several or none."""
+    values = np.unique(np.asarray(trajectory.material_params, dtype=np.float64))
+    values = values[np.isfinite(values)]
+    return float(values[0]) if len(values) == 1 else float("nan")
+
+
+def _start(simulator: LearnedSimulator, start_frame: int, trajectory: Trajectory, truth: Trajectory) -> Start:
+    """Where a rollout begins, and limits far beyond what the ground truth does."""
+    bounds = truth.metadata.bounds
+    size = max(high - low for low, high in bounds)
+    across = size / (trajectory.num_frames * truth.metadata.frame_dt)  # where everything rests
+    speed = float(np.linalg.norm(trajectory.vel, axis=-1).max(initial=0.0))
+    guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, across), bounds=bounds, margin=size, spacing=truth.metadata.spacing)
+    return Start(simulator.initial_state(trajectory, start_frame), truth.num_frames - 1, truth.metadata, guard)
+
+
+def _share_outside(prediction: Trajectory, first: int, last: int, tolerance: float) -> float:
+    """Share of particle-frames inside a wall or obstacle in frames ``first … last``; those that a stopped rollout lacks count as outside."""
+    wanted, good = last - first + 1, prediction.frames(first, last + 1)
+    return (share_outside(good, tolerance) * good.num_frames + wanted - good.num_frames) / wanted
+
+
+def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windows: int = ONE_STEP_WINDOWS) -> float:
+    """Noise-free one-step error over windows spread evenly over a split, relative to predicting free fall."""
+    dataset = WindowDataset(usable(open_split(root, split)), simulator.builder)
+    windows = np.unique(np.linspace(0, len(dataset) - 1, min(len(dataset), num_windows)).round().astype(int))
+    metric = OneStepNMSE()
+    with torch.inference_mode():
+        for chosen in np.array_split(windows, -(-len(windows) // SCENES_AT_ONCE)):
+            data = batched([dataset[int(window)] for window in chosen])
+            for material, value in simulator(data).acceleration.items():
+                metric.update(value, data[material].target / simulator.acceleration_std.float())
+    return float(metric.compute())
+
+
+def write_rows(path: Path, rows: list[Row]) -> None:
+    """Write rows as CSV, atomically, with their SHA-256 digest in a file beside it, as ``sha256sum`` writes it."""
+    table = io.StringIO(newline="")
+    writer = csv.DictWriter(table, fieldnames=list(Row.__dataclass_fields__))
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
+    content = table.getvalue().encode()
+    replace_text(
+        _digest_file(path), f"{hashlib.sha256(content).hexdigest()}  {path.name}\n"
+    )  # first: a table without one is taken as it is
+    with replacing(path) as part:
+        part.write_bytes(content)
+
+
+GROUPS = ("", *get_args(ParameterGroup))
+"""Of the material parameter; none where a value is of a whole split."""
+
+
+class MetricsError(GpeError, ValueError):
+    """A ``metrics.csv`` is damaged; the message names the file, and the line if it is one that cannot be read."""
+
+
+def read_rows(path: Path) -> Iterator[Row]:
+    """Rows of a ``metrics.csv``.
+
+    Raises:
+        MetricsError: it is not what ``write_rows`` has written.
+    """
+    digest = _digest_file(path)
+    try:
+        regular_files.check(path)
+        regular_files.check(digest)
+    except OSError as error:
+        raise MetricsError(f"{error.filename}: {error.strerror}; delete it to evaluate again") from None
+    content = path.read_bytes()
+    if digest.exists() and digest.read_bytes().split()[:1] != [hashlib.sha256(content).hexdigest().encode()]:
+        raise MetricsError(
+            f"{path}: damaged or changed (checksum mismatch); delete the file to evaluate again, or {digest.name} to take it as it is"
+        )
+    reader = csv.DictReader(io.TextIOWrapper(io.BytesIO(content), "utf-8", newline=""), strict=True)
+    try:
+        for r in reader:
+            if set(r) != set(Row.__dataclass_fields__) or None in r.values():
+                raise ValueError(f"expected the columns {', '.join(Row.__dataclass_fields__)}")
+            known: dict[str, Any] = {
+                **r,
+                "trajectory": int(r["trajectory"]),
+                "parameter": float(r["parameter"]),
+                "value": float(r["value"]),
+            }
+            if r["split"] not in SPLITS or r["parameter_group"] not in GROUPS or not (r["horizon"] == "full" or r["horizon"].isdecimal()):
+                raise ValueError(f"split, parameter group or horizon is {r['split']}, {r['parameter_group']}, {r['horizon']}")
+            if not (r["model"].isprintable() and r["metric"].isprintable()):
+                raise ValueError("model or metric holds characters that are not shown")
+            yield Row(**known)
+    except (ValueError, csv.Error) as error:  # also what is not text
+        raise MetricsError(f"{path}, line {reader.line_num}: damaged ({error}); delete the file to evaluate again") from None
+
+
+def _digest_file(path: Path) -> Path:
+    return path.with_name(f"{path.name}.sha256")
+
+
+def means(rows: list[Row], label: str = LEARNED) -> dict[str, float]:
+    """Means over trajectories of what was evaluated of a model, as ``split/metric@horizon``."""
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        if row.model == label:
+            values.setdefault(f"{row.split}/{row.metric}@{row.horizon}", []).append(row.value)
+    return {key: float(np.mean(v)) for key, v in values.items()}
+
+
+def _pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predictions: dict[str, Trajectory]) -> None:
+    from gpe_pl.viz.figures import rollout_figure
+    from gpe_pl.viz.video import write_animation
+    from gpe_pl.viz.viewer import write_viewer
+
+    stem = run_dir / f"rollout_{split}_{number:02d}"
+    save_figure(rollout_figure(truth, predictions), stem.with_suffix(".png"), dpi=150, bbox_inches="tight")
+    if truth.stress is not None and all(p.stress is not None for p in predictions.values()):
+        figure = rollout_figure(truth, predictions, color="von_mises")
+        save_figure(figure, run_dir / f"stress_{split}_{number:02d}.png", dpi=150, bbox_inches="tight")
+    stride = max(1, truth.num_frames // 60)
+    write_animation(stem.with_suffix(".gif"), truth, predictions, fps=20, stride=stride)
+    size = (1 + len(predictions)) * (truth.pos.nbytes + truth.vel.nbytes)
+    write_viewer(stem.with_suffix(".html"), truth, predictions, stride=-(-size // VIEWER_BYTES))
+
+
+def _exports(run_dir: Path, split: str, number: int, truth: Trajectory, prediction: Trajectory, formats: list[Export]) -> None:
+    from gpe_pl.export.trajectories import write_npz, write_vtk
+    from gpe_pl.viz.video import write_animation
+
+    for kind, trajectory in (("ground_truth", truth), ("rollout", prediction)):
+        stem = run_dir / f"{kind}_{split}_{number:02d}"
+        if "vtk" in formats:
+            write_vtk(stem.with_suffix(".pvd"), trajectory, None if trajectory is truth else truth)
+        if "npz" in formats:
+            write_npz(stem.with_suffix(".npz"), trajectory)
+    if "mp4" in formats:
+        write_animation(stem.with_suffix(".mp4"), truth, {LEARNED: prediction}, fps=20, stride=max(1, truth.num_frames // 200))
+
+
+def _error_curve(path: Path, curves: dict[str, list[np.ndarray]], frame_dt: float) -> None:
+    from gpe_pl.viz.figures import error_curve_figure
+
+    save_figure(error_curve_figure(curves, frame_dt), path, dpi=150)

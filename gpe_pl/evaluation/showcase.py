@@ -1,0 +1,246 @@
+"""A rollout in a scene far larger than those in training, for which there is no ground truth: what it takes, whether it stays sound, and what it looks like.
+
+Memory stays flat, however long the rollout: only the frames of the animation are kept.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, cast
+
+import numpy as np
+from pydantic import Field
+
+from gpe_pl.files.atomic import replace_text
+from gpe_pl.geometry.shapes import signed_distance, surface_tolerance
+from gpe_pl.learned.approximate import approximate
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.loop import Guard, Simulator, Start, frames, unsound
+from gpe_pl.solvers.materials import limits_fault
+from gpe_pl.solvers.scenes import Scene, describe
+from gpe_pl.system.machine import environment, peak_resident
+from gpe_pl.trajectory.trajectory import Metadata, State, Termination, Trajectory
+from gpe_pl.viz.saving import save_figure
+
+MAX_PICTURES = 60
+"""Frames of the animation at most."""
+MAX_SPEED_FACTOR = 2.0
+"""A node faster than this many times what free fall through the whole domain gives is counted as too fast."""
+DEPTH = 1e-3
+"""Depth in a solid, in rest spacings, from which a node counts as through the wall where nothing holds it back."""
+
+
+@dataclass(frozen=True)
+class ShowcaseSettings:
+    """What is rolled out.
+
+    Attributes:
+        num_steps: frames to add.
+        num_uncontained_steps: frames of a second rollout without containment, to see what it corrects.
+        values: of each material's parameter.
+        seed: of the scene.
+    """
+
+    num_steps: Annotated[int, Field(ge=1)] = 50
+    num_uncontained_steps: Annotated[int, Field(ge=0)] = 0
+    values: dict[str, float] = field(default_factory=dict)
+    seed: Annotated[int, Field(ge=0)] = 0
+
+
+@dataclass(frozen=True)
+class Record:
+    """One number: what was measured, and its unit."""
+
+    metric: str
+    value: float
+    unit: str
+
+
+def start(simulator: LearnedSimulator, scene: Scene, settings: ShowcaseSettings) -> tuple[State, Metadata]:
+    """The scene at rest, as the simulator takes it.
+
+    Raises:
+        SceneError: the scene does not fit the simulator.
+        ValueError: there is no such scene, no such material in it, or a value outside the limits of the solvers.
+    """
+    metadata = replace(describe(scene, simulator.builder.metadata.frame_dt, seed=settings.seed), dataset="showcase")
+    unknown = settings.values.keys() - set(metadata.materials)
+    if unknown:
+        raise ValueError(f"values.{min(unknown)}: no material of this scene, which has {', '.join(metadata.materials)}")
+    for material, value in settings.values.items():
+        if fault := limits_fault(material, value):
+            raise ValueError(f"values.{material}: {fault}")
+    state = simulator.standing(scene.sample(settings.values, settings.seed), metadata)
+    impossible = unsound(state, metadata)
+    if impossible is not None:
+        raise ValueError(f"values: {impossible.message}")
+    return state, metadata
+
+
+def run(
+    simulator: LearnedSimulator,
+    state: State,
+    metadata: Metadata,
+    settings: ShowcaseSettings,
+    folder: Path,
+    on_progress: Callable[[int, int], Any] | None = None,
+) -> list[Record]:
+    """Roll the simulator out from a ``start``; writes ``showcase.json`` and ``.md``, ``showcase.png`` and ``showcase.gif`` (``.mp4`` where that can be made).
+
+    Args:
+        simulator: a trained one, of the scene's spacing and materials.
+        state, metadata: where.
+        settings: how long.
+        folder: for the files.
+        on_progress: called with the frames done and their total.
+
+    Returns:
+        Numbers of nodes, steps done and seconds per step; peak memory of the process; shares of particle-steps that containment corrected, and
+        of those faster than gravity can explain, of particles in a wall at the end, and of particle-frames in one without containment, from the same start;
+        largest speed. Where the simulator skips approximately, also the share of particle-steps that were not computed and the momentum [kg m/s] that was lost.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    runner, total = approximate(simulator), settings.num_steps + settings.num_uncontained_steps
+    film, tally, stop, outside = _Film(state, metadata, settings.num_steps), _Tally(state, metadata), None, []
+    for frame, item in _frames(Contained(runner, metadata.frame_dt), state, settings.num_steps, metadata):
+        if isinstance(item, Termination):
+            stop = item.message
+            break
+        tally.add(item)
+        film.add(frame, item)
+        if on_progress is not None:
+            on_progress(frame, total)
+        tally.resume()
+    for frame, item in _frames(runner, state, settings.num_uncontained_steps, metadata):
+        outside.append(1.0 if isinstance(item, Termination) else _share_deeper(item, DEPTH * metadata.spacing))
+        if on_progress is not None:
+            on_progress(settings.num_steps + frame, total)
+    records = tally.records()
+    if runner is not simulator:
+        records += tally.skipped()
+    if outside:
+        records.append(Record("num_uncontained_steps", float(len(outside)), "1"))
+        records.append(Record("share_outside_uncontained", float(np.mean(outside)), "1"))
+    finite = [vars(r) | {"value": r.value if math.isfinite(r.value) else None} for r in records]  # of no step there is no mean
+    written = {"environment": environment(), "records": finite, "stopped": stop}
+    replace_text(folder / "showcase.json", json.dumps(written, indent=1, allow_nan=False))
+    replace_text(folder / "showcase.md", table(records, stop))
+    film.write(folder / "showcase")
+    return records
+
+
+class _Tally:
+    """What happens in a rollout, counted."""
+
+    def __init__(self, state: State, metadata: Metadata) -> None:
+        self.end, self.limit = state, MAX_SPEED_FACTOR * _fall_speed(state, metadata)
+        self.num_corrected, self.num_too_fast, self.top_speed = 0, 0, 0.0
+        self.num_asleep, self.lost_impulse = 0, 0.0
+        self.seconds: list[float] = []
+        self.resume()
+
+    def resume(self) -> None:
+        """The next step begins."""
+        self.started = time.perf_counter()
+
+    def add(self, state: State) -> None:
+        """A step ends."""
+        self.seconds.append(time.perf_counter() - self.started)
+        speed = state.vel.norm(dim=1)
+        self.end, self.top_speed = state, max(self.top_speed, float(speed.max()))
+        self.num_corrected += state.num_corrected
+        self.num_asleep += state.num_asleep
+        self.lost_impulse += state.lost_impulse
+        self.num_too_fast += int((speed > self.limit).sum())
+
+    def skipped(self) -> list[Record]:
+        particle_steps = len(self.seconds) * self.end.num_nodes or math.nan
+        return [Record("share_asleep", self.num_asleep / particle_steps, "1"), Record("lost_impulse", self.lost_impulse, "kg m/s")]
+
+    def records(self) -> list[Record]:
+        num_steps, size = len(self.seconds), self.end.num_nodes
+        particle_steps = num_steps * size if num_steps else math.nan
+        found: dict[str, tuple[float, str]] = {
+            "num_nodes": (size, "1"),
+            "num_boundary_nodes": (len(self.end.boundary.pos), "1"),
+            "num_steps": (num_steps, "1"),
+            "seconds_per_step": (float(np.median(self.seconds)) if num_steps else math.nan, "s"),
+            "peak_memory": (peak_resident(), "B"),
+            "share_corrected": (self.num_corrected / particle_steps, "1"),
+            "share_too_fast": (self.num_too_fast / particle_steps, "1"),
+            "share_outside_at_end": (_share_deeper(self.end, surface_tolerance(self.end.boundary.shapes)), "1"),
+            "max_speed": (self.top_speed, "m/s"),
+        }
+        return [Record(metric, float(value), unit) for metric, (value, unit) in found.items()]
+
+
+def _frames(simulator: Simulator, state: State, num_steps: int, metadata: Metadata) -> Any:
+    """Frame number and new state, or why there is none, of one scene: a node that is not finite, or far outside the domain."""
+    guard = Guard(bounds=metadata.bounds, margin=max(high - low for low, high in metadata.bounds))
+    for _, frame, item in frames(simulator, [Start(state, num_steps, metadata, guard)]):
+        yield frame, item
+
+
+def _fall_speed(state: State, metadata: Metadata) -> float:
+    """Of the fastest node [m/s] after a free fall through the domain."""
+    height = sum((high - low) * abs(g) for (low, high), g in zip(metadata.bounds, metadata.gravity, strict=True))
+    return math.sqrt(2 * height + float(state.vel.norm(dim=1).max()) ** 2)
+
+
+def _share_deeper(state: State, depth: float) -> float:
+    """Share of nodes more than a depth [m] inside a solid."""
+    distance = signed_distance(state.boundary.shapes, state.pos)
+    return float(cast(Any, distance < -depth).double().mean())
+
+
+class _Film:
+    """Evenly spaced frames of a rollout in single precision."""
+
+    def __init__(self, state: State, metadata: Metadata, num_steps: int) -> None:
+        self.state, self.stride = state, max(1, -(-num_steps // MAX_PICTURES))
+        self.metadata = replace(metadata, frame_dt=self.stride * metadata.frame_dt)
+        self.pos: list[np.ndarray] = []
+        self.add(0, state)
+
+    def add(self, frame: int, state: State) -> None:
+        if frame % self.stride == 0:
+            self.pos.append(state.pos.cpu().numpy().astype(np.float32))
+
+    def write(self, stem: Path) -> None:
+        from gpe_pl.viz.coloring import Coloring
+        from gpe_pl.viz.film_strip import evenly_spaced_frames, film_strip
+        from gpe_pl.viz.video import write_film
+
+        trajectory = Trajectory(
+            self.metadata,
+            pos := np.stack(self.pos),
+            np.broadcast_to(np.float32(0), pos.shape),  # not shown
+            self.state.node_type.cpu().numpy(),
+            self.state.mass.cpu().numpy(),
+            self.state.material_params.cpu().numpy(),
+            self.state.boundary.to_numpy(),
+            is_prediction=True,
+        )
+        columns = evenly_spaced_frames(trajectory.num_frames, 4)
+        strip = film_strip([("", trajectory)], columns, Coloring("height", [trajectory], columns))
+        save_figure(strip, stem.with_suffix(".png"), dpi=220)
+        extension = ".mp4" if find_spec("imageio_ffmpeg") else ".gif"
+        write_film(stem.with_suffix(extension), "prediction", trajectory, fps=min(25.0, 1 / self.metadata.frame_dt))
+
+
+def table(records: list[Record], stopped: str | None) -> str:
+    """Markdown: a row per number, and why the rollout stopped early if it did."""
+    lines = ["| | value | unit |", "|---|---|---|", *(f"| {r.metric.replace('_', ' ')} | {r.value:.6g} | {r.unit} |" for r in records)]
+    return "\n".join([*lines, *(["", f"Stopped: {stopped}"] if stopped else []), ""])
+
+
+def summary(records: list[Record]) -> str:
+    """A line per number."""
+    return "\n".join(f"showcase  {r.metric:28} {r.value:12.6g} {r.unit}" for r in records)

@@ -1,0 +1,229 @@
+"""Trajectories in other programs' formats: VTK series for ParaView, and NumPy archives.
+
+A series is ``NAME.pvd``, which one opens, and a folder ``NAME`` with an unstructured grid per frame (``.vtu``, zlib-compressed, base64). Format: VTK file
+formats, XML part [Kitware, docs.vtk.org]. Nodes of meshes belong to their cells; every other node is a cell of its own, so particles show as points.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import shutil
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from jaxtyping import Float
+
+from gpe_pl.files.atomic import replace_text, replacing
+from gpe_pl.graphs.islands import unwrapped
+from gpe_pl.graphs.multiscale import cell_edges
+from gpe_pl.metrics import displacement
+from gpe_pl.schema import CELL_KINDS
+from gpe_pl.trajectory.cells import is_corner, kinds_of
+from gpe_pl.trajectory.store import stored_arrays, stored_attributes
+from gpe_pl.trajectory.trajectory import Trajectory, von_mises
+
+VERTEX = 1
+CELL_TYPES = {"triangle": 5, "quadrilateral": 9, "tetrahedron": 10, "hexahedron": 12}
+"""VTK's numbers of kinds of cells."""
+
+SYMMETRIC = {4: (0, 2, 3, 1), 6: (0, 3, 5, 1, 4, 2)}
+"""Where VTK's components XX, YY, ZZ, XY, YZ, XZ stand in a stress of so many components; in plane strain the last two are zero."""
+
+VTK_TYPES = {"float32": "Float32", "float64": "Float64", "int32": "Int32", "int64": "Int64", "uint8": "UInt8"}
+
+
+def write_npz(path: Path | str, trajectory: Trajectory) -> None:
+    """Write a trajectory as arrays that ``numpy.load`` reads, in the precision of the store; the file appears complete or not at all.
+
+    Names, shapes and units are those of ``schema.FIELDS``; ``metadata``, ``shapes`` and ``node_types`` are JSON.
+
+    Raises:
+        ValueError: ``path`` does not end in ``.npz``.
+    """
+    path = Path(path)
+    if path.suffix != ".npz":
+        raise ValueError(f"{path}: a NumPy archive ends in .npz")
+    texts = {key: np.array(text) for key, text in stored_attributes(trajectory).items()}
+    with replacing(path) as part:
+        np.savez_compressed(part, allow_pickle=False, **stored_arrays(trajectory), **texts)
+
+
+def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory | None = None, stride: int = 1) -> None:
+    """Write a series for ParaView: ``path`` (``.pvd``), a folder of the same name with a file per frame, and the boundary in it.
+
+    Points carry ``velocity`` [m/s], ``material`` (index into ``schema.NODE_TYPES``), ``mass`` [kg], the material parameters by their names and, where
+    they are known, ``displacement`` from rest [m], ``error`` (distance from the ground truth [m]), and ``stress`` and ``von_mises`` [Pa]; cells carry the
+    last two as well, NaN on particles. Boundary nodes that move are points like others; ``boundary.vtu`` has the rest, with ``normal``, ``friction`` and
+    ``restitution``.
+
+    In a periodic domain a mesh is drawn where its first node is, so that its cells stay whole at the seam, unless it reaches around the domain;
+    ``displacement`` follows the way that nodes have gone.
+
+    Args:
+        path: ends in ``.pvd``.
+        trajectory: a ground truth or a prediction.
+        ground_truth: of the same frames and nodes, for ``error``; its later frames are ignored.
+        stride: every so many frames.
+
+    Raises:
+        ValueError: another file type, a stride that is not positive, a ground truth with other nodes, or a cell of no kind in ``schema.CELL_KINDS``.
+        FullDiskError: there is no room; what has been written of a new series is removed.
+    """
+    path = Path(path)
+    if path.suffix != ".pvd":
+        raise ValueError(f"{path}: a VTK series ends in .pvd")
+    if stride < 1:
+        raise ValueError(f"stride must be positive, got {stride}")
+    if ground_truth is not None and (ground_truth.num_nodes != trajectory.num_nodes or ground_truth.num_frames < trajectory.num_frames):
+        raise ValueError(
+            f"{path}: the ground truth has {ground_truth.pos.shape[:2]} frames and nodes, the trajectory {trajectory.pos.shape[:2]}"
+        )
+    trajectory = trajectory.with_moving_boundary()
+    ground_truth = None if ground_truth is None else ground_truth.with_moving_boundary()
+    folder = path.with_suffix("")
+    cells, num_particles = _cells(trajectory)
+    mesh = np.empty((0, 3), np.int64) if trajectory.cells is None else trajectory.cells.astype(np.int64)
+    edges = cell_edges(mesh, trajectory.num_nodes)
+    moved = _displacements(trajectory, edges)
+    entries = []
+    with _whole(folder):
+        for frame in range(0, trajectory.num_frames, stride):
+            name = f"frame_{frame:05d}.vtu"
+            points, in_cells = _point_data(trajectory, frame, ground_truth), _cell_data(trajectory, frame, num_particles)
+            if moved is not None:
+                points["displacement"] = _in_3d(moved[frame])
+            pos, _ = unwrapped(trajectory.pos[frame].astype(np.float64), edges, trajectory.metadata.periodicity)
+            replace_text(folder / name, _grid(pos.astype(trajectory.pos.dtype), cells, points, in_cells))
+            time = frame * trajectory.metadata.frame_dt
+            entries.append(f'<DataSet timestep="{time:.9g}" part="0" file={quoteattr(f"{folder.name}/{name}")}/>')
+        boundary = trajectory.boundary
+        if len(boundary.pos):
+            data = {"normal": _in_3d(boundary.normal), "friction": boundary.friction, "restitution": boundary.restitution}
+            replace_text(folder / "boundary.vtu", _grid(boundary.pos, _vertices(np.arange(len(boundary.pos))), data, {}))
+        replace_text(path, _document("Collection", "<Collection>\n" + "\n".join(entries) + "\n</Collection>"))
+
+
+@contextlib.contextmanager
+def _whole(folder: Path) -> Iterator[None]:
+    """What is written to a new folder stays if the block ends well."""
+    is_new = not folder.exists()
+    try:
+        yield
+    except BaseException:
+        if is_new:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+class _Cells(NamedTuple):
+    """Cells as VTK has them: nodes of one after the other, and the number of corners and VTK type of each [cell]."""
+
+    nodes: np.ndarray
+    corners: np.ndarray
+    types: np.ndarray
+
+
+def _vertices(nodes: np.ndarray) -> _Cells:
+    """A cell for each particle."""
+    return _Cells(nodes, np.ones(len(nodes), int), np.full(len(nodes), VERTEX))
+
+
+def _cells(trajectory: Trajectory) -> tuple[_Cells, int]:
+    """All cells, those of the mesh first, and the number of particles, which come after them."""
+    loose = _vertices(np.arange(trajectory.num_nodes))
+    if trajectory.cells is None or len(trajectory.cells) == 0:
+        return loose, len(loose.nodes)
+    cells = trajectory.cells
+    kinds, own = kinds_of(cells, trajectory.cell_dim, trajectory.metadata.dim), is_corner(cells)
+    if (kinds < 0).any():
+        cell = int(kinds.argmin())
+        raise ValueError(f"cell {cell} has the nodes {cells[cell].tolist()}, which is none of {', '.join(CELL_KINDS)}")
+    loose = _vertices(np.setdiff1d(np.arange(trajectory.num_nodes), cells))
+    mesh = _Cells(cells[own], own.sum(axis=1), np.array([CELL_TYPES[kind] for kind in CELL_KINDS])[kinds])
+    return _Cells(*(np.concatenate(parts) for parts in zip(mesh, loose, strict=True))), len(loose.nodes)
+
+
+def _displacements(trajectory: Trajectory, edges: np.ndarray) -> np.ndarray | None:
+    """From rest [frame, node, dim] in m; in a periodic domain the sum of the shortest ways from frame to frame, with one start for all nodes of a mesh."""
+    if trajectory.rest_pos is None:
+        return None
+    where = trajectory.metadata.periodicity
+    moved = trajectory.pos.astype(np.float64) - trajectory.rest_pos
+    moved[0] = unwrapped(where.shortest(moved[0]), edges, where)[0]
+    for axis in where.axes:
+        moved[..., axis] = np.unwrap(moved[..., axis], axis=0, period=where.period[axis])
+    return moved.astype(trajectory.pos.dtype)
+
+
+def _point_data(trajectory: Trajectory, frame: int, ground_truth: Trajectory | None) -> dict[str, np.ndarray]:
+    data = {
+        "velocity": _in_3d(trajectory.vel[frame]),
+        "material": trajectory.node_type,
+        "mass": trajectory.mass,
+        **{name: trajectory.material_params[:, k] for k, name in enumerate(trajectory.metadata.param_names)},
+    }
+    if ground_truth is not None:
+        data["error"] = np.linalg.norm(displacement(trajectory.pos[frame], ground_truth.pos[frame], trajectory.metadata), axis=-1)
+    if trajectory.stress is not None:
+        data |= _stress(trajectory.stress.node[frame])
+    return data
+
+
+def _cell_data(trajectory: Trajectory, frame: int, num_particles: int) -> dict[str, np.ndarray]:
+    if trajectory.stress is None:
+        return {}
+    stress = trajectory.stress.cell[frame]
+    return _stress(np.concatenate([stress, np.full((num_particles, stress.shape[1]), np.nan, stress.dtype)]))
+
+
+def _stress(stress: Float[np.ndarray, "item component"]) -> dict[str, np.ndarray]:
+    ordered = np.zeros((len(stress), 6), stress.dtype)
+    order = SYMMETRIC[stress.shape[1]]
+    ordered[:, : len(order)] = stress[:, order]
+    return {"stress": ordered, "von_mises": von_mises(stress)}
+
+
+def _in_3d(values: Float[np.ndarray, "row dim"]) -> Float[np.ndarray, "row 3"]:
+    return np.pad(values, ((0, 0), (0, 3 - values.shape[1])))
+
+
+def _grid(pos: np.ndarray, cells: _Cells, points: Mapping[str, np.ndarray], in_cells: Mapping[str, np.ndarray]) -> str:
+    """A ``.vtu`` document."""
+    parts = [
+        _array("Points", _in_3d(pos)).join(("<Points>", "</Points>")),
+        "<Cells>",
+        _array("connectivity", cells.nodes.astype(np.int64)),
+        _array("offsets", np.cumsum(cells.corners).astype(np.int64)),
+        _array("types", cells.types.astype(np.uint8)),
+        "</Cells>",
+        "<PointData>",
+        *(_array(name, values) for name, values in points.items()),
+        "</PointData>",
+        "<CellData>",
+        *(_array(name, values) for name, values in in_cells.items()),
+        "</CellData>",
+    ]
+    piece = f'<Piece NumberOfPoints="{len(pos)}" NumberOfCells="{len(cells.types)}">\n' + "\n".join(parts) + "\n</Piece>"
+    return _document("UnstructuredGrid", f"<UnstructuredGrid>\n{piece}\n</UnstructuredGrid>")
+
+
+def _array(name: str, values: np.ndarray) -> str:
+    """Values as one compressed block, after a header of four numbers: blocks, block size, size of a last partial block, compressed size."""
+    values = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+    data = zlib.compress(values.tobytes(), 1)
+    header = np.array([1, values.nbytes, 0, len(data)] if values.nbytes else [0, 0, 0], "<u8").tobytes()
+    text = base64.b64encode(header).decode() + (base64.b64encode(data).decode() if values.nbytes else "")
+    components = f' NumberOfComponents="{values.shape[1]}"' if values.ndim == 2 else ""
+    labels = {"stress": ("XX", "YY", "ZZ", "XY", "YZ", "XZ")}.get(name, ())
+    components += "".join(f' ComponentName{k}="{label}"' for k, label in enumerate(labels))
+    return f'<DataArray type="{VTK_TYPES[values.dtype.name]}" Name={quoteattr(name)}{components} format="binary">{text}</DataArray>'
+
+
+def _document(kind: str, content: str) -> str:
+    attributes = 'version="1.0" byte_order="LittleEndian" header_type="UInt64" compressor="vtkZLibDataCompressor"'
+    return f'<?xml version="1.0"?>\n<VTKFile type="{kind}" {attributes}>\n{content}\n</VTKFile>\n'

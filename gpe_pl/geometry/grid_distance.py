@@ -1,0 +1,251 @@
+"""Signed distances at the nodes of a grid, negative inside: to a ground given by heights, to triangles, to oriented points. The last axis points up."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, no_type_check
+
+import numpy as np
+from numba import njit
+
+from gpe_pl.geometry.shapes import MAX_GRID_NODES
+
+Bounds = tuple[tuple[float, float], ...]
+Solid = Literal["inside", "outside", "below"]
+"""Which side of a surface is solid."""
+
+_BAND = 2
+"""Cells around a triangle whose distances are exact by construction; farther ones inherit the nearest triangle of a neighbour."""
+MAX_PAIRS = 2**30
+"""Of triangles and grid nodes near them, whose distances are computed: about half a minute."""
+
+
+def lattice(bounds: Bounds, spacing: float) -> tuple[np.ndarray, tuple[int, ...]]:
+    """First node and number of nodes of the grid that covers the domain."""
+    if len(bounds) != 3 or any(not -math.inf < low < high < math.inf for low, high in bounds):
+        raise ValueError(f"terrain needs bounds (low, high) with low < high along 3 axes, got {bounds}")
+    if not 0 < spacing < math.inf:
+        raise ValueError(f"spacing must be positive, got {spacing}")
+    counts = tuple(max(1, math.ceil((high - low) / spacing - 1e-6)) + 1 for low, high in bounds)
+    if math.prod(counts) > MAX_GRID_NODES:
+        raise ValueError(f"a grid of {counts} nodes is too large, at most {MAX_GRID_NODES} together; use a wider spacing than {spacing} m")
+    return np.array([low for low, _ in bounds], float), counts
+
+
+def columns_of(low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
+    """Positions of the grid's vertical lines [along x, along y, 2]."""
+    axes = [low[k] + spacing * np.arange(counts[k]) for k in range(2)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
+def below_heights(heights: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
+    """Signed distances to the ground under heights [m] at the grid's vertical lines."""
+    corners = _ground(heights, low, spacing, np.ones((counts[0] - 1, counts[1] - 1), dtype=bool))
+    z = low[2] + spacing * np.arange(counts[2])
+    return np.where(z < heights[..., None], -1.0, 1.0) * unsigned(corners, low, spacing, counts)
+
+
+def _ground(heights: np.ndarray, low: np.ndarray, spacing: float, cells: np.ndarray) -> np.ndarray:
+    """Corners [triangle, 3, 3] of two triangles in each of these cells between vertical lines."""
+    place = np.concatenate([columns_of(low, spacing, heights.shape), heights[..., None]], axis=-1)
+    a, b, c, d = place[:-1, :-1][cells], place[1:, :-1][cells], place[1:, 1:][cells], place[:-1, 1:][cells]
+    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+
+
+def mesh_distances(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...], solid: Solid) -> np.ndarray:
+    """Signed distances to triangles [triangle, 3, 3].
+
+    Raises:
+        ValueError: nothing lies ``below`` them, or so many are so large that it would take minutes.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    if (count := _num_pairs(corners, low, spacing, counts)) > MAX_PAIRS:
+        raise ValueError(
+            f"{len(corners)} triangles have together {count:.3g} grid nodes beside them, at most {MAX_PAIRS:.3g}; simplify the mesh, or use a wider spacing"
+        )
+    if solid == "below":
+        above, top = _crossings(corners, low, spacing, counts, 2)
+        covered = np.isfinite(top)
+        if not covered.any():
+            raise ValueError("the surface lies nowhere over the domain; check the options fit and up")
+        rim = distance_transform_edt(~covered, return_distances=False, return_indices=True)
+        top = top[tuple(rim)]
+        z = low[2] + spacing * np.arange(counts[2])
+        inside = np.where(covered[..., None], above % 2 == 1, z < top[..., None])
+        full = covered[:-1, :-1] & covered[1:, :-1] & covered[1:, 1:] & covered[:-1, 1:]
+        corners = np.concatenate([corners, _ground(top, low, spacing, ~full)])
+    else:  # two of three rays decide, so a crack that one ray slips through does no harm
+        votes = sum((_crossings(corners, low, spacing, counts, axis)[0] % 2).astype(int) for axis in range(3))
+        inside = (np.asarray(votes) >= 2) == (solid == "inside")
+    return np.where(inside, -1.0, 1.0) * unsigned(corners, low, spacing, counts)
+
+
+def cloud_distances(points: np.ndarray, normals: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
+    """Signed distances to an oriented point cloud: weighted mean of the distances to the tangent planes of the nearest points.
+
+    Far from the cloud, where planes mean little, it is the distance to the nearest point with the sign of that mean.
+    """
+    from scipy.spatial import cKDTree
+
+    nodes = low + spacing * np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1).reshape(-1, 3)
+    number = min(8, len(points))
+    tree = cKDTree(points)
+    gap = np.median(tree.query(points[:: max(1, len(points) // 1000)], k=number)[0][:, -1])
+    distance, near = tree.query(nodes, k=number)
+    plane = np.sum((nodes[:, None] - points[near]) * normals[near], axis=-1)
+    weight = np.exp(-((distance**2 - distance[:, :1] ** 2) / max(float(gap), 1e-9 * spacing) ** 2))
+    mean = np.sum(weight * plane, axis=1) / np.sum(weight, axis=1)
+    values = np.where(distance[:, 0] < 2 * max(float(gap), spacing), mean, np.where(mean < 0, -1.0, 1.0) * distance[:, 0])
+    return values.reshape(counts)
+
+
+def unsigned(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
+    """Distances [m] of grid nodes to the nearest of these triangles [triangle, 3, 3]."""
+    triangles = np.ascontiguousarray(corners, dtype=np.float64).reshape(-1, 9)
+    distance = np.full(counts, np.inf)
+    nearest = np.full(counts, -1, dtype=np.int64)
+    origin = np.array(low, dtype=np.float64)
+    _near(triangles, origin, float(spacing), _BAND, distance, nearest)
+    _spread(triangles, origin, float(spacing), distance, nearest)
+    return np.sqrt(distance)
+
+
+def _num_pairs(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> float:
+    """Triangles and grid nodes that ``unsigned`` compares: those in the box around each triangle, wider by ``_BAND`` cells."""
+    place = (corners - low) / spacing
+    last = np.array(counts) - 1.0
+    first = np.floor(np.clip(place.min(axis=1) - _BAND, 0.0, last))
+    return float((np.floor(np.clip(place.max(axis=1) + _BAND, 0.0, last)) - first + 1).prod(axis=1).sum())
+
+
+def _crossings(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...], axis: int) -> tuple[np.ndarray, np.ndarray]:
+    """How many triangles lie beyond each grid node along an axis, and for each line of nodes the last crossing (-inf: none)."""
+    order = [(axis + 1) % 3, (axis + 2) % 3, axis]
+    hits = np.zeros([counts[k] for k in order], dtype=np.int64)
+    last = np.full(hits.shape[:2], -np.inf)
+    _cast(
+        np.ascontiguousarray(corners[:, :, order], dtype=np.float64).reshape(-1, 9),
+        np.array(low[order], np.float64),
+        float(spacing),
+        hits,
+        last,
+    )
+    beyond = np.cumsum(hits[..., ::-1], axis=-1)[..., ::-1]
+    return np.transpose(beyond, np.argsort(order)), last
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _to_edge(px, py, pz, ax, ay, az, bx, by, bz):
+    """Squared distance of p to the segment from a to b."""
+    ex, ey, ez, wx, wy, wz = bx - ax, by - ay, bz - az, px - ax, py - ay, pz - az
+    length = ex * ex + ey * ey + ez * ez
+    t = (ex * wx + ey * wy + ez * wz) / length if length > 0.0 else 0.0
+    t = min(max(t, 0.0), 1.0)
+    return (wx - t * ex) ** 2 + (wy - t * ey) ** 2 + (wz - t * ez) ** 2
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _to_triangle(px, py, pz, t):
+    """Squared distance of p to a triangle: to its plane above the inside, else to the nearest edge."""
+    ux, uy, uz, vx, vy, vz = t[3] - t[0], t[4] - t[1], t[5] - t[2], t[6] - t[0], t[7] - t[1], t[8] - t[2]
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    wx, wy, wz = px - t[0], py - t[1], pz - t[2]
+    area = nx * nx + ny * ny + nz * nz
+    # barycentric coordinates of the foot point, times area
+    b = nx * (wy * vz - wz * vy) + ny * (wz * vx - wx * vz) + nz * (wx * vy - wy * vx)
+    c = nx * (uy * wz - uz * wy) + ny * (uz * wx - ux * wz) + nz * (ux * wy - uy * wx)
+    if area > 0.0 and b >= 0.0 and c >= 0.0 and b + c <= area:
+        return (nx * wx + ny * wy + nz * wz) ** 2 / area
+    first = _to_edge(px, py, pz, t[0], t[1], t[2], t[3], t[4], t[5])
+    second = _to_edge(px, py, pz, t[3], t[4], t[5], t[6], t[7], t[8])
+    third = _to_edge(px, py, pz, t[6], t[7], t[8], t[0], t[1], t[2])
+    return min(first, second, third)
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _node(x, count):
+    """A place along an axis as the index of a node that exists; also where it lies far outside of the grid."""
+    return int(min(max(x, 0.0), count - 1.0))
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _near(triangles, origin, spacing, band, distance, nearest):
+    """Squared distances of the nodes within ``band`` cells of a triangle; one outside of the grid counts for the nodes at the rim."""
+    nx, ny, nz = distance.shape
+    for f in range(len(triangles)):
+        t = triangles[f]
+        x0, x1 = (min(t[0], t[3], t[6]) - origin[0]) / spacing - band, (max(t[0], t[3], t[6]) - origin[0]) / spacing + band
+        y0, y1 = (min(t[1], t[4], t[7]) - origin[1]) / spacing - band, (max(t[1], t[4], t[7]) - origin[1]) / spacing + band
+        z0, z1 = (min(t[2], t[5], t[8]) - origin[2]) / spacing - band, (max(t[2], t[5], t[8]) - origin[2]) / spacing + band
+        for i in range(_node(x0, nx), _node(x1, nx) + 1):
+            for j in range(_node(y0, ny), _node(y1, ny) + 1):
+                for k in range(_node(z0, nz), _node(z1, nz) + 1):
+                    d = _to_triangle(origin[0] + i * spacing, origin[1] + j * spacing, origin[2] + k * spacing, t)
+                    if d < distance[i, j, k]:
+                        distance[i, j, k] = d
+                        nearest[i, j, k] = f
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _spread(triangles, origin, spacing, distance, nearest):
+    """Fast sweeping: every node tries the nearest triangles of its neighbours, in all eight orders, twice."""
+    nx, ny, nz = distance.shape
+    for sweep in range(16):
+        di, dj, dk = 1 - 2 * (sweep & 1), 1 - (sweep & 2), 1 - (sweep & 4) // 2
+        for a in range(nx):
+            i = a if di > 0 else nx - 1 - a
+            for b in range(ny):
+                j = b if dj > 0 else ny - 1 - b
+                for c in range(nz):
+                    k = c if dk > 0 else nz - 1 - c
+                    tried = nearest[i, j, k]
+                    for n in range(1, 8):
+                        p, q, r = i - di * (n & 1), j - dj * ((n & 2) >> 1), k - dk * ((n & 4) >> 2)
+                        if p < 0 or q < 0 or r < 0 or p >= nx or q >= ny or r >= nz:
+                            continue
+                        f = nearest[p, q, r]
+                        if f < 0 or f == tried or f == nearest[i, j, k]:
+                            continue
+                        tried = f
+                        d = _to_triangle(origin[0] + i * spacing, origin[1] + j * spacing, origin[2] + k * spacing, triangles[f])
+                        if d < distance[i, j, k]:
+                            distance[i, j, k] = d
+                            nearest[i, j, k] = f
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _cast(triangles, origin, spacing, hits, last):
+    """Count for each node the triangles that its line along the third axis crosses between it and the next node (after the last: anywhere).
+
+    Lines are moved towards the middle by a millionth of a cell and less, so that none runs through an edge of a mesh that is aligned with
+    the grid or just fills it.
+    """
+    nx, ny, nz = hits.shape
+    for f in range(len(triangles)):
+        t = triangles[f]
+        ax, ay, az = (t[0] - origin[0]) / spacing, (t[1] - origin[1]) / spacing, (t[2] - origin[2]) / spacing
+        bx, by, bz = (t[3] - origin[0]) / spacing, (t[4] - origin[1]) / spacing, (t[5] - origin[2]) / spacing
+        cx, cy, cz = (t[6] - origin[0]) / spacing, (t[7] - origin[1]) / spacing, (t[8] - origin[2]) / spacing
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if area == 0.0:
+            continue
+        for i in range(_node(math.floor(min(ax, bx, cx)), nx), _node(math.ceil(max(ax, bx, cx)), nx) + 1):
+            x = i + 1.31e-6 * ((nx - 0.93) * 0.5 - i) / nx
+            for j in range(_node(math.floor(min(ay, by, cy)), ny), _node(math.ceil(max(ay, by, cy)), ny) + 1):
+                y = j + 0.73e-6 * ((ny - 0.89) * 0.5 - j) / ny
+                u = ((bx - x) * (cy - y) - (by - y) * (cx - x)) / area
+                v = ((cx - x) * (ay - y) - (cy - y) * (ax - x)) / area
+                w = ((ax - x) * (by - y) - (ay - y) * (bx - x)) / area
+                if u < 0.0 or v < 0.0 or w < 0.0:
+                    continue
+                z = u * az + v * bz + w * cz
+                last[i, j] = max(last[i, j], origin[2] + z * spacing)
+                if z > 0.0:
+                    hits[i, j, _node(math.ceil(z) - 1.0, nz)] += 1

@@ -1,0 +1,135 @@
+"""Shapes in periodic domains, where each stands for all its images: an obstacle across a seam has its other part on the other side."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from array_api_compat import array_namespace, device
+
+from gpe_pl.geometry.periodicity import Periodicity
+from gpe_pl.geometry.shapes import Box, Polygon, Shape, Wall, signed_distance, surface_tolerance
+
+Array = Any
+
+ON_SEAM = 1e-9
+"""Fraction of a period by which ends of shapes may miss a seam."""
+
+
+@dataclass(frozen=True)
+class Repeated:
+    """A shape with its images along the axes that repeat.
+
+    Attributes:
+        shape: one of them, no wider than a period along these axes, except boxes. What is as wide as a period meets its images without a gap.
+        periodicity: where space repeats.
+    """
+
+    shape: Shape
+    periodicity: Periodicity
+    kind: ClassVar[str] = "repeated"
+
+    @property
+    def friction(self) -> float:
+        return self.shape.friction
+
+    @property
+    def restitution(self) -> float:
+        return self.shape.restitution
+
+    @property
+    def extent(self) -> float:
+        return self.shape.extent
+
+    def signed_distance(self, points: Array) -> Array:
+        """Distance [...] in m to the nearest image."""
+        xp, space = array_namespace(points), self.periodicity
+        centre = xp.asarray(self._centre, dtype=points.dtype, device=device(points))
+        near = centre + space.shortest(points - centre)
+        if not isinstance(self.shape, Polygon):  # symmetric, or with an inside of which each image has its own part
+            return self._whole.signed_distance(near)
+        distance = self._whole.signed_distance(near)
+        axes = [axis for axis in space.axes if axis != self._spanned]
+        for images in itertools.product((-1.0, 0.0, 1.0), repeat=len(axes)):
+            if any(images):
+                shift = np.zeros(len(space.period))
+                shift[axes] = np.array(images) * space.period[axes]
+                there = near + xp.asarray(shift, dtype=points.dtype, device=device(points))
+                distance = xp.minimum(distance, self._whole.signed_distance(there))
+        return distance
+
+    def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        """Boundary nodes inside the domain, each once, and their normals; faces at which an image meets the next one have none."""
+        pos, normal = self.shape.sample(spacing)
+        free = ~is_covered(pos, normal, (self.shape,), (self,))
+        return self.periodicity.wrapped(pos[free]), normal[free]
+
+    @cached_property
+    def _centre(self) -> np.ndarray:
+        values = vars(self.shape)
+        if "center" in values:
+            return np.array(values["center"], dtype=float)
+        if "vertices" in values:
+            corners = np.array(values["vertices"], dtype=float)
+        elif "origin" in values:  # of a grid
+            corners = np.stack([values["origin"], np.asarray(values["origin"]) + values["spacing"] * (np.asarray(values["counts"]) - 1)])
+        else:
+            corners = np.array([values["low"], values["high"]], dtype=float)
+        return np.asarray((corners.min(axis=0) + corners.max(axis=0)) / 2)
+
+    @cached_property
+    def _whole(self) -> Shape:
+        """The shape without the faces at which it meets its own images."""
+        if isinstance(self.shape, Polygon) and self._spanned is not None:
+            return self._chained(self.shape, self._spanned)
+        if not isinstance(self.shape, Box):
+            return self.shape
+        low, high, period = np.array(self.shape.low), np.array(self.shape.high), self.periodicity.period
+        reach = np.where((period > 0) & (high - low >= period * (1 - ON_SEAM)), period, 0.0)
+        return replace(self.shape, low=tuple((low - reach).tolist()), high=tuple((high + reach).tolist()))
+
+    @cached_property
+    def _spanned(self) -> int | None:
+        """The axis along which a polygon reaches from seam to seam, with one edge on each."""
+        if isinstance(self.shape, Polygon):
+            corners = np.array(self.shape.vertices, dtype=float)
+            for axis in self.periodicity.axes:
+                is_as_wide = abs(np.ptp(corners[:, axis]) / self.periodicity.period[axis] - 1) <= ON_SEAM
+                if is_as_wide and all(at.sum() == 2 and (at & np.roll(at, 1)).any() for at in self._on_seams(corners, axis)):
+                    return axis
+        return None
+
+    def _on_seams(self, corners: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+        """Which corners [corner] lie at the lower end of a shape, and which at its upper end."""
+        x, close = corners[:, axis], ON_SEAM * self.periodicity.period[axis]
+        return x <= x.min() + close, x >= x.max() - close
+
+    def _chained(self, polygon: Polygon, axis: int) -> Polygon:
+        """A polygon that spans an axis, in one with its images on both sides."""
+        corners = np.array(polygon.vertices, dtype=float)
+        low, _ = self._on_seams(corners, axis)
+        corners = np.roll(corners, -int(np.flatnonzero(low & ~np.roll(low, -1))[0]), axis=0)  # begins where the edge on the lower seam ends
+        _, high = self._on_seams(corners, axis)
+        there, back = np.split(corners, [1 + int(high.argmax())])
+        shifts = [k * self.periodicity.period[axis] * np.eye(2)[axis] for k in (-1, 0, 1)]
+        chain = np.concatenate([*(there + shift for shift in shifts), *(back + shift for shift in reversed(shifts))])
+        is_new = (np.abs(chain - np.roll(chain, 1, axis=0)) > ON_SEAM * self.periodicity.period[axis]).any(axis=1)
+        return replace(polygon, vertices=tuple(map(tuple, chain[is_new].tolist())))
+
+
+def is_covered(pos: np.ndarray, normal: np.ndarray, shapes: tuple[Shape, ...], images: tuple[Shape, ...]) -> np.ndarray:
+    """On which nodes of ``shapes`` [node], with normals [node, dim], one of their images lies: there is no free space in front of them."""
+    ahead = surface_tolerance(shapes)
+    points = pos.astype(np.float64) + ahead * normal
+    here, there = signed_distance(shapes, points), signed_distance(images, points)
+    return np.asarray((there < 0.5 * ahead) & (there < here - 0.5 * ahead))
+
+
+def repeated(shapes: tuple[Shape, ...], periodicity: Periodicity) -> tuple[Shape, ...]:
+    """Shapes that know their images; walls are plane, so they have no further ones along themselves. The same object where no axis repeats."""
+    if not periodicity:
+        return shapes
+    return tuple(shape if isinstance(shape, (Wall, Repeated)) else Repeated(shape, periodicity) for shape in shapes)

@@ -1,0 +1,101 @@
+"""Shapes as plain values, in which they are stored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, fields, replace
+from typing import Any
+
+import numpy as np
+
+from gpe_pl.geometry.periodicity import Periodicity
+from gpe_pl.geometry.repeated_shapes import Repeated
+from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Polygon, Shape, Sphere, Wall
+from gpe_pl.schema import LARGEST
+
+SHAPES: dict[str, type] = {cls.kind: cls for cls in (Wall, Sphere, Bowl, Box, Polygon, DistanceGrid, Repeated)}
+
+
+def shape_to_dict(shape: Shape) -> dict[str, Any]:
+    """Plain values from which ``shape_from_dict`` rebuilds the shape."""
+    if isinstance(shape, Repeated):
+        return {"kind": shape.kind, "shape": shape_to_dict(shape.shape), **asdict(shape.periodicity)}
+    return {"kind": shape.kind, **asdict(shape)}  # type: ignore[call-overload]
+
+
+def shape_from_dict(values: dict[str, Any]) -> Shape:
+    """Rebuild a shape; raises ``ValueError`` that names an unknown kind or key."""
+    values = dict(values)
+    kind = values.pop("kind", None)
+    if kind not in SHAPES:
+        raise ValueError(f"unknown shape kind {kind!r}; known: {', '.join(SHAPES)}")
+
+    def tuples(value: Any) -> Any:
+        return tuple(tuples(v) for v in value) if isinstance(value, (list, tuple)) else value
+
+    try:
+        if kind == Repeated.kind:
+            inner = values.pop("shape", None)
+            if not isinstance(inner, dict) or inner.get("kind") in (Repeated.kind, Wall.kind):
+                raise ValueError("shape 'repeated': its 'shape' must be an obstacle")
+            return Repeated(shape_from_dict(inner), Periodicity(**{key: tuples(value) for key, value in values.items()}))
+        return SHAPES[kind](**{key: tuples(value) for key, value in values.items()})
+    except TypeError as error:
+        raise ValueError(f"shape {kind!r}: {error}") from None
+
+
+def shapes_fault(shapes: Sequence[Shape], space: Periodicity) -> str | None:
+    """What is wrong with the first of the shapes that breaks a rule, or None. Files may hold anything, so whoever reads one asks.
+
+    Numbers are finite, vectors have a component per axis of ``space``, friction is at least 0, restitution between 0 and 1, radii are positive, boxes and
+    walls wider than nothing, and normals of walls along one axis. Shapes that are no stored ones are not looked at.
+    """
+    for k, shape in enumerate(shapes):
+        if isinstance(shape, Repeated) and shape.periodicity != space:
+            return f"shape {k} repeats along {shape.periodicity}, the domain along {space}"
+        inner = shape.shape if isinstance(shape, Repeated) else shape
+        if type(inner) in SHAPES.values() and (wrong := _fault(inner, len(space.bounds))):
+            return f"shape {k} ({inner.kind}): {wrong}"
+    return None
+
+
+_SCALARS = {"friction", "restitution", "radius", "offset", "spacing"}
+
+
+def _fault(shape: Shape, dim: int) -> str | None:
+    values: dict[str, np.ndarray] = {}
+    for key in (f.name for f in fields(shape) if f.name != "encoded"):  # type: ignore[arg-type]
+        try:
+            values[key] = np.asarray(getattr(shape, key))
+        except ValueError:  # lists of different lengths
+            return f"{key} must be numbers"
+        if values[key].dtype.kind not in "fiu":
+            return f"{key} must be numbers"
+        if not (np.abs(values[key]) <= LARGEST).all():
+            return f"not finite: {key}"
+        size = () if key in _SCALARS else (dim,)
+        if values[key].shape[key == "vertices" :] != size:
+            return f"{key} must have {dim} components" if size else f"{key} must be one number"
+    if values["friction"] < 0:
+        return f"friction is {shape.friction:g}, must be at least 0"
+    if not 0 <= values["restitution"] <= 1:
+        return f"restitution is {shape.restitution:g}, must lie between 0 and 1"
+    if "radius" in values and values["radius"] <= 0:
+        return f"radius is {values['radius']:g} m, must be positive"
+    if "low" in values and (values["low"] >= values["high"]).any():
+        return "low must be below high along every axis"
+    if "normal" in values and np.sort(np.abs(values["normal"])).tolist() != [0.0] * (dim - 1) + [1.0]:
+        return "normal must be a unit vector along one axis"
+    return None
+
+
+def moved(shape: Shape, by: np.ndarray) -> Shape:
+    """The shape displaced by ``by`` [dim] in m."""
+    if isinstance(shape, Repeated):
+        bounds = tuple((low + x, high + x) for (low, high), x in zip(shape.periodicity.bounds, by.tolist(), strict=True))
+        return Repeated(moved(shape.shape, by), replace(shape.periodicity, bounds=bounds))
+    values = shape_to_dict(shape)
+    values |= {name: (values[name] + by).tolist() for name in ("center", "low", "high", "vertices", "origin") if name in values}
+    if isinstance(shape, Wall):
+        values["offset"] += float(np.dot(shape.normal, by))
+    return shape_from_dict(values)

@@ -1,0 +1,176 @@
+"""Terrain for scenes, as signed distances on a grid, read from a mesh, a point cloud or a height map. The last axis of a scene points up."""
+
+from __future__ import annotations
+
+import logging
+import math
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from gpe_pl.geometry.grid_distance import Bounds, Solid, below_heights, cloud_distances, columns_of, lattice, mesh_distances
+from gpe_pl.geometry.shapes import DistanceGrid
+from gpe_pl.geometry.terrain_files import Cloud, Heights, Mesh, TerrainError, read_surface
+from gpe_pl.schema import STICKY
+
+log = logging.getLogger(__name__)
+
+Fit = Literal["contain", "stretch", "none"]
+Up = Literal["x", "y", "z"]
+
+_TO_Z_UP = {"x": [[0, 0, -1], [0, 1, 0], [1, 0, 0]], "y": [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "z": np.eye(3)}
+
+
+def read_terrain(
+    path: Path | str,
+    bounds: Bounds,
+    spacing: float,
+    *,
+    fit: Fit = "contain",
+    up: Up = "z",
+    solid: Solid | Literal["auto"] = "auto",
+    relief: float | None = None,
+    friction: float = STICKY,
+) -> DistanceGrid:
+    """Signed distances of the terrain in a file, at grid nodes that cover the domain.
+
+    * Triangle meshes: OBJ, STL, PLY.
+    * Point clouds: PLY without faces; XYZ (text) and NPY with 3 columns, or 6 with normals into free space; NPZ with ``points`` and
+      perhaps ``normals``. Without normals the ground is the height field through the points.
+    * Height maps, seen from above with north up (columns along x, rows against y): NPY with another number of columns, NPZ with
+      ``heights``, CSV, PNG (its largest grey value is 1).
+
+    Args:
+        path: the file; its extension tells the format.
+        bounds: ``(low, high)`` of the domain along x, y and z [m].
+        spacing: of the grid [m].
+        fit: ``contain`` scales by one factor until the terrain fits into the domain, ``stretch`` along each axis until it fills it; both put it
+            in the middle of the floor. ``none`` takes coordinates as they are, in m (pixels of a height map are 1 m wide).
+        up: axis of a mesh or point cloud that points up.
+        solid: what is solid: the ``inside`` of a closed mesh (behind the normals of a point cloud), the ``outside`` (a container), or
+            what is ``below`` an open surface, which continues beyond its rim at the height of the rim. ``auto``: ``inside`` for watertight meshes
+            and clouds with normals, ``below`` for all others; the choice is logged.
+        relief: height [m] between the lowest and the highest point; by default as it comes with ``fit``, and half the domain's height for a
+            height map that is not taken as it is.
+        friction: Coulomb coefficient of the surface.
+
+    Raises:
+        TerrainError: the file cannot be read, holds nothing usable, is too large, or does not fit the options; or it is an OBJ, STL or PLY and the package
+            trimesh is not installed.
+        ValueError: options or bounds that no file could fit.
+    """
+    path = Path(path)
+    low, counts = lattice(bounds, spacing)
+    for name, value, known in (("fit", fit, get_args(Fit)), ("up", up, get_args(Up)), ("solid", solid, ("auto", *get_args(Solid)))):
+        if value not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    if relief is not None and (fit == "none" or not 0 < relief < math.inf):
+        raise ValueError(f"relief must be positive, and not given with fit='none', got {relief}")
+    source = read_surface(path)
+    if solid == "auto":
+        closed = source.watertight if isinstance(source, Mesh) else isinstance(source, Cloud) and source.normals is not None
+        solid = "inside" if closed else "below"
+        log.info("%s: took what is %s the surface as solid; solid=inside|outside|below says otherwise", path, solid)
+    if solid != "below" and (isinstance(source, Heights) or (isinstance(source, Cloud) and source.normals is None)):
+        raise TerrainError(f"{path}: solid={solid!r} needs a mesh or normals; this file is a height field, use solid='below'")
+    if isinstance(source, Heights):
+        heights = _resampled(path, source.values, bounds, spacing, fit, relief)
+        values = below_heights(heights, low, spacing, counts)
+    elif isinstance(source, Mesh):
+        vertices, _ = _placed(path, source.vertices, None, bounds, fit, up, relief)
+        try:
+            values = mesh_distances(vertices[source.faces], low, spacing, counts, solid)
+        except ValueError as error:
+            raise TerrainError(f"{path}: {error}") from None
+    else:
+        points, normals = _placed(path, source.points, source.normals, bounds, fit, up, relief)
+        if solid == "below" or normals is None:
+            values = below_heights(_heights_of(path, points, low, spacing, counts), low, spacing, counts)
+        else:
+            values = cloud_distances(points, normals if solid == "inside" else -normals, low, spacing, counts)
+    if not (values.min() < 0 < values.max()):
+        what = "no free space" if values.max() <= 0 else "nothing solid"
+        raise TerrainError(f"{path}: there is {what} in the domain {bounds}; check fit={fit!r}, up={up!r} and solid={solid!r}")
+    return DistanceGrid.from_values(low, spacing, values, friction)
+
+
+def ground_of(points: np.ndarray, normals: np.ndarray, bounds: Bounds, spacing: float, friction: float = STICKY) -> DistanceGrid:
+    """What is solid below an open surface given by points [point, 3] in m with unit normals into free space, at grid nodes that cover the domain.
+
+    Near the surface the normals tell which side is free. Farther away, where the nearest normal may belong to the rim of a cliff, it is what lies above the
+    height field through the points.
+
+    Args:
+        points, normals: of the surface.
+        bounds: ``(low, high)`` of the domain along x, y and z [m].
+        spacing: of the grid [m].
+        friction: Coulomb coefficient of the surface.
+
+    Raises:
+        TerrainError: seen from above all points lie on one line.
+    """
+    low, counts = lattice(bounds, spacing)
+    values = cloud_distances(points, normals, low, spacing, counts)
+    heights = _heights_of(Path("points"), points, low, spacing, counts)
+    is_above = low[2] + spacing * np.arange(counts[2]) > heights[..., None]
+    values = np.where(np.abs(values) > spacing, np.where(is_above, 1.0, -1.0) * np.abs(values), values)
+    return DistanceGrid.from_values(low, spacing, values, friction)
+
+
+def _placed(
+    path: Path, points: np.ndarray, normals: np.ndarray | None, bounds: Bounds, fit: Fit, up: Up, relief: float | None
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points and normals in the frame of the scene."""
+    turn = np.asarray(_TO_Z_UP[up], float).T
+    points, normals = points @ turn, None if normals is None else normals @ turn
+    if fit == "none":
+        return points, normals
+    floor, room = np.array(bounds, float)[:, 0], np.ptp(np.array(bounds, float), axis=1)
+    low, extent = points.min(axis=0), np.ptp(points, axis=0)
+    if np.sum(extent > 0) < 2:
+        raise TerrainError(f"{path}: all points lie on one line")
+    share = np.divide(room, extent, out=np.full(3, np.inf), where=extent > 0)
+    vertical = share[2] if relief is None or extent[2] == 0 else relief / extent[2]
+    if fit == "contain":
+        one = min(share) if relief is None else min(share[:2])
+        scale = np.array([one, one, one if relief is None else vertical])
+    else:
+        scale = np.array([share[0], share[1], vertical])
+    scale = np.where(np.isfinite(scale), scale, 1.0)
+    start = floor + np.array([0.5, 0.5, 0.0]) * (room - scale * extent)
+    if normals is not None:
+        normals = normals / scale
+        normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    return start + (points - low) * scale, normals
+
+
+def _resampled(path: Path, values: np.ndarray, bounds: Bounds, spacing: float, fit: Fit, relief: float | None) -> np.ndarray:
+    """A height map placed in the scene: height [m] of the ground at the grid's vertical lines."""
+    from scipy.ndimage import map_coordinates
+
+    low, counts = lattice(bounds, spacing)
+    room, extent, rise = np.ptp(np.array(bounds), axis=1), np.array(values.shape) - 1.0, float(np.ptp(values))
+    place = columns_of(low, spacing, counts)
+    if fit == "none":
+        index = place
+    else:
+        scale = room[:2] / extent
+        scale = np.full(2, scale.min()) if fit == "contain" else scale
+        index = (place - low[:2] - 0.5 * (room[:2] - scale * extent)) / scale
+        values = low[2] + (values - values.min()) * ((relief or 0.5 * room[2]) / rise if rise > 0 else 0.0)
+    return np.asarray(map_coordinates(values, np.moveaxis(index, -1, 0), order=1, mode="nearest"))
+
+
+def _heights_of(path: Path, points: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
+    """Height [m] of a cloud's surface at the grid's vertical lines: linear between the points, that of the nearest point around them."""
+    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+    from scipy.spatial import QhullError
+
+    place = columns_of(low, spacing, counts)
+    nearest = np.asarray(NearestNDInterpolator(points[:, :2], points[:, 2])(place))
+    try:
+        heights = np.asarray(LinearNDInterpolator(points[:, :2], points[:, 2])(place))
+    except QhullError:
+        raise TerrainError(f"{path}: seen from above all points lie on one line; check the option up") from None
+    return np.where(np.isfinite(heights), heights, nearest)

@@ -1,0 +1,261 @@
+"""Surfaces in files: triangle meshes, point clouds and height maps.
+
+Nothing that is read is executed, and no file but the named one is opened.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpe_pl.errors import GpeError
+from gpe_pl.files.zip_members import num_members
+
+MESHES = (".obj", ".stl", ".ply")
+POINT_CLOUDS = (".ply", ".xyz", ".npy", ".npz")
+HEIGHT_MAPS = (".npy", ".npz", ".png", ".csv")
+
+MAX_FILE_BYTES = 2**30
+MAX_TRIANGLES = 2_000_000
+MAX_POINTS = 5_000_000
+MAX_HEIGHTS = 2**25
+MAX_MEMBERS = MAX_PARTS = 1000
+MAX_TEXT_TRIANGLES, MAX_TEXT_VERTICES, MAX_TEXT_VALUES = 1_000_000, 2_000_000, 10_000_000
+MAX_ASCII_TRIANGLES, MAX_ASCII_ELEMENTS, MAX_ASCII_BYTES = 300_000, 1_000_000, 2**24
+"""What readers of text get through in some seconds."""
+BINARY = {
+    ".obj": "write it as a binary .stl or .ply",
+    ".stl": "write it as a binary .stl",
+    ".ply": "write it as a binary .ply",
+    ".xyz": "write it as .npy",
+    ".csv": "write it as .npy",
+}
+HEADER_BYTES = 2**16
+"""In which a PLY file says how many elements it has."""
+
+
+class TerrainError(GpeError, ValueError):
+    """A terrain file cannot be used; the message names the file and what to do."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles between vertices."""
+
+    vertices: np.ndarray  # [vertex, 3]
+    faces: np.ndarray  # [triangle, 3]
+    watertight: bool
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points of a surface, perhaps with normals."""
+
+    points: np.ndarray  # [point, 3]
+    normals: np.ndarray | None  # [point, 3] into free space
+
+
+@dataclass(frozen=True)
+class Heights:
+    """Heights on a square lattice."""
+
+    values: np.ndarray  # [along x, along y]
+
+
+def read_surface(path: Path) -> Mesh | Cloud | Heights:
+    """What a file holds, as its extension says; raises ``TerrainError``."""
+    extension = path.suffix.lower()
+    if extension not in (*MESHES, *POINT_CLOUDS, *HEIGHT_MAPS):
+        raise TerrainError(
+            f"{path}: unknown extension {extension!r}; meshes are {', '.join(MESHES)}, point clouds {', '.join(POINT_CLOUDS)}, "
+            f"height maps {', '.join(HEIGHT_MAPS)}"
+        )
+    if not path.is_file():
+        raise TerrainError(f"{path}: no such file (searched from {Path.cwd()})")
+    if path.stat().st_size > MAX_FILE_BYTES:
+        raise TerrainError(f"{path}: {path.stat().st_size} bytes are too many, at most {MAX_FILE_BYTES}; simplify it first")
+    if extension in COUNTED:
+        _require_countable(path, extension)
+    try:
+        source = READERS[extension](path)
+    except TerrainError:
+        raise
+    except ModuleNotFoundError as error:
+        raise TerrainError(f"{path}: needs the package {error.name}; install it with `pip install 'gpe_pl[terrain]'`") from None
+    except Exception as error:  # the readers raise anything on damaged files
+        raise TerrainError(f"{path}: cannot be read as {extension[1:].upper()}: {type(error).__name__}: {error}") from error
+    return source
+
+
+COUNTED: dict[str, tuple[tuple[tuple[bytes, ...], int, str], ...]] = {
+    ".obj": (
+        ((b"\nf", b"\rf"), MAX_TEXT_TRIANGLES, "triangles"),
+        ((b"\nv", b"\rv"), MAX_TEXT_VERTICES, "vertices"),
+        ((b"usemtl", b"\no", b"\ng", b"\ro", b"\rg"), MAX_PARTS, "parts"),
+        ((b"\n", b"\r", b" ", b"\t"), 2 * MAX_TEXT_VALUES, "values"),
+    ),
+    ".stl": (((b"endfacet",), MAX_ASCII_TRIANGLES, "triangles"),),
+    ".xyz": (((b"\n", b"\r", b" ", b"\t"), MAX_TEXT_VALUES, "values"),),
+    ".ply": (),
+    ".csv": (((b"\n", b"\r", b","), MAX_TEXT_VALUES, "heights"),),
+}
+"""What begins or separates the parts of a text format, by extension: readers take far longer than counting these."""
+
+
+def _require_countable(path: Path, extension: str) -> None:
+    """Refuse what would take minutes to read before it turns out to be too much."""
+    content = path.read_bytes()
+    if extension == ".stl" and not content[:512].lstrip().lower().startswith(b"solid"):
+        return  # its header says how many, which the reader compares with the size
+    for marks, most, what in COUNTED[extension]:
+        if (count := sum(map(content.count, marks))) > most:
+            raise TerrainError(
+                f"{path}: about {count} {what} are too many for text, at most {most}; simplify it first, or {BINARY[extension]}"
+            )
+    if extension == ".ply":
+        _require_countable_elements(path, content)
+
+
+def _require_countable_elements(path: Path, content: bytes) -> None:
+    head = content[:HEADER_BYTES].partition(b"end_header")[0]
+    counts = [(kind, int(count)) for kind, count in re.findall(rb"element\s+(\S{1,100})\s+(\d{1,20})", head)]
+    for kind, count in counts:
+        if (MAX_TRIANGLES if kind == b"face" else MAX_POINTS) < count <= len(content):  # a header that promises more is damaged
+            raise TerrainError(f"{path}: {count} elements of kind {kind.decode(errors='replace')} are too many; simplify it first")
+    is_text = re.search(rb"format\s+ascii", head) is not None
+    if is_text and (len(content) > MAX_ASCII_BYTES or MAX_ASCII_ELEMENTS < sum(count for _, count in counts) <= len(content)):
+        raise TerrainError(
+            f"{path}: too large for text, of which {MAX_ASCII_BYTES} bytes and {MAX_ASCII_ELEMENTS} elements are read; {BINARY['.ply']}"
+        )
+
+
+def _read_mesh(path: Path) -> Mesh | Cloud:
+    import trimesh
+
+    # from memory, so that the reader cannot follow references to materials and textures
+    scene = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type=path.suffix[1:].lower(), skip_materials=True, process=False)
+    meshes = [g for g in scene.geometry.values() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
+    if not meshes:
+        clouds = [g for g in scene.geometry.values() if isinstance(g, trimesh.PointCloud) and len(g.vertices)]
+        if not clouds or path.suffix.lower() != ".ply":
+            raise TerrainError(f"{path}: holds no triangles; export the surface as a triangle mesh")
+        return _cloud(path, clouds[0].vertices, _ply_normals(clouds[0]))
+    mesh: Any = trimesh.util.concatenate(meshes)
+    if len(mesh.faces) > MAX_TRIANGLES:
+        raise TerrainError(f"{path}: {len(mesh.faces)} triangles are too many, at most {MAX_TRIANGLES}; decimate the mesh first")
+    _require_finite(path, mesh.vertices)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # texture seams are no holes
+    corners = np.asarray(mesh.triangles, np.float64)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
+    faces = np.asarray(mesh.faces, np.int64)[area > 1e-14 * np.max(np.ptp(corners.reshape(-1, 3), axis=0)) ** 2]
+    if len(faces) == 0:
+        raise TerrainError(f"{path}: all {len(area)} triangles are without area")
+    return Mesh(np.asarray(mesh.vertices, np.float64), faces, bool(mesh.is_watertight))
+
+
+def _ply_normals(cloud: Any) -> np.ndarray | None:
+    columns = cloud.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
+    names = columns.dtype.names or () if isinstance(columns, np.ndarray) else columns
+    return np.stack([np.ravel(columns[k]) for k in ("nx", "ny", "nz")], -1) if all(k in names for k in ("nx", "ny", "nz")) else None
+
+
+def _cloud(path: Path, points: np.ndarray, normals: np.ndarray | None) -> Cloud:
+    points = np.asarray(points, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 3:
+        raise TerrainError(f"{path}: a point cloud needs at least 3 points of 3 coordinates, got an array {list(points.shape)}")
+    if len(points) > MAX_POINTS:
+        raise TerrainError(f"{path}: {len(points)} points are too many, at most {MAX_POINTS}; thin them out first")
+    _require_finite(path, points)
+    if normals is not None:
+        normals = np.asarray(normals, np.float64)
+        _require_finite(path, normals)
+        if normals.shape != points.shape:
+            raise TerrainError(f"{path}: normals {list(normals.shape)} do not fit points {list(points.shape)}")
+        length = np.linalg.norm(normals, axis=-1)
+        if np.any(length < 1e-6):
+            raise TerrainError(f"{path}: normal {int(np.argmin(length))} has no length")
+        normals = normals / length[:, None]
+    return Cloud(points, normals)
+
+
+def _read_xyz(path: Path) -> Cloud:
+    return _columns(path, np.loadtxt(path, ndmin=2))
+
+
+def _columns(path: Path, values: np.ndarray) -> Cloud:
+    if values.ndim != 2 or values.shape[1] not in (3, 6):
+        raise TerrainError(f"{path}: a point cloud has 3 columns, or 6 with normals, got an array {list(values.shape)}")
+    return _cloud(path, values[:, :3], values[:, 3:] if values.shape[1] == 6 else None)
+
+
+def _height_map(path: Path, rows: np.ndarray) -> Heights:
+    """Heights of an image, its rows from north to south."""
+    if rows.ndim != 2 or min(rows.shape) < 2:
+        raise TerrainError(f"{path}: a height map has at least 2 rows and 2 columns, got an array {list(rows.shape)}")
+    if rows.size > MAX_HEIGHTS:
+        raise TerrainError(f"{path}: {rows.size} heights are too many, at most {MAX_HEIGHTS}; resample the map first")
+    values = np.asarray(rows, np.float64)[::-1].T
+    _require_finite(path, values)
+    return Heights(values)
+
+
+def _read_npy(path: Path) -> Cloud | Heights:
+    values = np.load(path, mmap_mode="r", allow_pickle=False)  # a header that promises more than the file holds is an error here
+    return _columns(path, values) if values.ndim == 2 and values.shape[1] in (3, 6) else _height_map(path, values)
+
+
+def _read_npz(path: Path) -> Cloud | Heights:
+    if (count := num_members(path)) > MAX_MEMBERS:
+        raise TerrainError(f"{path}: holds {count} arrays, at most {MAX_MEMBERS} are read")
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(entry.file_size for entry in archive.infolist())
+    if unpacked > MAX_FILE_BYTES:
+        raise TerrainError(f"{path}: unpacks to {unpacked} bytes, at most {MAX_FILE_BYTES}")
+    with np.load(path, allow_pickle=False) as arrays:
+        if "heights" in arrays:
+            return _height_map(path, arrays["heights"])
+        if "points" in arrays:
+            return _cloud(path, arrays["points"], arrays.get("normals"))
+        raise TerrainError(f"{path}: needs an array 'heights' or 'points', holds {', '.join(arrays.files) or 'none'}")
+
+
+def _read_png(path: Path) -> Heights:
+    from PIL import Image
+
+    with Image.open(path, formats=["PNG"]) as image:
+        if image.width * image.height > MAX_HEIGHTS:
+            raise TerrainError(
+                f"{path}: {image.width} x {image.height} pixels are too many, at most {MAX_HEIGHTS}; resample the image first"
+            )
+        deep = image.mode.startswith("I")  # 16 bits
+        return _height_map(path, np.asarray(image if deep else image.convert("L"), np.float64) / (65535 if deep else 255))
+
+
+def _read_csv(path: Path) -> Heights:
+    return _height_map(path, np.loadtxt(path, delimiter=",", ndmin=2))
+
+
+READERS: dict[str, Any] = {
+    ".obj": _read_mesh,
+    ".stl": _read_mesh,
+    ".ply": _read_mesh,
+    ".xyz": _read_xyz,
+    ".npy": _read_npy,
+    ".npz": _read_npz,
+    ".png": _read_png,
+    ".csv": _read_csv,
+}
+
+
+def _require_finite(path: Path, values: np.ndarray) -> None:
+    if not np.isfinite(values).all():
+        row = np.argwhere(~np.isfinite(values))[0].tolist()
+        raise TerrainError(f"{path}: the value at index {row} is not finite; remove or fill such values")
+    if np.abs(values).max(initial=0) > 1e12:
+        raise TerrainError(f"{path}: values up to {np.abs(values).max():.3g} are too large to be coordinates")

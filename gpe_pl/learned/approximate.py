@@ -1,0 +1,220 @@
+"""Learned simulators that skip more than is exact: what rests is left alone, and one prediction serves several frames.
+
+What a rollout has to remember for this travels in ``State.internal``, so it may stop anywhere and go on.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gpe_pl.graphs.features import history_of
+from gpe_pl.graphs.islands import islands_within
+from gpe_pl.graphs.multiscale import cell_edges
+from gpe_pl.graphs.neighbors import radius_between
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.cells import mean_over_corners
+from gpe_pl.trajectory.trajectory import State, Stress, search_tree
+
+
+def approximate(simulator: LearnedSimulator) -> Simulator:
+    """The simulator with the approximate levels that its ``skips`` ask for; itself if they ask for none."""
+    skips, dt = simulator.skips, simulator.builder.metadata.frame_dt
+    runner: Simulator = simulator
+    if skips.sleep_after is not None:
+        runner = Sleeping(simulator)
+    return runner if skips.hold == 1 else Holding(runner, dt, skips.hold)
+
+
+class _Batched(ABC):
+    """``step`` from ``step_all``."""
+
+    @abstractmethod
+    def step_all(self, states: list[State]) -> list[State | SimulationError]:
+        """The states one frame later, or why there is none."""
+
+    def step(self, state: State) -> State:
+        (after,) = self.step_all([state])
+        if isinstance(after, SimulationError):
+            raise after
+        return after
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """For how many predictions in a row each node has been at rest [node]."""
+
+    count: Tensor
+
+
+class Sleeping(_Batched):
+    """Islands at rest stand still and are not computed, until something that is not at rest, a wall included, comes within the graph's radius of them.
+
+    An island (``graphs.islands``, by the radius of the graph) sleeps when the steps of all its nodes have been shorter and more even than
+    ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` in the last ``Skips.sleep_after`` predictions. No pair that pushes each other is
+    thus ever frozen at one end only, and what moves sees its surroundings as before: the model gets all that is within its reach. The momentum that an
+    island still has when it falls asleep is lost; new states report it (``State.lost_impulse``), and how many nodes sleep (``State.num_asleep``).
+
+    Args:
+        simulator: whose ``skips`` say when to sleep.
+    """
+
+    def __init__(self, simulator: LearnedSimulator) -> None:
+        self.simulator = simulator
+        self.radius, self.dt = simulator.builder.scales.radius, simulator.builder.metadata.frame_dt
+
+    def step_all(self, states: list[State]) -> list[State | SimulationError]:
+        plans = [self._awake_and_seen(state) for state in states]
+        parts = [_part(state, seen) for state, (_, seen) in zip(states, plans, strict=True)]
+        stepped = iter(step_all(self.simulator, [part for part in parts if part.num_nodes]))
+        results: list[State | SimulationError] = []
+        for state, part, (awake, seen) in zip(states, parts, plans, strict=True):
+            after = next(stepped) if part.num_nodes else part
+            results.append(after if isinstance(after, SimulationError) else self._combined(state, after, awake, seen))
+        return results
+
+    def _awake_and_seen(self, state: State) -> tuple[Tensor, Tensor]:
+        """Nodes that move [node], and those that the model has to see for this, themselves included [node]."""
+        after = self.simulator.skips.sleep_after
+        assert after is not None
+        is_calm = (_rest_of(state) >= after).cpu().numpy()
+        if not is_calm.any():
+            everything = torch.ones(state.num_nodes, dtype=torch.bool, device=state.pos.device)
+            return everything, everything
+        pos = np.ascontiguousarray(state.pos.cpu().numpy())
+        is_calm &= ~self._are_near_a_moving_wall(state, pos)
+        cells = np.empty((0, 2), np.int64) if state.cells is None else state.cells.cpu().numpy()
+        edges, space = cell_edges(cells, len(pos)), state.periodicity
+        islands = islands_within(self.radius, pos, state.boundary.tree(space), edges, space)
+        awake = _in_the_same_island(~is_calm, islands.label)
+        seen = awake.copy()
+        if awake.any() and not awake.all():
+            reach = self.simulator.num_hops * self.radius
+            others = space.from_corner(pos[~awake]) if space else pos[~awake]
+            distance, _ = search_tree(pos[awake], space).query(others, distance_upper_bound=reach)
+            seen[~awake] = np.isfinite(distance)
+            if len(cells):  # a mesh is seen as a whole
+                seen = _in_the_same_island(seen, islands.label)
+        return torch.from_numpy(awake).to(state.pos.device), torch.from_numpy(seen).to(state.pos.device)
+
+    def _are_near_a_moving_wall(self, state: State, pos: np.ndarray) -> np.ndarray:
+        """Nodes [node] that a wall which moves in a prescribed way may push."""
+        near = np.zeros(len(pos), dtype=bool)
+        if state.boundary.motion is not None:
+            moves = (state.boundary.vel != 0).any(dim=1)
+            walls = np.ascontiguousarray(state.boundary.pos[moves].cpu().numpy())
+            near[radius_between(walls, pos, self.radius, state.periodicity)[1]] = True
+        return near
+
+    def _combined(self, state: State, after: State, awake: Tensor, seen: Tensor) -> State:
+        """The state with awake nodes as they are afterwards; the others stand where they are."""
+        pos, vel = state.pos.clone(), torch.zeros_like(state.vel)
+        moved = awake[seen]
+        pos[awake], vel[awake] = after.pos[moved], after.vel[moved]
+        skips, unit = self.simulator.skips, self.simulator.builder.scales.velocity
+        is_slow = vel.norm(dim=1) < skips.rest_step_spacings * unit
+        calm = is_slow & ((vel - state.vel).norm(dim=1) < skips.rest_step_change_spacings * unit)
+        count = torch.where(awake, torch.where(calm, _rest_of(state) + 1, 0), _rest_of(state))
+        return replace(
+            state,
+            pos=pos,
+            vel=vel,
+            velocity_history=torch.cat([history_of(state)[:, 1:], vel[:, None]], dim=1),
+            time=state.time + self.dt,
+            stress=_combined_stress(state, after, awake, moved),
+            num_asleep=int((~awake).sum()),
+            lost_impulse=float((state.mass * state.vel.norm(dim=1))[~awake].sum()),
+            internal=_Rest(count),
+            boundary=state.boundary.at(1),
+        )
+
+
+def _rest_of(state: State) -> Tensor:
+    if isinstance(state.internal, _Rest):
+        return state.internal.count
+    return torch.zeros(state.num_nodes, dtype=torch.int64, device=state.pos.device)
+
+
+def _in_the_same_island(chosen: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """All nodes of the islands [node] that hold a chosen node [node]."""
+    holds = np.zeros(label.max(initial=-1) + 1, dtype=bool)
+    holds[label[chosen]] = True
+    return holds[label]
+
+
+def _part(state: State, kept: Tensor) -> State:
+    """Some of the nodes [node] and the cells between them, without what belongs to a simulator."""
+    values: dict[str, Any] = {name: getattr(state, name)[kept] for name in ("pos", "vel", "node_type", "mass", "material_params")}
+    values["velocity_history"] = history_of(state)[kept]
+    if state.rest_pos is not None and state.cells is not None:
+        row = torch.cumsum(kept, dim=0) - 1
+        values |= {"rest_pos": state.rest_pos[kept], "cells": row[state.cells[kept[state.cells[:, 0]]]]}
+    return replace(state, **values, stress=None, internal=None)
+
+
+def _combined_stress(state: State, after: State, awake: Tensor, moved: Tensor) -> Stress | None:
+    if after.stress is None or state.cells is None:
+        return state.stress if not bool(awake.any()) else None
+    node = after.stress.node.new_zeros(state.num_nodes, after.stress.node.shape[1]) if state.stress is None else state.stress.node.clone()
+    node[awake] = after.stress.node[moved]
+    return Stress(node, mean_over_corners(node, state.cells))
+
+
+@dataclass(frozen=True)
+class _Held:
+    """The accelerations [node, dim] of a prediction, the frames that it still serves, and the internal part of the simulator that made it."""
+
+    acceleration: Tensor
+    frames: int
+    inner: Any
+
+
+class Holding(_Batched):
+    """Asks a simulator once for every ``frames`` frames and holds its accelerations in between, in which contacts that begin or end go unnoticed.
+
+    Args:
+        simulator: that predicts.
+        dt: frame interval [s].
+        frames: that one prediction serves.
+    """
+
+    def __init__(self, simulator: Simulator, dt: float, frames: int) -> None:
+        self.simulator, self.dt, self.frames = simulator, dt, frames
+
+    def step_all(self, states: list[State]) -> list[State | SimulationError]:
+        held = [s.internal if isinstance(s.internal, _Held) else None for s in states]
+        asked = [replace(s, internal=h.inner if h else s.internal) for s, h in zip(states, held, strict=True) if h is None or h.frames == 0]
+        answers = iter(step_all(self.simulator, asked))
+        results: list[State | SimulationError] = []
+        for state, h in zip(states, held, strict=True):
+            if h is not None and h.frames > 0:
+                results.append(self._go_on(state, h))
+                continue
+            after = next(answers)
+            results.append(after if isinstance(after, SimulationError) else self._hold(state, after))
+        return results
+
+    def _hold(self, state: State, after: State) -> State:
+        acceleration = integrators.acceleration(after.vel, state.vel, self.dt)
+        stopped = (after.vel == 0).all(dim=1, keepdim=True)  # as sleeping nodes are: it must not be driven back by what stopped it
+        return replace(after, internal=_Held(torch.where(stopped, 0.0, acceleration), self.frames - 1, after.internal))
+
+    def _go_on(self, state: State, held: _Held) -> State:
+        pos, vel = integrators.advance(state.pos, state.vel, held.acceleration, self.dt)
+        return replace(
+            state,
+            pos=state.periodicity.wrapped(pos),
+            vel=vel,
+            velocity_history=torch.cat([history_of(state)[:, 1:], vel[:, None]], dim=1),
+            time=state.time + self.dt,
+            lost_impulse=0.0,
+            internal=replace(held, frames=held.frames - 1),
+            boundary=state.boundary.at(1),
+        )

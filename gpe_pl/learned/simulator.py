@@ -1,0 +1,593 @@
+"""A learned model as a ``Simulator``: builder ∘ standardisation ∘ model ∘ integrator.
+
+Everything that a rollout needs travels in one checkpoint: the model's settings and weights, the statistics of the training data, the graph's settings and
+the data set's metadata.
+"""
+
+from __future__ import annotations
+
+import copy
+import importlib
+import inspect
+import io
+import json
+import logging
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor, nn
+from torch_geometric.data import HeteroData
+
+from gpe_pl.errors import GpeError
+from gpe_pl.files.atomic import replace_bytes
+from gpe_pl.graphs.batching import batched
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig, history_of
+from gpe_pl.graphs.standardizer import GraphStandardizer, StatisticsSample, named
+from gpe_pl.learned.checkpoint_archive import check_archive, check_values
+from gpe_pl.learned.pretrained import checkpoint_path, names
+from gpe_pl.models.base import Prediction
+from gpe_pl.nn.static_friction import is_held, supported
+from gpe_pl.rollout.loop import SimulationError
+from gpe_pl.rollout.skips import Skips
+from gpe_pl.schema import BOUNDARY, MATERIALS, EdgeType, node_code
+from gpe_pl.system.signatures import check_plain, checked
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.cells import mean_over_corners
+from gpe_pl.trajectory.scene_ranges import described, outside, scene_range, united, unlimited
+from gpe_pl.trajectory.trajectory import Metadata, State, Stress, Trajectory
+
+log = logging.getLogger(__name__)
+
+CHECKPOINT_FORMAT = 3
+
+RANGE_TOLERANCE = 1e-5
+"""Material parameters are stored in single precision; differences below this share of the value are none."""
+MASS_FACTOR = 2.0
+"""By which masses of nodes may leave the range of training: those at corners of meshes differ between bodies of one kind."""
+
+
+class CheckpointError(GpeError, ValueError):
+    """A checkpoint is missing, damaged, or not one of gpe_pl; the message names the file and what to do."""
+
+
+class SceneError(GpeError, ValueError):
+    """A scene does not fit a trained simulator, or holds values that are not finite."""
+
+
+class LearnedSimulator(nn.Module):
+    """Advances a state by one frame with a learned acceleration.
+
+    Args:
+        model: any ``models.base.Model``; its ``settings`` rebuild it from a checkpoint.
+        builder: makes the graphs.
+
+    Attributes:
+        skips: what steps leave out.
+        holds_parameters: material parameters outside the range of the training data are taken for the nearest trained value, which a network is more to be
+            trusted with than with its own continuation.
+        static_friction: share of what gravity gives within a frame below which what lies on a wall stays where it is (see ``nn.static_friction``); 0: none.
+
+    All may be changed at any time; a checkpoint that ``save`` writes keeps ``static_friction`` alone.
+    """
+
+    acceleration_std: Tensor
+    stress_std: Tensor
+    trained_scene: Tensor
+    trained_mass: Tensor
+    holds_parameters: bool = True
+
+    def __init__(self, model: nn.Module, builder: GraphBuilder) -> None:
+        super().__init__()
+        self.model, self.builder = model, builder
+        self._static_friction = 0.0
+        self._warned: set[str] = set()
+        self._unknown: list[str | EdgeType] | None = None  # not looked for yet
+        self.standardizer = GraphStandardizer(builder.spec)
+        self.register_buffer("acceleration_std", torch.ones((), dtype=torch.float64))
+        self.register_buffer("stress_std", torch.ones((), dtype=torch.float64))
+        self.register_buffer("trained_scene", torch.from_numpy(unlimited(builder.spec.dim)))
+        self.register_buffer("trained_mass", self._any_mass())
+        for material, count in builder.spec.param_channels.items():
+            self.register_buffer(
+                f"trained_{material}", torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).expand(2, count).clone()
+            )
+
+    def _any_mass(self) -> Float64[Tensor, "2 material"]:
+        return torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).repeat(1, len(self.builder.spec.materials))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        state_dict.setdefault(f"{prefix}trained_mass", self._any_mass())  # which the models that come with the package do not know
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+    @property
+    def skips(self) -> Skips:
+        return self.builder.skips
+
+    @skips.setter
+    def skips(self, skips: Skips) -> None:
+        self.builder = replace(self.builder, skips=skips)
+        cast(Any, self.model).skips = skips
+
+    @property
+    def static_friction(self) -> float:
+        return self._static_friction
+
+    @static_friction.setter
+    def static_friction(self, share: Any) -> None:
+        if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
+            raise ValueError(f"static_friction={share!r}: must be a number from 0 to less than 1, a share of gravity")
+        if share and not self.builder.spec.islands:
+            raise SceneError(f"static_friction={share:g}: needs a model that was trained with graph.islands=true; 0 turns it off")
+        self._static_friction = float(share)
+
+    @property
+    def num_hops(self) -> int:
+        """How many edges away a node can still count."""
+        return int(cast(Any, self.model).num_hops)
+
+    @torch.no_grad()
+    def fit_statistics(
+        self, graphs: Iterable[HeteroData], parameter_ranges: Mapping[str, Tensor] | None = None, trained_scene: np.ndarray | None = None
+    ) -> None:
+        """Set feature statistics, the range of material parameters, and the scales of acceleration and stress from training graphs with ``target``.
+
+        Each scale is one scalar for all axes or components and all materials, with mean zero. Materials and relations without statistics are named in a
+        warning.
+
+        Args:
+            graphs: a sample of the training data; as a ``StatisticsSample``, it knows more graphs of what is rare.
+            parameter_ranges: lowest and highest value [2, param] of each material's parameters in all of them; by default in the sample.
+            trained_scene: what all of their scenes have, as in ``scene_ranges``; by default nothing is known of it.
+        """
+        sample = graphs if isinstance(graphs, StatisticsSample) else StatisticsSample(list(graphs))
+        self._unknown = None
+        if missing := self.standardizer.fit(sample):
+            log.warning(
+                "not in the training windows that statistics are taken from: %s; its features are not standardised", ", ".join(missing)
+            )
+        target = torch.cat([g[m].target for g in sample for m in self.builder.spec.materials]).double()
+        rms = target.square().mean().sqrt()
+        if not torch.isfinite(rms) or rms == 0:
+            raise ValueError(f"the training data's accelerations without gravity have rms {float(rms)}; nothing to learn from")
+        self.acceleration_std.copy_(rms)
+        stress = [g[m].stress_target for m in self.builder.spec.stress_channels for g in sample.of(m) if "stress_target" in g[m]]
+        if stress:
+            rms = torch.cat(stress).double().square().mean().sqrt()
+            self.stress_std.copy_(torch.where(rms > 0, rms, 1.0))
+        for k, material in enumerate(self.builder.spec.materials):
+            mass = torch.cat([g[material].mass for g in sample.of(material)])
+            if len(mass):
+                self.trained_mass[:, k] = torch.stack([mass.min(), mass.max()])
+        if trained_scene is not None:
+            self.trained_scene.copy_(torch.from_numpy(trained_scene))
+        if parameter_ranges is None:
+            params = {m: torch.cat([g[m].material_params for g in sample.of(m)]) for m, _ in self.trained_ranges()}
+            parameter_ranges = {m: torch.stack([p.amin(dim=0), p.amax(dim=0)]) for m, p in params.items() if len(p)}
+        for material, trained in self.trained_ranges():
+            if material in parameter_ranges:
+                trained.copy_(parameter_ranges[material])
+
+    @torch.no_grad()
+    def start_from(self, trained: LearnedSimulator) -> None:
+        """Take over what another simulator has learned, with the statistics that its weights are made for, as far as it has them; trained ranges then
+        cover both.
+
+        Raises:
+            SceneError: the other one was trained on another frame interval, spacing, dimension or materials.
+            CheckpointError: it is another model, or makes other graphs; names the settings to choose.
+        """
+        trained.check_scene(self.builder.metadata)
+        there, now = trained._choices(), self._choices()
+        different = [f"{key}={value}" for key, value in there.items() if now.get(key) != value]
+        if different:
+            raise CheckpointError(f"the model to start from is another one or has other graphs; choose {' '.join(different)}")
+        ranges = {material: values.clone() for material, values in self.trained_ranges()}
+        statistics = copy.deepcopy(self.standardizer)
+        scene, mass = self.trained_scene.cpu().numpy().copy(), self.trained_mass.clone()
+        try:
+            self.load_state_dict(trained.state_dict())
+        except RuntimeError as error:  # one set of weights per level of a mesh, and meshes of other sizes
+            raise CheckpointError(f"the model to start from has meshes of other sizes ({reason(error)})") from None
+        statistics.take_over(self.standardizer)
+        self.standardizer, self._unknown = statistics, None
+        for material, values in self.trained_ranges():
+            known = [r for r in (values.clone(), ranges[material]) if bool(r.isfinite().all())]  # of materials that a training had
+            if known:
+                values[0].copy_(torch.stack(known).amin(dim=0)[0])
+                values[1].copy_(torch.stack(known).amax(dim=0)[1])
+        self.trained_scene.copy_(torch.from_numpy(united([scene, self.trained_scene.cpu().numpy()])))
+        self.trained_mass[0] = torch.minimum(mass[0], self.trained_mass[0])
+        self.trained_mass[1] = torch.maximum(mass[1], self.trained_mass[1])
+
+    def _choices(self) -> dict[str, str]:
+        """Overrides that make such a model and such graphs; the radius in spacings, whether the graph's or the data set's."""
+        own = self.description()
+        spacings = {"connectivity_spacings": float(f"{self.builder.scales.radius / self.builder.scales.spacing:.6g}")}
+        parts = {"model": {"_target_": own["model"], **own["settings"]}, "graph": own["graph"] | spacings}
+        return {
+            f"{part}.{key}": value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+            for part, values in parts.items()
+            for key, value in values.items()
+        }
+
+    def trained_ranges(self) -> Iterator[tuple[str, Tensor]]:
+        """Lowest and highest value [2, param] of each material's parameters in training."""
+        for material in self.builder.spec.param_channels:
+            yield material, self.get_buffer(f"trained_{material}")
+
+    def described_training(self) -> Iterator[tuple[str, str]]:
+        """What training had of material parameters, masses, gravity and boundary nodes: a name and its values with their unit, for each kind of value."""
+        for material, trained in self.trained_ranges():
+            spec = MATERIALS[material]
+            for low, high in trained.T.tolist():
+                yield f"{spec.name} of {material}", f"{low:g} to {high:g} {spec.unit}"
+        for material, (low, high) in zip(self.builder.spec.materials, self.trained_mass.T.tolist(), strict=True):
+            if math.isfinite(high):
+                yield f"mass of nodes of {material}", f"{low:g} to {high:g} kg"
+        yield from described(self.trained_scene.cpu().numpy())
+
+    def untrained_parameters(self, state: State) -> list[str]:
+        """What in a scene lies outside the range of the training data: one line per material parameter, empty if nothing does."""
+        return [line for _, line in self._outside_parameters(state)]
+
+    def _outside_parameters(self, state: State) -> Iterator[tuple[str, str]]:
+        for material, trained in self.trained_ranges():
+            column = self.builder.metadata.param_names.index(MATERIALS[material].name)
+            values = state.material_params[state.node_type == node_code(material), column]
+            margin = RANGE_TOLERANCE * trained.abs()
+            is_outside = (values < trained[0] - margin[0]) | (values > trained[1] + margin[1])
+            if bool(is_outside.any()):
+                spec, (low, high) = MATERIALS[material], trained[:, 0].tolist()
+                kind = f"{spec.name} of {material}"
+                yield kind, f"{kind} is {values[is_outside][0].item():g} {spec.unit}, trained were {low:g} to {high:g}"
+
+    def untrained_scene(self, state: State) -> list[str]:
+        """What masses, gravity and boundary nodes of a scene are that training had not: one line per kind of value, empty if there is nothing."""
+        return [line for _, line in self._outside_scene(state)]
+
+    def _outside_scene(self, state: State) -> Iterator[tuple[str, str]]:
+        own = self.builder.metadata
+        here = scene_range(state.gravity.cpu().numpy(), state.boundary.to_numpy(), state.periodicity)
+        yield from outside(self.trained_scene.cpu().numpy(), here, own.spacing / own.frame_dt)
+        for material, (low, high) in zip(self.builder.spec.materials, self.trained_mass.T.tolist(), strict=True):
+            mass = state.mass[state.node_type == node_code(material)]
+            is_outside = (mass < low / MASS_FACTOR) | (mass > high * MASS_FACTOR)
+            if bool(is_outside.any()):
+                kind = f"mass of nodes of {material}"
+                yield kind, f"{kind} is {mass[is_outside][0].item():g} kg, in training it was {low:g} to {high:g} kg"
+
+    def forward(self, data: HeteroData) -> Prediction:
+        """Accelerations without gravity per material, in units of ``acceleration_std``."""
+        limits = dict(self.trained_ranges()) if self.holds_parameters else None
+        return self.model(self.standardizer(data, self.skips.absent_types, limits))
+
+    def initial_state(self, trajectory: Trajectory, frame: int) -> State:
+        """The state at a frame with the velocity history that the graph needs, on this model's device. What training did not have of material
+        parameters, gravity and boundary nodes, and another version of the solver, is named in a warning, once per kind.
+
+        Raises:
+            IndexError: too few frames before ``frame``.
+            SceneError: another frame interval, dimension or material than in training, or a value that is not finite; names the node.
+        """
+        self.check_scene(trajectory.metadata)
+        own, scene = self.builder.metadata, trajectory.metadata
+        if scene.solver == own.solver and scene.solver_version != own.solver_version:
+            version = f"version {scene.solver_version} of the solver {scene.solver}, in training version {own.solver_version}"
+            self._warn_once("solver", f"the ground truth is of {version}, whose trajectories differ")
+        state = trajectory.state(frame, history=self.builder.config.history).to_torch(self.acceleration_std.device)
+        return self._checked(state, f"frame {frame}")
+
+    def standing(self, state: State, scene: Metadata) -> State:
+        """A scene's state as if it had never moved otherwise, on this model's device: what a rollout without frames before it starts from.
+
+        Raises:
+            SceneError: as ``initial_state``.
+        """
+        self.check_scene(scene)
+        state = state.to_torch(self.acceleration_std.device)
+        history = state.vel[:, None].expand(-1, self.builder.config.history, -1)
+        return self._checked(replace(state, velocity_history=history.clone()), "start")
+
+    def fits(self, scene: Metadata) -> bool:
+        """Whether a scene has the frame interval, spacing, dimension and materials that the model was trained on."""
+        own = self.builder.metadata
+        same_scales = abs(scene.frame_dt / own.frame_dt - 1) < 1e-6 and abs(scene.spacing / own.spacing - 1) < 0.01
+        return same_scales and scene.dim == own.dim and scene.param_names == own.param_names
+
+    def check_scene(self, scene: Metadata, choice: str = "data=… size=…") -> None:
+        """Refuse a scene that does not fit; the message recommends a ``choice`` of the data set.
+
+        Raises:
+            SceneError: another frame interval, spacing, dimension or materials than in training.
+        """
+        own = self.builder.metadata
+        if not self.fits(scene):
+            raise SceneError(
+                f"the model was trained with frame_dt={own.frame_dt:g} s and spacing={own.spacing:g} m in {own.dim}D on {', '.join(own.materials)}; "
+                f"the scene has frame_dt={scene.frame_dt:g} s and spacing={scene.spacing:g} m in {scene.dim}D and "
+                f"{', '.join(scene.materials)}; choose the data set with {choice}"
+            )
+
+    def _checked(self, state: State, where: str) -> State:
+        for name, values in (("pos", state.pos), ("velocity", history_of(state))):
+            bad = ~torch.isfinite(values).flatten(1).all(dim=1)
+            if bad.any():
+                raise SceneError(f"{where}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
+        bad = ~(torch.isfinite(state.mass) & (state.mass > 0))
+        if bad.any():
+            node = int(bad.nonzero()[0])
+            raise SceneError(f"node {node} has a mass of {float(state.mass[node]):g} kg")
+        for material, spec in MATERIALS.items():
+            if material in self.builder.metadata.materials:
+                rows = torch.nonzero(state.node_type == node_code(material)).flatten()
+                column = state.material_params[rows, self.builder.metadata.param_names.index(spec.name)]
+                wrong = ~spec.accepts(column)
+                if wrong.any():
+                    node, value = int(rows[wrong][0]), float(column[wrong][0])
+                    raise SceneError(f"node {node} ({material}): {spec.name} is {value:g} {spec.unit}, must be {spec.rule}")
+        held = "; taken for the nearest trained value" if self.holds_parameters else ""
+        found = [(kind, line + held) for kind, line in self._outside_parameters(state)]
+        for kind, line in (*found, *self._outside_scene(state)):
+            self._warn_once(kind, line)
+        return state
+
+    def _warn_once(self, kind: str, line: str) -> None:
+        if kind not in self._warned:
+            log.warning("outside the training data: %s", line)
+            self._warned.add(kind)
+
+    @torch.inference_mode()
+    def step(self, state: State) -> State:
+        return self._advance_all([state], [self.builder(state)])[0]
+
+    @torch.inference_mode()
+    def step_all(self, states: list[State]) -> list[State | SimulationError]:
+        """``step`` of several scenes in one pass of the model; a scene that has no graph any more is answered with the reason."""
+        return self.next_states(states)
+
+    def next_states(self, states: list[State]) -> list[State | SimulationError]:
+        """``step_all`` with tensors that may take part in training."""
+        graphs = [self._graph(state) for state in states]
+        sound = [k for k, graph in enumerate(graphs) if not isinstance(graph, SimulationError)]
+        new: list[Any] = list(graphs)
+        if sound:
+            for k, state in zip(sound, self._advance_all([states[k] for k in sound], [new[k] for k in sound]), strict=True):
+                new[k] = state
+        return new
+
+    def _graph(self, state: State) -> HeteroData | SimulationError:
+        try:
+            return self.builder(state)
+        except SimulationError as error:
+            return error
+
+    def _warn_of_unknown(self, graphs: list[HeteroData]) -> None:
+        """Name what a scene has and the statistics of the training lack, once each."""
+        if self._unknown is None:
+            self._unknown = self.standardizer.unknown()
+        for kind in [*self._unknown]:
+            if any(len(graph[kind].x if isinstance(kind, str) else graph[kind].odd) for graph in graphs):
+                log.warning("outside the training data: %s has no statistics; its features are not standardised", named(kind))
+                self._unknown.remove(kind)
+
+    def _advance_all(self, states: list[State], graphs: list[HeteroData]) -> list[State]:
+        self._warn_of_unknown(graphs)
+        data = graphs[0] if len(graphs) == 1 else batched(graphs)
+        predicted = self(data)
+        new = self.moved(states, graphs, predicted.acceleration)
+        return self._with_stress(new, predicted.stress, graphs) if predicted.stress else new
+
+    def moved(self, states: list[State], graphs: list[HeteroData], acceleration: dict[str, Tensor]) -> list[State]:
+        """The next states under what the model predicts for a batch of their graphs: accelerations without gravity per material, in units of
+        ``acceleration_std``.
+        """
+        acc = [state.gravity.expand_as(state.pos).clone() for state in states]
+        for scene, rows, part in _per_scene(acceleration, graphs):
+            acc[scene][rows] += part.double() * self.acceleration_std
+        new = [self.advance(state, a) for state, a in zip(states, acc, strict=True)]
+        return [self._held(*parts) for parts in zip(states, new, graphs, strict=True)] if self.static_friction else new
+
+    def _held(self, state: State, new: State, graph: HeteroData) -> State:
+        """The new state, with those nodes where they were that static friction holds."""
+        island = torch.empty(state.num_nodes, dtype=torch.int64, device=state.pos.device)
+        for material in self.builder.spec.materials:
+            island[graph[material].node_id] = graph[material].island
+        held = is_held(state.vel, new.vel, island, self.supported(graph), self.slowest(state.gravity))[:, None]
+        vel = torch.where(held, 0.0, new.vel)
+        history = torch.cat([history_of(new)[:, :-1], vel[:, None]], dim=1)
+        return replace(new, pos=torch.where(held, state.pos, new.pos), vel=vel, velocity_history=history)
+
+    def slowest(self, gravity: Tensor) -> Tensor:
+        """Speed [m/s] below which static friction holds."""
+        return self.static_friction * self.builder.metadata.frame_dt * gravity.norm()
+
+    def supported(self, graph: HeteroData) -> Tensor:
+        """Islands of a graph [island] that static friction may hold."""
+        spec = self.builder.spec
+        moves = (graph[BOUNDARY].x[:, : spec.dim] != 0).any(dim=1)
+        walls = [relation for relation in spec.relations if relation[0] == BOUNDARY]
+        edges = [(graph[relation].edge_index, graph[relation[2]].island) for relation in walls]
+        return supported(graph.island_is_free, [(island[i], moves[j]) for (j, i), island in edges])
+
+    def _with_stress(self, states: list[State], predicted: dict[str, Tensor], graphs: list[HeteroData]) -> list[State]:
+        components = next(iter(self.builder.spec.stress_channels.values()))
+        node = [state.pos.new_zeros(state.num_nodes, components) for state in states]
+        for scene, rows, part in _per_scene(predicted, graphs):
+            node[scene][rows] = part.double() * self.stress_std
+        return [
+            state if state.cells is None else replace(state, stress=Stress(n, mean_over_corners(n, state.cells)))
+            for state, n in zip(states, node, strict=True)
+        ]
+
+    def advance(self, state: State, acc: Tensor) -> State:
+        """The next state under a given acceleration [m/s²], gravity included."""
+        dt = self.builder.metadata.frame_dt
+        pos, vel = integrators.advance(state.pos, state.vel, acc, dt)
+        history = torch.cat([history_of(state)[:, 1:], vel[:, None]], dim=1)
+        return replace(
+            state,
+            pos=state.periodicity.wrapped(pos),
+            vel=vel,
+            velocity_history=history,
+            time=state.time + dt,
+            stress=None,
+            boundary=state.boundary.at(1),
+        )
+
+    @classmethod
+    def _check_size(cls, description: dict[str, Any], weights: dict[str, Tensor]) -> None:
+        """Raise ``ValueError`` where weights are not those of a description, before a model of any size is made of it."""
+        try:
+            with torch.device("meta"):
+                expected = cls.from_description(description).state_dict()
+        except RuntimeError:  # of a model that looks at its own values while it is made; any other comes again
+            return
+        for name, value in weights.items():
+            if name in expected and value.shape != expected[name].shape:
+                raise ValueError(f"size mismatch for {name}: {tuple(value.shape)} instead of {tuple(expected[name].shape)}")
+            if name in expected and value.is_floating_point() != expected[name].is_floating_point():
+                raise ValueError(f"{name} is of type {value.dtype}")
+            if value.untyped_storage().nbytes() < value.numel() * value.element_size():
+                raise ValueError(f"{name} has fewer values than its shape says")
+        missing = expected.keys() - weights.keys() - {"trained_mass"}
+        if missing:
+            raise ValueError(f"Missing key {min(missing)}")
+
+    def _check_values(self) -> None:
+        for name, values in self.state_dict().items():
+            is_range = name.startswith("trained_")  # unlimited before training
+            if bool(values.isnan().any()) or not (is_range or bool(values.isfinite().all())):
+                raise ValueError(f"{name} has values that are not finite")
+            is_scale = name in ("acceleration_std", "stress_std") or (name.startswith("standardizer.") and name.endswith(("std", "mass")))
+            if is_scale and not bool((values > 0).all()):
+                raise ValueError(f"{name} has values that are not positive")
+        for material, trained in self.trained_ranges():
+            if not bool((trained[0] <= trained[1]).all()):
+                raise ValueError(f"trained_{material} ends before it begins")
+        low, high = self.trained_scene
+        if not bool(((low <= high) | (low.isposinf() & high.isneginf())).all()):
+            raise ValueError("trained_scene ends before it begins")
+        if not bool((self.trained_mass[0] <= self.trained_mass[1]).all()):
+            raise ValueError("trained_mass ends before it begins")
+
+    # --- checkpoints ----------------------------------------------------------------------------------------------------------------------
+
+    def description(self) -> dict[str, Any]:
+        """Plain values from which ``from_description`` rebuilds this simulator, weights excluded."""
+        cls = type(self.model)
+        return {
+            "format": CHECKPOINT_FORMAT,
+            "model": f"{cls.__module__}.{cls.__qualname__}",
+            "settings": dict(cast(Any, self.model).settings),
+            "graph": asdict(self.builder.config),
+            "metadata": asdict(self.builder.metadata),
+            "static_friction": self.static_friction,
+        }
+
+    @classmethod
+    def from_description(cls, values: dict[str, Any]) -> LearnedSimulator:
+        """Rebuild from ``description``; raises ``ValueError`` for anything else."""
+        check_plain(values)
+        if values.get("format") != CHECKPOINT_FORMAT:
+            raise ValueError(f"checkpoint format {values.get('format')!r}, this version reads {CHECKPOINT_FORMAT}")
+        graph, metadata = GraphConfig(**checked(GraphConfig, values["graph"])), Metadata(**checked(Metadata, values["metadata"]))
+        for key, fault in metadata.violations():
+            raise ValueError(f"{key} {fault}")
+        builder, model = GraphBuilder(graph, metadata), model_class(values["model"])
+        simulator = cls(model(builder.spec, **checked(model, values["settings"], "spec")), builder)
+        simulator.static_friction = values.get("static_friction", 0.0)
+        return simulator
+
+    def save(self, path: Path | str) -> None:
+        """Write weights and description alone, which ``from_checkpoint`` reads, atomically; a training checkpoint also holds the optimiser's state."""
+        weights = {f"simulator.{name}": value.detach().cpu().clone() for name, value in self.state_dict().items()}
+        content = io.BytesIO()  # PyTorch's own writer aborts the process on a full disk
+        torch.save({"simulator": self.description(), "state_dict": weights}, content)
+        replace_bytes(Path(path), content.getbuffer())
+
+    @classmethod
+    def from_checkpoint(cls, path: Path | str, device: Any = "cpu") -> LearnedSimulator:
+        """Load a training checkpoint (averaged weights if the run averaged them), in evaluation mode. Only tensors and plain values are unpickled.
+
+        Args:
+            path: of the file; or a run's folder, of which the best checkpoint is taken; or the name of a model that comes with the package.
+            device: where to.
+
+        Raises:
+            CheckpointError: not a readable checkpoint of gpe_pl, damaged, or one of another model.
+        """
+        path = checkpoint_path(path)
+        checkpoint = load_checkpoint(path, device)
+        try:
+            if not isinstance(checkpoint, dict):
+                raise TypeError(f"holds a {type(checkpoint).__name__}")
+            weights = {k.removeprefix("simulator."): v for k, v in checkpoint["state_dict"].items() if k.startswith("simulator.")}
+            cls._check_size(checkpoint["simulator"], weights)
+            simulator = cls.from_description(checkpoint["simulator"])
+            simulator.load_state_dict(weights)
+            simulator._check_values()
+        except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model ({reason(error)})") from None
+        return simulator.to(device).eval()
+
+
+def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:
+    """What is in a checkpoint; only tensors and plain values are unpickled, and the checksums of the archive are compared first, which PyTorch does not.
+
+    Raises:
+        CheckpointError: no such file, damaged, or with anything else in it.
+    """
+    if not Path(path).is_file():
+        shipped = f", or a model that comes with the package: {', '.join(names())}" if names() else ""
+        raise CheckpointError(f"{path}: no such checkpoint; give the folder of a run, the path of a checkpoint{shipped}")
+    try:
+        check_archive(Path(path))
+        values = torch.load(path, map_location=device, weights_only=True)
+        check_values(values)
+        return values
+    except Exception as error:  # zipfile and torch raise many types for damaged or unsafe files
+        raise CheckpointError(
+            f"{path}: not a safe, complete checkpoint ({reason(error)}); if it was copied, copy it again, or take another of the run, such as last.ckpt"
+        ) from None
+
+
+def _per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """What was predicted for a batch, as (number of the scene, rows of its state, values)."""
+    for material, values in predicted.items():
+        rows = [graph[material].node_id for graph in graphs]
+        for scene, part in enumerate(values.split([len(r) for r in rows])):
+            yield scene, rows[scene], part
+
+
+def reason(error: Exception) -> str:
+    """What went wrong, in one line of bounded length."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+
+
+class UnknownModelError(GpeError, ValueError):
+    """A dotted name that is not a model of this package."""
+
+
+def model_class(target: str) -> type[nn.Module]:
+    """The model class of a dotted name; only classes under ``gpe_pl.models`` are accepted, because names come from files.
+
+    Raises:
+        UnknownModelError: any other name.
+    """
+    module, _, name = target.rpartition(".")
+    if not module.startswith("gpe_pl.models."):
+        raise UnknownModelError(f"model {target!r} is not one of gpe_pl.models")
+    try:
+        cls = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError):
+        raise UnknownModelError(f"model {target!r} does not exist in this version of gpe_pl") from None
+    if not (inspect.isclass(cls) and issubclass(cls, nn.Module)):
+        raise UnknownModelError(f"{target!r} is not a model")
+    return cls

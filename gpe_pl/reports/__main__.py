@@ -1,0 +1,8 @@
+"""``python -m gpe_pl.reports FOLDER``."""
+
+import sys
+
+from gpe_pl.reports.tables import main
+
+if __name__ == "__main__":
+    sys.exit(main())

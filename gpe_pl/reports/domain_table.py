@@ -1,0 +1,328 @@
+"""Table 1 of the paper from a sweep over domains, models and seeds: one table of numbers for machines, one for people, and two figures.
+
+The number judged is the rollout MSE over all frames, mean over the trajectories of a domain's unseen material parameters, median over seeds. A failed rollout
+counts as ballistic flight in the same scene (``finished_runs.rollout_errors``). One rule holds for all domains; a column of its own has the ratio by the other
+one, in which a failed rollout is infinitely wrong.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from gpe_pl.errors import GpeError
+from gpe_pl.evaluation.rollouts import LEARNED
+from gpe_pl.files.atomic import replace_text, replacing
+from gpe_pl.files.markdown import table_row
+from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio, median_of_means
+from gpe_pl.reports.finished_runs import (
+    STAND_IN,
+    Run,
+    axes_of,
+    distinct_runs,
+    replaced_data,
+    rollout_errors,
+    shared_table,
+    shared_trajectories,
+    values_by_seed,
+    with_groups,
+)
+from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
+from gpe_pl.rollout.baselines import BASELINES
+from gpe_pl.viz.saving import save_figure
+
+log = logging.getLogger(__name__)
+
+TABLE_CSV, TABLE_MD, RATIOS_MD, FIGURE = "table1.csv", "table1.md", "table1_ratios.md", "table1.png"
+TABLES = (TABLE_CSV, TABLE_MD, RATIOS_MD, FIGURE, PARAMETER_FIGURE)
+OWN = "GPE"
+NOT_LEARNED = 2.0
+"""A model that is not this many times better than the best trivial baseline has learned nothing worth comparing."""
+
+PAPER = {
+    "sand": {"DPINet": 5.15, "GNS": 3.80, "ContinuousConvNet": 3.51, "GPE": 2.37},
+    "snow": {"DPINet": 4.91, "GNS": 5.49, "ContinuousConvNet": 5.24, "GPE": 3.94},
+    "elastomer": {"DPINet": 2.07, "GNS": 3.58, "ContinuousConvNet": 2.82, "GPE": 1.35},
+    "fem": {"DPINet": 1.76, "GNS": 5.03, "ContinuousConvNet": 4.96, "GPE": 1.27},
+    "fluid": {"DPINet": 3.31, "GNS": 3.78, "ContinuousConvNet": 2.75, "GPE": 3.22},
+}
+"""Yang et al. 2022, table 1: average MSE ×1e-3 in the paper's own units, which are not ours; only ratios compare."""
+
+JUDGED = "test_unseen"
+"""Judged are all scenes with material parameters that training did not have, between the trained values and outside, in every domain. The paper says what it
+tests on for solids alone, and does so (trained on 1–4 MPa, tested on 0.5–10 MPa)."""
+
+PAPER_COLUMN = "paper"
+
+TRIVIAL_SHOWN = ("ballistic", "stops_at_walls")
+"""Trivial baselines with a column and a line in the figure; runs of earlier versions lack the second."""
+
+SAME_IN_A_ROW = ("data.", "evaluation.data.", "evaluation.containment", "evaluation.hold_parameters", "evaluation.static_friction")
+"""Configuration keys, by how they begin, that all models of a domain need alike to be compared."""
+
+
+class TableError(GpeError, ValueError):
+    """Runs that do not belong into one table; names them, and what to do."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A model in a domain.
+
+    Attributes:
+        errors: of single rollouts [seed, trajectory] in m²; failed ones as the rule has it.
+        num_failed: rollouts that had to be stopped.
+        trivial: mean error of each trivial baseline that was evaluated [m²].
+    """
+
+    errors: np.ndarray
+    num_failed: int
+    trivial: dict[str, float]
+
+    @cached_property
+    def interval(self) -> Interval:
+        """Mean over trajectories, median over seeds [m²]."""
+        return bootstrap_interval(self.errors, statistic=median_of_means)
+
+    @property
+    def median(self) -> float:
+        """Of the single rollouts, of all seeds [m²]."""
+        return float(np.median(self.errors))
+
+    @property
+    def is_learned(self) -> bool:
+        return self.interval.estimate * NOT_LEARNED <= min(self.trivial.values())
+
+
+def compares_models(runs: list[Run]) -> bool:
+    """Whether runs are of several models or domains."""
+    return len({(domain_of(run), model_of(run)) for run in runs}) > 1
+
+
+def report_domains(folder: Path, runs: list[Run]) -> None:
+    """Write table and figures of finished runs into a folder.
+
+    Raises:
+        TableError: runs of one model and domain differ in more than their seeds, or those of a domain were judged on different scenes.
+    """
+    runs = distinct_runs(runs)
+    if not runs:
+        log.warning("%s: no finished run", folder)
+        return
+    by_cell: dict[tuple[str, str], list[Run]] = defaultdict(list)
+    for run in runs:
+        by_cell[domain_of(run), model_of(run)].append(run)
+    domains = sorted({d for d, _ in by_cell}, key=lambda d: ([*PAPER, d].index(d), d))
+    models = sorted({m for _, m in by_cell}, key=lambda m: (m == OWN, m))
+    _check(folder, domains, by_cell)
+    _write_csv(folder / TABLE_CSV, runs)
+    cells: dict[tuple[str, str], Cell] = {}
+    strict: dict[tuple[str, str], Cell] = {}
+    for domain in domains:
+        for model, pair in _row({m: by_cell[d, m] for d, m in by_cell if d == domain}, domain).items():
+            cells[domain, model], strict[domain, model] = pair
+    ratios = _ratios(domains, cells, strict, by_cell)
+    replace_text(folder / TABLE_MD, _markdown(domains, models, cells, ratios, by_cell))
+    replace_text(
+        folder / RATIOS_MD,
+        "\n".join([*_lines(["domain", *ratios[0]], [[d, *row.values()] for d, row in zip(domains, ratios, strict=True)]), ""]),
+    )
+    _figures(folder, domains, models, cells, by_cell)
+
+
+def domain_of(run: Run) -> str:
+    """Name of the data set that a run was trained on."""
+    return str(run.config["data.name"])
+
+
+def model_of(run: Run) -> str:
+    """Class name of a run's model."""
+    return str(run.config["model._target_"]).rpartition(".")[2]
+
+
+def _check(folder: Path, domains: list[str], by_cell: dict[tuple[str, str], list[Run]]) -> None:
+    """Refuse to average, or to compare, what was not done in the same way."""
+    for (domain, model), runs in by_cell.items():
+        keys = [key for key in axes_of(runs) if key != "seed"]
+        if keys:
+            raise TableError(
+                f"{folder}: runs of {model} on {domain} differ in {', '.join(keys[:3])}, not in the seed alone; "
+                "give what is no part of the table a name=… of its own"
+            )
+    for domain in domains:
+        runs = [run for (d, _), members in by_cell.items() if d == domain for run in members]
+        keys = [key for key in axes_of(runs) if key.startswith(SAME_IN_A_ROW)] + replaced_data(runs)
+        if keys:
+            raise TableError(
+                f"{folder}: models on {domain} were trained or judged on different data ({', '.join(keys[:3])}) and do not compare; "
+                "give these runs a name=… of their own"
+            )
+        frames = {frame for frame in map(_first_frame, runs) if frame is not None}
+        if len(frames) > 1:
+            raise TableError(
+                f"{folder}: rollouts of models on {domain} start at different frames ({', '.join(map(str, sorted(frames)))}: evaluation.start_frame, "
+                "or else graph.history) and do not compare; evaluate all with one evaluation.start_frame=…"
+            )
+
+
+def _first_frame(run: Run) -> int | None:
+    """Where rollouts of a run start, if its configuration says so."""
+    frame = run.config.get("evaluation.start_frame")
+    return run.config.get("graph.history") if frame is None else frame
+
+
+def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, Cell]]:
+    """The cells of a domain by model, on the trajectories that all its runs have evaluated: as it is judged, and with failed rollouts infinitely wrong."""
+    found = {}
+    for model, runs in by_model.items():
+        values = {name: values_by_seed(runs, name, JUDGED, "rollout_mse", "full") for name in (LEARNED, *BASELINES)}
+        if values[LEARNED] and values[STAND_IN]:
+            found[model] = {name: table for name, table in values.items() if table}
+    trajectories = shared_trajectories(*(table for values in found.values() for table in values.values()))
+    if not trajectories:
+        return {}
+    num_evaluated = max(len(seed) for values in found.values() for seed in values[LEARNED])
+    if len(trajectories) < num_evaluated:
+        log.warning("%s: judged on the %d of %d trajectories that all runs have evaluated", domain, len(trajectories), num_evaluated)
+    row = {}
+    for model, values in found.items():
+        errors = shared_table(values.pop(LEARNED), trajectories)
+        judged = shared_table(rollout_errors(by_model[model], JUDGED, "full"), trajectories)
+        trivial = {name: float(shared_table(table[:1], trajectories).mean()) for name, table in values.items()}
+        num_failed = int((~np.isfinite(errors)).sum())
+        row[model] = Cell(judged, num_failed, trivial), Cell(errors, num_failed, trivial)
+    return row
+
+
+def _write_csv(path: Path, runs: Sequence[Run]) -> None:
+    """A line per domain, model, seed, split and metric, a column per horizon: the mean over trajectories. Trivial models have no seed."""
+    keys = ["domain", "model", "seed", "split", "metric"]
+    tables = []
+    for run in runs:
+        rows = with_groups(run.rows)
+        is_own = rows["model"] == LEARNED
+        rows = rows.assign(domain=domain_of(run), seed=np.where(is_own, str(run.config.get("seed")), ""))
+        tables.append(rows.assign(model=rows["model"].where(~is_own, model_of(run))).groupby([*keys, "horizon"])["value"].mean())
+    means = pd.concat(tables)
+    means = means[~means.index.duplicated(keep="last")].unstack("horizon")
+    means = means[sorted(means.columns, key=lambda horizon: (horizon == "full", horizon.zfill(6)))]
+    with replacing(path) as part:
+        means.sort_index().to_csv(part, float_format="%.6g", lineterminator="\n", na_rep="")
+
+
+def _markdown(
+    domains: list[str],
+    models: list[str],
+    cells: dict[tuple[str, str], Cell],
+    ratios: list[dict[str, str]],
+    by_cell: dict[tuple[str, str], list[Run]],
+) -> str:
+    shown = [name for name in TRIVIAL_SHOWN if any(name in c.trivial for c in cells.values())]
+    rows = []
+    for domain, ratio in zip(domains, ratios, strict=True):
+        trivial: dict[str, float] = next((c.trivial for (d, _), c in cells.items() if d == domain), {})
+        texts = [_text(cells.get((domain, m))) for m in models]
+        numbers = [f"{1e3 * trivial[name]:.3g}" if name in trivial else "–" for name in shown]
+        rows.append([domain, *texts, *numbers, *ratio.values()])
+    lines = _lines(["domain", *models, *(name.replace("_", " ") for name in shown), *ratios[0]], rows)
+    budget = ["", "Training, one row per model: steps and seeds.", "", table_row(["domain", *models]), "|" + "---|" * (len(models) + 1)]
+    for domain in domains:
+        steps = [
+            ", ".join(sorted({f"{int(r.config['training.num_steps']):,}" for r in by_cell[domain, m]})) + f" × {len(by_cell[domain, m])}"
+            if (domain, m) in by_cell
+            else "–"
+            for m in models
+        ]
+        budget.append(table_row([domain, *steps]))
+    note = (
+        "Rollout MSE ×1e-3 [m²] over all frames on material parameters not seen in training, between the trained ones and outside (where all models get "
+        "the nearest trained value): mean over trajectories, median over seeds, 95 % bootstrap interval over both. A rollout that had to be stopped has "
+        "failed, and counts as ballistic flight in the same scene. A model that is not twice as good as the best trivial baseline is *not learned* and wins "
+        "nothing. Ratio: over the best baseline that has learned, with its interval, on the same trajectories; bold where that excludes 1. *failed = ∞*: "
+        "the same ratio if the error of a failed rollout were infinite, and the mean with it."
+    ) + (" Last column: the paper's ratio, from its table 1; its units are not ours." if PAPER_COLUMN in ratios[0] else "")
+    return "\n".join([*lines, "", note, *_medians(domains, models, cells), *budget, ""])
+
+
+def _ratios(
+    domains: list[str], cells: dict[tuple[str, str], Cell], strict: dict[tuple[str, str], Cell], by_cell: dict[tuple[str, str], list[Run]]
+) -> list[dict[str, str]]:
+    """For each domain the ratios by their columns: as it is judged, by the other rule, and the paper's where its scenes are meant."""
+    other_scenes = any(key.startswith("evaluation.data.scene") for runs in by_cell.values() for run in runs for key in run.config)
+    rows = []
+    for domain in domains:
+        own, other = ({m: cell for (d, m), cell in table.items() if d == domain} for table in (cells, strict))
+        paper = {} if other_scenes else {PAPER_COLUMN: _paper_ratio(domain)}
+        rows.append({f"{OWN} / best baseline": _ratio(own), f"{OWN} / best baseline, failed = ∞": _ratio(other)} | paper)
+    return rows
+
+
+def _lines(header: list[str], rows: list[list[str]]) -> list[str]:
+    return [table_row(header), "|" + "---|" * len(header), *map(table_row, rows)]
+
+
+def _medians(domains: list[str], models: list[str], cells: dict[tuple[str, str], Cell]) -> list[str]:
+    """A second table: of the typical scene rather than of their mean, which a few scenes carry that can go either way."""
+    header = ["domain", *models, f"{OWN} / best baseline"]
+    lines = [table_row(header), "|" + "---|" * len(header)]
+    for domain in domains:
+        own = {m: cells[domain, m].median for m in models if (domain, m) in cells}
+        others = [value for m, value in own.items() if m != OWN]
+        ratio = f"{own[OWN] / min(others):.2f}" if OWN in own and others else "–"
+        lines.append(table_row([domain, *(f"{1e3 * own[m]:.3g}" if m in own else "–" for m in models), ratio]))
+    return ["", "The median over trajectories and seeds instead; it judges nothing.", "", *lines]
+
+
+def _text(cell: Cell | None) -> str:
+    if cell is None:
+        return "–"
+    i = cell.interval
+    numbers = f"{1e3 * i.estimate:.3g} [{1e3 * i.low:.3g}, {1e3 * i.high:.3g}]"
+    if cell.num_failed:
+        numbers = f"{numbers}, {cell.num_failed} of {cell.errors.size} failed"
+    return numbers if cell.is_learned else f"*not learned* ({numbers})"
+
+
+def _ratio(cells: dict[str, Cell]) -> str:
+    """GPE's error over that of the best baseline that has learned something, with the interval; bold where that excludes 1."""
+    own, others = cells.get(OWN), [c for m, c in cells.items() if m != OWN]
+    baselines = [c for c in others if c.is_learned]
+    if own is None or not others:
+        return "–"
+    if not baselines:
+        return "no baseline learned" if own.is_learned else "no model learned"
+    best = min(baselines, key=lambda c: c.interval.estimate)
+    i = bootstrap_ratio(own.errors, best.errors, statistic=median_of_means)
+    estimate = f"**{i.estimate:.2f}**" if i.low > 1 or i.high < 1 else f"{i.estimate:.2f}"
+    return f"{estimate} [{i.low:.2f}, {i.high:.2f}]" + ("" if own.is_learned else ", not learned")
+
+
+def _paper_ratio(domain: str) -> str:
+    values = PAPER.get(domain, {})
+    others = [v for m, v in values.items() if m != OWN]
+    return f"{values[OWN] / min(others):.2f}" if others else "–"
+
+
+def _figures(
+    folder: Path, domains: list[str], models: list[str], cells: dict[tuple[str, str], Cell], by_cell: dict[tuple[str, str], list[Run]]
+) -> None:
+    from gpe_pl.viz.comparison import comparison_figure
+
+    shown = {d: {m: cells[d, m].interval for m in models if (d, m) in cells} for d in domains}
+    trivial = {d: next(c.trivial for (domain, _), c in cells.items() if domain == d) for d in domains if shown[d]}
+    references = {
+        name.replace("_", " "): {d: t[name] for d, t in trivial.items() if name in t}
+        for name in TRIVIAL_SHOWN
+        if any(name in t for t in trivial.values())
+    }
+    if any(shown.values()):
+        save_figure(comparison_figure({d: s for d, s in shown.items() if s}, references, "rollout MSE [m²]"), folder / FIGURE, dpi=150)
+    by_domain = {d: {m: by_cell[d, m] for m in models if (d, m) in by_cell} for d in domains}
+    save_figure(parameter_curves(by_domain), folder / PARAMETER_FIGURE, dpi=150)

@@ -1,0 +1,242 @@
+"""Training runs that have ended: their configuration, what they were evaluated to, and the values that several of them share."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from gpe_pl.evaluation.rollouts import LEARNED, MetricsError, Row, read_rows
+from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError, config_in
+from gpe_pl.reports import run_archive
+
+log = logging.getLogger(__name__)
+
+UNSEEN_GROUPS = ("interpolated", "extrapolated")
+"""Where material parameters that training did not have can lie."""
+
+
+Curve = tuple[np.ndarray, np.ndarray]
+"""Steps, and the one-step validation loss at each."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run.
+
+    Attributes:
+        folder: where it lies, or lay before it was archived.
+        config: flattened: values by keys such as ``training.num_steps``.
+        rows: what it was evaluated to: a table with the fields of ``evaluation.Row`` as columns.
+        data: checksums of its data, by key of the configuration.
+        curve: of an archived run; others have theirs in their folder (``validation_curve``).
+    """
+
+    folder: Path
+    config: dict[str, Any]
+    rows: pd.DataFrame
+    data: dict[str, str] = field(default_factory=dict)
+    curve: Curve | None = None
+
+
+UNSAID: dict[str, Any] = {"training.sampling": "uniform", "training.push_share": 0.0, "training.push_correction": 1.0}
+"""What the ``config.json`` of a run leaves out where it is not used, as runs did before there was a choice."""
+
+WITHOUT_CONSEQUENCE = {"evaluation.num_pictures", "evaluation.export"}
+"""What runs may differ in without having been done otherwise."""
+
+TRAINED = {"data.name": str, "model._target_": str, "training.num_steps": int}
+"""What the configuration of every training run says, by type."""
+
+
+def table_of(rows: Iterable[Row]) -> pd.DataFrame:
+    """Rows of ``metrics.csv`` as a table."""
+    return pd.DataFrame([[*vars(row).values()] for row in rows], columns=run_archive.COLUMNS)
+
+
+def archive(runs: list[Run], root: Path, folder: Path) -> None:
+    """Keep runs below ``root`` in the two files of ``run_archive`` in a folder."""
+    about = {}
+    for run in runs:
+        settings = {f"{CONFIG}{key}": value for key, value in run.config.items()} | {
+            f"{DATA}{key}": value for key, value in run.data.items()
+        }
+        about[_name(run, root)] = settings | dict(zip(CURVE, (array.tolist() for array in validation_curve(run)), strict=True))
+    run_archive.write_archive(folder, about, {_name(run, root): run.rows for run in runs})
+
+
+CONFIG, DATA = "config:", "data:"
+"""Begin the keys under which an archive has the configuration of a run and the checksums of its data."""
+CURVE = ("validation_steps", "validation_losses")
+
+
+def _name(run: Run, root: Path) -> str:
+    return run.folder.relative_to(root).as_posix()
+
+
+def _archived(folder: Path) -> list[Run]:
+    about, rows = run_archive.read_archive(folder)
+    runs = []
+    for name, known in about.items():
+        config, data = ({key.removeprefix(kind): value for key, value in known.items() if key.startswith(kind)} for kind in (CONFIG, DATA))
+        curve = np.array(known[CURVE[0]], int), np.array(known[CURVE[1]], float)
+        runs.append(Run(folder / name, config, rows[name], data, curve))
+    return runs
+
+
+def finished_runs(folder: Path) -> list[Run]:
+    """All finished training runs below a folder, in order of their paths, or those that are archived in it; evaluations beside them are none."""
+    if (folder / run_archive.RUNS).exists():
+        return _archived(folder)
+    runs = []
+    for path in sorted(folder.rglob("metrics.csv")):
+        config = path.parent / "config.json"
+        if config.exists():
+            said = {key: value for key, value in _flatten(config_in(config)) if key not in WITHOUT_CONSEQUENCE}
+            data = {key: str(said.pop(key)) for key in list(said) if DATA_CHECKSUMS in key.split(".")}
+            values = UNSAID | said
+            if values.keys() >= TRAINED.keys():
+                for key, kind in TRAINED.items():
+                    if type(values[key]) is not kind:
+                        raise RunError(
+                            f"{config}: {key} is {values[key]!r}; delete the folder {path.parent}, which this package has not written"
+                        )
+                runs.append(Run(path.parent, values, table_of(read_rows(path)), data))
+            else:
+                log.warning(
+                    "%s is not of a training run (%s) and is left out of the report",
+                    path.parent,
+                    ", ".join(sorted(TRAINED.keys() - values.keys())),
+                )
+    _warn_of_replaced_data(runs)
+    return runs
+
+
+def _warn_of_replaced_data(runs: list[Run]) -> None:
+    """Say where two runs used data of one description that hold different things, as when data are imported again under the same name."""
+    first: dict[str, Run] = {}
+    for run in runs:
+        description = {
+            key: value for key, value in run.config.items() if key.partition(".")[0] == "data" or key.startswith("evaluation.data.")
+        }
+        before = first.setdefault(json.dumps(description, sort_keys=True), run)
+        if any(before.data.get(key, value) != value for key, value in run.data.items()):
+            log.warning("%s and %s used different data of the same name; their errors do not compare", before.folder, run.folder)
+
+
+def replaced_data(runs: list[Run]) -> list[str]:
+    """Keys of the data of which runs have different checksums. Runs of earlier versions have none, and differ in nothing."""
+    keys = sorted({key for run in runs for key in run.data})
+    return [key for key in keys if len({run.data[key] for run in runs if key in run.data}) > 1]
+
+
+def distinct_runs(runs: list[Run]) -> list[Run]:
+    """Runs of the same configuration count once."""
+    first: dict[str, Run] = {}
+    for run in runs:
+        kept = first.setdefault(json.dumps(run.config, sort_keys=True), run)
+        if kept is not run:
+            log.warning("%s repeats %s and is left out of the report", run.folder, kept.folder)
+    return list(first.values())
+
+
+def _flatten(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from _flatten(item, f"{path}.{key}" if path else str(key))
+    else:
+        yield path, value if not isinstance(value, list) else json.dumps(value)
+
+
+def axes_of(runs: list[Run]) -> list[str]:
+    """Configuration keys whose values differ between runs, ``seed`` last."""
+    keys = sorted({k for r in runs for k in r.config})
+    different = [k for k in keys if len({json.dumps(r.config.get(k)) for r in runs}) > 1]
+    return sorted(different, key=lambda k: (k == "seed", k))
+
+
+def with_groups(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows, and those of unseen parameters a second time, under ``split/group`` by where these lie."""
+    unseen = rows[rows["parameter_group"].isin(UNSEEN_GROUPS)]
+    return pd.concat([rows, unseen.assign(split=unseen["split"] + "/" + unseen["parameter_group"])], ignore_index=True)
+
+
+def splits_of(run: Run) -> list[str]:
+    """Splits that a run was evaluated on; unseen parameters also apart by where they lie."""
+    return sorted(with_groups(run.rows)["split"].unique())
+
+
+def validation_curve(run: Run) -> Curve:
+    """Of a run over all its starts; raises ``MetricsError`` where a log is damaged."""
+    if run.curve is not None:
+        return run.curve
+    points: dict[int, float] = {}
+    logs = {path: path.parent.name.removeprefix("version_") for path in run.folder.glob("log/version_*/metrics.csv")}
+    for path in sorted((path for path, version in logs.items() if version.isdecimal()), key=lambda path: int(logs[path])):
+        with open(path, newline="", encoding="utf-8") as handle:
+            reader = csv.DictReader(handle)
+            try:
+                for line in reader:
+                    if line.get("val/one_step_nmse"):
+                        points[int(line["step"]) + 1] = float(line["val/one_step_nmse"])
+            except (ValueError, KeyError, TypeError, csv.Error) as error:  # also what is not text
+                raise MetricsError(
+                    f"{path}, line {reader.line_num}: damaged ({error}); delete the file, which only the curve of the validation loss needs"
+                ) from None
+    steps = sorted(points)
+    return np.array(steps), np.array([points[s] for s in steps])
+
+
+Values = list[dict[int, float]]
+"""Of one metric: for each seed that has any, a value by number of the trajectory."""
+
+
+def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon: str) -> Values:
+    """What runs have of a metric, in order of trajectories."""
+    parent, _, group = split.partition("/")
+    table = []
+    for run in runs:
+        rows = run.rows
+        chosen = (rows["model"] == model) & (rows["metric"] == metric) & (rows["horizon"] == horizon) & (rows["split"] == parent)
+        if group:
+            chosen &= rows["parameter_group"] == group
+        found = rows[chosen].sort_values("trajectory")
+        table.append(dict(zip(found["trajectory"].tolist(), found["value"].tolist(), strict=True)))
+    return [t for t in table if t]
+
+
+STAND_IN = "ballistic"
+"""Trivial model whose error a failed rollout gets."""
+
+
+def rollout_errors(runs: list[Run], split: str, horizon: str) -> Values:
+    """Rollout MSE [m²] of learned models as tables judge it: a failed rollout gets the error of ballistic flight in the same scene over the same frames.
+
+    It stays infinite where ballistic flight was not evaluated. ``values_by_seed`` has the errors as they are.
+    """
+    errors = []
+    for run in runs:
+        trivial: dict[int, float] = dict(*values_by_seed([run], STAND_IN, split, "rollout_mse", horizon))
+        for seed in values_by_seed([run], LEARNED, split, "rollout_mse", horizon):
+            errors.append({k: value if math.isfinite(value) else trivial.get(k, value) for k, value in seed.items()})
+    return errors
+
+
+def shared_trajectories(*values: Values) -> list[int]:
+    """Numbers of the trajectories that all seeds, of several models if given, have evaluated."""
+    seeds = [set(seed) for table in values for seed in table]
+    return sorted(set.intersection(*seeds)) if seeds else []
+
+
+def shared_table(values: Values, trajectories: list[int] | None = None) -> np.ndarray:
+    """Values as a table [seed, trajectory], of the given trajectories or of those that all seeds have."""
+    chosen = shared_trajectories(values) if trajectories is None else trajectories
+    return np.array([[seed[k] for k in chosen] for seed in values]).reshape(len(values), len(chosen))

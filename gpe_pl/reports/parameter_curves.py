@@ -1,0 +1,43 @@
+"""How errors depend on the material parameter, trained values and others."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gpe_pl.evaluation.rollouts import LEARNED
+from gpe_pl.reports.finished_runs import Run, rollout_errors
+from gpe_pl.schema import MATERIALS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PARAMETER_FIGURE = "error_by_parameter.png"
+
+
+def parameter_curves(by_domain: dict[str, dict[str, list[Run]]]) -> Figure:
+    """Rollout MSE over all frames against the material parameter, of runs by domain and label; failed rollouts as in ``rollout_errors``."""
+    from gpe_pl.viz.comparison import parameter_figure
+
+    curves: dict[str, dict[str, dict[float, list[float]]]] = {}
+    seen: dict[str, set[float]] = {}
+    for domain, by_label in by_domain.items():
+        for label, members in by_label.items():
+            points = curves.setdefault(domain, {}).setdefault(label, {})
+            for run in members:
+                rows = run.rows
+                rows = rows[(rows["model"] == LEARNED) & (rows["metric"] == "rollout_mse") & (rows["horizon"] == "full")]
+                rows = rows[np.isfinite(rows["parameter"])]
+                for split, of_split in rows.groupby("split"):
+                    (errors,) = rollout_errors([run], str(split), "full")
+                    for trajectory, parameter in zip(of_split["trajectory"], of_split["parameter"], strict=True):
+                        points.setdefault(float(parameter), []).append(errors[int(trajectory)])
+                seen.setdefault(domain, set()).update(rows[rows["parameter_group"] == "seen"]["parameter"].tolist())
+    labels = {domain: _axis_label(next(iter(by_label.values()))[0]) for domain, by_label in by_domain.items()}
+    return parameter_figure(curves, {domain: sorted(values) for domain, values in seen.items()}, "rollout MSE [m²]", labels)
+
+
+def _axis_label(run: Run) -> str:
+    varied = [m for m in MATERIALS if any(key.startswith(f"data.parameters.{m}.") for key in run.config)]
+    return ", ".join(f"{MATERIALS[m].name.replace('_', ' ')}\n[{MATERIALS[m].unit}]" for m in varied)

@@ -1,0 +1,89 @@
+"""What many runs were evaluated to, in two small files from which tables are made again without the runs.
+
+``runs.json`` has their configurations and validation curves. ``rollouts.csv.xz`` has a line per run, model, split and trajectory, and a column per metric and
+horizon, such as ``rollout_mse@full``, with nine significant digits.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import lzma
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from gpe_pl.errors import GpeError
+from gpe_pl.files import sealed
+from gpe_pl.files.atomic import replacing
+
+RUNS, ROLLOUTS = "runs.json", "rollouts.csv.xz"
+NUMBER = "{:.9g}"
+KEYS = ["model", "split", "trajectory", "parameter_group", "parameter"]
+COLUMNS = [*KEYS, "metric", "horizon", "value"]
+"""Of the rows of a run, as ``metrics.csv`` has them."""
+MOST_BYTES = 2**28
+"""Of ``rollouts.csv.xz`` when it is unpacked."""
+MOST_MEMORY = 2**28
+"""Of the unpacker itself."""
+CONTENT = "rollouts_sha256"
+
+
+class ArchiveError(GpeError, ValueError):
+    """An archive is damaged; the message names the file."""
+
+
+def write_archive(folder: Path, runs: dict[str, dict[str, Any]], rows: dict[str, pd.DataFrame]) -> None:
+    """Write both files.
+
+    Args:
+        folder: which exists.
+        runs: what is known of each run by its name: tables of plain values.
+        rows: of each run, with ``COLUMNS``.
+    """
+    together = pd.concat([table.assign(run=name) for name, table in rows.items()], ignore_index=True)
+    together["column"] = together["metric"] + "@" + together["horizon"]
+    together["value"] = together["value"].map(NUMBER.format)  # a value that is not a number is "nan", a missing one is empty
+    wide = together.pivot(index=["run", *KEYS], columns="column", values="value").reset_index()
+    content = lzma.compress(wide.to_csv(index=False, lineterminator="\n").encode())
+    with replacing(folder / ROLLOUTS) as part:
+        part.write_bytes(content)
+    common = {key: value for key, value in next(iter(runs.values())).items() if all(run.get(key) == value for run in runs.values())}
+    own = {name: {key: value for key, value in run.items() if key not in common} for name, run in runs.items()}
+    sealed.write(folder / RUNS, {"common": common, "runs": own, CONTENT: hashlib.sha256(content).hexdigest()})
+
+
+def read_archive(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, pd.DataFrame]]:
+    """What ``write_archive`` was given, with values to nine digits.
+
+    Raises:
+        ArchiveError: a file is damaged or does not belong to the other.
+    """
+    advice = f"take {RUNS} and {ROLLOUTS} again from where they come from"
+    try:
+        about = sealed.read(folder / RUNS, advice)
+        content = (folder / ROLLOUTS).read_bytes()
+    except sealed.SealError as error:
+        raise ArchiveError(str(error)) from None
+    except OSError as error:
+        raise ArchiveError(f"{folder / ROLLOUTS}: {error.strerror}; {advice}") from None
+    if hashlib.sha256(content).hexdigest() != about.get(CONTENT):
+        raise ArchiveError(f"{folder / ROLLOUTS}: damaged, or of other runs than {RUNS} (checksum mismatch); {advice}")
+    unpacker = lzma.LZMADecompressor(memlimit=MOST_MEMORY)
+    unpacked = unpacker.decompress(content, MOST_BYTES)
+    if not unpacker.eof:
+        raise ArchiveError(f"{folder / ROLLOUTS}: unpacks to more than {MOST_BYTES} bytes; {advice}")
+    wide = pd.read_csv(io.BytesIO(unpacked), dtype=str, keep_default_na=False)
+    runs = {name: {**about["common"], **own} for name, own in about["runs"].items()}
+    return runs, {name: _long(table) for name, table in wide.groupby("run")}
+
+
+def _long(wide: pd.DataFrame) -> pd.DataFrame:
+    """Rows of one run with ``COLUMNS``; what a line lacks has no row."""
+    long = wide.melt(id_vars=KEYS, value_vars=[name for name in wide.columns if "@" in name], var_name="column")
+    long = long[long["value"] != ""]
+    long[["metric", "horizon"]] = long.pop("column").str.rsplit("@", n=1, expand=True)
+    kinds = {"trajectory": int, "parameter": float, "value": float}
+    long = long.assign(parameter=long["parameter"].replace("", "nan")).astype(kinds)
+    return long.sort_values(["split", "trajectory"], kind="stable").reset_index(drop=True)[COLUMNS]

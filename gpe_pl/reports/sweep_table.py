@@ -1,0 +1,280 @@
+"""From the runs of a sweep to one table and one figure: what differs between the runs becomes the axes."""
+
+from __future__ import annotations
+
+import csv
+import logging
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+
+from gpe_pl.evaluation.rollouts import LEARNED, read_rows
+from gpe_pl.files.atomic import replace_text, replacing
+from gpe_pl.files.markdown import table_row
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.metrics import bootstrap_interval
+from gpe_pl.nn.fused import unfused
+from gpe_pl.printable import printable
+from gpe_pl.reports.finished_runs import (
+    UNSEEN_GROUPS,
+    Run,
+    Values,
+    axes_of,
+    distinct_runs,
+    finished_runs,
+    rollout_errors,
+    shared_table,
+    splits_of,
+    table_of,
+    validation_curve,
+    values_by_seed,
+    with_groups,
+)
+from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
+from gpe_pl.rollout.baselines import BASELINES
+from gpe_pl.system.timing import paired_ratio, paired_times
+from gpe_pl.viz.saving import save_figure
+
+log = logging.getLogger(__name__)
+
+STRESS_METRICS = ("von_mises_error", "stress_error")
+SWEEP_MD = "table.md"
+
+TABLE_HORIZONS = 4
+"""The longest horizons, shown in the Markdown table; ``table.csv`` has all."""
+
+
+def report_sweep(folder: Path, runs: list[Run]) -> None:
+    """Compare finished runs; writes into a folder."""
+    _report(folder, distinct_runs(runs))
+
+
+def report(folder: Path) -> None:
+    """Report on the one run in a folder."""
+    _report(folder, [run for run in finished_runs(folder) if run.folder == folder])
+
+
+def _report(folder: Path, runs: list[Run]) -> None:
+    """Write ``table.csv``, ``table.md``, ``validation_loss.png`` and, of unseen material parameters, ``error_by_parameter.png``."""
+    if not runs:
+        return
+    axes = [a for a in axes_of(runs) if a != "seed"]
+    variants: dict[tuple[str, ...], list[Run]] = defaultdict(list)
+    for run in runs:
+        variants[tuple(str(run.config.get(a)) for a in axes)].append(run)
+    _write_csv(folder / "table.csv", axes, runs)
+    ratios = forward_time_ratios(variants)
+    replace_text(folder / SWEEP_MD, _markdown(axes, variants, ratios))
+    curves = {", ".join(v) or LEARNED: [validation_curve(r) for r in members] for v, members in variants.items()}
+    curves = {k: [c for c in v if len(c[0])] for k, v in curves.items()}
+    if all(curves.values()):
+        from gpe_pl.viz.figures import validation_loss_figure
+
+        save_figure(validation_loss_figure(curves), folder / "validation_loss.png", dpi=150)
+    rows = runs[0].rows
+    if (rows["parameter_group"].isin(UNSEEN_GROUPS) & np.isfinite(rows["parameter"])).any():
+        by_label = {", ".join(v) or LEARNED: members for v, members in variants.items()}
+        save_figure(parameter_curves({str(runs[0].config["data.name"]): by_label}), folder / PARAMETER_FIGURE, dpi=150)
+
+
+def conclusion(folder: Path) -> str:
+    """What a command ends with: the numbers of the run or evaluation in a folder, and what to look at next."""
+    viewers = sorted(folder.glob("rollout_*_00.html"))
+    return "\n".join([summary(table_of(read_rows(folder / "metrics.csv"))), *(printable(f"look at {viewer}") for viewer in viewers)])
+
+
+def summary(rows: pd.DataFrame) -> str:
+    """Means over trajectories as plain text: a line per split, metric and model, a column per horizon. Trivial models have their rollout MSE only."""
+    shown = with_groups(rows[~rows["model"].isin(BASELINES) | (rows["metric"] == "rollout_mse")])
+    groups: dict[tuple[str, str, str], dict[str, float]] = defaultdict(dict)
+    for (split, metric, model, horizon), value in shown.groupby(["split", "metric", "model", "horizon"])["value"].mean().items():
+        groups[split, metric, model][horizon] = value
+    horizons = sorted({*rows["horizon"]} - {"1", "full"}, key=int)
+    lines = [(("split", "metric", "model"), "".join(f"{h:>11}" for h in (*horizons, "full")))]
+    for key, values in sorted(groups.items()):
+        if "1" in values:  # of one step, or of a rollout as a whole
+            values["full"] = values["1"]
+        lines.append((key, "".join(f"{values[h]:11.4g}" if h in values else " " * 11 for h in (*horizons, "full"))))
+    widths = [max(len(key[column]) for key, _ in lines) for column in range(3)]
+    return "\n".join(" ".join(f"{name:{width}}" for name, width in zip(key, widths, strict=True)) + cells for key, cells in lines)
+
+
+def _column(axis: str) -> str:
+    return axis.rpartition(".")[2]
+
+
+def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
+    """One line per variant, seed, split, metric and horizon: the mean over trajectories."""
+    lines: list[list[Any]] = []
+    for run in runs:
+        key = [run.config.get(a) for a in axes]
+        rows = with_groups(run.rows[run.rows["model"] == LEARNED])
+        means = rows.groupby(["split", "metric", "horizon"])["value"].mean().to_dict()
+        steps, losses = validation_curve(run)
+        if len(steps):
+            means["val", "one_step_nmse", "1"] = float(losses[-1])
+        lines += [[*key, run.config.get("seed"), *group, value] for group, value in sorted(means.items())]
+    with replacing(path) as part, open(part, "w", newline="", encoding="utf-8") as handle:
+        writer = csv.writer(handle)
+        writer.writerow([*(_column(a) for a in axes), "seed", "split", "metric", "horizon", "value"])
+        writer.writerows(lines)
+
+
+def _interval(values: Values, scale: float = 1.0) -> str:
+    """Mean with its bootstrap interval; where rollouts failed, which makes the mean infinite, their number and the median."""
+    if not values:
+        return "–"
+    table = shared_table(values) * scale
+    failed = int(np.sum(~np.isfinite(table)))
+    if failed:
+        return f"{failed} of {table.size} failed, median {np.median(table):.3g}"
+    i = bootstrap_interval(table, statistic=np.mean)
+    return f"{i.estimate:.3g} [{i.low:.3g}, {i.high:.3g}]"
+
+
+def forward_time_ratios(variants: dict[tuple[str, ...], list[Run]], num_rounds: int = 30) -> dict[tuple[str, ...], float]:
+    """Forward time of each variant's trained model over that of the first, by PyTorch's operations alone, which all variants have in common: the median of
+    paired ratios on one graph; empty for a single variant.
+    """
+    from gpe_pl.graphs.lattice import lattice_graph
+
+    if len(variants) < 2:
+        return {}
+    names = {v: "/".join(v) for v in variants}
+    alternatives = {}
+    for v, members in variants.items():
+        simulator = LearnedSimulator.from_checkpoint(members[0].folder / "checkpoints" / "best.ckpt")
+        if simulator.builder.spec.materials != ("sand",) or simulator.builder.spec.dim != 2:
+            return {}  # the graph below is one layer of sand
+        _, graph = lattice_graph(600, 6000, simulator.builder.config)
+        alternatives[names[v]] = unfused()(torch.inference_mode()(lambda s=simulator, g=graph: s(g)))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    times = paired_times(alternatives, num_rounds)
+    torch.set_num_threads(threads)
+    first = names[next(iter(variants))]
+    return {v: paired_ratio(times, names[v], first) for v in variants}
+
+
+def _markdown(axes: list[str], variants: dict[tuple[str, ...], list[Run]], ratios: dict[tuple[str, ...], float]) -> str:
+    names = [_column(a) for a in axes] or ["model"]
+    first = next(iter(variants.values()))[0]
+    return "\n".join(
+        [*_training_table(names, variants, ratios), "", *_rollout_table(names, variants, first), *_stress_table(names, variants), ""]
+    )
+
+
+def _training_table(names: list[str], variants: dict[tuple[str, ...], list[Run]], ratios: dict[tuple[str, ...], float]) -> list[str]:
+    header = [
+        *names,
+        "seeds",
+        "validation loss (one-step nMSE)",
+        "forward time",
+        "momentum error, test [m/s]",
+        "outside without containment",
+        "corrected",
+    ]
+    lines = table_row(header), "|" + "---|" * len(header)
+    rows = []
+    for key, runs in variants.items():
+        losses = [loss[-1] for _, loss in (validation_curve(r) for r in runs) if len(loss)]
+        rows.append(
+            table_row(
+                [
+                    *(key or (LEARNED,)),
+                    str(len(runs)),
+                    f"{np.mean(losses):.4f} ({min(losses):.4f} – {max(losses):.4f})" if losses else "–",
+                    f"{ratios[key]:.2f}" if key in ratios else "–",
+                    _interval(values_by_seed(runs, LEARNED, "test", "momentum_error", "full")),
+                    _percent(values_by_seed(runs, LEARNED, "test", "share_outside_uncontained", "full")),
+                    _percent(values_by_seed(runs, LEARNED, "test", "share_corrected", "full")),
+                ]
+            )
+        )
+    note = (
+        "Validation loss: last value, mean over seeds (range). Forward time: trained models on one graph, by PyTorch's operations alone, "
+        "median of paired ratios to the first row. "
+        "Outside: share of particle-frames inside a wall or obstacle when containment is off; corrected: share of particle-steps that containment moves."
+    )
+    return [*lines, *rows, "", note]
+
+
+def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]], first: Run) -> list[str]:
+    splits = splits_of(first)
+    horizons = _horizons(first)
+    baselines = sorted({*first.rows["model"]} - {LEARNED})
+    header = [*names, "split", *(f"@{h}" for h in horizons)]
+    lines = [table_row(header), "|" + "---|" * len(header)]
+    for split in splits:
+        for key, runs in variants.items():
+            trivial = {
+                h: min((_mean(values_by_seed(runs[:1], b, split, "rollout_mse", h)) for b in baselines), default=float("nan"))
+                for h in horizons
+            }
+            cells = []
+            for h in horizons:
+                values = rollout_errors(runs, split, h)
+                failed = _failed(values_by_seed(runs, LEARNED, split, "rollout_mse", h))
+                cells.append(_interval(values, 1e3) + _factor(trivial[h] / _mean(values)) + failed if values else "–")
+            lines.append(table_row([*(key or (LEARNED,)), split, *cells]))
+        for baseline in baselines:
+            cells = [_interval(values_by_seed([first], baseline, split, "rollout_mse", h), 1e3) for h in horizons]
+            lines.append(table_row([baseline, *[""] * (len(names) - 1), split, *cells]))
+    note = (
+        "Rollout MSE ×1e-3 [m²] over frames 1 … h, nodes and axes: mean over trajectories and seeds, 95 % bootstrap interval over both (too narrow where "
+        "seeds or trajectories are few), and how many times lower than the best trivial baseline (bold where it is lower). A rollout that had to be "
+        "stopped has failed, and counts as ballistic flight in the same scene."
+    )
+    if "test_unseen" in splits:
+        note += " `test_unseen` holds material parameters that training did not have, between the trained ones and outside their range."
+    return [*lines, "", note]
+
+
+def _horizons(run: Run) -> list[str]:
+    found = {*run.rows[run.rows["metric"] == "rollout_mse"]["horizon"]}
+    return sorted(found, key=lambda h: (h == "full", h.zfill(6)))[-TABLE_HORIZONS:]
+
+
+def _stress_table(names: list[str], variants: dict[tuple[str, ...], list[Run]]) -> list[str]:
+    """Errors of displacement, velocity and stress beside each other, of models that decode a stress."""
+    stressed = {key: runs for key, runs in variants.items() if runs[0].rows["metric"].isin(STRESS_METRICS).any()}
+    if not stressed:
+        return []
+    horizons = _horizons(next(iter(stressed.values()))[0])
+    header = [*names, "split", "relative error", *(f"@{h}" for h in horizons)]
+    lines = ["", table_row(header), "|" + "---|" * len(header)]
+    for key, runs in stressed.items():
+        for split in sorted({*runs[0].rows["split"]}):
+            for metric in ("displacement_error", "velocity_error", *STRESS_METRICS):
+                cells = [_interval(values_by_seed(runs, LEARNED, split, metric, h)) for h in horizons]
+                lines.append(table_row([*(key or (LEARNED,)), split, metric.removesuffix("_error").replace("_", " "), *cells]))
+    note = (
+        "L2 errors relative to the ground truth's displacement and velocity up to the horizon, and to its stress over all frames; von Mises stress, and stress "
+        "as a tensor, at mesh nodes. Mean over trajectories and seeds with its interval, as above."
+    )
+    return [*lines, "", note]
+
+
+def _factor(ratio: float) -> str:
+    if ratio == 0:  # of a mean that failed rollouts make infinite
+        return ""
+    return f" **{ratio:.1f}×**" if ratio > 1 else f" {ratio:.2g}×" if ratio >= 0.01 else " < 0.01×"
+
+
+def _mean(values: Values) -> float:
+    return float(np.mean([v for seed in values for v in seed.values()])) if values else float("nan")
+
+
+def _failed(values: Values) -> str:
+    """How many rollouts failed, if any did."""
+    numbers = [value for seed in values for value in seed.values()]
+    failed = sum(not np.isfinite(value) for value in numbers)
+    return f", {failed} of {len(numbers)} failed" if failed else ""
+
+
+def _percent(values: Values) -> str:
+    return f"{100 * _mean(values):.3f} %" if values else "–"

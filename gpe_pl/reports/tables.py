@@ -1,0 +1,50 @@
+"""Tables and figures of the finished runs in a folder; also ``python -m gpe_pl.reports FOLDER``, which trains and evaluates nothing."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from gpe_pl.errors import GpeError
+from gpe_pl.files.run_folder import RunError
+from gpe_pl.printable import one_line, speak_utf8
+from gpe_pl.reports.domain_table import TABLE_MD, compares_models, report_domains
+from gpe_pl.reports.finished_runs import finished_runs
+from gpe_pl.reports.sweep_table import SWEEP_MD, report_sweep
+from gpe_pl.reports.trial_table import TRIALS_MD, compares_settings, report_trials
+from gpe_pl.system.locks import held
+
+
+def write_tables(folder: Path) -> Path:
+    """Write the tables that suit what the runs below a folder differ in, or those that are archived in it.
+
+    Returns:
+        The one to read, which is not there where no run has finished.
+    """
+    runs = finished_runs(folder)
+    if compares_settings(runs):
+        report_trials(folder, runs)
+        return folder / TRIALS_MD
+    if compares_models(runs):
+        report_domains(folder, runs)
+        return folder / TABLE_MD
+    report_sweep(folder, runs)
+    return folder / SWEEP_MD
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line; returns the exit status."""
+    parser = argparse.ArgumentParser(prog="python -m gpe_pl.reports", description="Write tables and figures of finished runs again.")
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of a sweep, such as runs/table1")
+    folder = parser.parse_args(arguments).folder
+    speak_utf8()
+    try:
+        if not finished_runs(folder):
+            raise RunError(f"{folder}: has no finished run, which would have a config.json and a metrics.csv")
+        with held(folder):
+            print(write_tables(folder).read_text(encoding="utf-8"))
+    except GpeError as error:
+        print(f"error: {one_line(str(error))}", file=sys.stderr)
+        return 2
+    return 0

@@ -1,0 +1,126 @@
+"""Trials of settings for several models or domains: within each, which setting did best.
+
+The number compared is the rollout MSE over all frames, mean over the trajectories of a split, median over seeds; failed rollouts count as in
+``finished_runs.rollout_errors``.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpe_pl.evaluation.rollouts import LEARNED
+from gpe_pl.files.atomic import replace_text, replacing
+from gpe_pl.files.markdown import table_row
+from gpe_pl.metrics import BOTH, bootstrap_interval, median_of_means
+from gpe_pl.reports.domain_table import TABLE_MD, TABLES, domain_of, model_of
+from gpe_pl.reports.finished_runs import Run, axes_of, rollout_errors, shared_table, validation_curve, values_by_seed
+
+log = logging.getLogger(__name__)
+
+TRIALS_CSV, TRIALS_MD = "trials.csv", "trials.md"
+CONSEQUENCES = ("training.val_interval", "seed")
+"""What differs between trials without having been tried: it follows from the number of steps, or is chance."""
+NUM_STEPS = "training.num_steps"
+"""Follows from a budget of time and the other settings; where these and the seed are equal, it was tried."""
+
+
+def compares_settings(runs: list[Run]) -> bool:
+    """Whether runs are of several models or domains, and one of these with several settings."""
+    groups = _by_model(runs)
+    return len(groups) > 1 and any(_settings(runs) for runs in groups.values())
+
+
+def report_trials(folder: Path, runs: list[Run]) -> None:
+    """Write ``trials.csv``, a line per run and split, and ``trials.md``, a line per setting with the best of each domain and model in bold.
+
+    A table of models in domains that is there goes: it would not be of all runs.
+    """
+    groups = _by_model(runs)
+    settings = sorted({key for members in groups.values() for key in _settings(members)})
+    splits = sorted({split for run in runs for split in run.rows["split"]})
+    columns = [key.rpartition(".")[2] for key in settings]
+    _write_csv(folder / TRIALS_CSV, groups, settings, columns, splits)
+    header = ["domain", "model", *columns, "seeds", "one-step nMSE", *splits]
+    lines = [table_row(header), "|" + "---|" * len(header)]
+    for (domain, model), members in sorted(groups.items()):
+        variants: dict[tuple[str, ...], list[Run]] = defaultdict(list)
+        for run in members:
+            variants[tuple(str(run.config.get(key)) for key in settings)].append(run)
+        error = {v: {s: _error(runs, s) for s in splits} for v, runs in variants.items()}
+        best = {s: min(error[v][s] for v in variants) for s in splits}
+        for v, runs in sorted(variants.items()):
+            cells = [_cell(runs, s, error[v][s], is_best=bool(np.isfinite(error[v][s]) and error[v][s] == best[s])) for s in splits]
+            losses = [loss[-1] for _, loss in (validation_curve(r) for r in runs) if len(loss)]
+            lines.append(table_row([domain, model, *v, str(len(runs)), f"{np.mean(losses):.3f}" if losses else "–", *cells]))
+    note = (
+        "Rollout MSE ×1e-3 [m²] over all frames: mean over the trajectories of a split, median over seeds, 95 % bootstrap interval over both (of one seed "
+        "it says nothing about training by other seeds). A rollout that had to be stopped has failed, and counts as ballistic flight in the same scene. Bold: "
+        "best of a domain and model. "
+        "One-step nMSE: of the validation split, relative to free fall."
+    )
+    replace_text(folder / TRIALS_MD, "\n".join([*lines, "", note, ""]))
+    if (folder / TABLE_MD).exists():
+        for name in TABLES:
+            (folder / name).unlink(missing_ok=True)
+        log.warning(
+            "%s: compares settings now (%s), and its table of models is gone; move the runs that are no part of it to another name=… to have it back",
+            folder,
+            ", ".join(settings),
+        )
+
+
+def _by_model(runs: list[Run]) -> dict[tuple[str, str], list[Run]]:
+    groups: dict[tuple[str, str], list[Run]] = defaultdict(list)
+    for run in runs:
+        groups[domain_of(run), model_of(run)].append(run)
+    return groups
+
+
+def _settings(runs: list[Run]) -> list[str]:
+    """Configuration keys that were tried."""
+    keys = [key for key in axes_of(runs) if key not in (*CONSEQUENCES, NUM_STEPS)]
+    steps: dict[tuple[str, ...], set[Any]] = defaultdict(set)
+    for run in runs:
+        steps[tuple(str(run.config.get(key)) for key in (*keys, "seed"))].add(run.config[NUM_STEPS])
+    return [*keys, NUM_STEPS] if any(len(found) > 1 for found in steps.values()) else keys
+
+
+def _error(runs: list[Run], split: str) -> float:
+    errors = shared_table(rollout_errors(runs, split, "full"))
+    return float(median_of_means(errors, BOTH)) if errors.size else float("inf")
+
+
+def _cell(runs: list[Run], split: str, error: float, *, is_best: bool) -> str:
+    as_they_are = shared_table(values_by_seed(runs, LEARNED, split, "rollout_mse", "full"))
+    failed = f"{int((~np.isfinite(as_they_are)).sum())} of {as_they_are.size} failed"
+    if not np.isfinite(error):  # without ballistic flight beside it
+        return failed
+    i = bootstrap_interval(shared_table(rollout_errors(runs, split, "full")), statistic=median_of_means)
+    text = f"{1e3 * error:.3g}"
+    cell = f"{f'**{text}**' if is_best else text} [{1e3 * i.low:.3g}, {1e3 * i.high:.3g}]"
+    return cell if np.isfinite(as_they_are).all() else f"{cell}, {failed}"
+
+
+def _write_csv(path: Path, groups: dict[tuple[str, str], list[Run]], settings: list[str], columns: list[str], splits: list[str]) -> None:
+    with replacing(path) as part, open(part, "w", newline="", encoding="utf-8") as handle:
+        writer = csv.writer(handle)
+        writer.writerow(["domain", "model", *columns, "num_steps", "seed", "split", "num_trajectories", "num_failed", "rollout_mse"])
+        for (domain, model), runs in sorted(groups.items()):
+            for run in runs:
+                for split in splits:
+                    for values in values_by_seed([run], LEARNED, split, "rollout_mse", "full"):
+                        about = [
+                            domain,
+                            model,
+                            *(run.config.get(key) for key in settings),
+                            run.config["training.num_steps"],
+                            run.config["seed"],
+                        ]
+                        errors = np.array([*values.values()])
+                        writer.writerow([*about, split, errors.size, int((~np.isfinite(errors)).sum()), float(errors.mean())])

@@ -1,0 +1,83 @@
+"""Trivial simulators that any learned model has to beat."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from array_api_compat import array_namespace
+
+from gpe_pl.geometry.shapes import signed_distance, surface_tolerance
+from gpe_pl.rollout.loop import Simulator
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.trajectory import Array, State
+
+NUM_BISECTIONS = 30
+
+
+def _later(state: State, dt: float, pos: Array, vel: Array) -> State:
+    return replace(
+        state, pos=pos, vel=vel, velocity_history=None, time=state.time + dt, stress=None, boundary=state.boundary.at(1), internal=None
+    )
+
+
+@dataclass(frozen=True)
+class ConstantVelocity:
+    """Every node keeps its velocity and ignores walls."""
+
+    dt: float
+
+    def step(self, state: State) -> State:
+        pos = state.periodicity.wrapped(state.pos + state.vel * self.dt)
+        return _later(state, self.dt, pos, state.vel)
+
+
+@dataclass(frozen=True)
+class StopsAtWalls:
+    """Every node keeps its velocity until it touches a wall or obstacle, where it sticks. Needs no gravity, so it is right where that is not known."""
+
+    dt: float
+
+    def step(self, state: State) -> State:
+        return _sticking(state, self.dt, 0.0 * state.gravity)
+
+
+@dataclass(frozen=True)
+class Ballistic:
+    """Free fall until a node touches a wall or obstacle, where it sticks."""
+
+    dt: float
+
+    def step(self, state: State) -> State:
+        return _sticking(state, self.dt, state.gravity)
+
+
+BASELINES: dict[str, Callable[[float], Simulator]] = {
+    "ballistic": Ballistic,
+    "stops_at_walls": StopsAtWalls,
+    "constant_velocity": ConstantVelocity,
+}
+"""What evaluations compare a model with, by the name in their tables; each takes the frame interval [s]."""
+
+
+def _sticking(state: State, dt: float, acceleration: Array) -> State:
+    """The state after a step with a constant acceleration [dim]; what touches a wall or obstacle on the way stays there."""
+    xp = array_namespace(state.pos)
+    shapes = state.boundary.shapes
+    pos, vel = integrators.advance(state.pos, state.vel, acceleration, dt)
+    stuck = xp.all(state.vel == 0, axis=-1) & (signed_distance(shapes, state.pos) < surface_tolerance(shapes))
+    hit = (signed_distance(shapes, pos) <= 0) & ~stuck
+    if bool(xp.any(hit)):
+        pos = xp.where(hit[:, None], _touchdown(state, pos), pos)
+    pos = xp.where(stuck[:, None], state.pos, pos)
+    vel = xp.where((hit | stuck)[:, None], xp.zeros_like(vel), vel)
+    return _later(state, dt, state.periodicity.wrapped(pos), vel)
+
+
+def _touchdown(state: State, end: Array) -> Array:
+    """The last free points on the straight paths from the state's positions to ``end``, by bisection."""
+    xp = array_namespace(end)
+    free, inside = state.pos, end
+    for _ in range(NUM_BISECTIONS):
+        middle = (free + inside) / 2
+        is_free = (signed_distance(state.boundary.shapes, middle) >= 0)[:, None]
+        free, inside = xp.where(is_free, middle, free), xp.where(is_free, inside, middle)
+    return free

@@ -1,0 +1,76 @@
+"""Walls that a learned simulator cannot cross: particles that end a step inside a boundary are put back on its surface, and counted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from array_api_compat import array_namespace
+
+from gpe_pl.geometry.shapes import outward_normal, signed_distance, surface_tolerance
+from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
+from gpe_pl.trajectory.trajectory import Array, State
+
+
+def contain(state: State, dt: float) -> tuple[State, Array]:
+    """Move nodes deeper than ``geometry.surface_tolerance`` along the surface normal back to the surface of the boundary's shapes.
+
+    Where surfaces meet so narrowly that this does not lead out, a node returns to where the step began.
+    Velocities, and the last entry of the velocity history, change by displacement / ``dt``, so that they still are differences of positions.
+
+    Args:
+        state: after a step.
+        dt: frame interval [s].
+
+    Returns:
+        The corrected state (the same object if nothing was inside) and a mask [node] of the corrected nodes.
+    """
+    shapes = state.boundary.shapes
+    pos = state.pos
+    xp = array_namespace(pos)
+    tolerance = surface_tolerance(shapes)
+    inside = signed_distance(shapes, pos) < -tolerance
+    if not bool(xp.any(inside)):
+        return state, inside
+    rows = xp.nonzero(inside)[0]
+    moved = pos[rows]
+    for _ in range(4):  # corners need a pass per surface
+        before = moved
+        for shape in shapes:
+            depth = xp.clip(-shape.signed_distance(moved), 0.0, None)
+            if bool(xp.any(depth > 0)):  # finding normals of shapes that nothing is in would take most of the time
+                moved = moved + depth[:, None] * outward_normal(shape, moved, step=tolerance)
+        if moved is before:
+            break
+    caught = signed_distance(shapes, moved) < -tolerance
+    moved = xp.where(caught[:, None], pos[rows] - state.vel[rows] * dt, moved)
+    new_pos, vel = xp.asarray(pos, copy=True), xp.asarray(state.vel, copy=True)
+    new_pos[rows] = state.periodicity.wrapped(moved)
+    vel[rows] = vel[rows] + (moved - pos[rows]) / dt
+    history = state.velocity_history
+    if history is not None:
+        history = xp.asarray(history, copy=True)
+        history[:, -1] = vel
+    return replace(state, pos=new_pos, vel=vel, velocity_history=history), inside
+
+
+@dataclass(frozen=True)
+class Contained:
+    """A simulator with containment after every step; new states know how many nodes it corrected (``State.num_corrected``).
+
+    Attributes:
+        simulator: the simulator inside.
+        dt: frame interval [s].
+    """
+
+    simulator: Simulator
+    dt: float
+
+    def step(self, state: State) -> State:
+        return self._contain(self.simulator.step(state))
+
+    def step_all(self, states: list[State]) -> list[State | SimulationError]:
+        return [self._contain(item) if isinstance(item, State) else item for item in step_all(self.simulator, states)]
+
+    def _contain(self, state: State) -> State:
+        contained, corrected = contain(state, self.dt)
+        return replace(contained, num_corrected=int(corrected.sum()))

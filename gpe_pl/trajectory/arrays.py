@@ -1,0 +1,277 @@
+"""Arrays that users bring: checks with errors that name argument, frame and node, and what can be told from positions alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from gpe_pl.errors import GpeError
+from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
+from gpe_pl.geometry.shapes import check_bounds
+from gpe_pl.schema import CELL_KINDS, LARGEST, MATERIALS, MESH_MATERIALS, NODE_TYPES, node_code, param_names
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.cells import fitting_kinds, stacked
+
+RADIUS_SPACINGS = 2.0
+"""Neighbour radius in rest spacings where none is given: about 12 neighbours in the plane and 32 in space."""
+
+FRAMES_AT_ONCE = 256
+NEIGHBOURS = 16
+MAX_VISITED = 50_000
+"""Points that stand for free space when normals are estimated."""
+
+
+class ArrayError(GpeError, ValueError):
+    """An array or value that does not fit; the message names it, and frame and node where there is one. ``frame`` is -1 where there is none."""
+
+    def __init__(self, message: str, frame: int = -1) -> None:
+        super().__init__(message)
+        self.frame = frame
+
+
+def numbers(name: str, values: Any, axes: Mapping[str, int | None]) -> np.ndarray:
+    """Finite real numbers of a given shape, of magnitudes up to ``LARGEST``.
+
+    Args:
+        name: of the argument, for messages.
+        values: anything that NumPy takes for an array.
+        axes: name and size of each axis; None where any size will do.
+
+    Raises:
+        ArrayError: other numbers or another shape; names the first place.
+    """
+    if np.ma.is_masked(values):
+        raise ArrayError(f"{name}: is a masked array with {np.ma.count_masked(values)} masked values; only whole arrays can be used")
+    try:
+        array = np.asarray(values)
+    except (ValueError, TypeError) as error:
+        raise ArrayError(f"{name}: not an array of numbers ({error})") from None
+    if array.dtype.kind not in "fiu":
+        raise ArrayError(f"{name}: has type {array.dtype}, expected real numbers")
+    wanted = ", ".join(axis if size is None else f"{axis} {size}" for axis, size in axes.items())
+    if array.ndim != len(axes) or any(size is not None and size != n for size, n in zip(axes.values(), array.shape, strict=True)):
+        raise ArrayError(f"{name}: has shape {list(array.shape)}, expected [{wanted}]")
+    for wrong, reason in ((~np.isfinite(array), ""), (np.abs(array) > LARGEST, f", too large to be stored (at most {LARGEST:.2g})")):
+        if wrong.any():
+            place = np.argwhere(wrong)[0]
+            where = ", ".join(f"{axis} {i}" for axis, i in zip(axes, place, strict=True) if axis != "dim")
+            frame = int(place[0]) if next(iter(axes)) == "frame" else -1
+            raise ArrayError(f"{name}: {where or f'component {place[0]}'} is {array[tuple(place)]}{reason}", frame)
+    return array
+
+
+def per_node(name: str, values: Any, shape: tuple[int, ...], axis: str = "node", low: float = -np.inf, high: float = np.inf) -> np.ndarray:
+    """One value for all nodes, or one per node, as float32 of ``shape``, from ``low`` to ``high``."""
+    array = np.asarray(values)
+    if array.dtype.kind in "fiu" and array.ndim < len(shape) and array.shape == shape[len(shape) - array.ndim :]:
+        array = np.broadcast_to(array, shape)
+    array = numbers(name, array, dict(zip((axis, "dim"), shape, strict=False)))
+    outside = (array < low) | (array > high)
+    if outside.any():
+        node = int(np.argwhere(outside)[0, 0])
+        limits = f"between {low:g} and {high:g}" if np.isfinite(high) else "positive" if low > 0 else f"at least {low:g}"
+        raise ArrayError(f"{name}: {axis} {node} is {array[outside].flat[0]:g}, must be {limits}")
+    return array.astype(np.float32)
+
+
+def positive(name: str, value: Any, unit: str) -> float:
+    """A positive, finite number."""
+    if isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and 0 < value < np.inf:
+        return float(value)
+    raise ArrayError(f"{name}={value!r}: must be a positive number of {unit}")
+
+
+def flags(name: str, values: Any, count: int) -> tuple[bool, ...]:
+    """``count`` truth values, one per axis; None: none is true."""
+    if values is None:
+        return (False,) * count
+    array = np.asarray(values)
+    if array.shape != (count,) or not (array.dtype == bool or (array.dtype.kind in "iu" and np.isin(array, (0, 1)).all())):
+        raise ArrayError(f"{name}={array.tolist()!r:.80}: needs true or false for each of {count} axes")
+    return tuple(array.astype(bool).tolist())
+
+
+def checked_bounds(bounds: Any, periodic: tuple[bool, ...], pos: np.ndarray, boundary_pos: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """Bounds that hold all positions [frame, node, dim] along axes that do not repeat; the extremes where none are given."""
+    dim = pos.shape[2]
+    if bounds is None:
+        if any(periodic):
+            raise ArrayError("bounds: a periodic axis needs bounds, since its period cannot be told from positions")
+        points = [pos.min(axis=(0, 1)), pos.max(axis=(0, 1))]
+        if len(boundary_pos):
+            points += [boundary_pos.min(axis=0), boundary_pos.max(axis=0)]
+        low, high = np.min(points, axis=0).astype(np.float64), np.max(points, axis=0).astype(np.float64)
+        thin = np.where(high > low, 0.0, 0.5 * (float(np.max(high - low)) or 1.0))  # a row of nodes has no height
+        return tuple(zip((low - thin).tolist(), (high + thin).tolist(), strict=True))
+    array = numbers("bounds", bounds, {"axis": dim, "low and high": 2}).astype(np.float64)
+    checked = tuple((float(low), float(high)) for low, high in array)
+    try:
+        check_bounds(checked)
+    except ValueError as error:
+        raise ArrayError(str(error)) from None
+    for axis, (low, high) in enumerate(checked):
+        far = max(abs(low), abs(high)) if pos.dtype == np.float32 else 0.0  # where rounding can lead out
+        slack = 1e-5 * max(far, high - low)
+        outside = (pos[..., axis] < low - slack) | (pos[..., axis] > high + slack)
+        if not periodic[axis] and outside.any():
+            frame, node = np.argwhere(outside)[0]
+            raise ArrayError(
+                f"pos: frame {frame}, node {node}: {'xyz'[axis]} = {pos[frame, node, axis]:.6g} m is outside the bounds {low:g} … {high:g} m",
+                int(frame),
+            )
+    return checked
+
+
+def checked_materials(
+    materials: str | Sequence[str], params: Mapping[str, Any], num_nodes: int
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Codes of ``node_type`` [node], ``material_params`` [node, param] and the names of the materials that occur."""
+    names = [materials] * num_nodes if isinstance(materials, str) else [str(name) for name in materials]
+    if len(names) != num_nodes:
+        raise ArrayError(f"materials: {len(names)} names for {num_nodes} nodes")
+    present = tuple(m for m in MATERIALS if m in set(names))
+    unknown = sorted(set(names) - set(MATERIALS))
+    if unknown:
+        raise ArrayError(f"materials: node {names.index(unknown[0])} is {unknown[0]!r}; known: {', '.join(MATERIALS)}")
+    if not isinstance(params, Mapping) or set(params) != set(present):
+        wanted = ", ".join(f"{m}: {MATERIALS[m].name} [{MATERIALS[m].unit}]" for m in present)
+        given = ", ".join(sorted(params)) if isinstance(params, Mapping) else "no names"
+        raise ArrayError(f"params: has {given or 'nothing'}, needs {wanted}; any constant will do where it never varies")
+    codes = np.array([node_code(name) for name in names], np.uint8)
+    columns = np.full((num_nodes, len(param_names(present))), np.nan, np.float32)
+    for material in present:
+        spec, rows = MATERIALS[material], codes == node_code(material)
+        values = per_node(f"params[{material!r}]", params[material], (num_nodes,))
+        wrong = rows & ~spec.accepts(values)
+        if wrong.any():
+            node = int(wrong.argmax())
+            raise ArrayError(f"params[{material!r}]: node {node} has {spec.name} = {values[node]:g} {spec.unit}, must be {spec.rule}")
+        columns[rows, param_names(present).index(spec.name)] = values[rows]
+    return codes, columns, present
+
+
+def checked_cells(cells: Any, codes: np.ndarray, dim: int) -> tuple[np.ndarray, int]:
+    """Cells [cell, corner] whose nodes exist and are of one material that can have a mesh, and their dimension.
+
+    Args:
+        cells: of one kind [cell, corner], or by kind.
+        codes: types of the nodes [node].
+        dim: of space.
+    """
+    if not isinstance(cells, Mapping):
+        array = _integers("cells", cells)
+        kinds = fitting_kinds(array.shape[1], dim)
+        if not kinds:
+            known = ", ".join(f"{kind} {corners}" for kind, (own_dim, corners) in CELL_KINDS.items() if own_dim <= dim)
+            raise ArrayError(f"cells: has shape {list(array.shape)}, expected [cell, corner] with as many corners as a kind has: {known}")
+        if len(kinds) > 1:
+            raise ArrayError(
+                f"cells: with {array.shape[1]} corners in 3D they are {' or '.join(kinds)}; say which: cells={{{kinds[0]!r}: …}}"
+            )
+        groups = {kinds[0]: _checked_kind("cells", array, kinds[0], codes)}
+    else:
+        possible = [kind for kind, (own_dim, _) in CELL_KINDS.items() if own_dim <= dim]
+        for kind in cells:
+            if kind not in possible:
+                raise ArrayError(f"cells: unknown kind {kind!r:.80}; in {dim}D there are {', '.join(possible)}")
+        groups = {kind: _checked_kind(f"cells[{kind!r}]", _integers(f"cells[{kind!r}]", cells[kind]), kind, codes) for kind in cells}
+    dims = {CELL_KINDS[kind][0] for kind in groups}
+    if len(dims) != 1:
+        raise ArrayError(f"cells: has {', '.join(groups) or 'no kind'}; the cells of a trajectory are all surfaces or all volumes")
+    return stacked(groups), dims.pop()
+
+
+def _integers(name: str, cells: Any) -> np.ndarray:
+    try:
+        array = np.asarray(cells)
+    except ValueError:
+        raise ArrayError(
+            f"{name}: rows have different lengths; give cells by kind, such as {{'triangle': …, 'quadrilateral': …}}"
+        ) from None
+    if array.dtype.kind not in "iu" or array.ndim != 2:
+        raise ArrayError(f"{name}: is {array.dtype}{list(array.shape)}, expected integers [cell, corner]")
+    return array
+
+
+def _checked_kind(name: str, array: np.ndarray, kind: str, codes: np.ndarray) -> np.ndarray:
+    """Cells [cell, corner] of one kind."""
+    if array.shape[1] != CELL_KINDS[kind][1]:
+        raise ArrayError(f"{name}: has shape {list(array.shape)}, expected [cell, {CELL_KINDS[kind][1]}]")
+    wrong = ((array < 0) | (array >= len(codes))).any(axis=1) | (np.diff(np.sort(array, axis=1), axis=1) == 0).any(axis=1)
+    if wrong.any():
+        cell = int(wrong.argmax())
+        raise ArrayError(f"{name}: cell {cell} has the nodes {array[cell].tolist()}; they must be different ones of the {len(codes)} nodes")
+    types = codes[array]
+    wrong = (types != types[:, :1]).any(axis=1) | ~np.isin(types[:, 0], [node_code(m) for m in MESH_MATERIALS])
+    if wrong.any():
+        cell = int(wrong.argmax())
+        found = ", ".join(sorted({NODE_TYPES[code] for code in types[cell]}))
+        raise ArrayError(
+            f"{name}: cell {cell} has nodes of {found}; a cell is of one material, and meshes are of {', '.join(MESH_MATERIALS)}"
+        )
+    return array
+
+
+def velocities_of(pos: np.ndarray, frame_dt: float, periodicity: Periodicity) -> np.ndarray:
+    """Velocities [frame, node, dim] in m/s from the frame before; the first frame has those of the second."""
+    vel = np.empty(pos.shape, np.float32)
+    for start in range(1, len(pos), FRAMES_AT_ONCE):  # in double precision, but not all of it at once
+        window = pos[start - 1 : start + FRAMES_AT_ONCE].astype(np.float64)
+        vel[start : start + FRAMES_AT_ONCE] = integrators.velocities(window, frame_dt, periodicity)
+    vel[0] = vel[1]
+    return vel
+
+
+def nearest_distances(pos: np.ndarray, periodicity: Periodicity = NOWHERE) -> np.ndarray:
+    """Distance [node] in m from each node [node, dim] to the nearest other one; infinite for a single node."""
+    from scipy.spatial import cKDTree
+
+    points, box = (periodicity.from_corner(pos), periodicity.period) if periodicity else (pos, None)
+    return cKDTree(points, boxsize=box).query(points, k=2)[0][:, 1]
+
+
+def typical_spacing(pos: np.ndarray, periodicity: Periodicity = NOWHERE) -> float:
+    """Median distance [m] of nodes [node, dim] to their nearest neighbour.
+
+    Raises:
+        ArrayError: a single node, or nodes that coincide.
+    """
+    if len(pos) < 2:
+        raise ArrayError("spacing: a single node has no neighbours; pass spacing")
+    spacing = float(np.median(nearest_distances(pos, periodicity)))
+    if spacing <= 0:
+        raise ArrayError("spacing: half of the nodes coincide with another one, so it cannot be told from positions; pass spacing")
+    return spacing
+
+
+def estimated_normals(boundary_pos: np.ndarray, visited: np.ndarray, periodicity: Periodicity = NOWHERE) -> np.ndarray:
+    """Unit normals [boundary_node, dim] of walls of which only points are known: the mean direction to the nearest places where nodes have been.
+
+    Args:
+        boundary_pos: points on the walls [boundary_node, dim] in m.
+        visited: positions of nodes [..., dim] in m, of one frame or of many.
+        periodicity: where space repeats.
+    """
+    from scipy.spatial import cKDTree
+
+    walls = np.asarray(boundary_pos, np.float64)
+    points = np.asarray(visited).reshape(-1, walls.shape[1])
+    points = points[:: -(-len(points) // MAX_VISITED)].astype(np.float64)
+    count = min(NEIGHBOURS, len(points))
+    if periodicity:
+        tree = cKDTree(periodicity.from_corner(points), boxsize=periodicity.period)
+        found = tree.query(periodicity.from_corner(walls), k=count)[1]
+    else:
+        found = cKDTree(points).query(walls, k=count)[1]
+    away = periodicity.shortest(points[found.reshape(len(walls), count)] - walls[:, None])
+    away /= np.maximum(np.linalg.norm(away, axis=-1, keepdims=True), np.finfo(float).tiny)
+    normal = away.mean(axis=1)
+    for fallback in (
+        away[:, 0],
+        np.broadcast_to(np.eye(walls.shape[1])[-1], walls.shape),
+    ):  # surrounded from all sides; coincident with a node
+        weak = np.linalg.norm(normal, axis=1) < 1e-3
+        normal[weak] = fallback[weak]
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)

@@ -1,0 +1,291 @@
+"""Rigid parts among nodes whose paths are known, recognised by how they move, and the normals that they carry along.
+
+Nodes are of one rigid part where one motion describes them in every frame::
+
+    x_n(t) = c(t) + R(t) (x_n(0) − c(0))
+
+with the rotation R(t) that brings the part of the first frame closest to where it is now [Kabsch 1976]. Nearness does not make a part: a piston that slides
+over a floor is another one than the floor. Places of a membrane that happen to move alike are none: most of what hangs together with them moves otherwise.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
+
+TOLERANCE = 1e-5
+"""Share of the boundary's extent below which differences of positions are rounding."""
+
+STRETCH = 0.25
+"""Relative change of their distance up to which near nodes of no rigid part hang together."""
+
+PARTNERS = 8
+NEIGHBOURS = 16
+FEW_FRAMES = 8
+"""Frames, evenly spread, that are looked at first: they exclude most of what does not move alike."""
+
+
+@dataclass(frozen=True)
+class _Paths:
+    """Nodes, and where they go.
+
+    Attributes:
+        first: positions in the first frame [node, dim] in m.
+        moved: displacements since then [frame, node, dim] in m.
+        periodicity: where space repeats.
+        tolerance: of positions [m].
+    """
+
+    first: np.ndarray
+    moved: np.ndarray
+    periodicity: Periodicity
+    tolerance: float
+
+    def arms(self, nodes: np.ndarray, centre: np.ndarray) -> np.ndarray:
+        """From a place [dim] to the nearest images of nodes in the first frame [node, dim]."""
+        return np.asarray(self.periodicity.shortest(self.first[nodes] - centre))
+
+    @cached_property
+    def few(self) -> _Paths:
+        """The same nodes in few frames."""
+        return replace(self, moved=self.moved[self._stages[0]])
+
+    @cached_property
+    def _stages(self) -> tuple[np.ndarray, slice]:
+        """Frames in the order in which they are looked at."""
+        return np.linspace(0, len(self.moved) - 1, FEW_FRAMES).astype(int), slice(None)
+
+    def keep_distance(self, nodes: np.ndarray, node: int) -> np.ndarray:
+        """Those of ``nodes`` that are as far from ``node`` in every frame as in the first."""
+        for frames in self._stages:
+            arm = self.arms(nodes, self.first[node])
+            length = np.linalg.norm(arm + self.moved[frames][:, nodes] - self.moved[frames][:, node, None], axis=-1)
+            nodes = nodes[(np.abs(length - np.linalg.norm(arm, axis=-1)) <= 2 * self.tolerance).all(axis=0)]
+        return nodes
+
+    def part_of(self, nodes: np.ndarray, reference: int) -> _Part:
+        """The motion that describes nodes best, whose images are those nearest to a reference node."""
+        arms = self.arms(nodes, self.first[reference])
+        mean, path = arms.mean(axis=0), self.moved[:, nodes].mean(axis=1)
+        change = self.moved[:, nodes] - path[:, None]
+        turn = None if np.abs(change).max() <= self.tolerance else rotations(arms - mean, change, self.tolerance)
+        return _Part(self.first[reference] + mean, path, turn)
+
+    def described(self, nodes: np.ndarray, part: _Part) -> np.ndarray:
+        """Which of ``nodes`` a motion describes in every frame [node]."""
+        fits = np.ones(len(nodes), dtype=bool)
+        for frames in self._stages:
+            rows, predicted = nodes[fits], part.path[frames][:, None]
+            if part.turn is not None:
+                arms = self.arms(rows, part.centre)
+                predicted = predicted + np.einsum("fde,ne->fnd", part.turn[frames], arms) - arms
+            fits[fits] = (np.abs(self.moved[frames][:, rows] - predicted) <= 2 * self.tolerance).all(axis=(0, 2))
+        return fits
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A rigid motion.
+
+    Attributes:
+        centre: in the first frame [dim] in m.
+        path: displacement of the centre [frame, dim] in m.
+        turn: rotation since the first frame [frame, dim, dim]; None where the part does not turn.
+    """
+
+    centre: np.ndarray
+    path: np.ndarray
+    turn: np.ndarray | None
+
+
+def carried_along(pos: np.ndarray, normal: np.ndarray, periodicity: Periodicity = NOWHERE) -> np.ndarray:
+    """Unit normals [frame, boundary_node, dim] that turn as the rigid part of each node does; those of parts that do not turn stay bit for bit.
+
+    A node of no rigid part turns as near nodes of none do that stay about as far from it, which follows a membrane. A single node does not turn. In
+    space, parts whose nodes lie in a row do not turn about that row.
+
+    Args:
+        pos: positions [frame, boundary_node, dim] in m, continuous also across seams.
+        normal: those of the first frame [boundary_node, dim].
+        periodicity: where space repeats.
+    """
+    turned = np.array(np.broadcast_to(normal, pos.shape))
+    if pos.shape[1] < 2:
+        return turned
+    paths = _Paths(pos[0], pos - pos[0], periodicity, _tolerance(pos))
+    label, parts = _parts(paths)
+    for number, part in enumerate(parts):
+        if part.turn is not None:
+            rows = label == number
+            turned[:, rows] = np.einsum("fde,ne->fnd", part.turn, normal[rows])
+    loose = np.flatnonzero(label < 0)
+    if len(loose) > 1:
+        for frame, turn in enumerate(_local_rotations(paths, loose)):
+            turned[frame, loose] = np.einsum("nde,ne->nd", turn, normal[loose])
+    return turned
+
+
+def _tolerance(pos: np.ndarray) -> float:
+    """What differences of positions [m] owe to rounding: of the precision that holds them, which may be finer in memory."""
+    is_single = bool((pos.astype(np.float32) == pos).all())
+    rounding = float(np.finfo(np.float32 if is_single else np.float64).eps) * float(np.abs(pos).max())
+    return max(TOLERANCE * float(np.ptp(pos[0], axis=0).max()), 8 * rounding)
+
+
+def _parts(paths: _Paths) -> tuple[np.ndarray, list[_Part]]:
+    """Rigid part of each node [node], -1 for those of none, and the parts."""
+    label = np.full(len(paths.first), -1)
+    parts: list[_Part] = []
+    left = np.arange(len(paths.first))
+    while len(left):
+        seed, nodes = int(left[0]), paths.keep_distance(left, int(left[0]))
+        found, part = np.array([seed]), None
+        for some in _hypotheses(paths, nodes, seed):
+            if len(_grown(paths.few, nodes, some, seed)[0]) <= len(found):
+                continue
+            members, motion = _grown(paths, nodes, some, seed)
+            if len(members) > len(found):
+                found, part = members, motion
+            if len(found) == len(nodes):
+                break
+        if part is not None:
+            label[found] = len(parts)
+            parts.append(part)
+        left = np.setdiff1d(left, np.append(found, seed))
+    if parts:
+        _settle(paths, label, parts)
+    label[~_hold_together(paths, label)] = -1
+    return label, parts
+
+
+def _hold_together(paths: _Paths, label: np.ndarray) -> np.ndarray:
+    """Which nodes are of a part to whose nodes most of what hangs together with them belongs [node]; what is known to be rigid hangs with nothing else."""
+    is_rigid = np.zeros(len(label), dtype=bool)
+    while True:
+        nodes = np.flatnonzero(~is_rigid)
+        if not (label[nodes] >= 0).any():
+            return is_rigid
+        near, _, hangs = _surroundings(paths, nodes)
+        of_part, count = label[nodes] >= 0, np.bincount(label[nodes] + 1)
+        own = (label[near] == label[nodes][:, None]).sum(axis=1)
+        most = np.minimum(hangs.sum(axis=1), count[label[nodes] + 1] - 1)
+        share, whole = (np.bincount(label[nodes][of_part], values[of_part]) for values in (own, most))
+        accepted = np.flatnonzero((2 * share >= whole) & (count[1:] > 0))
+        if not len(accepted):
+            return is_rigid
+        is_rigid |= np.isin(label, accepted)
+
+
+def _hypotheses(paths: _Paths, nodes: np.ndarray, seed: int) -> Iterator[np.ndarray]:
+    """Few nodes whose common motion may be that of a part to which ``seed`` belongs; all of them keep their distance from it."""
+    yield np.array([seed])  # no turn
+    others = nodes[nodes != seed]
+    distance = np.linalg.norm(paths.arms(others, paths.first[seed]), axis=1)
+    others = others[distance > 100 * paths.tolerance]  # the direction to nearer ones is rounding
+    order = np.argsort(distance[distance > 100 * paths.tolerance], kind="stable")
+    ends = np.unique(np.concatenate([np.arange(min(len(order), PARTNERS)), np.arange(max(0, len(order) - PARTNERS), len(order))]))
+    for partner in others[order[ends]]:
+        pair = np.array([seed, partner])
+        if paths.first.shape[1] == 2:
+            yield pair
+            continue
+        third = paths.keep_distance(others, int(partner))
+        arms, along = paths.arms(third, paths.first[seed]), paths.arms(pair[1:], paths.first[seed])[0]
+        away = np.linalg.norm(np.cross(arms, along / np.linalg.norm(along)), axis=1)
+        near = np.argsort(np.linalg.norm(arms, axis=1), kind="stable")[:NEIGHBOURS]
+        yield pair if away[near].max(initial=0.0) <= 100 * paths.tolerance else np.append(pair, third[near[away[near].argmax()]])
+        yield pair if away.max(initial=0.0) <= 100 * paths.tolerance else np.append(pair, third[away.argmax()])
+
+
+def _grown(paths: _Paths, nodes: np.ndarray, some: np.ndarray, seed: int) -> tuple[np.ndarray, _Part]:
+    """Those of ``nodes`` that move as some of them do, and their motion: fitted again to all that were found, which is more exact."""
+    part = paths.part_of(some, seed)
+    for _ in range(4):
+        found = nodes[paths.described(nodes, part)]
+        if len(found) <= len(some):
+            break
+        some, part = found, paths.part_of(found, seed)
+    return some, part
+
+
+def _settle(paths: _Paths, label: np.ndarray, parts: list[_Part]) -> None:
+    """Give nodes to the nearest part whose motion describes them where there are several, as on the axis of a wheel, or where the node has no part yet.
+
+    Changes ``label``.
+    """
+    fits = np.stack([paths.described(np.arange(len(label)), part) for part in parts])
+    open_ones = np.flatnonzero(fits.sum(axis=0) > (label >= 0))
+    for node in open_ones:
+        others = np.setdiff1d(np.flatnonzero(np.isin(label, np.flatnonzero(fits[:, node]))), open_ones)
+        if len(others):
+            label[node] = label[others[np.linalg.norm(paths.arms(others, paths.first[node]), axis=1).argmin()]]
+
+
+def rotations(arms: np.ndarray, change: np.ndarray, tolerance: float) -> np.ndarray:
+    """Rotations [frame, dim, dim] that bring arms closest to what they are in each frame.
+
+    Args:
+        arms: from the centre to nodes in the first frame [node, dim] in m.
+        change: since then [frame, node, dim] in m.
+        tolerance: of positions [m]. Nodes in a row to 100 times of it do not say how they turn about the row: they do not.
+    """
+    now = arms + change
+    if arms.shape[1] == 2:
+        angle = np.arctan2((arms[:, 0] * now[..., 1] - arms[:, 1] * now[..., 0]).sum(axis=1), (arms * now).sum(axis=(1, 2)))
+        return np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], axis=1).reshape(-1, 2, 2)
+    if np.linalg.svd(arms, compute_uv=False)[1:2].max(initial=0.0) <= 100 * tolerance:
+        return _transported(now[:, np.linalg.norm(arms, axis=1).argmax()])
+    return _closest(np.einsum("nd,fne->fde", arms, now))
+
+
+def _closest(covariance: np.ndarray) -> np.ndarray:
+    """The rotations R [..., dim, dim] that maximise tr(R C) for covariances C = Σ a bᵀ of arms a before and b after."""
+    u, _, vt = np.linalg.svd(covariance)
+    u[..., -1] *= np.linalg.det(u @ vt)[..., None]  # a rotation, no reflection
+    return np.asarray(np.swapaxes(u @ vt, -1, -2))
+
+
+def _transported(direction: np.ndarray) -> np.ndarray:
+    """Rotations [frame, 3, 3] since the first frame, each step by the shortest way that turns a direction [frame, 3]."""
+    unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    turn = [np.eye(3)]
+    for before, after in itertools.pairwise(unit):
+        x, y, z = np.cross(before, after)
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        turn.append((np.eye(3) + cross + cross @ cross / max(1 + before @ after, 1e-12)) @ turn[-1])
+    return np.stack(turn)
+
+
+def _surroundings(paths: _Paths, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The nearest others of these nodes [node, neighbour], the arms to them [node, neighbour, dim] in m, and which of them hang together."""
+    points, box = paths.first[nodes], None
+    if paths.periodicity:
+        points, box = paths.periodicity.from_corner(points), paths.periodicity.period
+    count = min(2 ** points.shape[1], len(nodes) - 1)
+    found = cKDTree(points, boxsize=box).query(points, k=1 + count)[1].reshape(len(nodes), 1 + count)
+    near = nodes[found[:, 1:]]
+    arms = paths.periodicity.shortest(paths.first[near] - paths.first[nodes][:, None])
+    length = np.linalg.norm(arms, axis=-1)
+    hangs = length > 0
+    for moved in paths.moved:
+        now = np.linalg.norm(arms + moved[near] - moved[nodes][:, None], axis=-1)
+        hangs &= np.abs(now - length) <= STRETCH * length
+    return near, arms, hangs
+
+
+def _local_rotations(paths: _Paths, nodes: np.ndarray) -> Iterator[np.ndarray]:
+    """For every frame, how the surroundings of each of these nodes have turned [node, dim, dim]."""
+    near, arms, hangs = _surroundings(paths, nodes)
+    arms, dim = np.where(hangs[..., None], arms, 0.0), arms.shape[2]
+    extent = np.linalg.svd(np.einsum("nkd,nke->nde", arms, arms), compute_uv=False)
+    unknown = extent[:, dim - 2] <= 1e-6 * extent[:, 0] if dim == 3 else extent[:, 0] == 0  # a row in space, or nothing
+    for moved in paths.moved:
+        turn = _closest(np.einsum("nkd,nke->nde", arms, arms + moved[near] - moved[nodes][:, None]))
+        yield np.where(unknown[:, None, None], np.eye(dim), turn)

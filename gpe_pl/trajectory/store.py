@@ -1,0 +1,401 @@
+"""Trajectories on disk.
+
+A shard is one HDF5 file with a group per trajectory. It is written under a temporary name and renamed, so a reader never sees half of one.
+Every array is chunked with a fletcher32 checksum, and each group carries a SHA-256 digest of all its arrays and attributes. Text is stored
+with a fixed length: HDF5 keeps text of variable length outside its checksums, where one flipped bit can hang the library.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from gpe_pl.errors import GpeError
+from gpe_pl.files.atomic import replacing
+from gpe_pl.files.hdf5_arrays import attribute, dataset_in, is_named, is_own, obstacle
+from gpe_pl.files.json_text import parsed
+from gpe_pl.geometry.shape_values import shape_from_dict, shape_to_dict, shapes_fault
+from gpe_pl.geometry.shapes import Shape
+from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, SCHEMA_VERSION, node_code
+from gpe_pl.system.late_failure import LateFailure
+from gpe_pl.trajectory.trajectory import Boundary, Metadata, Motion, Stress, Trajectory
+from gpe_pl.trajectory.values import faults, size_conflicts
+
+
+class StoreError(GpeError, ValueError):
+    """A file of the store is missing, damaged or of another schema; the message names file, trajectory and field."""
+
+
+class UnsoundError(StoreError):
+    """A stored trajectory can be read, but holds what nothing can be learned from or compared with.
+
+    Attributes:
+        fault: what is wrong, without file and trajectory.
+    """
+
+    def __init__(self, where: str, fault: str) -> None:
+        super().__init__(f"{where}: {fault}; see `python -m gpe_pl.data.validate`")
+        self.fault = fault
+
+
+def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
+    """The arrays of a trajectory by the names, and with the types, of ``schema.FIELDS``."""
+    b = trajectory.boundary
+    arrays: dict[str, Any] = {
+        "pos": trajectory.pos,
+        "vel": trajectory.vel,
+        "node_type": trajectory.node_type,
+        "mass": trajectory.mass,
+        "material_params": trajectory.material_params,
+        "boundary_pos": b.pos[None] if b.motion is None else b.motion.pos,
+        "boundary_vel": b.vel[None] if b.motion is None else b.motion.vel,
+        "boundary_normal": b.normal[None] if b.motion is None else b.motion.normal,
+        "boundary_friction": b.friction,
+        "boundary_restitution": b.restitution,
+        "rest_pos": trajectory.rest_pos,
+        "cells": trajectory.cells,
+        "cell_dim": None if trajectory.cells is None or trajectory.cell_dim is None else [trajectory.cell_dim],
+    }
+    if trajectory.stress is not None:
+        for part in ("node", "cell"):
+            arrays[f"{part}_stress"] = getattr(trajectory.stress, part)
+            arrays[f"{part}_von_mises"] = getattr(trajectory.stress, f"{part}_von_mises")
+    return {k: np.ascontiguousarray(v, dtype=FIELDS[k].dtype) for k, v in arrays.items() if v is not None}
+
+
+def array_bytes(trajectory: Trajectory) -> int:
+    """Bytes of what is stored of a trajectory, uncompressed."""
+    return sum(array.nbytes for array in stored_arrays(trajectory).values())
+
+
+PREDICTION = "prediction"
+"""Attribute that only predictions have."""
+START_TIME = "start_time"
+"""Attribute of trajectories that begin later than their scene, in s: solvers do not take their first frame for undeformed."""
+ATTRIBUTES = ("metadata", "shapes", "node_types")
+"""Of a trajectory's group, beside the digest."""
+
+
+def stored_attributes(trajectory: Trajectory) -> dict[str, str]:
+    """What else is stored of a trajectory, as JSON: metadata, shapes of its boundary, the names behind ``node_type``, and when it begins, if not at 0."""
+    m = trajectory.metadata
+    meta = json.dumps(asdict(m), sort_keys=True)
+    shapes = json.dumps([shape_to_dict(s) for s in trajectory.boundary.shapes], sort_keys=True)
+    begins = {START_TIME: repr(float(trajectory.start_time))} if trajectory.start_time else {}
+    return {"metadata": meta, "shapes": shapes, "node_types": json.dumps(NODE_TYPES), **begins}
+
+
+def digest(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
+    """SHA-256 over names, shapes, types and bytes of all arrays and attributes of a trajectory."""
+    sha = hashlib.sha256()
+    for name, text in sorted(attributes.items()):
+        sha.update(f"{name}={text};".encode())
+    for name, array in sorted(arrays.items()):
+        sha.update(f"{name}:{array.dtype.str}:{array.shape};".encode())
+        sha.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+    return sha.hexdigest()
+
+
+COMPRESSION = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
+"""Lossless: a quarter less disk for particles, more for meshes; higher levels save a per cent."""
+
+
+def _chunks(array: np.ndarray, dims: tuple[str, ...]) -> tuple[int, ...]:
+    """Whole arrays in one chunk, except that frames are cut into chunks of about 256 kB."""
+    if dims[0] != "frame" and not (dims[0] == MOTION and len(array) > 1):
+        return tuple(max(1, n) for n in array.shape)
+    frame_bytes = max(1, array[:1].nbytes)
+    return (max(1, min(array.shape[0], 2**18 // frame_bytes)), *(max(1, n) for n in array.shape[1:]))
+
+
+def write_shard(path: Path | str, trajectories: Iterable[Trajectory], names: Iterable[str] | None = None) -> None:
+    """Write trajectories into one file, atomically: the file appears complete or not at all.
+
+    Args:
+        path: target file; an existing one is replaced.
+        trajectories: consumed one by one.
+        names: group names; by default ``00000, 00001, …``.
+
+    Raises:
+        ValueError: ``names`` are fewer than the trajectories.
+        FullDiskError: there is no room for the file.
+    """
+    path = Path(path)
+    name_of = iter(names) if names is not None else (f"{k:05d}" for k in range(10**9))
+    # track_times off and the libver pinned: equal content gives equal bytes
+    with replacing(path) as part, LateFailure(part) as place:
+        with h5py.File(place, "w", libver=("v110", "v110"), track_order=False) as file:
+            file.attrs["schema_version"] = SCHEMA_VERSION
+            _write_text(file, "units", json.dumps({k: f.unit for k, f in FIELDS.items()}, sort_keys=True))
+            count = 0
+            for trajectory in trajectories:
+                name = next(name_of, None)
+                if name is None:
+                    raise ValueError(f"{path}: {count} names for more than {count} trajectories")
+                _write_trajectory(file.create_group(name), trajectory)
+                place.check()
+                count += 1
+            file.attrs["num_trajectories"] = count
+        place.check()
+
+
+def _write_trajectory(group: h5py.Group, trajectory: Trajectory) -> None:
+    arrays, attributes = stored_arrays(trajectory), stored_attributes(trajectory)
+    for key, text in attributes.items():
+        _write_text(group, key, text)
+    _write_text(group, "sha256", digest(arrays, attributes))
+    if trajectory.is_prediction:
+        _write_text(group, PREDICTION, "")
+    for key, array in arrays.items():
+        empty = array.size == 0
+        options = {} if empty else {"chunks": _chunks(array, FIELDS[key].dims), "fletcher32": True, **COMPRESSION}
+        dataset = group.create_dataset(key, data=array, track_times=False, **options)
+        _write_text(dataset, "unit", FIELDS[key].unit)
+
+
+def _write_text(owner: h5py.HLObject, key: str, text: str) -> None:
+    owner.attrs.create(key, np.bytes_(text.encode()))
+
+
+@contextmanager
+def open_shard(path: Path | str) -> Iterator[h5py.File]:
+    """Open a shard of this schema version for reading; whatever HDF5 raises on a damaged file becomes a ``StoreError``."""
+    path = Path(path)
+    if not path.is_file():
+        raise StoreError(f"{path}: no such file; generate data with `python -m gpe_pl.simulate`")
+    try:
+        with h5py.File(path, "r") as file:
+            version = attribute(file, "schema_version")
+            if not isinstance(version, np.integer) or version != SCHEMA_VERSION:
+                raise StoreError(
+                    f"{path}: schema version {version}, this version of gpe_pl reads {SCHEMA_VERSION}; regenerate or convert the data"
+                )
+            yield file
+    except StoreError:
+        raise
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:  # all of these come out of HDF5 and h5py
+        raise StoreError(
+            f"{path}: not a readable HDF5 file (damaged or truncated: {error}); delete it and generate or import the data again"
+        ) from error
+
+
+def _where(group: h5py.Group) -> str:
+    return f"{group.file.filename}:{group.name.lstrip('/')}"
+
+
+def open_group(file: h5py.File, name: str) -> h5py.Group:
+    """The group of one trajectory."""
+    if not is_named(file, name):
+        raise StoreError(f"{file.filename}: no trajectory {name!r}; it has {len(file)} trajectories")
+    if not is_own(file, name) or not isinstance(file[name], h5py.Group):
+        raise StoreError(
+            f"{file.filename}: {name!r} is not a trajectory of this file; delete the shard and generate or import the data again"
+        )
+    return file[name]
+
+
+def read_text(group: h5py.Group, key: str) -> str:
+    """A text attribute of a trajectory."""
+    if key not in group.attrs:
+        raise StoreError(f"{_where(group)}: attribute {key!r} is missing; delete the shard and generate or import the data again")
+    text = attribute(group, key)
+    if not isinstance(text, bytes):  # text of variable length is not safe to read from a damaged file
+        stored = group.attrs.get_id(key)
+        raise StoreError(f"{_where(group)}: attribute {key!r} is {stored.dtype}{list(stored.shape)}, expected text of fixed length")
+    return text.decode()
+
+
+def open_field(group: h5py.Group, key: str) -> h5py.Dataset:
+    """One stored array, compared with ``schema.FIELDS`` before any of it is read."""
+    spec, where = FIELDS[key], f"{_where(group)}: field {key!r}"
+    if not is_named(group, key):
+        raise StoreError(f"{where} is missing; delete the shard and generate or import the data again")
+    dataset = dataset_in(group, key)
+    if dataset is None:
+        raise StoreError(f"{where} is not an array inside this file; a shard must not refer to other files")
+    if dataset.shape is None or len(dataset.shape) != len(spec.dims) or dataset.dtype != np.dtype(spec.dtype):
+        raise StoreError(f"{where} is {dataset.dtype}{list(dataset.shape or ())}, expected {spec.dtype} [{', '.join(spec.dims)}]")
+    if (reason := obstacle(dataset)) is not None:
+        raise StoreError(f"{where} {reason}")
+    return dataset
+
+
+def read_field(group: h5py.Group, key: str, frames: slice | None = None) -> np.ndarray:
+    """What a stored array holds; only ``frames`` of it where it has frames."""
+    spec, dataset = FIELDS[key], open_field(group, key)
+    try:
+        has_frames = spec.dims[0] == "frame" or (spec.dims[0] == MOTION and dataset.shape[0] > 1)
+        return dataset[frames] if frames is not None and has_frames else dataset[()]
+    except (OSError, RuntimeError):
+        where = f"{_where(group)}: field {key!r}"
+        raise StoreError(f"{where} is damaged (checksum mismatch); delete the shard and generate or import the data again") from None
+
+
+def trajectory_names(path: Path | str) -> list[str]:
+    """Group names of a shard, in order."""
+    with open_shard(path) as file:
+        return sorted(file)
+
+
+def read_metadata(path: Path | str, name: str) -> Metadata:
+    """Only the metadata of one trajectory."""
+    with open_shard(path) as file:
+        return metadata_of(open_group(file, name))
+
+
+def metadata_of(group: h5py.Group) -> Metadata:
+    """The metadata of a trajectory's group; every key must be there with the right type, and no other."""
+    try:
+        text = read_text(group, "metadata")
+        values = parsed(text)
+        known = {f.name for f in fields(Metadata)}
+        if not isinstance(values, dict) or set(values) != known:
+            raise ValueError(f"keys {sorted(set(values) ^ known)} missing or unknown")
+        return TypeAdapter(Metadata).validate_json(text, strict=True)
+    except StoreError:
+        raise
+    except ValidationError as error:
+        wrong = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors(include_url=False)[:5])
+        raise StoreError(f"{_where(group)}: metadata unreadable: {wrong}") from None
+    except (ValueError, TypeError) as error:
+        raise StoreError(f"{_where(group)}: metadata unreadable: {error}") from None
+
+
+def _parsed_list(group: h5py.Group, key: str) -> list[Any]:
+    values = parsed(read_text(group, key))
+    if not isinstance(values, list):
+        raise ValueError(f"is a {type(values).__name__}, must be a list")
+    return values
+
+
+def shapes_of(group: h5py.Group) -> tuple[Shape, ...]:
+    """The obstacle and wall geometry of a trajectory's group."""
+    try:
+        return tuple(shape_from_dict(values) for values in _parsed_list(group, "shapes"))
+    except StoreError:
+        raise
+    except (ValueError, TypeError, AttributeError, ArithmeticError, LookupError) as error:
+        raise StoreError(f"{_where(group)}: attribute 'shapes' is unreadable: {error}") from None
+
+
+def start_time_of(group: h5py.Group) -> float:
+    """When the first frame of a trajectory's group is, in s since the start of its scene."""
+    if START_TIME not in group.attrs:
+        return 0.0
+    try:
+        seconds = parsed(read_text(group, START_TIME))
+        if type(seconds) not in (int, float) or not math.isfinite(seconds):
+            raise ValueError("must be a number of seconds")
+    except StoreError:
+        raise
+    except ValueError as error:
+        raise StoreError(f"{_where(group)}: attribute {START_TIME!r} is unreadable: {error}") from None
+    return float(seconds)
+
+
+def node_types_of(group: h5py.Group) -> tuple[str, ...]:
+    """The names behind the integers of ``node_type`` in a trajectory's group; all of them are in ``schema.NODE_TYPES``."""
+    try:
+        names = tuple(_parsed_list(group, "node_types"))
+    except StoreError:
+        raise
+    except (ValueError, TypeError) as error:
+        raise StoreError(f"{_where(group)}: attribute 'node_types' is unreadable: {error}") from None
+    unknown = [name for name in names if name not in NODE_TYPES]
+    if unknown:
+        raise StoreError(f"{_where(group)}: attribute 'node_types' names {unknown}; known: {', '.join(NODE_TYPES)}")
+    return names
+
+
+def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: slice | None = None) -> Trajectory:
+    """Read one trajectory.
+
+    Args:
+        path: shard.
+        name: group name.
+        frames: only these frames, without reading the others; not together with ``verify``.
+        verify: recompute the SHA-256 digest (HDF5's own checksums are always verified).
+
+    Raises:
+        StoreError: file, group or field missing, wrong shape or type, or a checksum that does not match.
+        UnsoundError: metadata, shapes or values that break their rules (``Metadata.violations``, ``shape_values.shapes_fault``, ``schema.FIELDS``);
+            names field, frame and node.
+    """
+    if verify and frames is not None:
+        raise ValueError("the digest covers all frames: pass verify or frames, not both")
+    with open_shard(path) as file:
+        group = open_group(file, name)
+        metadata = metadata_of(group)
+        arrays = {key: read_field(group, key, frames) for key, spec in FIELDS.items() if spec.required or is_named(group, key)}
+        first_frame = 0 if frames is None else frames.indices(open_field(group, "pos").shape[0])[0]
+        if verify:
+            attributes = {key: read_text(group, key) for key in (*ATTRIBUTES, START_TIME) if key in (*ATTRIBUTES, *group.attrs)}
+            if digest(arrays, attributes) != read_text(group, "sha256"):
+                raise StoreError(
+                    f"{path}:{name}: SHA-256 digest does not match the content; delete the shard and generate or import the data again"
+                )
+        if ("node_stress" in arrays) != ("cell_stress" in arrays):
+            raise StoreError(f"{path}:{name}: has only one of the fields 'node_stress' and 'cell_stress'")
+        for conflict in size_conflicts(arrays, metadata.dim, len(metadata.param_names)):
+            raise StoreError(f"{path}:{name}: {conflict}")
+        shapes, names, is_prediction, begins = shapes_of(group), node_types_of(group), PREDICTION in group.attrs, start_time_of(group)
+    for key, violation in metadata.violations():
+        raise UnsoundError(f"{path}:{name}", f"{key} {violation}")
+    if (wrong := shapes_fault(shapes, metadata.periodicity)) is not None:
+        raise UnsoundError(f"{path}:{name}", wrong)
+    for fault in faults(arrays, names, metadata.materials, metadata.param_names, first_frame):
+        raise UnsoundError(f"{path}:{name}", str(fault))
+    motion = Motion(arrays["boundary_pos"], arrays["boundary_vel"], arrays["boundary_normal"])
+    boundary = Boundary(
+        motion.pos[0],
+        motion.vel[0],
+        motion.normal[0],
+        arrays["boundary_friction"],
+        arrays["boundary_restitution"],
+        shapes,
+        None if motion.num_frames == 1 else motion,
+    )
+    return Trajectory(
+        metadata,
+        arrays["pos"],
+        arrays["vel"],
+        np.array([node_code(n) for n in names], dtype=np.uint8)[arrays["node_type"]],
+        arrays["mass"],
+        arrays["material_params"],
+        boundary,
+        rest_pos=arrays.get("rest_pos"),
+        cells=arrays.get("cells"),
+        cell_dim=int(arrays["cell_dim"][0]) if "cell_dim" in arrays else None,
+        stress=Stress(arrays["node_stress"], arrays["cell_stress"]) if "node_stress" in arrays else None,
+        start_time=begins + metadata.frame_dt * first_frame,
+        is_prediction=is_prediction,
+    )
+
+
+def shards(root: Path | str, split: str) -> list[Path]:
+    """Shard files of a split under a data set's folder, in order; raises ``StoreError`` when there is none."""
+    found = sorted((Path(root) / split).glob("shard-*.h5"))
+    if not found:
+        others = sorted({path.parent.name for path in Path(root).glob("*/shard-*.h5")})
+        raise StoreError(
+            f"{root}: has no split {split!r} but {', '.join(others) or 'none'}; generate it with `python -m gpe_pl.simulate`, import data that have it, "
+            "or choose another split"
+        )
+    return found
+
+
+def iter_trajectories(root: Path | str, split: str) -> Iterator[Trajectory]:
+    """All trajectories of a split, one at a time."""
+    for path in shards(root, split):
+        for name in trajectory_names(path):
+            yield read_trajectory(path, name)

@@ -1,0 +1,381 @@
+"""Faults in small numbers: what is wrong is refused, and the judges see it when it is not."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import runpy
+import shutil
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from gpe_pl.benchmarks.faults import checkpoints, configs, field_values, isolation, pairs, runs, scenes, side_files, stores, suite
+from gpe_pl.benchmarks.faults.isolation import CANARY, Ended, verdicts
+from gpe_pl.benchmarks.faults.suite import report
+from gpe_pl.benchmarks.faults.verdict import GOOD, Fault, Verdict, judge
+from gpe_pl.data.ground_truth import DatasetSpec
+from gpe_pl.errors import GpeError
+from gpe_pl.simulate import dataset
+from gpe_pl.system import early_interrupts
+
+
+@pytest.fixture(scope="module")
+def spec() -> DatasetSpec:
+    return dataset("data=sand", "size=tiny", "data.sizes.tiny.d2.num_particles=40")
+
+
+def bad(faults: list[Fault], folder: Path) -> list[tuple[str, str, Verdict]]:
+    """Faults of which nothing good came."""
+    found = []
+    for k, fault in enumerate(faults):
+        own = folder / str(k)
+        own.mkdir()
+        verdict = fault.attack(own)
+        if verdict.status not in GOOD:
+            found.append((fault.kind, fault.name, verdict))
+    return found
+
+
+# --- what is wrong is refused ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", [3, pytest.param(1, marks=pytest.mark.long)])
+def test_damaged_and_wrong_shards(shard: Path, tmp_path: Path, step: int) -> None:
+    faults = stores.faults(shard, 16)
+    assert len(faults) > 100
+    assert not bad(faults[::step], tmp_path)
+
+
+@pytest.mark.parametrize("step", [8, pytest.param(1, marks=pytest.mark.long)])
+def test_damaged_wrong_and_hostile_checkpoints(checkpoint: Path, tmp_path: Path, step: int) -> None:
+    faults = checkpoints.faults(checkpoint, 16)
+    assert len(faults) > 100
+    assert not bad(faults[::step], tmp_path)
+
+
+def test_a_system_that_does_not_fork_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(multiprocessing, "get_all_start_methods", lambda: ["spawn"])  # as on Windows
+    with pytest.raises(GpeError, match="suite=faults needs processes that are forked"):
+        next(verdicts([]), None)
+
+
+def test_every_bit_of_a_weight_counts(checkpoint: Path, tmp_path: Path) -> None:
+    """PyTorch does not compare the checksums of the archive that it writes."""
+    weights = torch.load(checkpoint, weights_only=True)["state_dict"]
+    sought = max(weights.values(), key=lambda w: w.numel()).numpy().tobytes()
+    where = checkpoint.read_bytes().index(sought)
+    verdict = checkpoints.load_damaged(checkpoint, lambda data: data[:where] + bytes([data[where] ^ 1]) + data[where + 1 :], tmp_path)
+    assert verdict.status == "refused"
+    assert "checksum mismatch" in verdict.detail
+
+
+@pytest.mark.parametrize("learned", [False, True], ids=["solver", "model"])
+def test_impossible_scenes(spec: DatasetSpec, tmp_path: Path, learned: bool) -> None:
+    every = [f for f in scenes.faults({"sand": spec}, 1) if ("model" in f.name) is learned]
+    assert {f.kind.removeprefix("scene, ") for f in every} == set(scenes.CHANGES)
+    assert not bad(every, tmp_path)
+
+
+@pytest.mark.parametrize("step", [23, pytest.param(1, marks=pytest.mark.long)])
+def test_values_that_break_a_rule(shard: Path, tmp_path: Path, step: int) -> None:
+    faults = field_values.faults({"sand": shard})
+    assert {f.kind.removeprefix("value, ") for f in faults} == set(field_values.WAYS)
+    assert len(faults) > 200
+    assert not bad(faults[::step], tmp_path)
+
+
+@pytest.mark.parametrize("step", [19, pytest.param(1, marks=pytest.mark.long)])
+def test_small_files_and_archives(tmp_path: Path, step: int) -> None:
+    side_files.raw_arrays(tmp_path / "raw")
+    faults = side_files.faults(tmp_path / "raw")
+    assert len(faults) > 100
+    assert not bad(faults[::step], tmp_path)
+
+
+# --- and it is seen when it is not ----------------------------------------------------------------------------------------------------------
+
+
+def test_judges_tell_what_came_of_it() -> None:
+    def fails(error: Exception) -> None:
+        raise error
+
+    assert judge(lambda: 1, lambda x: x == 1).status == "harmless"
+    assert judge(lambda: 2, lambda x: x == 1).status == "accepted"
+    assert judge(lambda: fails(GpeError("file, reason")), lambda _: True) == Verdict("refused", "file, reason")
+    assert judge(lambda: fails(GpeError("")), lambda _: True).status == "traceback"
+    assert judge(lambda: fails(KeyError("x")), lambda _: True) == Verdict("traceback", "KeyError: 'x'")
+
+
+def test_a_changed_value_with_a_fitting_checksum_is_accepted(shard: Path, tmp_path: Path) -> None:
+    def rewrite(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            file["00001"]["pos"][2, 3, 1] += np.float32(0.1)
+
+    assert stores.read_rewritten(shard, rewrite, tmp_path).status == "accepted"
+
+
+def test_bytes_without_meaning_may_change(shard: Path, tmp_path: Path) -> None:
+    same, other = tmp_path / "same.h5", tmp_path / "other.h5"
+    same.write_bytes(shard.read_bytes() + b"beyond the end")
+    shutil.copy(shard, other)
+    with h5py.File(other, "r+") as file:
+        file["00000"]["pos"][0, 0, 0] += 0.5
+    assert runs._hold_the_same(shard, same)
+    assert not runs._hold_the_same(shard, other)
+    assert not runs._hold_the_same(shard, tmp_path / "missing.h5")
+
+
+def test_payloads_work_where_they_are_let(tmp_path: Path) -> None:
+    for kind in checkpoints.PAYLOADS:
+        folder = tmp_path / kind
+        folder.mkdir()
+        torch.save(checkpoints.payload(kind, folder), folder / "evil.ckpt")
+        torch.load(folder / "evil.ckpt", weights_only=False)
+        assert (folder / checkpoints.TRACE).exists(), kind
+
+
+@pytest.mark.parametrize(
+    ("code", "output", "status"),
+    [
+        (0, "", "harmless"),
+        (2, "some text\nerror: name=1: must be a name\n", "refused"),
+        (1, "Traceback (most recent call last):\n  …\nKeyError: 1\n", "traceback"),
+        (2, "", "traceback"),  # no message
+        (-11, "", "died"),
+        (None, "", "hung"),
+    ],
+)
+def test_a_command_is_judged_by_its_last_words(code: int | None, output: str, status: str) -> None:
+    assert Ended(code, output).verdict().status == status
+
+
+def test_every_kind_of_wrong_configuration_is_made_of_a_value() -> None:
+    values = dict(configs.leaves({"a": {"b": 1, "c": 0.5, "d": True}, "e": "text", "f": [1, 2], "paths": {"data": "x"}}))
+    assert values == {"a.b": 1, "a.c": 0.5, "a.d": True, "e": "text", "f": [1, 2]}
+    for key, value in values.items():
+        kinds = {kind for kind, _, _ in configs.mutations(key, value)}
+        assert kinds >= {"unknown key", "missing key", "wrong type"}
+    assert ("wrong type", "a.b=banana", True) in list(configs.mutations("a.b", 1))
+
+
+def _finds(_: Path) -> Verdict:
+    return Verdict("refused", "found")
+
+
+def _hangs(_: Path) -> Verdict:
+    time.sleep(600)
+    return Verdict("harmless")
+
+
+def _dies(_: Path) -> Verdict:
+    os._exit(3)
+
+
+def _raises(_: Path) -> Verdict:
+    raise KeyError("by mistake")
+
+
+@pytest.mark.long
+def test_what_hangs_or_dies_costs_only_itself() -> None:
+    attacks: dict[str, Callable[[Path], Verdict]] = {
+        "refused": _finds,
+        "hung": _hangs,
+        "died": _dies,
+        "traceback": _raises,
+        "harmless": partial(_sleeps, 0.01),
+    }
+    faults = [Fault("kind", name, attack) for name, attack in attacks.items()] * 2
+    assert [v.status for v in verdicts(faults, limit=20.0)] == [f.name for f in faults]
+
+
+def _sleeps(seconds: float, _: Path) -> Verdict:
+    time.sleep(seconds)
+    return Verdict("harmless")
+
+
+def _writes_outside(path: str, own: Path) -> Verdict:
+    (own.parent / CANARY / path).write_text("changed")
+    return Verdict("harmless")
+
+
+@pytest.mark.parametrize("path", ["checkpoints/best.ckpt", "new"])
+def test_what_changes_a_folder_beside_its_own_is_outside(tmp_path: Path, path: str) -> None:
+    verdict = isolation._watched(Fault("kind", "name", partial(_writes_outside, path)), tmp_path / "own", tmp_path / CANARY)
+    assert verdict.status == "outside" and path in verdict.detail
+
+
+def test_what_takes_longer_than_it_may_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(isolation, "HANG", 0.05)
+    fault = Fault("kind", "name", partial(_sleeps, 0.2))
+    assert isolation._watched(fault, tmp_path / "own", tmp_path / CANARY).status == "hung"
+    assert isolation._watched(replace(fault, seconds=30.0), tmp_path / "own", tmp_path / CANARY).status == "harmless"
+
+
+@dataclass
+class Ends:
+    """A command that has ended already."""
+
+    exitcode: int
+
+    def kill(self) -> None:
+        pass
+
+    def join(self, _: float = 0.0) -> None:
+        pass
+
+
+HELD = "error: runs/fit: another command writes to it (process 7 on here, since noon: fit); wait until it has ended"
+
+
+def ends_at_once(monkeypatch: pytest.MonkeyPatch, codes: tuple[int, ...], said: str, found: dict[str, str]) -> None:
+    """Commands end with these codes, say this where it is not 0, and leave files with these digests."""
+    ended = iter(codes)
+
+    def start(module: str, arguments: list[str], output: Path) -> Ends:
+        code = next(ended)
+        output.write_text(said if code else "")
+        return Ends(code)
+
+    monkeypatch.setattr(isolation, "start", start)
+    monkeypatch.setattr(runs, "digests", lambda _: found)
+
+
+COMMANDS = [runs.Command(name, "fit", ()) for name in ("one", "other")]
+
+
+@pytest.mark.parametrize(
+    ("codes", "said", "left", "status"),
+    [
+        ((0, 2), HELD, "first", "refused"),
+        ((0, 2), HELD, "second", "different"),  # of the one that was refused
+        ((0, 2), HELD, "both", "different"),
+        ((0, 0), "", "both", "harmless"),
+        ((0, 0), "", "first", "different"),  # the other said that it succeeded
+        ((2, 2), HELD, "", "different"),
+        ((0, 1), "Traceback (most recent call last):", "first", "traceback"),
+        ((2, 0), "error: something is in the way", "second", "accepted"),  # of whom?
+        ((2, 0), HELD, "second", "refused"),
+        ((2, 0), HELD.replace("fit)", f"fit {'x' * 400})"), "second", "refused"),
+    ],
+)
+def test_two_commands_are_judged_by_what_they_leave(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codes: tuple[int, int], said: str, left: str, status: str
+) -> None:
+    expected = ({"a": "1", "b": "2"}, {"a": "1", "c": "3"})
+    ends_at_once(monkeypatch, codes, said, {"first": expected[0], "second": expected[1], "both": expected[0] | expected[1], "": {}}[left])
+    assert pairs.together(COMMANDS, expected, 0.0, 10.0, tmp_path).status == status
+
+
+@pytest.mark.parametrize(("left", "status"), [(".fit.lock", "harmless"), (".fit.holder", "harmless"), ("x.part", "half-written")])
+def test_a_lock_of_a_killed_command_may_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, left: str, status: str) -> None:
+    """The operating system has released it; but the command that ends by itself removes what is temporary."""
+
+    class Runs(Ends):
+        pid = 0
+
+    process, waits = Runs(0), iter([False, True])
+
+    def start(module: str, arguments: list[str], output: Path) -> Runs:
+        output.touch()
+        (tmp_path / "killed-0" / "runs").mkdir(parents=True)
+        (tmp_path / "killed-0" / "runs" / left).touch()
+        return process
+
+    monkeypatch.setattr(isolation, "start", start)
+    monkeypatch.setattr(isolation, "run", lambda *_: Ended(0, ""))
+    monkeypatch.setattr(isolation, "waited", lambda *_: next(waits))
+    monkeypatch.setattr(os, "kill", lambda *_: None)
+    assert [verdict.status for verdict in runs.kills(COMMANDS[0], tmp_path, 1)] == [status]
+
+
+@pytest.mark.parametrize(
+    ("module", "found", "said", "status"),
+    [
+        ("convert", "1", "error: exists already", "harmless"),
+        ("convert", "2", "error: exists already", "different"),
+        ("convert", "1", "Traceback (most recent call last):", "different"),
+        ("fit", "1", "error: exists already", "different"),
+    ],
+)
+def test_an_import_that_is_done_need_not_be_done_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, found: str, said: str, status: str
+) -> None:
+    monkeypatch.setattr(isolation, "run", lambda *_: Ended(2, said))
+    monkeypatch.setattr(runs, "digests", lambda _: {"a": found})
+    assert runs.finished(runs.Command("one", module, ()), tmp_path, {"a": "1"}, 1.0).status == status
+
+
+def test_a_traceback_is_shown_where_more_was_printed_after_it() -> None:
+    text = "a\nException ignored in: <x>\nTraceback (most recent call last):\n  File 'a'\n    b()\nKeyboardInterrupt\nruns/fit\n"
+    found = runs.TRACEBACK.search(text)
+    assert found is not None
+    assert found.group() == text[2:-10]
+
+
+def test_a_command_that_is_killed_at_once_has_printed_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Context:
+        def Process(self, **_: object) -> Context:
+            return self
+
+        def start(self) -> None:
+            pass
+
+    monkeypatch.setattr(isolation, "forks", Context)
+    isolation.start("fit", [], tmp_path / "output")
+    assert (tmp_path / "output").read_bytes() == b""
+
+
+def test_an_early_interrupt_is_one_line_in_a_forked_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in one that ``python -m`` starts."""
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(os, "dup2", lambda *_: None)
+    caught: list[object] = []
+    monkeypatch.setattr(runpy, "run_module", lambda *_, **__: caught.append(signal.getsignal(signal.SIGINT)))
+    monkeypatch.setattr("sys.argv", [])
+    try:
+        isolation._run_command("fit", [], str(tmp_path / "output"), None)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert caught == [early_interrupts._end_process]
+
+
+def test_the_time_of_a_command_is_that_without_compilation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, takes = [0.0], iter([60.0, 2.0])
+
+    def run(*_: object) -> Ended:
+        clock[0] += next(takes)
+        return Ended(0, "")
+
+    monkeypatch.setattr(isolation, "run", run)
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    settings = suite.Settings(cases={}, data=[], commands={"simulate": suite.Attacked("simulate", [])})
+    assert suite._prepared(settings, tmp_path)["simulate"].seconds == 2.0
+
+
+def test_the_matrix_counts_and_shows_what_is_bad() -> None:
+    records = [{"kind": "shard, truncated", "fault": f"{k}", "status": "refused", "detail": "x"} for k in range(3)]
+    records += [{"kind": "shard, truncated", "fault": "7|8", "status": "accepted", "detail": "no error"}]
+    records += [{"kind": "file", "fault": "a pipe", "status": "hung", "detail": "12 s"}]
+    records += [
+        {"kind": "fit killed", "fault": "", "status": status, "detail": "SIGKILL after 1 s"}
+        for status in ("harmless", "harmless", "different")
+    ]
+    text = report(records)
+    assert text.startswith(
+        "5 corrupted or hostile inputs: 0 tracebacks without a typed error, 1 silent acceptances, 0 executed payloads, "
+        "0 paths outside, 1 hangs over 10 s, 0 other failures. 3 kills: 2 "
+    )
+    assert "| fault | number | refused | harmless | accepted | different | hung |" in text
+    assert "| shard, truncated | 4 | 3 | 0 | 1 | 0 | 0 |" in text
+    assert "| fit killed | 3 | 0 | 2 | 0 | 1 | 0 |" in text
+    assert "- shard, truncated, 7\\|8: accepted: no error" in text
+    assert "**3 failures**" in text

@@ -1,0 +1,200 @@
+"""Cost against error: what follows from points on the two axes, and that all simulators get there."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpe_pl.benchmarks import runtime_vs_error as module
+from gpe_pl.benchmarks.runtime_vs_error import (
+    DATA,
+    ComparisonError,
+    Family,
+    Point,
+    Settings,
+    _models,
+    _Restricted,
+    _timed,
+    _with_longer_steps,
+    break_even,
+    compare,
+    cost_at_error,
+    error_at_cost,
+    figures,
+    front,
+    hypervolume,
+    run,
+    training_seconds,
+    verdicts,
+)
+from gpe_pl.benchmarks.trained import Case
+from gpe_pl.data.ground_truth import generate_trajectory, initial_state, trajectory_metadata
+from gpe_pl.files import sealed
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.models.gns import GNS
+from gpe_pl.models.gpe import GPE
+from gpe_pl.reports.finished_runs import Run, table_of
+from gpe_pl.rollout.baselines import ConstantVelocity
+from gpe_pl.simulate import dataset_spec
+from gpe_pl.solvers.resolution import Resolved
+from tests.runs import compose
+
+OVERRIDES = ["data=sand", "size=tiny", "data.sizes.tiny.num_frames=24"]
+
+
+def point(name: str, cost: float, error: float, family: Family = "solver") -> Point:
+    return Point(name, family, [cost], {"full": [error]})
+
+
+LADDER = [point("fine", 8.0, 1e-4), point("medium", 2.0, 1e-3), point("worse", 3.0, 5e-3), point("coarse", 0.5, 1e-2)]
+
+
+def test_the_front_is_what_nothing_beats() -> None:
+    assert [p.name for p in front(LADDER, "full")] == ["coarse", "medium", "fine"]
+    assert [p.name for p in front([*LADDER, point("broken", 0.1, float("inf"))], "full")] == ["coarse", "medium", "fine"]
+
+
+def test_equal_error_costs_what_lies_between_two_resolutions() -> None:
+    assert cost_at_error(LADDER, 1e-3, "full") == pytest.approx(2.0)
+    assert cost_at_error(LADDER, 10**-3.5, "full") == pytest.approx(4.0)
+    assert cost_at_error(LADDER, 1.0, "full") == 0.5
+    assert cost_at_error(LADDER, 1e-5, "full") == float("inf")
+
+
+def test_equal_cost_buys_what_lies_between_two_resolutions() -> None:
+    assert error_at_cost(LADDER, 2.0, "full") == pytest.approx(1e-3)
+    assert error_at_cost(LADDER, 4.0, "full") == pytest.approx(10**-3.5)
+    assert error_at_cost(LADDER, 100.0, "full") == pytest.approx(1e-4)
+    assert error_at_cost(LADDER, 0.1, "full") == float("inf")
+
+
+def test_the_verdict_says_who_is_below_the_curve_or_what_the_nearest_lacks() -> None:
+    def verdict(*models: Point) -> str:
+        (line,) = verdicts([*LADDER, *models], ["full"])
+        return line
+
+    slow, fast = point("slow", 8.0, 10**-3.5, "learned"), point("fast", 1.0, 1e-3, "learned")
+    assert "**below" in verdict(slow, fast) and "fast" in verdict(slow, fast) and "slow" not in verdict(slow, fast)
+    assert "Nearest is slow: it would have to be 2 times faster, or 3.2 times more accurate at its cost" in verdict(slow)
+    assert "**below" in verdict(point("exact", 100.0, 1e-6, "learned"))
+    careless, lost = point("careless", 0.01, 0.5, "learned"), point("lost", 1.0, float("inf"), "learned")
+    assert "as the cheapest of the solvers (coarse). Nearest is careless: it would have to be 50 times more accurate" in verdict(
+        careless, lost
+    )
+
+
+def test_training_pays_off_after_what_it_saves() -> None:
+    model = point("model", 1.0, 1e-3, "learned")
+    model.overhead = 600.0
+    assert break_even(model, LADDER, "full", duration=2.0) == pytest.approx(300.0)
+    model.seconds = [3.0]
+    assert break_even(model, LADDER, "full", duration=2.0) == float("inf")
+
+
+def test_hypervolume_is_the_area_of_steps() -> None:
+    assert hypervolume([point("a", 1.0, 1e-2)], "full", (10.0, 1.0)) == pytest.approx(2.0)
+    two = [point("a", 1.0, 1e-1), point("b", 10**0.5, 1e-2)]
+    assert hypervolume(two, "full", (10.0, 1.0)) == pytest.approx(1.0 + 0.5)
+    assert hypervolume([point("slow", 20.0, 1e-2)], "full", (10.0, 1.0)) == 0
+
+
+def untrained() -> LearnedSimulator:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    builder = GraphBuilder(GraphConfig(history=2), trajectory_metadata(spec, "test", 0))
+    return LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder)
+
+
+def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    settings = Settings({}, [], factors=[2.0], step_factors=[2], num_trajectories=1, horizons=[10])
+    points, order = compare(spec, {"GPE 1 × 8": (untrained(), 60.0)}, settings)
+    by_name = {p.name: p for p in points}
+    assert {DATA, "GPE 1 × 8", "ballistic", "stops at walls", "constant velocity"} < set(by_name)
+    assert by_name[DATA].error("10") < by_name["solver, spacing × 2"].error("10") < by_name["constant velocity"].error("10")
+    assert by_name[DATA].error("10") < by_name["solver, steps × 2"].error("10") < by_name["constant velocity"].error("10")
+    assert all(p.cost > 0 and set(p.mse) == {"10", "full"} for p in points)
+    assert by_name["GPE 1 × 8"].overhead > 60.0
+    assert np.isfinite(order)
+
+
+def test_training_took_its_steps_at_the_step_time_of_its_sweep(tmp_path: Path) -> None:
+    config = {"data.name": "sand", "size.name": "tiny", "model._target_": "gpe_pl.models.gpe.GPE", "training.num_steps": 100}
+    config |= {"size.comparison.budget_minutes": 1}
+    sweep = tmp_path / "sweep"
+    sweep.mkdir()
+    trained = Run(sweep / "seed=0", config, table_of([]))
+    assert math.isnan(training_seconds(trained))
+    times = {"sand tiny GPE 1": 0.5, "sand tiny GPE 2": 0.1, "sand tiny GPE 3": 0.7, "sand small GPE 1": 0.55, "sand tiny GNS 1": 0.58}
+    sealed.write(sweep / "step_times.json", times)
+    assert training_seconds(trained) == 50.0  # 70 s were more than it had
+
+
+def test_longer_steps_are_as_many_frames_and_what_lies_between_is_interpolated() -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    data, start = generate_trajectory(spec, "test", 0), initial_state(spec, "test", 0)
+    dt = data.metadata.frame_dt
+    for every in (1, 3):
+        at = _Restricted(Resolved(start, lambda pos: pos), True, every)
+        prediction, _ = _timed(ConstantVelocity(every * dt), at, data, 0)
+        times = dt * np.arange(data.num_frames)[:, None, None]
+        assert prediction.num_frames == data.num_frames
+        np.testing.assert_allclose(prediction.pos, start.pos + times * start.vel, rtol=1e-6, atol=1e-9)
+
+
+def test_solvers_on_a_grid_have_longer_steps_up_to_a_cell() -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    longer = _with_longer_steps(spec, 4)
+    assert longer is not None
+    assert (longer.frame_dt, longer.cfl) == (4 * spec.solver.frame_dt, 1.0)
+    assert _with_longer_steps(dataset_spec(compose("simulate", "data=fem", "size=tiny")), 4) is None
+
+
+def test_every_model_also_holds_its_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulator = untrained()
+    simulator.model = GNS(simulator.builder.spec, num_message_passing_steps=1, hidden_channels=8)
+    monkeypatch.setattr(module, "trained_on", lambda *_: {"GNS": (simulator, None)})
+    monkeypatch.setattr(module, "training_seconds", lambda _: 120.0)
+    models = _models([], dataset_spec(compose("simulate", *OVERRIDES)), Settings({}, [], holds=[2, 4]))
+    assert {label: (s.skips.hold, seconds) for label, (s, seconds) in models.items()} == {
+        "GNS": (1, 120.0),
+        "GNS, held predictions × 2": (2, 120.0),
+        "GNS, held predictions × 4": (4, 120.0),
+    }
+    assert all(s.model is simulator.model for s, _ in models.values())
+
+
+def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    points = [
+        *LADDER,
+        point("model", 1.0, 2e-3, "learned"),
+        point("slow model", 9.0, 2e-3, "learned"),
+        point("exact model", 9.0, 1e-5, "learned"),
+        point("careless model", 0.1, 5e-2, "learned"),
+        point("ballistic", 0.01, 0.1, "trivial"),
+    ]
+    for p in points:
+        p.distance = [1e-3]
+    monkeypatch.setattr(module, "_models", lambda *_: {"model": None})
+    monkeypatch.setattr(module, "compare", lambda *_: (points, 1.3))
+    records, table = run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec})
+    assert "| model | **1.3** |" in table and "| slow model | 0.15 |" in table
+    assert "| slow model | never |" in table
+    assert {(r["simulator"], r["value"]) for r in records if r["metric"] == "break_even"} >= {("slow model", float("inf")), ("model", 0.0)}
+    assert "| exact model | **more accurate" in table and "| careless model | cheaper and less accurate" in table
+    assert "@full: **below the solver's curve**: model, exact model." in table
+    assert "order of convergence is 1.3" in table
+    axes = figures(records)["cost_error_sand"].axes[0]
+    labels = ["solver, coarser to the left", "solver, longer steps", "model", "slow", "exact", "careless", "ballistic"]
+    assert axes.get_title() == "all frames" and [line.get_label() for line in axes.lines] == labels
+
+
+def test_nothing_to_compare_says_so(tmp_path: Path) -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    with pytest.raises(ComparisonError, match=": no finished run that was trained on the data set 'sand' of size 'tiny'"):
+        run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec})

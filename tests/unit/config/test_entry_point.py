@@ -1,0 +1,397 @@
+"""Whatever is wrong in a config: one line that names it and says what is allowed, exit code 2, no traceback."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Annotated, Any, Literal
+
+import hydra
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from pydantic import Field
+
+from gpe_pl.benchmark import benchmark, without_folder
+from gpe_pl.config import entry_point as configuration
+from gpe_pl.config.entry_point import ConfigError, Report, bind, construct, entry_point, explain, output_dir, quoted
+from gpe_pl.config.folder import CONF
+from gpe_pl.errors import GpeError
+from gpe_pl.fit import fit
+from gpe_pl.learned.simulator import UnknownModelError
+from gpe_pl.simulate import dataset_spec
+from tests.runs import compose
+
+ROOT = Path(__file__).parents[3]
+
+
+@dataclass(frozen=True)
+class Inner:
+    size: Annotated[int, Field(ge=1)]
+    kind: Literal["a", "b"] = "a"
+    rate: Annotated[float, Field(gt=0)] | None = 0.5
+    names: list[str] = field(default_factory=lambda: ["x"])
+
+    def __post_init__(self) -> None:
+        if self.kind == "b" and self.size > 5:
+            raise ValueError("size must be at most 5 for kind b")
+
+
+class Network:
+    def __init__(self, spec: Any, width: Annotated[int, Field(ge=1)] = 3, *, deep: bool = False) -> None:
+        self.spec, self.width, self.deep = spec, width, deep
+
+
+# --- construct -----------------------------------------------------------------------------------------------------------------------------
+
+
+def test_construct_checks_and_converts() -> None:
+    made = construct(Inner, OmegaConf.create({"size": "3", "kind": "b", "rate": None, "names": ["p", "q"]}), "inner")
+    assert made == Inner(3, "b", None, ["p", "q"])
+    assert construct(Inner, {"size": 2}, "inner") == Inner(2)
+    network = construct(Network, {"width": 7}, "model", spec=SimpleNamespace())
+    assert (network.width, network.deep) == (7, False)
+
+
+def test_construct_resolves_interpolations() -> None:
+    cfg = OmegaConf.create({"n": 4, "inner": {"size": "${n}"}})
+    assert construct(Inner, cfg.inner, "inner").size == 4
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"size": 0}, "inner.size=0: input should be greater than or equal to 1"),
+        ({"size": "many"}, "inner.size='many': input should be a valid integer, unable to parse string as an integer"),
+        ({"size": 1.5}, "inner.size=1.5: input should be a valid integer, got a number with a fractional part"),
+        ({"size": None}, "inner.size=None: input should be a valid integer"),
+        ({}, "inner.size: field required"),
+        ({"size": 1, "kind": "c"}, "inner.kind='c': input should be 'a' or 'b'"),
+        ({"size": 1, "rate": -1.0}, "inner.rate=-1.0: input should be greater than 0"),
+        ({"size": 1, "rate": float("inf")}, "inner.rate=inf: input should be a finite number"),
+        ({"size": 10**30}, f"inner.size={10**30}: must be within ±9223372036854775807"),
+        ({"size": 1, "names": ["x", -(10**30)]}, f"inner.names.1={-(10**30)}: must be within ±9223372036854775807"),
+        ({"size": 1, "names": ["x", 3]}, "inner.names.1=3: input should be a valid string"),
+        ({"size": 1, "sise": 2}, "inner.sise: unknown key; valid keys: size, kind, rate, names"),
+        ({"size": 0, "kind": "c"}, "inner.size=0: input should be greater than or equal to 1; inner.kind='c': input should be 'a' or 'b'"),
+        ({"size": 9, "kind": "b"}, "inner: size must be at most 5 for kind b"),
+    ],
+)
+def test_construct_names_key_value_and_what_is_allowed(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        construct(Inner, settings, "inner")
+    assert str(caught.value) == message
+
+
+def test_a_given_argument_is_no_key() -> None:
+    with pytest.raises(ConfigError, match="model.spec: unknown key; valid keys: width, deep"):
+        construct(Network, {"spec": 3}, "model", spec=SimpleNamespace())
+
+
+def test_bind_checks_before_anything_is_built() -> None:
+    with pytest.raises(ConfigError, match="model.width=0"):
+        bind(Network, {"width": 0}, "model", "spec")
+    network = bind(Network, {"width": 2}, "model", "spec")(spec="later")
+    assert (network.spec, network.width) == ("later", 2)
+
+
+def test_typed_errors_pass_through_construct() -> None:
+    class Special(GpeError, ValueError):
+        pass
+
+    def target(x: int) -> None:
+        raise Special("as it is")
+
+    with pytest.raises(Special, match="^as it is$"):
+        construct(target, {"x": 1}, "path")
+
+
+# --- composition ---------------------------------------------------------------------------------------------------------------------------
+
+
+def complaint(name: str, *overrides: str) -> str:
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"), pytest.raises(HydraException) as caught:
+        hydra.compose(name, list(overrides), return_hydra_config=True)
+    return explain(caught.value, name, list(overrides))
+
+
+@pytest.mark.parametrize(
+    ("name", "override", "words"),
+    [
+        ("fit", "trianing.num_steps=5", ["trianing.num_steps: unknown key 'trianing'; valid keys: ", "training", "experiment"]),
+        ("fit", "training.noise_std=0.3", ["unknown key 'noise_std'; valid keys of training: ", "velocity_noise_of_change"]),
+        ("fit", "training.num_stpes=5", ["training.num_stpes: unknown key 'num_stpes'; valid keys of training: ", "num_steps"]),
+        ("fit", "model.interation=odd", ["unknown key 'interation'; valid keys of model: ", "interaction"]),
+        ("fit", "data.scene.num_partcles=3", ["unknown key 'num_partcles'; valid keys of data.scene: ", "num_particles"]),
+        ("fit", "data.sizes.tiny.num_trian=3", ["unknown key 'num_trian'; valid keys of data.sizes.tiny: ", "num_train"]),
+        ("fit", "data.sizes.tyni.num_train=3", ["unknown key 'tyni'; valid keys of data.sizes: ", "tiny"]),
+        ("fit", "experimnt=sand", ["unknown key 'experimnt'; valid keys: ", " experiment,"]),
+        ("fit", "modle=gpe", ["unknown key 'modle'; valid keys: ", " model,"]),
+        ("fit", "model=gep", ["'model/gep'", "gpe"]),
+        ("fit", "recipe=papr", ["'recipe/papr'", "paper"]),
+        ("fit", "experiment=snad", ["'experiment/snad'", "ablation_momentum", "sand"]),
+        ("fit", "size=tyni", ["'size/tyni'", "paper small tiny"]),
+        ("fit", "~training.num_stpes", ["training.num_stpes"]),
+        ("fit", "a=b=c", ["a=b=c: "]),
+        ("fit", "num_steps", ["'num_steps' missing EQUAL"]),
+        ("fit", "hydra.swep.dir=x", ["hydra.swep.dir"]),
+        ("simulate", "data.sede=3", ["unknown key 'sede'; valid keys of data: ", "seed"]),
+        ("simulate", "num_wrokers=3", ["unknown key 'num_wrokers'; valid keys: ", "num_workers"]),
+        ("benchmark", "suite.num_nods=3", ["unknown key 'num_nods'; valid keys of suite: ", "num_nodes"]),
+        ("benchmark", "suite=sped", ["'suite/sped'", "speed"]),
+    ],
+)
+def test_a_misspelling_gets_the_valid_ones(name: str, override: str, words: list[str]) -> None:
+    line = complaint(name, override)
+    assert all(word in line for word in words), line
+    assert "\n" not in line
+    assert "See https" not in line
+
+
+def test_the_keys_are_those_of_the_chosen_groups() -> None:
+    line = complaint("fit", "logger=wandb", "logger.projct=x")
+    assert "valid keys of logger: kind, mode, project" in line
+
+
+def test_a_misspelling_beside_a_sweep_gets_the_valid_ones() -> None:
+    """In a multi-run, Hydra composes one job but ``sys.argv`` still holds the sweep."""
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"), pytest.raises(HydraException) as caught:
+        hydra.compose("fit", ["model.interation=odd", "seed=0"])
+    line = explain(
+        caught.value, "fit", ["-m", "model.interation=odd,negated", "seed=0,1", "evaluation.splits=[test,val]", "size=tiny,small"]
+    )
+    assert "valid keys of model: " in line
+
+
+# --- values, by the entry points' own checks -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("training.num_steps=0", "training.num_steps=0: input should be greater than or equal to 1"),
+        ("training.num_steps=", "training.num_steps='': input should be a valid integer"),
+        ("training.sampling=unform", "training.sampling='unform': input should be 'uniform' or 'activity'"),
+        ("training.learning_rate=inf", "training.learning_rate=inf: input should be a finite number"),
+        ("model.interaction=ood", "model.interaction='ood': input should be 'directed', 'negated', 'odd' or 'odd_even'"),
+        ("model.hidden_channels=-1", "model.hidden_channels=-1: input should be greater"),
+        ("+model.foo=1", "model.foo: unknown key; valid keys: interaction"),
+        ("training.velocity_noise_of_change=-1", "training.velocity_noise_of_change=-1: input should be greater"),
+        ("training.gradient_clip=0", "training.gradient_clip=0: input should be greater"),
+        ("+training.foo=1", "training.foo: unknown key; valid keys: num_steps"),
+        ("graph.history=0", "graph.history=0: input should be greater"),
+        ("training.val_interval=7", "training: val_interval=7 must divide num_steps="),
+        ("evaluation.splits=[tset]", "evaluation.splits.0='tset': input should be 'train', 'val', 'test' or 'test_unseen'"),
+        ("evaluation.splits=[]", r"evaluation.splits=\[\]: list should have at least 1 item"),
+        ("seed=-1", "seed=-1: must be an integer of at least 0"),
+        ("seed=first", "seed='first': must be an integer of at least 0"),
+        ("logger.kind=tb", "logger.kind='tb': input should be 'csv' or 'wandb'"),
+        ("trainer.num_workers=-1", "trainer.num_workers=-1: input should be greater"),
+    ],
+)
+def test_fit_names_the_value_before_it_does_anything(override: str, message: str, tmp_path: Path) -> None:
+    cfg = compose("fit", override, f"paths.data={tmp_path / 'data'}", f"paths.runs={tmp_path / 'runs'}")
+    with pytest.raises(ConfigError, match=f"^{message}"):
+        fit(cfg)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("target", ["gpe_pl.models.gpe.GEP", "os.system", "3"])
+def test_fit_takes_only_models(target: str, tmp_path: Path) -> None:
+    with pytest.raises(UnknownModelError, match=f"model '{target}'"):
+        fit(compose("fit", f"model._target_='{target}'", f"paths.data={tmp_path}", f"paths.runs={tmp_path}"))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("data.num_train=0", "data.num_train=0: input should be greater than or equal to 1"),
+        (
+            "data.parameters.sand.extrapolated=[100]",
+            r"data: parameters.sand.extrapolated: friction_angle = 100.0 deg is outside 0 … 60, the solvers' limits$",
+        ),
+        ("data.parameters.sand.interpolated=[20.0]", r"data.parameters.sand: unseen values \[20.0\] are among the seen ones$"),
+        ("data.solver.materials=[snad]", "data.scene: materials must be different ones of sand, snow, fluid, elastomer, solid, got "),
+        ("data.scene._target_=os.system", "data.scene._target_='os.system': must be a class of gpe_pl.solvers$"),
+        ("data.name=a/b", "data.name='a/b': must be a folder's name of letters"),
+        ("data.solver.cfl=0", "data.solver.cfl=0: input should be greater than 0"),
+        ("data.scene.gravity=[0,down]", "data.scene.gravity.1='down': input should be a valid number"),
+        ("+data.solver.foo=1", "data.solver.foo: unknown key; valid keys: "),
+    ],
+)
+def test_a_data_set_names_the_value(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{message}") as caught:
+        dataset_spec(compose("simulate", override))
+    assert len(str(caught.value)) < 400
+
+
+# --- entry points --------------------------------------------------------------------------------------------------------------------------
+
+
+def call(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, task: Callable[[DictConfig], Any], *arguments: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["command", f"paths.runs={tmp_path}", *arguments])
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)  # forgotten again after the test
+    GlobalHydra.instance().clear()
+    entry_point("benchmark")(task)()
+
+
+@pytest.mark.parametrize("suite", ["speed", "scaling", "skip", "runtime_vs_error"])
+def test_a_suite_for_a_gpu_says_that_there_is_none(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, suite: str
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(SystemExit):
+        call(monkeypatch, tmp_path, benchmark, f"suite={suite}", "trainer=gpu")
+    assert capsys.readouterr().err.startswith("error: trainer.accelerator=gpu: PyTorch finds no GPU here")
+
+
+@pytest.mark.parametrize(
+    ("task", "arguments", "line"),
+    [
+        (lambda cfg: None, ["suit=speed"], "error: suit: unknown key 'suit'; valid keys: paths, size, suite, trainer"),
+        (lambda cfg: None, ["suite=sped"], "error: In 'benchmark': Could not find 'suite/sped' Available options in 'suite': faults "),
+        (lambda cfg: None, ["suite=3"], "error: Config group override must be a string or a list. Got int"),
+        (lambda cfg: None, ["paths.data=null"], "error: paths.data=None: input should be a valid string"),
+        (lambda cfg: None, ["+foo=1"], "error: foo: unknown or missing key; valid keys: paths, size, suite, trainer"),
+        (benchmark, ["suite.name=nope"], "error: suite.name='nope': must be one of "),
+        (benchmark, ["suite.name=trained"], "error: suite.name='trained': must be one of faults, "),
+        (benchmark, ["suite=skip", "suite.edge_states=[]"], "error: suite.edge_states=[]: "),
+        (benchmark, ["suite=scaling", "suite.num_nodes=[]"], "error: suite.num_nodes=[]: "),
+        (lambda cfg: None, ["suite.name=${nothing}"], "error: Interpolation key 'nothing' not found"),
+        (lambda cfg: construct(Inner, {"size": cfg.suite.num_nodes}, "suite"), ["suite.num_nodes=0"], "error: suite.size=0: input should"),
+    ],
+)
+def test_an_entry_point_fails_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, task: Any, arguments: list[str], line: str
+) -> None:
+    with pytest.raises(SystemExit) as caught:
+        call(monkeypatch, tmp_path, task, *arguments)
+    assert caught.value.code == 2
+    output = capsys.readouterr()
+    assert output.err.startswith(line)
+    assert output.err.count("\n") == 1 and "search path" not in output.err
+    assert output.out == ""
+
+
+@pytest.mark.parametrize(("error", "code"), [(ConfigError("no table"), 2), (RuntimeError("a bug"), 1)])
+def test_a_report_that_fails_fails_the_command(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, error: Exception, code: int
+) -> None:
+    """Hydra alone would turn the exception into a warning and exit with 0."""
+
+    def broken(_: Path) -> None:
+        raise error
+
+    monkeypatch.setattr("gpe_pl.reports.sweep_table.report", broken)
+    with pytest.raises(SystemExit) as caught:
+        Report().on_run_end(OmegaConf.create({"hydra": {"run": {"dir": str(tmp_path)}}}))
+    assert caught.value.code == code
+    assert str(error) in capsys.readouterr().err
+
+
+def test_an_interruption_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    def task(_: DictConfig) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as caught:
+        call(monkeypatch, tmp_path, task)
+    assert caught.value.code == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def task(_: DictConfig) -> None:
+        raise ValueError("a bug, not a setting")
+
+    with pytest.raises(ValueError, match="a bug"):
+        call(monkeypatch, tmp_path, task)
+
+
+def test_results_do_not_say_where_they_lay(tmp_path: Path) -> None:
+    runs = str(tmp_path / "runs")
+    settings = {
+        "runs": [f"{runs}/table1", runs, f"{runs}_old"],
+        "cases": {"sand": {"overrides": [f"name={runs}"]}},
+        "budget": 5.0,
+        "size": None,
+    }
+    assert without_folder(settings, runs) == {**settings, "runs": ["paths.runs/table1", "paths.runs", f"{runs}_old"]}
+    assert without_folder({"runs": ["runs/table1"]}, "runs") == {"runs": ["paths.runs/table1"]}
+
+
+def test_without_hydra_the_output_lies_under_runs(tmp_path: Path) -> None:
+    assert output_dir(OmegaConf.create({"paths": {"runs": str(tmp_path)}, "name": "x"})) == tmp_path / "x"
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "line"),
+    [
+        (
+            "fit",
+            ["-m", "model.interation=odd,negated", "seed=0,1"],
+            "error: model.interation: unknown key 'interation'; valid keys of model: ",
+        ),
+        pytest.param(
+            *("fit", ["training.num_steps=-1"], "error: training.num_steps=-1: input should be greater"),
+            marks=pytest.mark.slow,
+        ),
+        ("simulate", ["num_workers=0"], "error: num_workers=0: must be null (one per core) or an integer of at least 1"),
+        pytest.param(
+            *("benchmark", ["suite.num_rounds=none"], "error: suite.num_rounds='none': input should be a valid integer"),
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_commands_fail_in_one_line(tmp_path: Path, command: str, arguments: list[str], line: str) -> None:
+    child = subprocess.run(
+        [sys.executable, "-m", f"gpe_pl.{command}", *arguments, f"paths.runs={tmp_path}", f"paths.data={tmp_path}"],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+    assert child.returncode == 2
+    errors = child.stderr.splitlines()
+    assert len(errors) == 1
+    assert errors[0].startswith(line)
+    assert "Traceback" not in child.stdout + child.stderr
+
+
+def test_a_table_by_model_has_a_default() -> None:
+    table = ["data=mixed", "comparison=equal_steps", "data.comparison.velocity_noise_of_change.default=0.5"]
+    table += ["++data.comparison.velocity_noise_of_change.GNS=2.0"]
+    assert compose("fit", *table).training.velocity_noise_of_change == 0.5
+    assert compose("fit", *table, "model=gns").training.velocity_noise_of_change == 2.0
+
+
+def test_a_path_with_an_equals_sign_is_taken_as_typed(tmp_path: Path) -> None:
+    run = tmp_path / "data=sand" / "seed=0"
+    run.mkdir(parents=True)
+    assert compose("evaluate", quoted(f"checkpoint={run}")).checkpoint == str(run)
+    for argument in (
+        f"checkpoint={tmp_path}",
+        "checkpoint=",
+        "model.decoder=node",
+        f'checkpoint="{run}"',
+        "--help",
+        "a=b=c",
+        "a=" + 200 * "b=c",
+    ):
+        assert quoted(argument) == argument
+    assert "a value that holds = needs quotes: 'KEY=\"VALUE\"'" in complaint("evaluate", f"checkpoint={run}0")
+
+
+def test_a_full_disk_is_named_where_there_is_no_temporary_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    def none() -> str:
+        raise FileNotFoundError(2, "No usable temporary directory found")
+
+    monkeypatch.setattr("tempfile.gettempdir", none)
+    assert Path("results") in configuration._written({"runs": "results"})

@@ -1,0 +1,74 @@
+"""What someone types and nothing reads is refused, whichever experiment, comparison and recipe it stands beside."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+import hydra
+import pytest
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import DictConfig, OmegaConf
+
+from gpe_pl.config.folder import CONF
+from gpe_pl.config.typed_keys import without_effect
+from gpe_pl.files.run_folder import without_tables
+
+EXPERIMENTS = sorted(p.stem for p in (CONF / "experiment").glob("*.yaml") if p.stem != "search")  # that proposes its values while it runs
+
+
+def unresolved(*overrides: str, hydra_config: bool = False) -> DictConfig:
+    GlobalHydra.instance().clear()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        return hydra.compose("fit", [*overrides], return_hydra_config=hydra_config)
+
+
+@pytest.mark.parametrize(
+    ("beside", "typed", "because"),
+    [
+        ("experiment=table1", "training.num_steps=77", "training.budget_minutes=0.5"),
+        ("batching=by_nodes", "training.batch_size=4", "batching.max_nodes=20000"),
+        ("recipe=paper", "training.warmup_steps=10", "training.schedule=exponential"),
+        ("recipe=paper", "training.push_correction=0.2", "training.push_share=0.0"),
+        ("model=gns", "graph.num_levels=2", "graph.mesh=False"),
+        ("data=imported", "dimension=3", "data.size=imported"),
+        ("model=gns", "size.comparison.learning_rate.default=1e-4", "no other setting"),
+        ("recipe=paper", "data.comparison.sampling=uniform", "no other setting"),
+        ("recipe=paper", "size.comparison.num_message_passing_steps=4", "no other setting"),
+    ],
+)
+def test_what_nothing_reads_is_refused(beside: str, typed: str, because: str) -> None:
+    refusal = without_effect(unresolved(beside, typed), [beside, typed])
+    assert refusal.startswith(f"{typed}: has no effect") and because in refusal
+
+
+@pytest.mark.parametrize(
+    ("beside", "typed"),
+    [
+        ("recipe=paper", "training.warmup_steps=0"),
+        ("experiment=table1", "size.comparison.budget_minutes=3"),
+        ("experiment=table1", "size.comparison.seeds='0'"),
+        ("experiment=table1", "data.comparison.connectivity_spacings.default=3.0"),
+        ("recipe=paper", "data.comparison.position_noise_of_domain=1e-4"),
+        ("experiment=larger_scenes", "data.larger.solver.bounds=[[0,3],[0,1]]"),
+        ("model=gpe", "training.num_steps=77"),
+        ("model=gpe", "graph.num_levels=2"),
+    ],
+)
+def test_what_is_read_is_not(beside: str, typed: str) -> None:
+    assert without_effect(unresolved(beside, typed), [beside, typed]) == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_with_the_papers_recipe_too_an_axis_changes_something_or_is_refused(experiment: str) -> None:
+    params: dict[str, Any] = unresolved(f"experiment={experiment}", hydra_config=True).hydra.sweeper.params or {}
+    axes = [[f"{key}={value}" for value in str(values).split(",")] for key, values in params.items() if key != "seed"]
+    runs = []
+    for overrides in product(*axes):
+        cfg = unresolved(f"experiment={experiment}", "recipe=paper", *overrides)
+        if not without_effect(cfg, overrides):
+            values: Any = OmegaConf.to_container(cfg, resolve=True)
+            kept = without_tables(values)
+            runs.append([kept[key] for key in ("data", "graph", "model", "training")])
+    assert all(run not in runs[:k] for k, run in enumerate(runs))

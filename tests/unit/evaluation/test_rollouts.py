@@ -1,0 +1,103 @@
+"""Numbers of ``metrics.csv`` that no failure may improve, and how they are written."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gpe_pl.evaluation.rollouts import EvaluationSettings, MetricsError, Row, StartError, _parameter, _share_outside, read_rows, write_rows
+from gpe_pl.trajectory.trajectory import Termination, Trajectory
+
+
+@pytest.fixture
+def inside(new_trajectory: Callable[..., Trajectory]) -> Trajectory:
+    """Eleven frames with all particles in free space."""
+    return new_trajectory(num_frames=11)
+
+
+def test_frames_that_a_stopped_rollout_lacks_count_as_outside(inside: Trajectory) -> None:
+    stopped = replace(inside.frames(0, 5), termination=Termination("nan", 5, 0, "frame 5"))
+    assert _share_outside(inside, 1, 10, 0.0) == 0.0
+    assert _share_outside(stopped, 1, 10, 0.0) == pytest.approx(6 / 10)
+    assert _share_outside(inside, 10, 10, 0.0) == 0.0
+    assert _share_outside(stopped, 10, 10, 0.0) == 1.0
+
+
+def test_a_particle_inside_a_wall_counts(inside: Trajectory) -> None:
+    pos = inside.pos.copy()
+    pos[3, 0] = -0.5
+    assert _share_outside(replace(inside, pos=pos), 1, 10, 0.0) == pytest.approx(1 / (10 * inside.num_nodes))
+
+
+def test_rows_survive_the_file(tmp_path: Path) -> None:
+    rows = [Row("learned", "test", 3, "seen", 30.0, "rollout_mse", "full", np.inf), Row("ballistic", "test", 0, "", 0.1, "x", "5", 1e-300)]
+    write_rows(tmp_path / "metrics.csv", rows)
+    assert list(read_rows(tmp_path / "metrics.csv")) == rows
+    assert {p.name for p in tmp_path.iterdir()} == {"metrics.csv", "metrics.csv.sha256"}
+    digest = (tmp_path / "metrics.csv.sha256").read_text()
+    assert digest == f"{hashlib.sha256((tmp_path / 'metrics.csv').read_bytes()).hexdigest()}  metrics.csv\n"
+
+
+@pytest.mark.parametrize("change", [lambda b: b.replace(b"30.0", b"31.0"), lambda b: b[: b.rindex(b"ballistic")], lambda b: b""])
+def test_changed_rows_are_refused(tmp_path: Path, change: Callable[[bytes], bytes]) -> None:
+    path = tmp_path / "metrics.csv"
+    write_rows(path, [Row(model, "test", 3, "seen", 30.0, "rollout_mse", "full", 1.0) for model in ("learned", "ballistic")])
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(MetricsError, match=r"metrics.csv: damaged or changed \(checksum mismatch\); delete the file to evaluate again"):
+        list(read_rows(path))
+    (tmp_path / "metrics.csv.sha256").unlink()
+    assert len(list(read_rows(path))) < 3  # as in runs of earlier versions
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"horizon": "many"},
+        {"horizon": "-5"},
+        {"horizon": ""},
+        {"split": "exam"},
+        {"parameter_group": "new"},
+        {"model": "\x1b[2Kerror: forged"},
+        {"metric": "a\u202eb"},
+        {"trajectory": "one"},
+        {"value": "x"},
+    ],
+)
+def test_rows_without_a_digest_have_to_mean_something(tmp_path: Path, change: dict[str, str]) -> None:
+    row = {
+        "model": "learned",
+        "split": "test",
+        "trajectory": 3,
+        "parameter_group": "seen",
+        "parameter": 30.0,
+        "metric": "x",
+        "horizon": "full",
+    }
+    with open(tmp_path / "metrics.csv", "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [*row, "value"])
+        writer.writeheader()
+        writer.writerow({**row, "value": 1.0, **change})
+    with pytest.raises(MetricsError, match="metrics.csv, line 2: damaged") as refused:
+        list(read_rows(tmp_path / "metrics.csv"))
+    assert str(refused.value).isprintable()
+
+
+def test_rollouts_start_where_asked_or_as_early_as_they_can() -> None:
+    assert EvaluationSettings().first_frame(3) == 3
+    assert EvaluationSettings(start_frame=5).first_frame(3) == 5
+    with pytest.raises(StartError, match="start_frame=2: graph.history=3 needs"):
+        EvaluationSettings(start_frame=2).first_frame(3)
+
+
+def test_a_scene_of_several_materials_has_no_one_parameter(inside: Trajectory) -> None:
+    values = np.full((inside.num_nodes, 2), np.nan)
+    values[:, 0] = 30.0
+    assert _parameter(replace(inside, material_params=values)) == 30.0
+    values[0] = np.nan, 1e5
+    assert np.isnan(_parameter(replace(inside, material_params=values)))

@@ -1,0 +1,149 @@
+"""Tables of runs whose numbers are known."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gpe_pl.evaluation.rollouts import LEARNED, MetricsError, Row, read_rows, write_rows
+from gpe_pl.files import sealed
+from gpe_pl.files.run_folder import RunError
+from gpe_pl.reports import sweep_table
+from gpe_pl.reports.finished_runs import finished_runs
+
+ERRORS = {  # of two test scenes; free flight has 2e-3 and 6e-3
+    ("negated", 0): [1e-3, 3e-3],
+    ("negated", 1): [2e-3, 2e-3],
+    ("odd", 0): [8e-3, 8e-3],
+    ("directed", 0): [float("inf"), 5e-3],
+    ("odd_even", 0): [4e6, 4e6],
+}
+
+
+def write_run(folder: Path, interaction: str, seed: int) -> None:
+    folder.mkdir(parents=True)
+    model = {"_target_": "gpe_pl.models.gpe.GPE", "interaction": interaction}
+    sealed.write(folder / "config.json", {"seed": seed, "data": {"name": "sand"}, "model": model, "training": {"num_steps": 10}})
+    groups = ("interpolated", "extrapolated")
+    rows = [Row(LEARNED, "test_unseen", k, groups[k], 20.0, "rollout_mse", "full", v) for k, v in enumerate(ERRORS[interaction, seed])]
+    rows += [Row("ballistic", "test_unseen", k, groups[k], 20.0, "rollout_mse", "full", v) for k, v in enumerate((2e-3, 6e-3))]
+    write_rows(folder / "metrics.csv", [*rows, Row("constant_velocity", "test_unseen", 0, groups[0], 20.0, "rollout_mse", "full", 1.0)])
+    log = folder / "log" / "version_0"
+    log.mkdir(parents=True)
+    (log / "metrics.csv").write_text(f"step,val/one_step_nmse\n9,0.9\n19,{0.2 + 0.2 * seed}\n")
+
+
+@pytest.fixture
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(sweep_table, "forward_time_ratios", lambda variants: {})  # there are no checkpoints
+    for interaction, seed in ERRORS:
+        write_run(tmp_path / interaction / str(seed), interaction, seed)
+    return tmp_path
+
+
+def cells(folder: Path, interaction: str) -> list[list[str]]:
+    """The row of one variant in each table of ``table.md``, without its intervals."""
+    lines = (folder / "table.md").read_text().splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith(f"| {interaction} ")]
+    return [[" ".join(word for word in cell.split() if word[0] != "[" and word[-1] != "]") for cell in row] for row in rows]
+
+
+def test_errors_are_means_and_factors_over_the_best_trivial_baseline(runs: Path) -> None:
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    training, rollout, *_ = cells(runs, "negated")
+    assert training[1:3] == ["2", "0.3000 (0.2000 – 0.4000)"]
+    assert rollout[1:] == ["test_unseen", "2 **2.0×**"]
+    assert [row[1:] for row in cells(runs, "negated")[2:]] == [
+        ["test_unseen/extrapolated", "2.5 **2.4×**"],
+        ["test_unseen/interpolated", "1.5 **1.3×**"],
+    ]
+    assert cells(runs, "odd")[1][2] == "8 0.5×"
+    assert cells(runs, "odd_even")[1][2] == "4e+09 < 0.01×"
+    assert cells(runs, "ballistic")[0][2] == "4"
+
+
+def test_failed_rollouts_are_counted(runs: Path) -> None:
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    _, rollout, *_ = cells(runs, "directed")
+    assert rollout[2] == "3.5 **1.1×**, 1 of 2 failed"  # ballistic flight's 2 in the scene that failed, and 5
+
+
+def test_the_csv_has_unseen_values_also_apart(runs: Path) -> None:
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    with open(runs / "table.csv", newline="") as handle:
+        lines = [line for line in csv.DictReader(handle) if line["interaction"] == "negated" and line["seed"] == "0"]
+    values = {line["split"]: float(line["value"]) for line in lines if line["metric"] == "rollout_mse"}
+    assert values == pytest.approx({"test_unseen": 2e-3, "test_unseen/interpolated": 1e-3, "test_unseen/extrapolated": 3e-3})
+
+
+def test_a_repeated_run_counts_once(runs: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_run(runs / "again", "odd", 0)
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    assert cells(runs, "odd")[0][1] == "1"
+    assert "repeats" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "content", [b"{", b"5", b"\xa1\xff", b"[" * 10**6, b'{"a":' * 70 + b"1" + b"}" * 70, b'{"a": 1' + b"0" * 10**5 + b"}", b'{"seed": 0}']
+)
+def test_a_damaged_configuration_is_named(runs: Path, content: bytes) -> None:
+    path = runs / "negated" / "0" / "config.json"
+    path.write_bytes(content)
+    with pytest.raises(RunError, match=r"negated/0/config.json: .*; delete the folder"):
+        sweep_table.report_sweep(runs, finished_runs(runs))
+
+
+@pytest.mark.parametrize(
+    "change", [{"training": {"num_steps": "many"}}, {"data": {"name": 3}}, {"model": {"_target_": None}}, {"training": {"num_steps": True}}]
+)
+def test_a_configuration_of_other_types_is_named(runs: Path, change: dict[str, Any]) -> None:
+    path = runs / "negated" / "0" / "config.json"
+    values = sealed.read(path, "")
+    sealed.write(path, values | change)
+    with pytest.raises(RunError, match=r"negated/0/config.json: [a-z_.]+ is .*; delete the folder"):
+        sweep_table.report_sweep(runs, finished_runs(runs))
+
+
+@pytest.mark.parametrize(
+    "content", [b"step,val/one_step_nmse\n9,x\n", b"step,val/one_step_nmse\nlast,0.5\n", b"val/one_step_nmse\n0.5\n", b"\xff\n"]
+)
+def test_a_damaged_log_of_the_training_is_named(runs: Path, content: bytes) -> None:
+    (runs / "odd" / "0" / "log" / "version_mine").mkdir()
+    (runs / "odd" / "0" / "log" / "version_mine" / "metrics.csv").touch()  # of somebody else
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    (runs / "odd" / "0" / "log" / "version_0" / "metrics.csv").write_bytes(content)
+    with pytest.raises(MetricsError, match=r"odd/0/log/version_0/metrics.csv, line \d: damaged \(.*; delete the file"):
+        sweep_table.report_sweep(runs, finished_runs(runs))
+
+
+def test_names_of_files_that_are_shown_are_printable(runs: Path) -> None:
+    folder = runs / "odd" / "0"
+    (folder / "rollout_\x1b[2K_00.html").touch()
+    assert "look at" in sweep_table.conclusion(folder) and "\x1b" not in sweep_table.conclusion(folder)
+
+
+def test_a_parameter_that_training_did_not_have_makes_a_figure(runs: Path) -> None:
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    assert (runs / "error_by_parameter.png").stat().st_size > 1000
+
+
+def test_stress_is_reported_beside_displacement_and_velocity(runs: Path) -> None:
+    path = runs / "negated" / "0" / "metrics.csv"
+    values = {"displacement_error": 0.25, "velocity_error": 0.5, "von_mises_error": 0.75, "stress_error": 1.25}
+    rows = [Row(LEARNED, "test_unseen", 0, "interpolated", 20.0, metric, "full", value) for metric, value in values.items()]
+    write_rows(path, [*read_rows(path), *rows])
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    found = {row[2]: row[3] for row in cells(runs, "negated") if len(row) == 4}
+    assert found == {"displacement": "0.25", "velocity": "0.5", "von mises": "0.75", "stress": "1.25"}
+    assert not [row for row in cells(runs, "odd") if len(row) == 4]
+
+
+def test_scenes_without_one_parameter_make_no_figure(runs: Path) -> None:
+    for path in runs.glob("*/*/metrics.csv"):
+        write_rows(path, [replace(row, parameter=float("nan")) for row in read_rows(path)])
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    assert (runs / "table.md").exists() and not (runs / "error_by_parameter.png").exists()

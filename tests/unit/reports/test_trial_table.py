@@ -1,0 +1,98 @@
+"""Tables of trials from run folders whose numbers are known."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from gpe_pl.evaluation.rollouts import LEARNED, Row, write_rows
+from gpe_pl.files import sealed
+from gpe_pl.reports.finished_runs import finished_runs
+from gpe_pl.reports.trial_table import compares_settings, report_trials
+
+ERRORS = {  # of two seeds, by domain, model and noise
+    ("sand", "GPE", 0.3): [[1e-3, 3e-3], [4e-3, 6e-3]],
+    ("sand", "GPE", 1.0): [[2e-3, 2e-3]],
+    ("sand", "GNS", 0.3): [[float("inf"), 1e-3]],
+    ("sand", "GNS", 1.0): [[7e-3, 7e-3]],
+}
+
+
+def write_run(folder: Path, domain: str, model: str, noise: float, seed: int, errors: list[float]) -> None:
+    folder.mkdir(parents=True)
+    training = {"velocity_noise_of_change": noise, "num_steps": 1000 + int(noise), "val_interval": 10 + int(noise)}
+    config = {"seed": seed, "data": {"name": domain}, "model": {"_target_": f"gpe_pl.models.x.{model}"}, "training": training}
+    sealed.write(folder / "config.json", config)
+    rows = [Row(LEARNED, "val", k, "seen", 20.0, "rollout_mse", "full", value) for k, value in enumerate(errors)]
+    flight = [Row("ballistic", "val", k, "seen", 20.0, "rollout_mse", "full", 20e-3) for k in range(len(errors))]
+    write_rows(folder / "metrics.csv", [*rows, *flight])
+
+
+@pytest.fixture
+def trials(tmp_path: Path) -> Path:
+    for (domain, model, noise), seeds in ERRORS.items():
+        for seed, errors in enumerate(seeds):
+            write_run(tmp_path / domain / model / str(noise) / str(seed), domain, model, noise, seed, errors)
+    return tmp_path
+
+
+def test_the_best_setting_of_each_model_is_bold(trials: Path) -> None:
+    report_trials(trials, finished_runs(trials))
+    rows = [[c.strip() for c in line.strip("|").split("|")] for line in (trials / "trials.md").read_text().splitlines() if "|" in line]
+    assert rows[0] == ["domain", "model", "velocity_noise_of_change", "seeds", "one-step nMSE", "val"]
+    assert rows[2:] == [
+        ["sand", "GNS", "0.3", "1", "–", "10.5 [1, 20], 1 of 2 failed"],
+        ["sand", "GNS", "1.0", "1", "–", "**7** [7, 7]"],
+        ["sand", "GPE", "0.3", "2", "–", "3.5 [1, 6]"],
+        ["sand", "GPE", "1.0", "1", "–", "**2** [2, 2]"],
+    ]
+
+
+def test_the_csv_has_a_line_per_run_and_split(trials: Path) -> None:
+    report_trials(trials, finished_runs(trials))
+    with open(trials / "trials.csv", newline="") as handle:
+        lines = list(csv.DictReader(handle))
+    assert len(lines) == 5
+    failed = next(line for line in lines if line["num_failed"] == "1")
+    assert (failed["model"], failed["velocity_noise_of_change"], failed["rollout_mse"]) == ("GNS", "0.3", "inf")
+
+
+def test_seeds_and_steps_are_not_settings(tmp_path: Path) -> None:
+    for model in ("GPE", "GNS"):
+        for seed in (0, 1):
+            write_run(tmp_path / model / str(seed), "sand", model, 0.3, seed, [1e-3])
+    assert not compares_settings(finished_runs(tmp_path))
+
+
+def test_one_model_with_several_settings_is_an_ablation(tmp_path: Path) -> None:
+    for noise in (0.3, 1.0):
+        write_run(tmp_path / str(noise), "sand", "GPE", noise, 0, [1e-3])
+    assert not compares_settings(finished_runs(tmp_path))
+    write_run(tmp_path / "GNS", "sand", "GNS", 0.3, 0, [1e-3])
+    assert compares_settings(finished_runs(tmp_path))
+
+
+def test_another_budget_alone_is_a_setting(tmp_path: Path) -> None:
+    for model in ("GPE", "GNS"):
+        write_run(tmp_path / model, "sand", model, 0.3, 0, [1e-3])
+    longer = tmp_path / "longer"
+    write_run(longer, "sand", "GPE", 0.3, 0, [1e-3])
+    config = json.loads((longer / "config.json").read_text())
+    config["training"]["num_steps"] = 9000
+    sealed.write(longer / "config.json", config)
+    assert compares_settings(finished_runs(tmp_path))
+    report_trials(tmp_path, finished_runs(tmp_path))
+    assert "| sand | GPE | 9000 |" in (tmp_path / "trials.md").read_text()
+
+
+def test_a_table_of_models_does_not_outlive_a_comparison_of_settings(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for model in ("GPE", "GNS"):
+        write_run(tmp_path / model, "sand", model, 0.3, 0, [1e-3])
+    (tmp_path / "table1.md").write_text("of the two")
+    write_run(tmp_path / "trial", "sand", "GPE", 1.0, 0, [1e-3])
+    report_trials(tmp_path, finished_runs(tmp_path))
+    assert not (tmp_path / "table1.md").exists()
+    assert "compares settings now (training.velocity_noise_of_change)" in caplog.text
