@@ -1,4 +1,4 @@
-"""Text that may hold what a file or a command line says, as it is shown: names in a hostile file must not steer a terminal, nor look like another message."""
+"""Printable forms of text from files and command lines. Names in a hostile file must not control the terminal or imitate another message."""
 
 from __future__ import annotations
 
@@ -10,16 +10,20 @@ import warnings
 from types import TracebackType
 
 LONGEST = 4000
-"""Characters of a message. Names can have tens of thousands."""
+"""Maximum length of a message [characters]. A name can have tens of thousands."""
 
 
 def printable(text: str) -> str:
-    """The text with its control characters, text directions, line ends and whatever else is not shown as escapes."""
+    """Replace control characters, text directions, line ends and other characters that are not printable by escapes."""
     return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in _decoded(text))
 
 
 def one_line(text: str, longest: int = LONGEST) -> str:
-    """A message as one line: spaces for line ends, escapes for what is not shown, and the middle left out where it is longer than ``longest``."""
+    """Return a message as one line of printable text.
+
+    Line ends become spaces, and other characters that are not printable become escapes. The middle of a message with more than ``longest`` characters is
+    left out.
+    """
     if len(text) > longest:
         head, tail = text[: longest * 3 // 4], text[-(longest // 4) :]
         text = f"{head} … ({len(text) - len(head) - len(tail)} characters) … {tail}"
@@ -27,31 +31,31 @@ def one_line(text: str, longest: int = LONGEST) -> str:
 
 
 def _decoded(text: str) -> str:
-    """Names of files that Python has read in another encoding than UTF-8, as UTF-8 where they are."""
+    """Decode file names as UTF-8 where they are UTF-8 but Python has read them in another encoding."""
     try:
         return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
-    except UnicodeEncodeError:  # not from the name of a file
+    except UnicodeEncodeError:  # the text is not a file name
         return text
 
 
 class LogRecord(logging.LogRecord):
-    """A record whose message is one line."""
+    """Log record whose message is one line of printable text."""
 
     def getMessage(self) -> str:
         return one_line(super().getMessage())
 
 
 def speak_utf8() -> None:
-    """What this process prints from now on is UTF-8 whatever the locale, and what cannot be encoded an escape."""
+    """Print UTF-8 from now on, whatever the locale. Characters that cannot be encoded become escapes."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(encoding="utf-8", errors="backslashreplace")
 
 
 def clean_messages() -> None:
-    """From now on what this process logs and warns of is one line, whatever handler writes it, and the lines of its tracebacks are printable.
+    """Make every log message and warning one line from now on, whatever handler writes it, and make tracebacks printable.
 
-    A line that cannot be written to a log file, as on a full disk, is lost; ``logging`` would print a traceback for each.
+    A line that cannot be written to a log file, for example on a full disk, is lost. By default ``logging`` would print a traceback for each.
     """
     logging.raiseExceptions = False
     logging.setLogRecordFactory(LogRecord)

@@ -1,4 +1,4 @@
-"""Files that appear complete or not at all."""
+"""Atomic writes: a file appears complete or not at all."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ import psutil
 from gpe_pl.errors import GpeError
 
 FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
-"""What systems answer where there is no room: on the disk, in a file, for this user."""
+"""Error numbers for missing room: the disk is full, the file is too large, or the user's quota is used up."""
 
 ALMOST_FULL = 2**20
-"""Bytes. A command that ends has removed what it could not finish."""
+"""A disk with fewer free bytes counts as full. Some bytes are free again because a failing command has already removed its unfinished file."""
 
 
 class FullDiskError(GpeError):
-    """There is no room for a file or folder; the message names it."""
+    """Raised when there is no room for a file or folder; the message names it."""
 
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(f"{path}: cannot be written, there is no room ({reason}); make some, and run the command again")
@@ -35,9 +35,9 @@ class FullDiskError(GpeError):
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A path beside ``path`` and with its suffix: what is written there takes its place when the block ends well, and is removed otherwise.
+    """Yield a temporary path in the folder of ``path``, with the same suffix, that replaces ``path`` when the block succeeds.
 
-    Makes the folder where there is none, and removes what processes that were killed have left of earlier attempts.
+    The temporary file or folder is removed when the block fails. A missing folder is created. Leftovers of killed processes are removed.
 
     Raises:
         FullDiskError: there is no room.
@@ -52,7 +52,7 @@ def replacing(path: Path) -> Iterator[Path]:
         yield part
         _flush(part)
         os.replace(part, path)
-    except FullDiskError as error:  # of a file in a folder that is being made
+    except FullDiskError as error:  # ``part`` is a folder, and a file in it did not fit
         raise FullDiskError(path, error.reason) from None
     except OSError as error:
         if error.errno is None or error.errno not in FULL:
@@ -63,7 +63,10 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def unnamed(error: OSError, folders: Iterable[Path]) -> OSError | FullDiskError:
-    """What to say of an error: one of a full disk that names no file names those of the folders whose disks are full, or all of them."""
+    """Turn the error of a full disk that names no file into one that names ``folders``; return other errors unchanged.
+
+    Only the folders whose disks are full are named, or all of them if none is.
+    """
     if error.errno is None or error.errno not in FULL or error.filename is not None:
         return error
     places = list(dict.fromkeys(folders))
@@ -72,31 +75,31 @@ def unnamed(error: OSError, folders: Iterable[Path]) -> OSError | FullDiskError:
 
 
 def free_bytes(folder: Path) -> int:
-    """Room on the disk of a folder, which need not exist yet."""
+    """Free bytes on the disk of a folder. The folder need not exist yet."""
     return shutil.disk_usage(next(place for place in (folder, *folder.absolute().parents) if place.exists())).free
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a text file."""
+    """Write a UTF-8 text file atomically."""
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
 
 
 def replace_bytes(path: Path, content: bytes | bytearray | memoryview) -> None:
-    """Write a file."""
+    """Write a binary file atomically."""
     with replacing(path) as part:
         part.write_bytes(content)
 
 
 def _is_running(pid: str) -> bool:
-    """Whether there is such a process on this machine."""
+    """Whether a process with this id runs on this machine; True for text that is no id."""
     return not pid.isdigit() or psutil.pid_exists(int(pid))
 
 
 def _flush(path: Path) -> None:
-    """To the disk, so that a power cut does not leave an empty file under the final name."""
+    """Flush a file to the disk, so that a power cut does not leave an empty file under the final name."""
     if path.is_file():
-        with open(path, "rb+") as file:  # Windows flushes only what may be written
+        with open(path, "rb+") as file:  # Windows flushes only files that are open for writing
             os.fsync(file.fileno())
 
 

@@ -1,6 +1,6 @@
-"""What may be read of an HDF5 file that anyone may have written: its own arrays, if reading them takes about what they hold.
+"""Safe reading of untrusted HDF5 files: only arrays inside the file, and only if reading needs little more memory and time than their size.
 
-HDF5 takes chunk shapes and filters from the file. A chunk is always unpacked as a whole, so a few numbers can stand for gigabytes.
+HDF5 takes chunk shapes and filters from the file and always unpacks whole chunks. A small file can therefore unpack to gigabytes.
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ import h5py
 from gpe_pl.files.json_text import MAX_CHARACTERS
 
 LARGEST_DEFLATE_RATIO = 1032
-"""Deflate cannot compress better than this (RFC 1951: 258 bytes by two bits)."""
+"""Largest compression ratio of deflate (RFC 1951: two bits encode 258 bytes)."""
 LARGEST_RATIO, SPARE_UNPACKED = 64, 2**29
-"""What is stored unpacks to no more than so many times its bytes, and so many more: constants in a file of megabytes would be gigabytes in memory."""
+"""An array may unpack to ``LARGEST_RATIO`` times its stored bytes plus ``SPARE_UNPACKED`` bytes. Without this limit, megabytes of compressed constants would
+become gigabytes in memory."""
 
 FILTERS = {
     h5py.h5z.FILTER_DEFLATE: "gzip",
@@ -23,33 +24,37 @@ FILTERS = {
     h5py.h5z.FILTER_FLETCHER32: "fletcher32",
     h5py.h5z.FILTER_LZF: "lzf",
 }
-"""Filters that are known to unpack no more than ``LARGEST_DEFLATE_RATIO`` times what is stored; others may be programs that HDF5 would load."""
+"""Accepted filters. Each unpacks to at most ``LARGEST_DEFLATE_RATIO`` times the stored bytes. HDF5 would load programs for unknown filters."""
 
 SPARE_BYTES = 2**24
-"""That chunks may take beyond a few times their array, which those of a growing array do."""
+"""Bytes that chunks may take beyond eight times their array. Chunks of a growing array are larger than the array at first."""
 SPARE_CHUNKS = 2**17
+"""Number of chunks that an array of any size may have."""
 BYTES_PER_CHUNK = 2**10
-"""On average, of all chunks beyond ``SPARE_CHUNKS``: to look up smaller ones takes longer than to read them."""
+"""Minimum mean size of all chunks beyond ``SPARE_CHUNKS`` [bytes]. Finding smaller chunks takes longer than reading them."""
 
 
 def dataset_in(group: h5py.Group, name: str) -> h5py.Dataset | None:
-    """The array of that name which this file itself holds; None where there is something else. Follows no link: it could lead into another file."""
+    """Return the array ``name`` if the file itself holds it, else None. Links are not followed, because they could lead into another file."""
     found = group[name] if is_own(group, name) else None
     return found if isinstance(found, h5py.Dataset) and not found.is_virtual and not found.external else None
 
 
 def is_own(group: h5py.Group, name: str) -> bool:
-    """Whether something of that name lies in the file, rather than a link to elsewhere or nothing."""
+    """Whether ``name`` exists in the file itself; False for soft and external links."""
     return isinstance(group.get(name, getlink=True), h5py.HardLink)
 
 
 def is_named(group: h5py.Group, name: str) -> bool:
-    """Whether there is something of that name, without following it; ``in`` would open a file that a link leads to."""
+    """Whether ``name`` exists, as an object or as a link. The operator ``in`` would open the file that a link leads to."""
     return group.get(name, getlink=True) is not None
 
 
 def attribute(owner: h5py.HLObject, name: str) -> Any:
-    """A number or text (bytes) of fixed length; None where there is something else, which may refer to anywhere in the file, or more than can be meant."""
+    """Return an attribute that is an integer or a text of fixed length (as bytes), else None.
+
+    Other types may refer to any place in the file. Texts longer than ``MAX_CHARACTERS`` are refused too.
+    """
     if name not in owner.attrs:
         return None
     stored = owner.attrs.get_id(name)
@@ -57,12 +62,12 @@ def attribute(owner: h5py.HLObject, name: str) -> Any:
 
 
 def most_unpacked(stored: int) -> int:
-    """Bytes that so many stored ones may unpack to."""
+    """Maximum number of bytes that ``stored`` bytes may unpack to."""
     return min(stored * LARGEST_DEFLATE_RATIO, stored * LARGEST_RATIO + SPARE_UNPACKED)
 
 
 def obstacle(dataset: h5py.Dataset) -> str | None:
-    """Why an array cannot be read without more memory or time than it is worth; None where it can."""
+    """Return why reading an array would take too much memory or time, or None if it is safe to read."""
     stored, size = dataset.id.get_storage_size(), dataset.nbytes
     if size > stored * LARGEST_DEFLATE_RATIO or stored > dataset.file.id.get_filesize():
         return f"claims {size} bytes, the file holds {min(stored, dataset.file.id.get_filesize())}"
@@ -80,14 +85,14 @@ def obstacle(dataset: h5py.Dataset) -> str | None:
         return f"holds {size} bytes in {count} chunks {list(dataset.chunks)} of {unpacked} bytes in all; store it in smaller chunks"
     if count > SPARE_CHUNKS + size // BYTES_PER_CHUNK:
         return f"holds {size} bytes in {count} chunks {list(dataset.chunks)}; store it in larger chunks"
-    # what is beyond the array's edge in a chunk is constant, and compresses well; a stored chunk may unpack to more than a chunk holds
+    # A stored chunk may unpack to more than a chunk holds. The part of a chunk beyond the array's edge is constant and compresses well.
     if filters and stored > 1.05 * size + unpacked / 128 + 64 * count + 4096:
         return f"holds {size} bytes, for which {stored} bytes are stored: too many for its filters"
     return None
 
 
 def _filters(dataset: h5py.Dataset) -> list[tuple[int, str]]:
-    """Code and name of each filter."""
+    """Return code and name of each filter of an array."""
     properties = dataset.id.get_create_plist()
     found: list[tuple[int, Any, Any, bytes]] = [properties.get_filter(k) for k in range(properties.get_nfilters())]
     return [(code, FILTERS.get(code) or f"{name.decode('utf-8', 'replace')[:40] or 'unknown'} ({code})") for code, _, _, name in found]

@@ -1,4 +1,4 @@
-"""JSON that anyone may have written, with bounds on what reading it takes."""
+"""Safe reading of untrusted JSON, with limits on length, depth and integers."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from typing import Any
 MAX_CHARACTERS = 2**27
 MAX_DEPTH = 64
 MAX_DIGITS = 20
-"""Of an integer; 64 bits have no more."""
+"""Digits of an integer; a 64-bit integer has no more."""
 
 
 def parsed(text: str | bytes) -> Any:
-    """The values of a JSON text.
+    """Parse a JSON text.
 
     Raises:
-        ValueError: it is no JSON, too long, nested deeper than ``MAX_DEPTH``, or has an integer of more than ``MAX_DIGITS``.
+        ValueError: the text is not JSON, is longer than ``MAX_CHARACTERS``, is nested deeper than ``MAX_DEPTH``, or has an integer of more than
+            ``MAX_DIGITS`` digits.
     """
     if len(text) > MAX_CHARACTERS:
         raise ValueError(f"has {len(text)} characters, at most {MAX_CHARACTERS} are read")
@@ -37,7 +38,7 @@ def _integer(digits: str) -> int:
 
 
 def _depth(values: Any) -> int:
-    """Levels of lists and objects within each other."""
+    """Return how deeply lists and objects are nested; counting stops just above ``MAX_DEPTH``."""
     depth, level = 0, [values]
     while level := [v for v in level if isinstance(v, (list, dict))]:
         depth += 1

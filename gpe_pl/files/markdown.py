@@ -1,8 +1,8 @@
-"""Tables for people, as Markdown."""
+"""Markdown tables."""
 
 from gpe_pl.printable import printable
 
 
 def table_row(cells: list[str]) -> str:
-    """A row of a Markdown table."""
+    """Format cells as one row of a Markdown table."""
     return "| " + " | ".join(map(printable, cells)) + " |"

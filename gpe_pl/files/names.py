@@ -1,4 +1,4 @@
-"""Names that become folders: of runs, sweeps and data sets."""
+"""Checks of the names of runs, sweeps and data sets, which become folder names."""
 
 from __future__ import annotations
 
@@ -9,24 +9,26 @@ from pydantic import AfterValidator
 from gpe_pl.errors import GpeError
 
 MOST_BYTES = 200
-"""Of a name that a user chooses. File systems allow 255, and locks and temporary files beside it have longer names."""
+"""Longest name that a user may choose [bytes]. File systems allow 255, but the names of locks and temporary files are longer than the name itself."""
 MOST_BYTES_OF_VALUES = 255
+"""Longest part of a path that is made of overrides [bytes]; the limit of file systems."""
 FORBIDDEN = frozenset('<>:"|?*\\')
-"""What Windows does not allow."""
+"""Characters that Windows does not allow in names."""
 RESERVED = {"con", "prn", "aux", "nul", *(f"{port}{k}" for port in ("com", "lpt") for k in range(1, 10))}
-"""Devices of Windows, with any suffix."""
+"""Device names of Windows, which are reserved with any suffix."""
 PLAIN = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_.-")
+"""Characters of data set names."""
 
 
 class NameRefused(GpeError, ValueError):
-    """A name cannot be that of a folder; the message names the key and says why."""
+    """Raised for a name that cannot be a folder's name; the message names the key and the reason."""
 
 
 def run_name(name: Any, key: str = "name") -> str:
-    """The name, which is one of runs in the folder of results; ``/`` stands between a folder and a run in it, as in ``sweep/first``.
+    """Check and return the name of a run in the results folder; ``/`` separates folders, as in ``sweep/first``.
 
     Raises:
-        NameRefused: it leads elsewhere, or some system would not take it.
+        NameRefused: the name leads out of the results folder, or some operating system does not allow it.
     """
     faults = ["must be the name of a folder for the results"] if not isinstance(name, str) else map(_fault, name.split("/"))
     for fault in filter(None, faults):
@@ -35,10 +37,10 @@ def run_name(name: Any, key: str = "name") -> str:
 
 
 def data_name(name: Any, key: str = "name") -> str:
-    """The name, which is one of a data set: letters, digits, ``_``, ``-`` and ``.``, a letter or digit first.
+    """Check and return the name of a data set: letters, digits, ``_``, ``-`` and ``.``, starting with a letter or digit.
 
     Raises:
-        NameRefused: it is not.
+        NameRefused: the name breaks this rule, or some operating system does not allow it.
     """
     try:
         return _plain(name)
@@ -55,13 +57,16 @@ def _plain(name: Any) -> str:
 
 
 DataName = Annotated[str, AfterValidator(_plain)]
+"""Type of a setting that is the name of a data set; pydantic checks it as ``data_name`` does."""
 
 
 def sweep_name(overrides: str) -> str:
-    """The overrides of a run of a sweep, as the path of its folder in the sweep's. Their values can be paths, with ``/`` in them; the rest is ``portable``.
+    """Return the folder of a sweep's run, relative to the sweep's folder, named by the run's overrides.
+
+    A ``/`` in a value separates folders. Other characters that are not allowed everywhere are encoded by ``portable``.
 
     Raises:
-        NameRefused: that path leads elsewhere, or a part of it is longer than file systems allow.
+        NameRefused: the path leads out of the sweep's folder, or a part of it is not printable or longer than file systems allow.
     """
     parts = overrides.lstrip("/").split("/")
     for part in parts:
@@ -77,7 +82,7 @@ def sweep_name(overrides: str) -> str:
 
 
 def portable(part: str) -> str:
-    """A part of a path, with ``~`` and two hexadecimal digits for each character that Windows does not take there. Different parts stay different."""
+    """Encode each character of a path's part that Windows does not allow as ``~`` and two hexadecimal digits. Different parts stay different."""
     text = "".join(_coded(letter) if letter in FORBIDDEN or letter == "~" else letter for letter in part)
     if text.endswith((".", " ")):
         text = f"{text[:-1]}{_coded(text[-1])}"
@@ -89,7 +94,7 @@ def _coded(letter: str) -> str:
 
 
 def _fault(part: str) -> str | None:
-    """Why a part of a path is no folder's name on every system."""
+    """Return why a part of a path cannot be a folder's name on every system, or None if it can."""
     if not part.strip():
         return "must be the name of a folder, not empty"
     if part[0] == ".":

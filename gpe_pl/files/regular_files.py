@@ -1,4 +1,4 @@
-"""What is read from a path that others chose is a regular file: a pipe or a device in its place never ends."""
+"""Check that a path from outside is a regular file. Reading a pipe or a device could never end."""
 
 from __future__ import annotations
 
@@ -7,6 +7,10 @@ from pathlib import Path
 
 
 def check(path: Path) -> None:
-    """Raise ``OSError`` where something else than a regular file, or a link to one, lies at a path; where nothing does, whoever opens it says so."""
+    """Check that a path is a regular file or a link to one. A missing file passes; opening it raises its own error.
+
+    Raises:
+        OSError: the path is a folder, pipe or device.
+    """
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "is no file", str(path))

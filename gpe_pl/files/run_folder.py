@@ -1,4 +1,4 @@
-"""Folders of runs: each belongs to one configuration, which is written into it."""
+"""Run folders. Each belongs to one configuration, which is stored in it as ``config.json``."""
 
 from __future__ import annotations
 
@@ -11,22 +11,28 @@ from gpe_pl.files import sealed
 
 CONFIG = "config.json"
 DATA_CHECKSUMS = "data_sha256"
-"""Key of a configuration: the checksums of the splits that were used. Data of one name may be replaced."""
+"""Configuration key with the checksums of the splits that a run used, because data of the same name may be replaced."""
 HYDRA = ".hydra"
-"""Folder in that of a run, in which Hydra writes through links."""
+"""Subfolder of a run folder that Hydra writes. Hydra follows links in it."""
 OFFERED = ("comparison", "larger")
-"""Tables of ``data`` and ``size`` that other keys are taken from."""
+"""Lookup tables of ``data`` and ``size`` from which other configuration keys take their values."""
 
 
 class RunError(GpeError, RuntimeError):
-    """A run folder cannot be used; the message says why and what to do."""
+    """Raised when a run folder cannot be used; the message says why and what to do."""
 
 
 def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("checkpoints/last.ckpt", "metrics.csv")) -> None:
-    """Take a folder for a run with this configuration; one without ``results`` (patterns) is free.
+    """Assign a folder to a run with this configuration and write the configuration into it.
+
+    Args:
+        run_dir: folder of the run; created if it is missing.
+        config: configuration of the run.
+        results: file patterns. A folder without any such file is free, whatever its configuration.
 
     Raises:
-        RunError: the folder holds a run with another configuration, or a link that leads out of it; names the first differing key, or the link.
+        RunError: the folder holds a run with another configuration (the message names up to three differing keys), or a link that leads out of it (the
+            message names the link).
     """
     config = without_tables(config)
     refuse_links(run_dir)
@@ -43,7 +49,11 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
 
 
 def refuse_links(run_dir: Path) -> None:
-    """Raise ``RunError`` where the folder of a run or data set, which may be someone else's, has a link through which a command would write outside of it."""
+    """Check that no link in the folder of a run or data set leads out of it. Commands would write through such a link, and the folder may come from others.
+
+    Raises:
+        RunError: a link leads out of the folder; the message names it.
+    """
     inside = run_dir.resolve()
     for path in sorted(path for folder in (run_dir, run_dir / HYDRA) if folder.is_dir() for path in folder.iterdir()):
         if path.is_symlink() and not path.resolve().is_relative_to(inside):
@@ -51,16 +61,17 @@ def refuse_links(run_dir: Path) -> None:
 
 
 def release(run_dir: Path) -> None:
-    """Give a claimed folder back if nothing was written to it."""
+    """Delete a claimed folder if nothing was written to it."""
     if [path.name for path in run_dir.iterdir()] == [CONFIG]:
         (run_dir / CONFIG).unlink()
         run_dir.rmdir()
 
 
 def without_tables(values: dict[str, Any]) -> dict[str, Any]:
-    """A configuration without what data and sizes offer to comparisons and evaluations; graph, model, training and the evaluated scene say what was taken.
+    """Return a configuration without the lookup tables (``OFFERED``) of ``data`` and ``size``.
 
-    The budget of a comparison stays: it decides the number of steps.
+    The values taken from these tables are kept under graph, model, training and the evaluated scene. The time budget of a comparison stays, because it
+    decides the number of steps.
     """
     kept = {
         name: {key: value for key, value in part.items() if key not in OFFERED}
@@ -73,7 +84,11 @@ def without_tables(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def config_in(path: Path) -> dict[str, Any]:
-    """The configuration that a run has left in a file; raises ``RunError`` if that is damaged, or was changed since."""
+    """Read the configuration that a run has stored.
+
+    Raises:
+        RunError: the file is damaged, or was changed after the run wrote it.
+    """
     try:
         return sealed.read(path, f"the run was made with other settings; delete the folder {path.parent} or choose another name=…")
     except sealed.SealError as error:
@@ -81,7 +96,7 @@ def config_in(path: Path) -> dict[str, Any]:
 
 
 def differences(a: Any, b: Any, path: str = "") -> list[str]:
-    """Where two configurations differ: each key with both values."""
+    """List the keys in which two configurations differ, each with both values."""
     if isinstance(a, dict) and isinstance(b, dict):
         return [d for k in sorted({*a, *b}) for d in differences(a.get(k), b.get(k), f"{path}.{k}" if path else k)]
     return [] if a == b else [f"{path}: {a!r} there, {b!r} now"]

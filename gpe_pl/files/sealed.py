@@ -1,7 +1,7 @@
-"""JSON files that the project writes for itself: with a checksum, and read within bounds.
+"""JSON files with a checksum, which the project writes and reads itself.
 
-A file is a table whose key ``sha256`` holds the digest of the others, so that a digit that is changed is seen. What reads it bounds its size, its depth and
-its numbers before it looks at a value: a damaged or hostile file ends in one typed line.
+A file holds a table. Its key ``sha256`` is the checksum of the other keys, so every changed digit is detected. Reading checks size, depth and numbers before
+any value is used. A damaged or hostile file raises ``SealError`` with a one-line message.
 """
 
 from __future__ import annotations
@@ -17,40 +17,44 @@ from gpe_pl.files.atomic import replace_text
 
 SEAL = "sha256"
 MOST_BYTES = 2**22
-"""The largest table of the project has some tens of thousands."""
+"""Maximum size of a file [bytes]. The largest table of the project has some tens of thousands."""
 
 
 class SealError(GpeError, ValueError):
-    """A file is no JSON within bounds, or not as it was written; the message names it and says what to do."""
+    """Raised for a file that is not JSON within the limits, or was changed after it was written; the message names it and says what to do."""
 
 
 def write(path: Path, values: dict[str, Any]) -> None:
-    """Write a table with its seal; raises ``ValueError`` for numbers that are not finite."""
+    """Write a table with its checksum.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
     replace_text(path, json.dumps(sealed(values), indent=1, sort_keys=True, allow_nan=False) + "\n")
 
 
 def sealed(values: dict[str, Any]) -> dict[str, Any]:
-    """A table with its seal, in place of one that it has."""
+    """Return a table with its checksum, which replaces an existing one."""
     own = {key: value for key, value in values.items() if key != SEAL}
     return {**own, SEAL: checksum(own)}
 
 
 def checksum(values: dict[str, Any]) -> str:
-    """SHA-256 of values, whatever the order of their keys."""
-    plain = json.loads(json.dumps(values, allow_nan=False))  # keys become text, by which they are sorted
+    """SHA-256 of values, independent of the order of their keys."""
+    plain = json.loads(json.dumps(values, allow_nan=False))  # keys become text, so that they can be sorted
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
 def read(path: Path, advice: str) -> dict[str, Any]:
-    """The table in a file, without its seal.
+    """Read a table and check its checksum, which is not returned.
 
     Args:
-        path: of the file.
-        advice: what to do where it is damaged, for the message.
+        path: path of the file.
+        advice: what to do if the file is damaged; becomes part of the message.
 
     Raises:
-        SealError: it is not what ``write`` has written.
-        OSError: it cannot be read.
+        SealError: the file was not written by ``write``, or was changed since.
+        OSError: the file cannot be read.
     """
     values = parsed(path, advice)
     if not isinstance(values, dict):
@@ -64,11 +68,11 @@ def read(path: Path, advice: str) -> dict[str, Any]:
 
 
 def parsed(path: Path, advice: str) -> Any:
-    """The value in a JSON file, which has a bounded size and depth and only finite numbers.
+    """Read a JSON file with limited size and depth and only finite numbers.
 
     Raises:
-        SealError: it is none.
-        OSError: it cannot be read.
+        SealError: the file is not regular, is not JSON, or breaks a limit.
+        OSError: the file cannot be read.
     """
     try:
         regular_files.check(path)

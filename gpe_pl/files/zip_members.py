@@ -1,4 +1,4 @@
-"""How many files a zip archive holds that anyone may have written: opening it takes time and memory for each."""
+"""Count the files in an untrusted ZIP archive before it is opened. Opening takes time and memory for each file."""
 
 from __future__ import annotations
 
@@ -6,12 +6,17 @@ import os
 from pathlib import Path
 
 SIGNATURE = b"PK\x01\x02"
-"""Of each entry of an archive's directory, which is at its end."""
+"""Signature of each entry of an archive's directory, which lies at the end of the archive."""
 BYTES_SEARCHED = 2**27
+"""Number of bytes at the end of an archive in which entries are counted."""
 
 
 def num_members(path: Path) -> int:
-    """Entries of the directory in the last ``BYTES_SEARCHED`` of a file; raises ``OSError``."""
+    """Count the directory entries in the last ``BYTES_SEARCHED`` bytes of a file.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
     with open(path, "rb") as file:
         file.seek(max(0, os.fstat(file.fileno()).st_size - BYTES_SEARCHED))
         return file.read().count(SIGNATURE)
