@@ -18,7 +18,7 @@ from gpe_pl.data.ground_truth import DatasetSpec, initial_state, parameter_value
 from gpe_pl.files.atomic import replacing
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.simulate import dataset
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 
 HORIZONS = (20, 50, 100)
 SHIFTS = (1e-4, 1e-3)

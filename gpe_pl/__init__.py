@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from gpe_pl.rollout.containment import Contained as Contained
     from gpe_pl.rollout.loop import rollout as roll_out  # noqa: F401
     from gpe_pl.simulate import dataset as dataset
+    from gpe_pl.trajectory.boundary import Boundary as Boundary
+    from gpe_pl.trajectory.state import State as State
     from gpe_pl.trajectory.store import iter_trajectories as iter_trajectories
     from gpe_pl.trajectory.store import read_trajectory as read_trajectory
-    from gpe_pl.trajectory.trajectory import Boundary as Boundary
     from gpe_pl.trajectory.trajectory import Metadata as Metadata
-    from gpe_pl.trajectory.trajectory import State as State
     from gpe_pl.trajectory.trajectory import Trajectory as Trajectory
     from gpe_pl.viz.figures import rollout_figure as rollout_figure
     from gpe_pl.viz.video import write_animation as write_animation
@@ -47,12 +47,12 @@ early_interrupts.begin()
 prepare()  # before Numba and Matplotlib are imported
 
 _MODULES = {
-    "Boundary": "trajectory.trajectory",
+    "Boundary": "trajectory.boundary",
     "Contained": "rollout.containment",
     "GpeError": "errors",
     "LearnedSimulator": "learned.simulator",
     "Metadata": "trajectory.trajectory",
-    "State": "trajectory.trajectory",
+    "State": "trajectory.state",
     "Trajectory": "trajectory.trajectory",
     "dataset": "simulate",
     "domain_walls": "geometry.shapes",

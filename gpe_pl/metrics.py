@@ -24,7 +24,8 @@ from torchmetrics import Metric
 
 from gpe_pl.rollout.loop import share_outside
 from gpe_pl.trajectory import integrators
-from gpe_pl.trajectory.trajectory import Metadata, Trajectory, von_mises
+from gpe_pl.trajectory.state import von_mises
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 Horizon = int | Literal["full"]
 

@@ -13,8 +13,9 @@ from hypothesis import settings
 
 from gpe_pl.geometry.shapes import Box, domain_walls
 from gpe_pl.schema import node_code
+from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.store import write_shard
-from gpe_pl.trajectory.trajectory import Boundary, Metadata, Trajectory
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 settings.register_profile("fast", max_examples=20, deadline=None, derandomize=True, database=None)
 settings.register_profile("fuzz", max_examples=2000, deadline=None, print_blob=True)  # make fuzz

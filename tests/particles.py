@@ -11,7 +11,8 @@ import numpy.typing as npt
 from gpe_pl.rollout.loop import Simulator
 from gpe_pl.schema import MATERIALS, NODE_TYPES, node_code, param_names
 from gpe_pl.solvers.materials import Elastomer, Sand, Snow
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 
 DENSITY = {"sand": Sand().density, "snow": Snow().density, "elastomer": Elastomer().density, "fluid": 1000.0}
 VALUE = {"sand": 30.0, "snow": 10.0, "elastomer": 1e5, "fluid": 0.05}

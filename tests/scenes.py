@@ -15,7 +15,9 @@ from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.schema import MESH_MATERIALS, STICKY, node_code, param_names
-from gpe_pl.trajectory.trajectory import Boundary, Metadata, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata
 
 SPACING = 0.05
 

@@ -17,7 +17,9 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.schema import MATERIALS, STICKY, node_code, param_names
 from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.scenes import BodyScene
-from gpe_pl.trajectory.trajectory import Boundary, Metadata, State, Trajectory
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 from tests.scenes import SPACING, builder, metadata
 
 PARTICLES = ("sand", "snow", "fluid")

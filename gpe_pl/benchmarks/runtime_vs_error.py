@@ -33,7 +33,8 @@ from gpe_pl.rollout.loop import SimulationError, Simulator
 from gpe_pl.schema import Split
 from gpe_pl.solvers.resolution import Resolved, coarser, finer
 from gpe_pl.training.budget import read_times
-from gpe_pl.trajectory.trajectory import State, Trajectory
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

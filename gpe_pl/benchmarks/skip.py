@@ -24,7 +24,8 @@ from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import param_names
 from gpe_pl.system.machine import synchronized
 from gpe_pl.system.timing import paired_ratio, paired_times
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 
 MATERIALS = ("sand", "snow", "fluid")
 FAR = 5.0

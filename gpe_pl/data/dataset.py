@@ -23,8 +23,9 @@ from gpe_pl.data.statistics import FRAMES_AT_ONCE
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import StoreError, UnsoundError, open_field, open_group, open_shard, read_trajectory, shards, trajectory_names
-from gpe_pl.trajectory.trajectory import State, Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 

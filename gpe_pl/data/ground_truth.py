@@ -23,7 +23,8 @@ from gpe_pl.rollout.loop import Guard, Simulator, rollout
 from gpe_pl.schema import SPLITS, ParameterGroup
 from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.solvers.scenes import Scene, describe
-from gpe_pl.trajectory.trajectory import Metadata, State, Trajectory
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 MOST = 1_000_000
 """Trajectories of a split, and frames of a trajectory: far more than anyone needs, and few enough to be listed."""

@@ -31,7 +31,8 @@ from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import Guard, Simulator, Start, rollout, rollouts, share_outside
 from gpe_pl.schema import SPLITS, ParameterGroup, Split
-from gpe_pl.trajectory.trajectory import State, Trajectory
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.saving import save_figure
 
 log = logging.getLogger(__name__)

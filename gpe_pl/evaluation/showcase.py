@@ -26,7 +26,8 @@ from gpe_pl.rollout.loop import Guard, Simulator, Start, frames, unsound
 from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.system.machine import environment, peak_resident
-from gpe_pl.trajectory.trajectory import Metadata, State, Termination, Trajectory
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata, Termination, Trajectory
 from gpe_pl.viz.saving import save_figure
 
 MAX_PICTURES = 60

@@ -36,7 +36,8 @@ from gpe_pl.nn.static_friction import is_held
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, RADIUS, EdgeType, FeatureSpec, grid, level_of
 from gpe_pl.trajectory import integrators
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 
 Scene = dict[str, Tensor]
 """Tensors by the names of ``describe``."""

@@ -24,8 +24,9 @@ from gpe_pl.graphs.multiscale import cell_edges
 from gpe_pl.metrics import displacement
 from gpe_pl.schema import CELL_KINDS
 from gpe_pl.trajectory.cells import is_corner, kinds_of
+from gpe_pl.trajectory.state import von_mises
 from gpe_pl.trajectory.store import stored_arrays, stored_attributes
-from gpe_pl.trajectory.trajectory import Trajectory, von_mises
+from gpe_pl.trajectory.trajectory import Trajectory
 
 VERTEX = 1
 CELL_TYPES = {"triangle": 5, "quadrilateral": 9, "tetrahedron": 10, "hexahedron": 12}

@@ -34,7 +34,9 @@ from gpe_pl.graphs.neighbors import check_crowding, radius_between, radius_pairs
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of, node_code
-from gpe_pl.trajectory.trajectory import Boundary, Metadata, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata
 
 
 class GraphError(GpeError, ValueError):

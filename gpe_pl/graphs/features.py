@@ -26,7 +26,9 @@ from gpe_pl.schema import (
     param_names,
     radius_relations,
 )
-from gpe_pl.trajectory.trajectory import Boundary, Metadata, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata
 
 Features = Literal["paper", "contact"]
 

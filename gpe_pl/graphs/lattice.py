@@ -11,7 +11,9 @@ from torch_geometric.data import HeteroData
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.schema import node_code, param_names
-from gpe_pl.trajectory.trajectory import Boundary, Metadata, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata
 
 
 def lattice_scene(num_nodes: int, num_edges: int, config: GraphConfig, dim: int = 2, seed: int = 0) -> tuple[GraphBuilder, State]:

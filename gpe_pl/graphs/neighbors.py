@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.rollout.loop import CROWDING_LIMIT, SimulationError, crowding
-from gpe_pl.trajectory.trajectory import search_tree
+from gpe_pl.trajectory.boundary import search_tree
 
 MOST_PAIRS = 2**26
 """That are listed; a gigabyte of indices."""

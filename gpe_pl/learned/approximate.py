@@ -20,8 +20,9 @@ from gpe_pl.graphs.neighbors import radius_between
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
 from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.boundary import search_tree
 from gpe_pl.trajectory.cells import mean_over_corners
-from gpe_pl.trajectory.trajectory import State, Stress, search_tree
+from gpe_pl.trajectory.state import State, Stress
 
 
 def approximate(simulator: LearnedSimulator) -> Simulator:

@@ -41,7 +41,8 @@ from gpe_pl.system.signatures import check_plain, checked
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.cells import mean_over_corners
 from gpe_pl.trajectory.scene_ranges import described, outside, scene_range, united, unlimited
-from gpe_pl.trajectory.trajectory import Metadata, State, Stress, Trajectory
+from gpe_pl.trajectory.state import State, Stress
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,8 @@ from array_api_compat import array_namespace
 from gpe_pl.geometry.shapes import signed_distance, surface_tolerance
 from gpe_pl.rollout.loop import Simulator
 from gpe_pl.trajectory import integrators
-from gpe_pl.trajectory.trajectory import Array, State
+from gpe_pl.trajectory.boundary import Array
+from gpe_pl.trajectory.state import State
 
 NUM_BISECTIONS = 30
 

@@ -17,7 +17,9 @@ from gpe_pl.errors import GpeError
 from gpe_pl.geometry.shape_values import shapes_fault
 from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.schema import NODE_TYPES
-from gpe_pl.trajectory.trajectory import Metadata, Motion, State, Stress, Termination, Trajectory
+from gpe_pl.trajectory.boundary import Motion
+from gpe_pl.trajectory.state import State, Stress
+from gpe_pl.trajectory.trajectory import Metadata, Termination, Trajectory
 from gpe_pl.trajectory.values import faults, size_conflicts
 
 

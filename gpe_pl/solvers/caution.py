@@ -9,7 +9,7 @@ import numpy as np
 from scipy import sparse
 
 from gpe_pl.schema import MATERIALS
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 
 CELLS_ACROSS = 4
 """Cells that a body should have across: one of two triangles bends as if it were half as stiff again."""

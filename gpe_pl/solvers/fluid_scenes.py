@@ -20,7 +20,8 @@ from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Shape, domain_walls,
 from gpe_pl.geometry.terrain import Fit, Up, read_terrain
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers.scenes import CLEARANCE, MAX_ATTEMPTS, check_domain, check_ranges, draw_velocity, filled_box, floats, jittered_lattice
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegativeFloat = Annotated[float, Field(ge=0, allow_inf_nan=False)]

@@ -28,7 +28,8 @@ from gpe_pl.geometry.shapes import Shape, domain_walls, signed_distance
 from gpe_pl.geometry.terrain import ground_of
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers.scenes import CLEARANCE, filled_box
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from gpe_pl.geometry.meshing import triangulate
-from gpe_pl.trajectory.trajectory import State, Stress
+from gpe_pl.trajectory.state import State, Stress
 
 Positions = Float[np.ndarray, "node dim"]
 

@@ -18,7 +18,9 @@ from pydantic.dataclasses import dataclass
 
 from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, check_bounds, domain_walls, signed_distance
 from gpe_pl.schema import MATERIALS, STICKY, node_code, param_names
-from gpe_pl.trajectory.trajectory import Boundary, Metadata, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata
 
 PositiveFloat = Annotated[float, Field(gt=0)]
 Probability = Annotated[float, Field(ge=0, le=1)]

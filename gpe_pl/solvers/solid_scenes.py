@@ -30,7 +30,8 @@ from gpe_pl.solvers.scenes import (
     draw_walls,
     floats,
 )
-from gpe_pl.trajectory.trajectory import Boundary, State, Stress
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State, Stress
 
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegativeFloat = Annotated[float, Field(ge=0, allow_inf_nan=False)]

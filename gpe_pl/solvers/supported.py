@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gpe_pl.rollout.loop import SimulationError
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 
 
 def check_surroundings(state: State, solver: str) -> None:

@@ -19,7 +19,7 @@ from gpe_pl.graphs.batching import batched
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.system import ranks
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 
 MOVED = ("pos", "vel", "velocity_history", "time")
 """Of a state: what a step changes, apart from a moving boundary, which follows from the number of steps."""

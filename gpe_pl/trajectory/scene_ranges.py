@@ -14,7 +14,7 @@ from jaxtyping import Float64
 from gpe_pl.geometry.periodicity import Periodicity
 from gpe_pl.schema import STICKY
 from gpe_pl.trajectory.arrays import nearest_distances
-from gpe_pl.trajectory.trajectory import Boundary
+from gpe_pl.trajectory.boundary import Boundary
 
 BOUNDARY_CHANNELS = (("friction", ""), ("restitution", ""), ("speed", " m/s"), ("spacing", " m"))
 """Names and units."""

@@ -28,7 +28,9 @@ from gpe_pl.geometry.shape_values import shape_from_dict, shape_to_dict, shapes_
 from gpe_pl.geometry.shapes import Shape
 from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, SCHEMA_VERSION, node_code
 from gpe_pl.system.late_failure import LateFailure
-from gpe_pl.trajectory.trajectory import Boundary, Metadata, Motion, Stress, Trajectory
+from gpe_pl.trajectory.boundary import Boundary, Motion
+from gpe_pl.trajectory.state import Stress
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 from gpe_pl.trajectory.values import faults, size_conflicts
 
 

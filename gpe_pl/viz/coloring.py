@@ -11,7 +11,8 @@ from matplotlib.colors import Colormap, LinearSegmentedColormap, ListedColormap,
 from gpe_pl.metrics import displacement
 from gpe_pl.schema import BOUNDARY, MATERIALS, node_code
 from gpe_pl.trajectory.cells import mean_over_corners
-from gpe_pl.trajectory.trajectory import Trajectory, von_mises
+from gpe_pl.trajectory.state import von_mises
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import vertical_axis
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

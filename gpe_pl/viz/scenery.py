@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float
 from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 
 from gpe_pl.geometry.shapes import Shape, signed_distance
-from gpe_pl.trajectory.trajectory import Boundary, Trajectory
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import Camera
 
 INK = "0.15"

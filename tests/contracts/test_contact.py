@@ -18,7 +18,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE, IslandError
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import node_code
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 from tests import scenes
 
 BOTH = ("sand", "elastomer")

@@ -16,7 +16,8 @@ from gpe_pl.graphs.builder import GraphBuilder, GraphError
 from gpe_pl.graphs.features import edge_features, scales_of
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import BOUNDARY, STICKY, node_code
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 from tests import scenes
 
 SAND, TWO, THREE = ("sand",), ("sand", "snow"), ("sand", "snow", "fluid")

@@ -25,8 +25,9 @@ from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import Guard, SimulationError, rollout
 from gpe_pl.schema import param_names
 from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import iter_trajectories, write_shard
-from gpe_pl.trajectory.trajectory import State, Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests import scenes
 
 HISTORIES = (1, 2, 5)

@@ -17,7 +17,7 @@ from gpe_pl.graphs.multiscale import MeshError, MultiscaleGraph, _cached, build,
 from gpe_pl.graphs.standardizer import GraphStandardizer
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import BOUNDARY, grid, is_symmetric, node_code
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 from tests import scenes
 
 KINDS = ["lattice", "triangles", "tetrahedra"]

@@ -28,8 +28,10 @@ from gpe_pl.metrics import per_frame_mse, rollout_metrics
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import BOUNDARY
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import iter_trajectories, write_shard
-from gpe_pl.trajectory.trajectory import Boundary, State, Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.panel import Panel
 from tests import scenes

@@ -25,9 +25,11 @@ from gpe_pl.learned.pretrained import names
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import STICKY
+from gpe_pl.trajectory.boundary import Boundary, Motion
 from gpe_pl.trajectory.scene_ranges import described, scene_range, united
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import read_trajectory, trajectory_names, write_shard
-from gpe_pl.trajectory.trajectory import Boundary, Motion, State, Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests import scenes
 
 GRAVITY = (0.0, -9.81)

@@ -24,8 +24,10 @@ from gpe_pl.graphs.neighbors import radius_pairs
 from gpe_pl.rollout.containment import contain
 from gpe_pl.rollout.loop import share_outside
 from gpe_pl.trajectory.arrays import ArrayError
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import iter_trajectories
-from gpe_pl.trajectory.trajectory import Boundary, State, Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 
 SPACING = 0.05
 CHANNEL = Periodicity(((0.1, 0.9), (0.0, 0.4)), (True, False))

@@ -19,7 +19,8 @@ from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.momentum_conv import MomentumConv
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import node_code
-from gpe_pl.trajectory.trajectory import State, search_tree
+from gpe_pl.trajectory.boundary import search_tree
+from gpe_pl.trajectory.state import State
 from tests import scenes
 
 NOTHING = Skips(absent_types=False, static_boundary=False, isolated_nodes=False, edges_at_once=None, sorted_from=None)
@@ -172,7 +173,7 @@ def test_the_boundary_is_sorted_once(static: bool, monkeypatch: pytest.MonkeyPat
         sizes.append(len(pos))
         return search_tree(pos, *others)
 
-    for module in ("trajectory.trajectory", "graphs.neighbors"):
+    for module in ("trajectory.boundary", "graphs.neighbors"):
         monkeypatch.setattr(f"gpe_pl.{module}.search_tree", counted)
     roll(simulated, start, replace(NOTHING, static_boundary=static), 4)
     assert sizes.count(len(start.boundary.pos)) == (1 if static else 4)

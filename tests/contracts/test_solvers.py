@@ -21,8 +21,9 @@ from gpe_pl.solvers.flip import FLIP
 from gpe_pl.solvers.materials import LIMITS, check_limits
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.solid_scenes import SolidScene
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.store import read_trajectory, write_shard
-from gpe_pl.trajectory.trajectory import Boundary, State, Stress
 from tests.particles import block, run, together
 from tests.scenes import metadata
 

@@ -16,7 +16,7 @@ from gpe_pl.models.base import Prediction
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.static_friction import supported
 from gpe_pl.rollout.loop import rollout
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 from tests import scenes
 
 NET = 0.4

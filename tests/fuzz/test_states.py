@@ -20,7 +20,7 @@ from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import Guard, SimulationError, crowding, rollout
 from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.scenes import BodyScene
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 from tests.scenes import builder, metadata
 from tests.strategies import PARTICLES, body_scenes, graphs, seeds, states
 

@@ -20,7 +20,7 @@ from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import Start, frames
 from gpe_pl.system.machine import resident_bytes
 from gpe_pl.training.module import TrainingModule
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 from tests import scenes
 from tests.runs import tiny
 

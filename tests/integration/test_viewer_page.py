@@ -14,7 +14,8 @@ import pytest
 from PIL import Image
 
 from gpe_pl.schema import node_code
-from gpe_pl.trajectory.trajectory import Stress, Termination, Trajectory
+from gpe_pl.trajectory.state import Stress
+from gpe_pl.trajectory.trajectory import Termination, Trajectory
 from gpe_pl.viz.coloring import MATERIAL_COLORS
 from gpe_pl.viz.viewer import write_viewer
 from tests.unit.viz.conftest import falling, falling_mesh

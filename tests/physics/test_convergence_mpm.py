@@ -8,7 +8,7 @@ import pytest
 
 from gpe_pl import dataset
 from gpe_pl.geometry.shapes import domain_walls
-from gpe_pl.trajectory.trajectory import Boundary
+from gpe_pl.trajectory.boundary import Boundary
 from tests.particles import block, run
 from tests.physics.test_convergence_flip import effective_viscosity
 from tests.physics.test_mpm import L0, collapse

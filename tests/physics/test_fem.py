@@ -14,7 +14,8 @@ from gpe_pl.solvers.fem import FEM
 from gpe_pl.solvers.fem.elements import build_mesh
 from gpe_pl.solvers.materials import lame_parameters
 from gpe_pl.solvers.solid_scenes import SolidScene
-from gpe_pl.trajectory.trajectory import Boundary, State, von_mises
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State, von_mises
 
 pytestmark = pytest.mark.slow
 

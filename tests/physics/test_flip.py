@@ -14,7 +14,8 @@ from gpe_pl.solvers.flip import FLIP
 from gpe_pl.solvers.flip.solver import Fields
 from gpe_pl.solvers.flip.transfer import add_impulse, scatter
 from gpe_pl.solvers.fluid_scenes import FluidScene
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 
 pytestmark = pytest.mark.slow
 

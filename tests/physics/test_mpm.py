@@ -11,7 +11,7 @@ from gpe_pl.geometry.shapes import Bowl, Shape, Sphere, domain_walls, signed_dis
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers.materials import Elastomer, Fluid, Sand, Snow, lame_parameters
 from gpe_pl.solvers.mpm import MPM
-from gpe_pl.trajectory.trajectory import Boundary
+from gpe_pl.trajectory.boundary import Boundary
 from tests.particles import VALUE, block, run, together
 
 pytestmark = pytest.mark.slow

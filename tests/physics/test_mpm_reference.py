@@ -12,7 +12,8 @@ from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.materials import Elastomer, Snow
 from gpe_pl.solvers.mpm import MPM
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 
 pytestmark = pytest.mark.slow
 

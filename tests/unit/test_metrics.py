@@ -17,7 +17,9 @@ from gpe_pl.metrics import (
     per_frame_mse,
     rollout_metrics,
 )
-from gpe_pl.trajectory.trajectory import Boundary, Metadata, Stress, Termination, Trajectory
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import Stress
+from gpe_pl.trajectory.trajectory import Metadata, Termination, Trajectory
 
 DT = 0.1
 

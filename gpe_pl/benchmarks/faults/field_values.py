@@ -24,8 +24,10 @@ from gpe_pl.data.validate import validate
 from gpe_pl.errors import GpeError
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, Values, node_code
+from gpe_pl.trajectory.boundary import Boundary, Motion
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import digest, read_trajectory, stored_arrays, write_shard
-from gpe_pl.trajectory.trajectory import Boundary, Motion, State, Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 
 NUM_FRAMES = 6
 NOT_NUMBERS = (np.nan, np.inf, -np.inf, -1e30)

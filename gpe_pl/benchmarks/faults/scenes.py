@@ -20,7 +20,8 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import Guard, rollout
-from gpe_pl.trajectory.trajectory import Metadata, State, Trajectory
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 NUM_STEPS = 3
 NODE_FIELDS = ("pos", "vel", "node_type", "mass", "material_params")

@@ -12,7 +12,7 @@ from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, 
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gns import GNS
 from gpe_pl.rollout.loop import Guard, rollout
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 
 NUM_STEPS = 300
 

@@ -12,7 +12,7 @@ from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, 
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.neighbors import radius_pairs
 from gpe_pl.rollout.loop import SimulationError
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 
 NUM_MOVES = 1000
 NUM_CROWDED = 20_000

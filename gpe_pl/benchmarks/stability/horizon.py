@@ -20,7 +20,8 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import displacement
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import Simulator, Start, rollout, rollouts
-from gpe_pl.trajectory.trajectory import State, Trajectory
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
 
 MAX_CORRECTED = 0.01
 """Share of particle-steps beyond which containment does the model's work."""

@@ -14,7 +14,8 @@ from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, 
 from gpe_pl.errors import GpeError
 from gpe_pl.rollout.loop import Guard, SimulationError, Simulator, Start, rollout, rollouts, step_all
 from gpe_pl.schema import BOUNDARY, MATERIALS, node_code
-from gpe_pl.trajectory.trajectory import State, Trajectory
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
 
 NUM_STEPS = 20
 

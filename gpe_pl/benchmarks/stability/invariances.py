@@ -25,7 +25,7 @@ from gpe_pl.benchmarks.stability.subject import (
 )
 from gpe_pl.graphs.batching import batched
 from gpe_pl.schema import FeatureSpec, is_symmetric
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 
 NUM_DRAWS = 5
 

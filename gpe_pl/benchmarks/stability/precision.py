@@ -37,7 +37,7 @@ from gpe_pl.rollout.loop import Guard, rollout
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.system.machine import resident_bytes
 from gpe_pl.training.module import TrainingModule
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 
 NUM_STEPS = 100
 

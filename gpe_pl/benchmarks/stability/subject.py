@@ -19,7 +19,9 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.base import Prediction
 from gpe_pl.rollout.loop import Guard
 from gpe_pl.trajectory import integrators
-from gpe_pl.trajectory.trajectory import Boundary, State, Trajectory
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,8 @@ from gpe_pl.data.importers.source import (
 )
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.trajectory.arrays import estimated_normals, flags, numbers
-from gpe_pl.trajectory.trajectory import Boundary, Trajectory
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.trajectory import Trajectory
 
 KEYS = (
     *(

@@ -20,7 +20,8 @@ from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES
 from gpe_pl.trajectory.arrays import estimated_normals, numbers
-from gpe_pl.trajectory.trajectory import Boundary, Motion, Trajectory
+from gpe_pl.trajectory.boundary import Boundary, Motion
+from gpe_pl.trajectory.trajectory import Trajectory
 
 Format = Literal["gns", "lagrangebench", "meshgraphnets", "dpinet", "dmcf", "arrays"]
 

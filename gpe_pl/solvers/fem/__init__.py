@@ -35,7 +35,8 @@ from gpe_pl.solvers.fem.elements import (
 )
 from gpe_pl.solvers.materials import LIMITS, check_limits, lame_parameters
 from gpe_pl.solvers.supported import check_surroundings
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 
 OK, NOT_FINITE, ESCAPE, TOO_MANY_SUBSTEPS = 0, 1, 2, 3
 KINDS = {"triangle": 0, "quad": 1, "tetrahedron": 2}

@@ -25,7 +25,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import eigsh
 
 from gpe_pl.rollout.loop import SimulationError
-from gpe_pl.trajectory.trajectory import Stress
+from gpe_pl.trajectory.state import Stress
 
 SMALLEST_RATIO = 0.2
 """Volume ratio J below which the logarithm is continued by its tangent."""

@@ -19,7 +19,8 @@ from gpe_pl.solvers.mpm.collider import Collider, collider
 from gpe_pl.solvers.mpm.frame import ESCAPE, NOT_FINITE, OK, advance
 from gpe_pl.solvers.mpm.particles import Particles
 from gpe_pl.solvers.supported import check_surroundings
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 
 PADDING = 3
 """Cells between the domain and the edge of the grid: room for the kernel of a particle on a wall, or one cell behind it."""

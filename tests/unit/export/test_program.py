@@ -23,7 +23,7 @@ from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.loop import rollout
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 from tests import scenes
 
 SMALL: dict[Any, dict[str, Any]] = {

@@ -14,8 +14,9 @@ from gpe_pl.export.trajectories import write_npz, write_vtk
 from gpe_pl.rollout.baselines import ConstantVelocity
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import FIELDS, node_code
+from gpe_pl.trajectory.state import Stress
 from gpe_pl.trajectory.store import iter_trajectories, stored_arrays
-from gpe_pl.trajectory.trajectory import Metadata, Stress, Trajectory
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 from tests.unit.viz.conftest import block, falling, falling_mesh
 
 meshio = pytest.importorskip("meshio", reason="meshio, another reader of VTK files, is not installed")

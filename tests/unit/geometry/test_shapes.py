@@ -27,7 +27,7 @@ from gpe_pl.geometry.shapes import (
     outward_normal,
     signed_distance,
 )
-from gpe_pl.trajectory.trajectory import Boundary
+from gpe_pl.trajectory.boundary import Boundary
 
 CONCAVE = ((0.2, 0.2), (0.9, 0.1), (0.5, 0.5), (0.8, 0.9), (0.2, 0.8))
 SOLIDS: dict[str, Any] = {

@@ -15,7 +15,7 @@ from torch_geometric.data import Batch
 from gpe_pl.graphs.islands import islands_within
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE, IslandError
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 from tests import scenes
 
 TWO = ("sand", "snow")

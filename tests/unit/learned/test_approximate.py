@@ -21,7 +21,7 @@ from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import Guard, Start, rollout, rollouts
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 from tests import scenes
 
 RADIUS = 0.12

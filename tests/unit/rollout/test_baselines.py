@@ -10,7 +10,8 @@ import pytest
 from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, domain_walls, signed_distance
 from gpe_pl.rollout.baselines import Ballistic, ConstantVelocity, StopsAtWalls
 from gpe_pl.rollout.loop import rollout
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 from tests import scenes
 
 DT, G = 0.01, -9.81

@@ -11,7 +11,8 @@ import torch
 
 from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, domain_walls, outward_normal, signed_distance, surface_tolerance
 from gpe_pl.rollout.containment import Contained, contain
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 from tests import scenes
 
 DT = 0.01

@@ -13,7 +13,8 @@ import torch
 
 from gpe_pl.rollout.loop import Guard, Replay, SimulationError, Simulator, Start, frames, rollout, rollouts, share_outside
 from gpe_pl.trajectory import integrators
-from gpe_pl.trajectory.trajectory import State, Termination, Trajectory
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Termination, Trajectory
 
 New = Callable[..., Trajectory]
 

@@ -7,7 +7,7 @@ from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Polygon, Shape, Sphe
 from gpe_pl.schema import STICKY
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.mpm.collider import collider, push_out
-from gpe_pl.trajectory.trajectory import Boundary
+from gpe_pl.trajectory.boundary import Boundary
 from tests.particles import block, run
 
 BOUNDS = ((0.0, 1.0), (0.0, 1.0))

@@ -14,7 +14,7 @@ from gpe_pl.solvers.fem import FEM
 from gpe_pl.solvers.fem.elements import SMALLEST_RATIO, build_mesh, cauchy_stress, elastic_energy
 from gpe_pl.solvers.materials import lame_parameters
 from gpe_pl.solvers.solid_scenes import SolidScene
-from gpe_pl.trajectory.trajectory import Boundary
+from gpe_pl.trajectory.boundary import Boundary
 
 SQUARE = ((0.0, 1.0), (0.0, 1.0))
 SCENES = {

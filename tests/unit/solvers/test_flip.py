@@ -17,7 +17,8 @@ from gpe_pl.solvers.flip.grid import PADDING, make_grid, make_solids
 from gpe_pl.solvers.flip.linear import conjugate_gradients, incomplete_cholesky
 from gpe_pl.solvers.flip.pressure import surface_distance
 from gpe_pl.solvers.flip.solver import Fields
-from gpe_pl.trajectory.trajectory import Boundary, State
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import State
 
 
 def liquid(dim=2, count=200, boundary=None, seed=0):

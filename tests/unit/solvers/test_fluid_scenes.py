@@ -19,7 +19,7 @@ from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, domain_walls, signed
 from gpe_pl.geometry.terrain_files import TerrainError
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.solvers.fluid_scenes import CLEARANCE, FluidScene, TerrainOptions
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 
 EARTH_2D = (0.0, -9.81)
 

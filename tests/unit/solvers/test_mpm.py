@@ -11,7 +11,7 @@ from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import node_code
 from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.mpm import MPM, MPMInternal
-from gpe_pl.trajectory.trajectory import Boundary
+from gpe_pl.trajectory.boundary import Boundary
 from tests.particles import VALUE, block, run, together
 
 ALL = ("sand", "snow", "elastomer", "fluid")

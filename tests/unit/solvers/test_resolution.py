@@ -8,7 +8,7 @@ import pytest
 from gpe_pl.data.ground_truth import DatasetSpec, initial_state
 from gpe_pl.simulate import dataset_spec
 from gpe_pl.solvers.resolution import Resolved, coarser, finer, outline
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 from tests.runs import compose
 
 

@@ -24,8 +24,10 @@ from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.push_forward import walked
 from gpe_pl.training.run import TrainingSettings
+from gpe_pl.trajectory.boundary import Motion
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import write_shard
-from gpe_pl.trajectory.trajectory import Motion, State, Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests.scenes import assert_equal_graphs
 
 

@@ -32,7 +32,8 @@ from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, train
-from gpe_pl.trajectory.trajectory import Boundary, Trajectory
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests import scenes
 
 NUM_FRAMES, FRAME_DT, SPACING = 16, 0.01, 0.1

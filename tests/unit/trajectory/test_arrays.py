@@ -18,8 +18,9 @@ from gpe_pl.geometry.periodicity import Periodicity, PeriodicityError
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.schema import STICKY, node_code
 from gpe_pl.trajectory.arrays import ArrayError, estimated_normals, typical_spacing
+from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.store import iter_trajectories, read_trajectory
-from gpe_pl.trajectory.trajectory import Boundary, Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests.sources import DT, motion
 
 BOX = ((0.0, 1.0), (0.0, 1.0))

@@ -15,7 +15,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.trajectory.cells import is_corner, mean_over_corners
-from gpe_pl.trajectory.trajectory import State
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.values import faults
 from tests import scenes
 

@@ -26,8 +26,9 @@ from gpe_pl.rollout.loop import rollout
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, node_code
 from gpe_pl.trajectory.arrays import ArrayError
+from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.store import read_trajectory, write_shard
-from gpe_pl.trajectory.trajectory import Boundary, Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.viewer import write_viewer
 
 DT, NUM_FRAMES, SPACING = 0.01, 12, 0.05

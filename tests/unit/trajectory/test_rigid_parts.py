@@ -7,7 +7,7 @@ import pytest
 
 from gpe_pl.geometry.periodicity import Periodicity
 from gpe_pl.trajectory.arrays import ArrayError
-from gpe_pl.trajectory.trajectory import Boundary
+from gpe_pl.trajectory.boundary import Boundary
 
 DT, NUM_FRAMES, SPACING = 0.01, 21, 0.05
 TIME = np.linspace(0, 1, NUM_FRAMES)

@@ -15,8 +15,9 @@ import numpy as np
 import pytest
 
 from gpe_pl.schema import NODE_TYPES, SCHEMA_VERSION
+from gpe_pl.trajectory.state import Stress, von_mises
 from gpe_pl.trajectory.store import StoreError, iter_trajectories, read_metadata, read_trajectory, shards, trajectory_names, write_shard
-from gpe_pl.trajectory.trajectory import Stress, Trajectory, von_mises
+from gpe_pl.trajectory.trajectory import Trajectory
 
 New = Callable[..., Trajectory]
 

@@ -18,8 +18,10 @@ from gpe_pl.geometry.repeated_shapes import Repeated
 from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, Wall
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import FIELDS, LARGEST, MATERIALS, NODE_TYPES, node_code, param_names
+from gpe_pl.trajectory.boundary import Boundary, Motion
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import StoreError, UnsoundError, read_trajectory, stored_arrays, write_shard
-from gpe_pl.trajectory.trajectory import Boundary, Motion, State, Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.trajectory.values import faults
 
 NAN, INF = float("nan"), float("inf")

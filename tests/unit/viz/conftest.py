@@ -6,7 +6,9 @@ import pytest
 
 from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, domain_walls
 from gpe_pl.schema import node_code
-from gpe_pl.trajectory.trajectory import Boundary, Metadata, Stress, Termination, Trajectory
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.state import Stress
+from gpe_pl.trajectory.trajectory import Metadata, Termination, Trajectory
 
 
 def falling(dim: int, num_frames: int = 12, noise: float = 0.0) -> Trajectory:

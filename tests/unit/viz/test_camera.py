@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from gpe_pl.geometry.shapes import Bowl, domain_walls
-from gpe_pl.trajectory.trajectory import Boundary, Metadata, Trajectory
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 from gpe_pl.viz.camera import Camera
 
 

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.colors import to_rgba
 
 from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Sphere, domain_walls
-from gpe_pl.trajectory.trajectory import Boundary
+from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.viz.camera import Camera
 from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.film_strip import new_figure

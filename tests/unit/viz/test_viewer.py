@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gpe_pl.trajectory.trajectory import Stress, Trajectory
+from gpe_pl.trajectory.state import Stress
+from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.viewer import FASTEST, ViewerError, write_viewer
 
 

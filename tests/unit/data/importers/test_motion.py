@@ -16,8 +16,9 @@ from gpe_pl.data.validate import validate
 from gpe_pl.geometry.shapes import Shape, Sphere, domain_walls
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.arrays import ArrayError
+from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.store import iter_trajectories
-from gpe_pl.trajectory.trajectory import Boundary, Trajectory
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests import sources
 from tests.sources import DT, SPACING
 
