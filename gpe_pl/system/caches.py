@@ -1,4 +1,7 @@
-"""Where libraries keep what they compile: apart for each version of the sources, and also where package and home cannot be written."""
+"""Cache folders for the code that libraries compile.
+
+Each version of the sources has its own folder. A folder is found even where the package and the home folder cannot be written.
+"""
 
 from __future__ import annotations
 
@@ -13,21 +16,22 @@ from pathlib import Path
 PACKAGE = Path(__file__).parents[1]
 
 COMPILED = ("schema.py", "graphs/islands.py", "geometry/grid_distance.py", "data/importers/tfrecord.py", "nn/fused*.py", "solvers/**/*.py")
-"""Sources of compiled functions, and of the types and constants in them."""
+"""Source files of compiled functions, and of the types and constants in them."""
 NAME = "gpe_pl-compiled-"
-"""Begins the names of folders of compiled functions; a digest of ``COMPILED`` follows."""
+"""Prefix of the names of folders of compiled functions; a digest of ``COMPILED`` follows."""
 SECONDS_UNUSED = 30 * 24 * 3600
-"""After so long, compiled functions of other sources are removed."""
+"""Folders of compiled functions that were unused for this time [s] are removed."""
 
 
 def prepare() -> None:
-    """Choose folders for what Numba compiles, and for Matplotlib and Triton where those that they would take cannot be written.
+    """Choose cache folders for Numba, and for Matplotlib and Triton where their default folders cannot be written.
 
-    Numba compiles a function again when its own file has changed, but not when another file has that defines a type, a constant or a function in it. So each
-    version of ``COMPILED`` has a folder of its own: in ``NUMBA_CACHE_DIR`` if that is set, else in the package, else in the user's folder for caches, else in
-    one below the system's temporary folder. Where none can be written, each process compiles anew. Matplotlib and Triton warn where they have no folder, and
-    work anew in each process; what the user has set stays.
-    Takes effect on what is imported afterwards.
+    Numba compiles a function again when its own file changes, but not when the change is in another file that defines a type, a constant or a function which
+    it uses. Each version of ``COMPILED`` therefore has its own folder. It lies in the first of these places that is set or can be written:
+    ``NUMBA_CACHE_DIR``, the package, the user's cache folder, the system's temporary folder. If there is none, each process compiles again.
+
+    Matplotlib and Triton without a folder would warn and work again in each process. Environment variables that the user has set are kept. The choice affects
+    only libraries that are imported afterwards.
     """
     _prepare_numba()
     if not _is_writable(Path("~/.config/matplotlib").expanduser()):
@@ -48,7 +52,7 @@ def _prepare_numba() -> None:
         os.utime(folder)
         if is_new:
             _remove_unused(parent)
-    except OSError:  # Numba looks for another place itself
+    except OSError:  # Numba then looks for another place itself
         if not any(map(_is_writable, _usual_places())):
             _compile_without_cache()
         return
@@ -58,10 +62,10 @@ def _prepare_numba() -> None:
 
 
 def _parent_of_compiled() -> Path | None:
-    """Where folders of compiled functions lie."""
+    """Return the parent of the folders of compiled functions, or None if no place can be written."""
     if given := os.environ.get("NUMBA_CACHE_DIR"):
         chosen = Path(given)
-        return chosen.parent if chosen.name.startswith(NAME) else chosen  # that of the process that started this one
+        return chosen.parent if chosen.name.startswith(NAME) else chosen  # set by the process that started this one
     if own := next(filter(_is_writable, _usual_places()), None):
         return own
     temporary = _own_folder()
@@ -69,20 +73,20 @@ def _parent_of_compiled() -> Path | None:
 
 
 def _usual_places() -> tuple[Path, Path]:
-    """Folders in the package and in the user's folder for caches."""
+    """Return the cache folders in the package and in the user's cache folder."""
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
     return PACKAGE / "__pycache__", home / "numba"
 
 
 def _compile_without_cache() -> None:
-    """Numba refuses to compile a function that wants a cache where it finds no place for one: each process compiles anew, in its memory."""
+    """Make each process compile in memory. Otherwise Numba refuses to compile a function with ``cache=True`` when it finds no place for the cache."""
     from numba.core.dispatcher import Dispatcher
 
     setattr(Dispatcher, "enable_caching", lambda _: None)  # noqa: B010
 
 
 def _digest() -> str:
-    """Of the names and contents of ``COMPILED``."""
+    """Return a digest of the names and contents of ``COMPILED``."""
     digest = hashlib.blake2b(digest_size=8)
     for path in sorted(path for pattern in COMPILED for path in PACKAGE.glob(pattern)):
         digest.update(f"{path.relative_to(PACKAGE).as_posix()}\n".encode())
@@ -97,7 +101,7 @@ def _remove_unused(parent: Path) -> None:
 
 
 def _is_writable(folder: Path) -> bool:
-    """Whether a folder can be written, or made; ``access`` also knows of disks that are read-only."""
+    """Whether a folder can be written, or created. Unlike the file mode, ``os.access`` also detects disks that are read-only."""
     there = next(each for each in (folder, *folder.absolute().parents) if each.exists())
     return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
 
@@ -108,7 +112,7 @@ def _set(variable: str, name: str) -> None:
 
 
 def _own_folder() -> Path | None:
-    """A folder that only this user can write: what libraries find there they run."""
+    """Return a temporary folder that only this user can write, or None. Libraries run the code that they find there."""
     import tempfile
 
     try:

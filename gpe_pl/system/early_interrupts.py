@@ -1,4 +1,4 @@
-"""Ctrl-C while a command imports what it needs, before it can catch anything itself, and where Python ignores exceptions."""
+"""Handling of Ctrl-C where a command cannot catch it: during its imports, and in code whose exceptions Python ignores."""
 
 from __future__ import annotations
 
@@ -15,31 +15,35 @@ if TYPE_CHECKING:
 
 NOTICE = "interrupted"
 STATUS = 130
-"""Exit status after Ctrl-C, as shells have it."""
+"""Exit status after Ctrl-C, following the convention of shells."""
 COMMANDS = ("fit", "simulate", "evaluate", "benchmark", "convert")
 
 
 def begin() -> None:
-    """End the process with one line on Ctrl-C from now on, if it is a command that begins: ``python -m gpe_pl.COMMAND``."""
+    """Let Ctrl-C end the process with one line from now on, if the process is starting a command (``python -m gpe_pl.COMMAND``)."""
     is_command = sys.argv[:1] == ["-m"] and any(f"gpe_pl.{name}" in sys.orig_argv for name in COMMANDS)
     if is_command:
         catch()
 
 
 def catch() -> None:
-    """The same in any process, unless Ctrl-C is ignored or somebody else catches it."""
+    """Let Ctrl-C end the process with one line from now on, unless Ctrl-C is ignored or already has another handler."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end_process)
 
 
 def end() -> None:
-    """Ctrl-C raises ``KeyboardInterrupt`` again, and a moment later once more where that is ignored, as in destructors and callbacks of weak references."""
+    """Let Ctrl-C raise ``KeyboardInterrupt`` again.
+
+    Python ignores exceptions in destructors and in callbacks of weak references. An interrupt there is repeated after ``SECONDS_LATER``.
+    """
     sys.unraisablehook = _interrupt_again
     if signal.getsignal(signal.SIGINT) is _end_process:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 SECONDS_LATER = 0.02
+"""Delay before an ignored interrupt is repeated [s]."""
 
 
 def _interrupt_again(ignored: UnraisableHookArgs) -> None:
@@ -52,6 +56,6 @@ def _interrupt_again(ignored: UnraisableHookArgs) -> None:
 
 
 def _end_process(number: int, frame: FrameType | None) -> None:
-    """At once: nothing has been written, and libraries may take an exception in their imports for another one."""
+    """End the process at once. Nothing has been written yet, and libraries may misread an exception during their imports."""
     os.write(2, f"{NOTICE}\n".encode())
     os._exit(STATUS)

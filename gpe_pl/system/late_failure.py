@@ -1,4 +1,4 @@
-"""A file for libraries that crash when writing fails: what there is no room for stays in memory, and whoever opened the file is told."""
+"""A file for libraries that crash when writing fails. Data that do not fit on the disk stay in memory, and the owner of the file is told afterwards."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 
 
 class LateFailure(io.RawIOBase):
-    """A new file that can be written and read anywhere, and never fails in writing.
+    """A new file with random access whose writing never raises.
 
     Attributes:
-        error: why writing failed for the first time; ``check`` raises it.
+        error: the first error of writing, or None; ``check`` raises it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -22,7 +22,7 @@ class LateFailure(io.RawIOBase):
         self._kept: list[tuple[int, bytes]] = []
 
     def check(self) -> None:
-        """Raise what has failed so far."""
+        """Raise the first error of writing, if there was one."""
         if self.error is not None:
             raise self.error
 

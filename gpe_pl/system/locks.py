@@ -1,8 +1,8 @@
-"""Folders that one command at a time writes to.
+"""Locks that let only one command at a time write to a folder.
 
-The lock of ``FOLDER`` is ``.FOLDER.lock`` beside it, and belongs to the operating system, which releases it however its process ends. ``.FOLDER.holder``
-says who has it. Where a disk has no such locks, the existence of the file is the lock: one of a process that has ended is removed on the same machine, and
-on another one the message says which file to delete. Whoever only reads needs no lock.
+The lock of ``FOLDER`` is the file ``.FOLDER.lock`` in the same parent folder. The operating system holds it and releases it however the process ends.
+``.FOLDER.holder`` says which process has the lock. Some disks have no such locks; there the existence of the file is the lock. A file left by an ended
+process is then removed on the same machine, and on another machine the message says which file to delete. Readers need no lock.
 """
 
 from __future__ import annotations
@@ -29,22 +29,23 @@ from gpe_pl.files.atomic import replace_text
 log = logging.getLogger(__name__)
 
 LONGEST_NAME = 200
+"""Longest folder name that names of locks contain [bytes], and longest command that a holder file contains [characters]."""
 WITHOUT_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP}
-"""What disks answer that have no locks."""
+"""Error numbers of disks without locks."""
 RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
 """Environment variables that number the processes of one run, as Lightning reads them."""
 
 _held: set[Path] = set()
-"""Locks of this process."""
+"""Locks that this process holds."""
 
 
 class FolderError(GpeError):
-    """A folder cannot be made or written, another command writes to it, or it was deleted meanwhile; the message names the folder and what to do."""
+    """Raised when a folder cannot be created or written, is in use by another command, or was deleted; the message names it and says what to do."""
 
 
 @dataclass(frozen=True)
 class Holder:
-    """Who holds a lock."""
+    """The process that holds a lock: its id, machine, command and start time."""
 
     pid: int
     host: str
@@ -57,19 +58,19 @@ class Holder:
 
 @contextlib.contextmanager
 def held(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bool = True, num_processes: int = 1) -> Iterator[None]:
-    """Inside, no other command writes to the folder.
+    """Keep other commands from writing to a folder inside the block.
 
-    A process that holds a folder may do so again.
+    A process that already holds the lock may take it again.
 
     Args:
-        folder: of a run, a sweep or a data set.
-        key: where its parent is configured, for messages.
-        waits: until the other command has ended, rather than refuse; a log line says for whom.
-        makes: the folder.
-        num_processes: of the run. Of several, which ``RANKS`` number, the first holds the folder for all.
+        folder: folder of a run, a sweep or a data set.
+        key: configuration key of the parent folder, for messages.
+        waits: wait until the other command has ended instead of raising; a log line names that command.
+        makes: create the folder.
+        num_processes: number of processes of the run, which ``RANKS`` number. The first process holds the lock for all.
 
     Raises:
-        FolderError: another command writes to the folder, the folder cannot be made, or it was deleted inside.
+        FolderError: another command writes to the folder, the folder cannot be created, or it was deleted inside the block.
     """
     path = _beside(folder, "lock")
     if num_processes > 1 and is_later_process():
@@ -92,11 +93,11 @@ def held(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bool
         with contextlib.suppress(OSError):
             holder.unlink(missing_ok=True)
         if not isinstance(lock, SoftFileLock):
-            with contextlib.suppress(OSError):  # Windows does not remove what is open
-                path.unlink(missing_ok=True)  # before the release: who has opened it meanwhile sees that it is gone, and tries again
+            with contextlib.suppress(OSError):  # Windows does not remove open files
+                path.unlink(missing_ok=True)  # before the release: a process that has opened it sees that it is gone, and tries again
         lock.release()
         for each in made:
-            with contextlib.suppress(OSError):  # nothing was written to it
+            with contextlib.suppress(OSError):  # fails unless the folder is still empty
                 each.rmdir()
 
 
@@ -124,13 +125,13 @@ def _acquired(folder: Path, path: Path, waits: bool) -> BaseFileLock:
 def _beside(folder: Path, suffix: str) -> Path:
     place = folder.resolve()
     name = place.name
-    if len(name.encode()) > LONGEST_NAME:  # of a run in a sweep
+    if len(name.encode()) > LONGEST_NAME:  # names of a sweep's runs can be longer
         name = hashlib.sha256(name.encode()).hexdigest()
     return place.with_name(f".{name}.{suffix}")
 
 
 def _make(folder: Path, key: str) -> list[Path]:
-    """Make a folder; returns what had to be made, the innermost first."""
+    """Create a folder and return the folders that were missing, the innermost first."""
     missing: list[Path] = []
     try:
         for each in (folder, *folder.parents):
@@ -148,12 +149,12 @@ def _make(folder: Path, key: str) -> list[Path]:
 
 @contextlib.contextmanager
 def _same(folder: Path) -> Iterator[None]:
-    """Raises ``FolderError`` where a folder that is there at the start is not at the end, or another one is."""
+    """Raise ``FolderError`` if a folder that exists at the start of the block has been deleted or replaced at its end."""
     before = _identity(folder)
     handle = None
     if before is not None:
-        with contextlib.suppress(OSError):  # Windows opens no folders
-            handle = os.open(folder, os.O_RDONLY)  # keeps its number from being given to another one
+        with contextlib.suppress(OSError):  # Windows cannot open folders
+            handle = os.open(folder, os.O_RDONLY)  # keeps the system from giving the folder's number to another folder
     lost = f"{folder}: was deleted or replaced while this command wrote to it; run the command again"
     try:
         yield
@@ -161,7 +162,7 @@ def _same(folder: Path) -> Iterator[None]:
             raise FolderError(lost)
     except OSError as error:
         is_missing = isinstance(error, FileNotFoundError | NotADirectoryError) or error.errno == getattr(errno, "ESTALE", errno.ENOENT)
-        if is_missing and _identity(folder) != before:  # with another error, the command itself has removed what it had begun
+        if is_missing and _identity(folder) != before:  # after another error, the command itself removes its unfinished folder
             raise FolderError(lost) from error
         raise
     finally:
@@ -178,7 +179,7 @@ def _identity(folder: Path) -> tuple[int, int] | None:
 
 
 def is_later_process() -> bool:
-    """Whether ``RANKS`` number this process, and not as the first."""
+    """Whether this process is not the first of its run, according to ``RANKS``."""
     return next((os.environ[key] for key in RANKS if key in os.environ), "0") != "0"
 
 
@@ -190,7 +191,7 @@ def _this_process() -> Holder:
 
 
 def _holder(folder: Path) -> str:
-    """Who holds the lock of a folder, as far as it is known: the lock comes before the note."""
+    """Describe the holder of a folder's lock, if its file exists already. The lock is taken before the file is written."""
     try:
         values: Any = json.loads(_beside(folder, "holder").read_bytes()[:10_000])
         return str(Holder(int(values["pid"]), str(values["host"]), str(values["command"]), str(values["since"])))

@@ -1,5 +1,6 @@
-"""What numbers depend on besides the code, and what the machine can do at best: rates of matrix products and copies, from which floors of run times follow, and
-the memory that a function needs.
+"""The machine: its description, its peak rates and the memory that functions need.
+
+The rates of matrix products and copies give lower bounds of run times.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ CLEAR_REFS = Path("/proc/self/clear_refs")
 
 
 def environment() -> dict[str, Any]:
-    """What a number depends on besides the code: machine, library versions, commit."""
+    """Describe the environment of a measurement: time, commit, versions and machine."""
     return {
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "commit": commit(),
@@ -39,14 +40,17 @@ def environment() -> dict[str, Any]:
 
 
 def _processor() -> str:
-    """Its name, as far as the system tells."""
+    """Return the name of the processor, as far as the system tells it."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines() if cpuinfo.exists() else []
     return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor())
 
 
 def commit() -> str:
-    """Of the running code, ``-dirty`` where files differ from it; ``unknown`` where it is not in a repository of its own, or git is not installed."""
+    """Return the commit of the running code, with ``-dirty`` if files differ from it.
+
+    The answer is ``unknown`` if the code is not tracked in a repository, or git is not installed.
+    """
     here = Path(__file__).resolve()
     try:
         tracked = subprocess.run(["git", "ls-files", "--error-unmatch", here.name], cwd=here.parent, capture_output=True, check=False)
@@ -64,10 +68,10 @@ def commit() -> str:
 
 
 def keep_freed_memory() -> None:
-    """Let this process reuse the memory of large arrays that it has freed, rather than give it back and have the system clear it anew every time.
+    """Let this process reuse the memory of large freed arrays instead of returning it to the system.
 
-    Where arrays of edges are larger than 32 MB, that clearing can take half of a rollout on a CPU. Does something with glibc only, whose
-    ``mallopt`` it calls; more than 2 GiB that are free at the end of the heap are still given back.
+    The system clears memory each time it hands it out. With arrays of edges larger than 32 MB, the clearing can take half of a rollout on a CPU. The function
+    calls glibc's ``mallopt`` and does nothing with other C libraries. Free memory above 2 GiB at the end of the heap is still returned.
     """
     mmap_threshold, trim_threshold = -3, -1  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD in malloc.h
     if platform.libc_ver()[0] == "glibc":
@@ -77,12 +81,12 @@ def keep_freed_memory() -> None:
 
 
 def has_cpp_compiler() -> bool:
-    """Whether there is one, which ``torch.compile`` needs on a CPU."""
+    """Whether a C++ compiler is installed. ``torch.compile`` needs one on a CPU."""
     return any(shutil.which(name) for name in ("c++", "g++", "clang++", "cl"))
 
 
 def synchronized(function: Callable[[], Any], device: str) -> Callable[[], Any]:
-    """The function, which then also waits until a GPU has finished what it started."""
+    """Return a function that also waits until the GPU has finished the work; unchanged for other devices."""
     if not device.startswith("cuda"):
         return function
 
@@ -95,7 +99,7 @@ def synchronized(function: Callable[[], Any], device: str) -> Callable[[], Any]:
 
 
 def best_time(function: Callable[[], Any], device: str, num_rounds: int = 10) -> float:
-    """Seconds of the fastest of several calls, after one that does not count."""
+    """Time of the fastest of several calls [s], after one call that does not count."""
     call = synchronized(function, device)
     call()
     times = []
@@ -107,7 +111,10 @@ def best_time(function: Callable[[], Any], device: str, num_rounds: int = 10) ->
 
 
 def gemm_rate(rows: int, channels: int, device: str) -> float:
-    """FLOP/s of the product of a matrix [rows × channels] with a square one, in one piece or in blocks that fit the cache, whichever is faster."""
+    """Rate of the product of a matrix [rows, channels] with a square one [FLOP/s].
+
+    The product is computed in one piece and in blocks that fit the cache; the faster counts.
+    """
     square = torch.randn(channels, channels, device=device)
     rates = []
     for height in (rows, min(rows, 1024)):
@@ -118,7 +125,7 @@ def gemm_rate(rows: int, channels: int, device: str) -> float:
 
 
 def reduces_precision(device: str) -> bool:
-    """Whether single-precision products become less exact where they may: not every processor has units for that, nor every GPU."""
+    """Whether single-precision products lose precision on this device when PyTorch allows it. Not every processor or GPU has units for that."""
     left, right = torch.linspace(0.1, 0.9, 2 * 256**2, device=device).view(2, 256, 256)
     before = torch.get_float32_matmul_precision()
     products = []
@@ -132,14 +139,14 @@ def reduces_precision(device: str) -> bool:
 
 
 def copy_rate(device: str, num_bytes: int = 2**28) -> float:
-    """Bytes/s read and written in copying an array that no cache holds."""
+    """Rate of copying an array that is too large for caches, reads and writes together [bytes/s]."""
     source = torch.zeros(num_bytes // 4, device=device)
     target = torch.empty_like(source)
     return 2 * num_bytes / best_time(lambda: target.copy_(source), device, 5)
 
 
 def peak_on_gpu(function: Callable[[], Any]) -> int:
-    """Bytes of a GPU's memory that a call needs beyond what is there before it."""
+    """GPU memory that a call needs in addition to the memory allocated before it [bytes]."""
     function()
     torch.cuda.synchronize()
     before = torch.cuda.memory_allocated()
@@ -149,9 +156,16 @@ def peak_on_gpu(function: Callable[[], Any]) -> int:
 
 
 def peak_memory(function: Callable[..., Callable[[], Any]], *arguments: Any) -> int:
-    """Bytes that the function which ``function(*arguments)`` returns needs beyond what was there when it was called, in a process of its own.
+    """Memory that a function needs in addition to the memory in use when it is called [bytes], measured in a separate process.
 
     On a GPU use ``peak_on_gpu`` instead.
+
+    Args:
+        function: picklable; its result is the measured function.
+        arguments: passed to ``function``.
+
+    Raises:
+        MemoryError: the separate process ended without an answer.
     """
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
@@ -175,7 +189,10 @@ def _peak_memory(sender: Any, function: Callable[..., Callable[[], Any]], argume
 
 
 def _resident() -> int:
-    """Bytes in use; forgets an earlier peak where the system can (Linux), else the peak so far, against which a smaller need cannot be seen."""
+    """Memory in use [bytes], after resetting the peak on Linux.
+
+    Other systems cannot reset it. There the result is the peak so far, and a smaller need is not visible.
+    """
     if not CLEAR_REFS.exists():
         return peak_resident()
     CLEAR_REFS.write_text("5", encoding="utf-8")
@@ -183,12 +200,12 @@ def _resident() -> int:
 
 
 def peak_resident() -> int:
-    """Most bytes that this process has had in memory so far."""
+    """Peak memory of this process so far [bytes]."""
     if CLEAR_REFS.exists():
         return _status("VmHWM")
     if hasattr(usage := psutil.Process().memory_info(), "peak_wset"):  # Windows
         return int(usage.peak_wset)
-    import resource  # Windows has none
+    import resource  # does not exist on Windows
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
@@ -199,5 +216,5 @@ def _status(key: str) -> int:
 
 
 def resident_bytes() -> int:
-    """Bytes of this process in use now."""
+    """Memory of this process in use now [bytes]."""
     return int(psutil.Process().memory_info().rss)

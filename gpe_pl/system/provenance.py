@@ -1,4 +1,4 @@
-"""Where results come from: ``provenance.json`` beside them, which commands write."""
+"""Provenance of results: commands write ``provenance.json`` into the results folder."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ PROVENANCE = "provenance.json"
 PACKAGES = ("torch", "torch-geometric", "lightning", "numpy", "numba")
 ADVICE = "delete the file; only the record of how the results were made is lost"
 LOCAL = ("paths.", "hydra.run.dir", "hydra.sweep.dir")
-"""Begin overrides that say where files lie, which results do not depend on."""
+"""Prefixes of overrides that say where files lie. Results do not depend on them."""
 
 
 RESULTS = ("*.json", "*.csv", "*.md", "*/**/config.json")
-"""Patterns of which a folder has one where there are results."""
+"""File patterns. A folder with at least one match contains results."""
 
 
 @contextlib.contextmanager
 def recorded(folder: Path, command: str, arguments: Sequence[str], runs: str) -> Iterator[None]:
-    """Note in a folder how a command came to the results in it: a session more in ``provenance.json``, however the command ends.
+    """Add a session to ``provenance.json`` in a results folder when the block ends, with or without an error.
 
-    A session that is killed is not noted, so the seconds of a resumed command may lack some. Where the file cannot be written, a warning says so.
+    A killed session is not recorded, so the total time of a resumed command may be too short. If the file cannot be written, a warning is logged.
 
     Args:
-        folder: of the results.
-        command: ``fit`` and so on.
-        arguments: of its command line.
-        runs: the folder of all results, which is written as ``paths.runs``.
+        folder: folder of the results.
+        command: name of the command, such as ``fit``.
+        arguments: arguments of its command line.
+        runs: folder of all results; written as ``paths.runs``.
     """
     began, started = datetime.now(UTC), time.monotonic()
     try:
@@ -60,12 +60,16 @@ def recorded(folder: Path, command: str, arguments: Sequence[str], runs: str) ->
 
 
 def sessions(folder: Path) -> list[dict[str, Any]]:
-    """What is noted in a folder; raises ``SealError`` where that is damaged."""
+    """Return the sessions recorded in a folder.
+
+    Raises:
+        SealError: the file is damaged.
+    """
     path = folder / PROVENANCE
     return list(sealed.read(path, ADVICE)["sessions"]) if path.exists() else []
 
 
 def shown(command: str, arguments: Sequence[str], runs: str) -> str:
-    """A command as one would type it, without the folders of one machine."""
+    """Return a command line to repeat the command, without folders of this machine."""
     kept = [argument.replace(runs, "paths.runs") for argument in arguments if not argument.lstrip("+").startswith(LOCAL)]
     return shlex.join(["python", "-m", f"gpe_pl.{command}", *kept])

@@ -1,4 +1,4 @@
-"""The processes of a data-parallel run: which one this is, and sums and lists over all of them. Without such a run there is one process, rank 0."""
+"""Processes of a data-parallel run: the rank of this process, and sums and lists over all ranks. Any other run has one process, rank 0."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ def _is_parallel() -> bool:
 
 
 def rank() -> int:
-    """The number of this process, from 0."""
+    """Rank of this process, counted from 0."""
     return dist.get_rank() if _is_parallel() else 0
 
 
 def num_ranks() -> int:
-    """How many processes there are."""
+    """Number of processes of the run."""
     return dist.get_world_size() if _is_parallel() else 1
 
 
 def summed(values: Tensor) -> Tensor:
-    """The sum over ranks of tensors of one shape; the same bits everywhere. All ranks have to call it."""
+    """Sum tensors of one shape over all ranks. Every rank must call it and gets the same bits."""
     if num_ranks() == 1:
         return values
     total = values.clone()
@@ -34,7 +34,7 @@ def summed(values: Tensor) -> Tensor:
 
 
 def gathered(value: T) -> list[T]:
-    """The values of all ranks, in their order. All ranks have to call it."""
+    """Return the values of all ranks in rank order. Every rank must call it."""
     if num_ranks() == 1:
         return [value]
     values: list[T | None] = [None] * num_ranks()

@@ -1,4 +1,4 @@
-"""Values from files and command lines, checked against the annotated signature of what takes them: types, ranges, choices, names."""
+"""Checks of values from files and command lines against the annotated signature of their target: types, ranges, choices and names."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from typing import Any, get_type_hints
 from pydantic import ConfigDict, create_model
 
 MOST_VALUES, MOST_LEVELS, LONGEST_TEXT, LARGEST_NUMBER = 20_000, 20, 10_000, 2**64
-"""Of plain values from a file; the largest description of a model has some hundreds."""
+"""Limits for plain values from a file. The largest description of a model has some hundreds of values."""
 
 
 def check_plain(values: Any) -> None:
-    """Compare values from a file with limits before anything else, a message included, goes through them.
+    """Check limits on values from a file before anything else, such as a message, visits them.
 
-    A value that is referred to in several places counts in each: a file of a kilobyte can hold lists of lists that nobody could ever print.
+    A value that is referenced in several places counts each time. A file of a kilobyte can contain nested references that are too large to print.
 
     Raises:
-        ValueError: too many values, too deeply nested, too long or too large; or something else than text, numbers, lists, tables and None.
+        ValueError: there are too many values, or one is too deeply nested, too long or too large, or is not text, a number, a list, a table or None.
     """
     count, waiting = 0, [(values, 0)]
     while waiting:
@@ -43,7 +43,7 @@ def check_plain(values: Any) -> None:
 
 
 def parameters(target: Callable[..., Any], *later: str) -> dict[str, Any]:
-    """Annotation and default of each parameter of a class or function, but those that come later."""
+    """Return annotation and default of each parameter of a class or function, except those named in ``later``."""
     annotated = target.__init__ if inspect.isclass(target) and not is_dataclass(target) else target
     hints = get_type_hints(annotated, include_extras=True)
     return {
@@ -54,10 +54,15 @@ def parameters(target: Callable[..., Any], *later: str) -> dict[str, Any]:
 
 
 def checked(target: Callable[..., Any], values: Mapping[str, Any], *later: str) -> dict[str, Any]:
-    """The values as the target takes them; ``later`` are parameters that are not among them.
+    """Validate values for a target and convert them to its annotated types.
+
+    Args:
+        target: class or function that takes the values.
+        values: values by parameter name.
+        later: parameters that are passed separately and are not among the values.
 
     Raises:
-        pydantic.ValidationError: an unknown or missing name, another type, or a value out of range.
+        pydantic.ValidationError: a name is unknown or missing, a type is wrong, or a value is out of range.
     """
     config = ConfigDict(extra="forbid", arbitrary_types_allowed=True, protected_namespaces=(), allow_inf_nan=False)
     found = create_model("Settings", __config__=config, **parameters(target, *later))(**values)

@@ -1,4 +1,4 @@
-"""Wall times of alternatives, measured in turns so that whatever else the machine does hits all of them alike."""
+"""Wall times of alternatives, measured in turns so that other load on the machine affects all of them alike."""
 
 from __future__ import annotations
 
@@ -18,13 +18,20 @@ import numpy as np
 log = logging.getLogger(__name__)
 
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
-"""Of glibc's ``mallopt``."""
+"""Options of glibc's ``mallopt``."""
 
 
 def paired_times(
     alternatives: Mapping[str, Callable[[], Any]], num_rounds: int = 20, num_warmups: int = 2, what: str = ""
 ) -> dict[str, np.ndarray]:
-    """Seconds [round] of each alternative; every round runs all of them once, in an order that rotates. Rounds of ``what`` are logged, if it is given."""
+    """Time each alternative in every round [round, s]. A round runs all of them once, in rotating order.
+
+    Args:
+        alternatives: functions by name.
+        num_rounds: number of measured rounds.
+        num_warmups: number of calls of each alternative before the first round; not measured.
+        what: name of the measurement. If given, each round is logged with it.
+    """
     names = list(alternatives)
     for _ in range(num_warmups):
         for name in names:
@@ -42,19 +49,19 @@ def paired_times(
 
 
 def paired_ratio(times: Mapping[str, np.ndarray], name: str, reference: str) -> float:
-    """Median over rounds of the time of ``name`` divided by that of ``reference`` in the same round."""
+    """Return the median over rounds of the time of ``name`` divided by the time of ``reference`` in the same round."""
     return float(np.median(times[name] / times[reference]))
 
 
 @contextmanager
 def apart(factories: Mapping[str, Callable[[], Callable[[], Any]]]) -> Iterator[dict[str, Callable[[], None]]]:
-    """The functions that the factories make, each in a process of its own: a call waits until the function has run there, and returns nothing.
+    """Run functions in separate processes. A call waits until the function has run there, and returns nothing.
 
-    In one process functions with large arrays find what the others left in the allocator's heap, which can cost them a third of their time; so can pages that
-    the system takes back and returns. Here each has a heap of its own, which keeps what it has (with glibc).
+    Functions with large arrays disturb each other through the heap of a shared process, which can cost a third of their time. Returning memory to the system
+    can cost as much. Here each function has its own heap, which keeps its memory (with glibc).
 
     Args:
-        factories: picklable, called in the new processes.
+        factories: picklable functions that are called in the new processes and return the functions to run.
 
     Raises:
         RuntimeError: a process ended; its error is on the standard error.
@@ -68,7 +75,7 @@ def apart(factories: Mapping[str, Callable[[], Callable[[], Any]]]) -> Iterator[
             process.start()
             there.close()
             stack.callback(process.join)
-            stack.callback(here.close)  # comes first, and ends the process
+            stack.callback(here.close)  # runs before the join, and ends the process
             connections[name] = here
         for name, connection in connections.items():
             _wait(name, connection)
@@ -76,7 +83,7 @@ def apart(factories: Mapping[str, Callable[[], Callable[[], Any]]]) -> Iterator[
 
 
 def _serve(connection: Connection, factory: Callable[[], Callable[[], Any]]) -> None:
-    """Runs the function whenever it is asked to, until there is nobody left to ask."""
+    """Run the function at every request, until the connection is closed."""
     _keep_memory()
     function = factory()
     connection.send(None)
@@ -90,7 +97,7 @@ def _serve(connection: Connection, factory: Callable[[], Callable[[], Any]]) -> 
 
 
 def _keep_memory() -> None:
-    """Nothing that is freed goes back to the system, so that what is allocated next finds its pages there."""
+    """Keep freed memory in this process, so that the next allocation finds its pages there."""
     if hasattr(os, "confstr_names") and "CS_GNU_LIBC_VERSION" in os.confstr_names:
         libc = ctypes.CDLL(None)
         libc.mallopt(M_MMAP_MAX, 0)

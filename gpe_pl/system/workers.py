@@ -1,4 +1,4 @@
-"""Functions called in several processes, which end with the one that started them."""
+"""Worker processes, which end with the process that started them."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from gpe_pl.errors import GpeError
 
 
 class WorkerError(GpeError, RuntimeError):
-    """A process died."""
+    """Raised when a worker process died."""
 
 
 def _prepare() -> None:
-    """A worker whose parent was killed must not stay behind; Ctrl-C, which reaches all processes, is for the parent to answer."""
+    """Prepare a worker: it ends when its parent is killed, and ignores Ctrl-C, which reaches all processes and is handled by the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
 
@@ -34,7 +34,10 @@ def _prepare() -> None:
 
 @contextlib.contextmanager
 def pool(num_workers: int) -> Iterator[Executor | None]:
-    """Processes for ``results``; None where one is enough, which is this one. If the block ends with an error, what they are doing is given up."""
+    """Start worker processes for ``results``; yields None for one worker, whose work this process does itself.
+
+    If the block ends with an error, the workers are terminated.
+    """
     if num_workers == 1:
         yield None
         return
@@ -56,7 +59,16 @@ def pool(num_workers: int) -> Iterator[Executor | None]:
 
 
 def results(executor: Executor | None, function: Callable[..., Any], arguments: list[tuple[Any, ...]]) -> Iterator[Any]:
-    """Results of ``function`` as they complete; raises ``WorkerError`` where a process died."""
+    """Yield the results of ``function`` as they complete.
+
+    Args:
+        executor: from ``pool``; None calls the function in this process.
+        function: picklable function.
+        arguments: positional arguments of each call.
+
+    Raises:
+        WorkerError: a worker process died.
+    """
     if executor is None:
         for values in arguments:
             yield function(*values)
@@ -74,7 +86,7 @@ def results(executor: Executor | None, function: Callable[..., Any], arguments: 
 
 @contextlib.contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Ctrl-C waits; processes that start meanwhile never see one, not even before they can ignore it."""
+    """Delay Ctrl-C inside the block. Processes started in it never receive one, even before they can ignore it."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
