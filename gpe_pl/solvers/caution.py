@@ -1,4 +1,4 @@
-"""What a solver does not resolve, said before data are made with it; ``docs/results/convergence.md`` has measurements."""
+"""Warnings of what a solver does not resolve, given before data are made; ``docs/results/convergence.md`` has measurements."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from gpe_pl.schema import MATERIALS
 from gpe_pl.trajectory.state import State
 
 CELLS_ACROSS = 4
-"""Cells that a body should have across: one of two triangles bends as if it were half as stiff again."""
+"""Number of cells that a body should have across; a body two triangles thick is half again as stiff in bending."""
 
 THIN_SHARE = 0.1
-"""Of the nodes of a mesh: less is not worth a word."""
+"""Fraction of the nodes of a mesh that may be thin without a warning."""
 
 
 def unresolved(solver: Any, parameters: Mapping[str, Sequence[float]], scenes: Iterable[State]) -> Iterator[str]:
-    """One sentence for each thing that the solver does not resolve of these parameter values and of the initial states of some scenes."""
+    """Yield one sentence for each parameter value or initial state that the solver does not resolve."""
     for material, smallest in getattr(solver, "smallest_resolved", {}).items():
         name, unit = MATERIALS[material].name, MATERIALS[material].unit
         values = [value for value in parameters.get(material, ()) if value < smallest]
@@ -39,9 +39,9 @@ def unresolved(solver: Any, parameters: Mapping[str, Sequence[float]], scenes: I
 
 
 def thin_nodes(cells: np.ndarray, num_nodes: int, dim: int) -> np.ndarray:
-    """Nodes [node] that no part of a mesh holds which is ``CELLS_ACROSS`` cells thick; cells [cell, corner] of one kind.
+    """Return a mask [node] of the nodes outside every part of a mesh that is ``CELLS_ACROSS`` cells thick; cells [cell, corner] of one kind.
 
-    A morphological opening along the edges: what is not within as many cells of a node that is half of ``CELLS_ACROSS`` from the surface.
+    This is a morphological opening along the edges: half of ``CELLS_ACROSS`` steps from the surface inward, then as many outward.
     """
     corners = cells.shape[1]
     pairs = np.repeat(cells, corners, axis=1).ravel(), np.tile(cells, (1, corners)).ravel()

@@ -29,7 +29,7 @@ NonNegativeFloat = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 @dataclass(frozen=True, config={"extra": "forbid"})
 class TerrainOptions:
-    """How ``read_terrain`` takes a terrain file; its documentation says what they mean."""
+    """Options of ``read_terrain``, which describes them."""
 
     fit: Fit = "contain"
     up: Up = "z"
@@ -42,24 +42,24 @@ class FluidScene:
     """Distribution of scenes with liquid.
 
     Attributes:
-        scene: ``bowl``, liquid that falls into a closed sphere (2D: circle) one cell narrower than the domain; ``dam_break``, a column that
-            collapses from one side of a box; ``canyon``, a reservoir that runs down a river bed and over a waterfall (3D).
-        bounds: ``(low, high)`` per axis of the domain [m].
-        grid_spacing: of the solver [m].
-        num_particles: exact number in every scene.
-        particles_per_cell: along each axis; the rest spacing is ``grid_spacing / particles_per_cell``.
-        density: [kg/m³].
-        gravity: [m/s²].
-        friction: of all solids; ``schema.STICKY`` is no-slip, 0 slips freely.
+        scene: ``bowl``: liquid falls into a closed sphere (2D: circle) that is one cell narrower than the domain. ``dam_break``: a column collapses from one
+            side of a box. ``canyon``: a reservoir runs down a river bed and over a waterfall (3D).
+        bounds: ``(low, high)`` of the domain along each axis [m].
+        grid_spacing: grid spacing of the solver [m].
+        num_particles: exact number of particles in every scene.
+        particles_per_cell: particles along each axis of a cell; the rest spacing is ``grid_spacing / particles_per_cell``.
+        density: density of the liquid [kg/m³].
+        gravity: acceleration of gravity [m/s²].
+        friction: friction coefficient of all solids; ``schema.STICKY`` is no-slip, 0 is frictionless.
         connectivity_cells: recommended connectivity radius in grid cells.
-        max_bodies: in the bowl; their number is uniform in 1 … max_bodies.
-        max_speed: of a body in the bowl along each axis [m/s]; upward at most a quarter of it.
+        max_bodies: largest number of bodies in the bowl; the number is uniform in 1 … max_bodies.
+        max_speed: largest speed of a body in the bowl along each axis [m/s]; upward at most a quarter of it.
         column_aspect: range of height / width of the column of the dam break.
-        max_obstacles: boxes on the floor of the dam break; their number is uniform in 0 … max_obstacles.
-        terrain: mesh, point cloud or height map for the canyon instead of a random one, relative to the working directory.
-        terrain_options: how to take that file.
-        reservoir: region ``(low, high)`` per axis [m] where the water of the canyon starts: within the range of x from low x on, from its lowest free
-            place up. By default that of the random canyon; on terrain of a file, the third of the domain at low x.
+        max_obstacles: largest number of boxes on the floor of the dam break; the number is uniform in 0 … max_obstacles.
+        terrain: mesh, point cloud or height map that replaces the random canyon, as a path relative to the working directory.
+        terrain_options: options for reading that file.
+        reservoir: region ``(low, high)`` along each axis [m] where the water of the canyon starts. Water fills it from its low x and its lowest free place
+            on. The default is the reservoir of the random canyon or, with a terrain file, the third of the domain at low x.
     """
 
     scene: Literal["bowl", "dam_break", "canyon"]
@@ -124,10 +124,10 @@ class FluidScene:
         return {} if self.terrain is None else {"terrain": self.terrain}
 
     def sample(self, values: Mapping[str, float], seed: int) -> State:
-        """Draw a scene: a pure function of configuration, values, seed and, where there is one, the content of the terrain file.
+        """Draw a scene. It depends only on configuration, values, seed and the content of the terrain file, if any.
 
         Args:
-            values: of ``fluid``, the kinematic viscosity [m²/s].
+            values: kinematic viscosity [m²/s] under the key ``fluid``.
             seed: non-negative integer.
 
         Returns:
@@ -138,7 +138,7 @@ class FluidScene:
         """
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
         shapes, pos, vel = {"bowl": _bowl, "dam_break": _dam_break, "canyon": _canyon}[self.scene](self, rng)
-        order = rng.permutation(self.num_particles)  # labels must not tell where a particle started
+        order = rng.permutation(self.num_particles)  # node numbers must not reveal where a particle started
         return State(
             pos=np.ascontiguousarray(pos[order]),
             vel=np.ascontiguousarray(vel[order]),
@@ -175,7 +175,7 @@ def _bowl(config: FluidScene, rng: np.random.Generator) -> Sampled:
 
 
 def _placed(bodies: list[np.ndarray], bowl: Bowl, config: FluidScene, rng: np.random.Generator) -> list[np.ndarray] | None:
-    """The bodies at random places in the bowl, a cell away from each other, or None where this fails."""
+    """Place the bodies at random in the bowl, one cell away from each other; return None if this fails."""
     placed: list[np.ndarray] = []
     center = np.array(bowl.center)
     for body in bodies:
@@ -194,7 +194,7 @@ def _placed(bodies: list[np.ndarray], bowl: Bowl, config: FluidScene, rng: np.ra
 
 
 def _body(count: int, config: FluidScene, rng: np.random.Generator) -> np.ndarray:
-    """``count`` points [count, dim] of a jittered lattice that fill a ball or a randomly turned box around the origin."""
+    """Return ``count`` points [count, dim] of a jittered lattice that fill a ball or a randomly turned box around the origin."""
     dim = config.dim
     gauge: Callable[[np.ndarray], np.ndarray]
     if rng.random() < 0.5:
@@ -218,11 +218,11 @@ def _body(count: int, config: FluidScene, rng: np.random.Generator) -> np.ndarra
 
 
 def _dam_break(config: FluidScene, rng: np.random.Generator) -> Sampled:
-    """The column stands at the low or high side along x and, in 3D, reaches across."""
+    """Place a column at the low or high side along x; in 3D it spans the whole width."""
     low, high = np.array(config.bounds).T
     room = high - low
     face = config.num_particles * config.spacing**config.dim / float(np.prod(room[1:-1]))  # width times height
-    # a rim of one spacing, because the lattice seldom divides the domain
+    # leave a rim of one spacing, because the lattice seldom divides the domain
     widest, tallest = 0.8 * room[0], room[-1] - config.spacing
     least, most = max(config.column_aspect[0], face / widest**2), min(config.column_aspect[1], tallest**2 / face)
     if least > most:
@@ -251,7 +251,7 @@ def _mirrored(box: Box, twice_middle: float) -> Box:
 
 
 def _obstacles(config: FluidScene, start: float, rng: np.random.Generator) -> list[Box]:
-    """Boxes on the floor beyond x = ``start``, two cells away from the liquid, from each other and from the walls that they do not stand on."""
+    """Place boxes on the floor beyond x = ``start``, two cells away from the liquid, from each other and from the walls that they do not stand on."""
     low, high = np.array(config.bounds).T
     gap, boxes = 2.0 * config.grid_spacing, list[Box]()
     for _ in range(rng.integers(config.max_obstacles + 1)):
@@ -262,7 +262,7 @@ def _obstacles(config: FluidScene, start: float, rng: np.random.Generator) -> li
         if np.any(room < 0):
             continue
         corner = corner + share * room
-        corner[-1], size[-1] = low[-1] - gap, size[-1] + gap  # through the floor: no water gets under it
+        corner[-1], size[-1] = low[-1] - gap, size[-1] + gap  # extends below the floor, so that no water gets under it
         if any(np.all(corner < np.array(b.high) + gap) and np.all(corner + size > np.array(b.low) - gap) for b in boxes):
             continue
         boxes.append(Box(floats(corner), floats(corner + size), config.friction))
@@ -270,7 +270,7 @@ def _obstacles(config: FluidScene, start: float, rng: np.random.Generator) -> li
 
 
 def _canyon(config: FluidScene, rng: np.random.Generator) -> Sampled:
-    """Water fills the region of the reservoir from its headwall and its lowest place on, in equal shares of its length and height."""
+    """Fill the reservoir from its headwall and its lowest place on, to the same fraction of its length and height."""
     bounds = config.bounds
     if config.terrain is None:
         made = canyon(int(rng.integers(2**32)), bounds, config.grid_spacing, config.friction)
@@ -299,5 +299,5 @@ def _canyon(config: FluidScene, rng: np.random.Generator) -> Sampled:
 
 @functools.lru_cache(maxsize=4)
 def _read(path: str, stamp: tuple[int, int], bounds: Bounds, spacing: float, options: TerrainOptions, friction: float) -> DistanceGrid:
-    """``read_terrain``, once per content of the file (``stamp``) and not once per scene."""
+    """Call ``read_terrain``, once per content of the file (``stamp``) instead of once per scene."""
     return read_terrain(path, bounds, spacing, friction=friction, **asdict(options))  # type: ignore[call-overload]

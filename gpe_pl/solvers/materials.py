@@ -1,7 +1,7 @@
-"""Materials of the solvers: limits of their parameters; constants of the material point method, and what a law takes for a stored parameter.
+"""Materials of the solvers: limits of their parameters, and constants of the material point method.
 
-Every law is isotropic hyperelasticity, some with a return mapping; the laws themselves are in ``mpm.laws_2d`` and ``mpm.laws_3d``. A law reads one row of
-constants per particle; ``LAMBDA`` … ``MAX_HARDENING`` name the columns. Viscosity is added to what any law says.
+Every law is isotropic hyperelasticity, some with a return mapping. The laws themselves are in ``mpm.laws_2d`` and ``mpm.laws_3d``. A law reads one row of
+constants per particle; ``LAMBDA`` … ``MEMORY`` name the columns. Viscous stress is added to the stress of every law.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import MATERIALS
 
 SAND, SNOW, ELASTOMER = 0, 1, 2
-"""Codes under which ``respond`` calls the laws."""
+"""Codes by which ``respond`` selects a law."""
 
 LAMBDA, MU, COEFFICIENT, SMALLEST, LARGEST, MAX_HARDENING, VISCOSITY, MEMORY = range(8)
-"""Columns of a particle's constants: Lamé parameters at rest [Pa], slope of the cone in strains (sand) or ξ (snow), three of snow's constants, the
-kinematic viscosity [m²/s], and for how long a particle keeps a velocity that the grid does not hold, per grid spacing [s/m]."""
+"""Columns of a particle's constants: Lamé parameters at rest [Pa]; slope of the cone in strains (sand) or ξ (snow); three constants of snow; kinematic
+viscosity [m²/s]; and the time for which a particle keeps a velocity that the grid does not represent, per grid spacing [s/m]."""
 NUM_CONSTANTS = 8
 
 
 class Limits(NamedTuple):
-    """Smallest and largest value of a material parameter that the solvers compute, in its unit."""
+    """Smallest and largest value of a material parameter that the solvers accept, in the unit of the parameter."""
 
     low: float
     high: float
@@ -42,11 +42,11 @@ LIMITS: dict[str, Limits] = {
     "elastomer": Limits(1e3, 1e8),
     "solid": Limits(1e3, 1e9),
 }
-"""By material. Imported data need not keep to them: ``schema.MaterialParameter.rule`` says what can be stored."""
+"""Limits by material. Imported data may exceed them; ``schema.MaterialParameter.rule`` says what can be stored."""
 
 
 def limits_fault(material: str, value: float) -> str:
-    """What to say of a parameter that no solver computes; empty where one does."""
+    """Return a message for a parameter outside the solvers' limits, or an empty string."""
     parameter, limits = MATERIALS[material], LIMITS[material]
     if limits.low <= value <= limits.high:
         return ""
@@ -54,18 +54,18 @@ def limits_fault(material: str, value: float) -> str:
 
 
 def check_limits(material: str, values: np.ndarray, nodes: np.ndarray) -> None:
-    """Refuse parameters that no solver computes.
+    """Refuse parameters outside the solvers' limits.
 
     Args:
-        material: of all nodes.
-        values: its parameter [node].
+        material: material of all nodes.
+        values: values of its parameter [node].
         nodes: numbers of the nodes [node], for the message.
 
     Raises:
         SimulationError: a value is outside ``LIMITS``, or not a number.
     """
     parameter, limits = MATERIALS[material], LIMITS[material]
-    slack = 1 + np.finfo(np.float32).eps  # of limits that were stored
+    slack = 1 + np.finfo(np.float32).eps  # values at a limit may have been rounded in storage
     wrong = ~((values >= limits.low / slack) & (values <= limits.high * slack))
     if wrong.any():
         node, value = int(nodes[wrong][0]), values[wrong][0]
@@ -81,14 +81,14 @@ FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
 
 def lame_parameters(youngs_modulus: FloatOrArray, poisson_ratio: float) -> tuple[FloatOrArray, FloatOrArray]:
-    """First Lamé parameter λ and shear modulus μ in Pa (plane strain in 2D)."""
+    """Return the first Lamé parameter λ and the shear modulus μ in Pa (plane strain in 2D)."""
     shear = youngs_modulus / (2.0 * (1.0 + poisson_ratio))
     first = youngs_modulus * poisson_ratio / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))
     return first, shear
 
 
 def drucker_prager_coefficient(friction_angle: np.ndarray, dim: int) -> np.ndarray:
-    """Slope α of the Drucker-Prager cone in ``|dev ε| = -α (dλ + 2μ)/(2μ) tr ε``.
+    """Return the slope α of the Drucker-Prager cone in ``|dev ε| = -α (dλ + 2μ)/(2μ) tr ε``.
 
     In plane strain α = sin φ / √2 makes the law Mohr-Coulomb, ``|τ₁ - τ₂| = -sin φ (τ₁ + τ₂)``; in 3D the cone passes through the triaxial
     compression corners, α = √(2/3) 2 sin φ / (3 - sin φ) (Klar et al. 2016, section 5).
@@ -102,12 +102,12 @@ def drucker_prager_coefficient(friction_angle: np.ndarray, dim: int) -> np.ndarr
 
 
 def _memory(cells: float, lam: FloatOrArray, mu: FloatOrArray, density: float) -> FloatOrArray:
-    """Time [s] per grid spacing [m] in which a pressure wave crosses so many cells."""
+    """Return the time [s] per grid spacing [m] in which a pressure wave crosses ``cells`` cells."""
     return cells * np.sqrt(density / (lam + 2.0 * mu))  # type: ignore[return-value]
 
 
 def _constants(count: int, **columns: float | np.ndarray) -> np.ndarray:
-    """Rows [node, constant] from the columns that a law reads."""
+    """Return rows [node, constant] filled with the named columns."""
     rows = np.zeros((count, NUM_CONSTANTS))
     for name, value in columns.items():
         rows[:, globals()[name]] = value
@@ -119,10 +119,10 @@ class Sand:
     """Dry sand: Hencky elasticity with Drucker-Prager plasticity (Klar et al. 2016). Material parameter: friction angle [°].
 
     Attributes:
-        youngs_modulus: [Pa]; a numerical choice, stiff enough to keep the wave speed well above the speeds of the flow.
-        poisson_ratio: below 0.5.
+        youngs_modulus: Young's modulus [Pa]. It is a numerical choice, stiff enough to keep the wave speed well above the speeds of the flow.
+        poisson_ratio: Poisson's ratio, below 0.5.
         density: mass per volume at rest [kg/m³].
-        memory_cells: as of ``Elastomer``. Grains bounce little: columns collapse as far as in experiments with a short memory only.
+        memory_cells: as in ``Elastomer``. Columns collapse as far as in experiments only with a short memory, because grains bounce little.
     """
 
     youngs_modulus: Positive = 3e5
@@ -132,7 +132,7 @@ class Sand:
     law: ClassVar[int] = SAND
 
     def constants(self, friction_angle: np.ndarray, dim: int) -> np.ndarray:
-        """What the law reads [node, constant]."""
+        """Return the constants that the law reads [node, constant]."""
         lam, mu = lame_parameters(self.youngs_modulus, self.poisson_ratio)
         slope = drucker_prager_coefficient(friction_angle, dim) * (dim * lam + 2.0 * mu) / (2.0 * mu)
         memory = _memory(self.memory_cells, lam, mu, self.density)
@@ -150,12 +150,12 @@ class Snow:
 
     Attributes:
         youngs_modulus: E₀ [Pa] before any compaction.
-        poisson_ratio: below 0.5.
+        poisson_ratio: Poisson's ratio, below 0.5.
         density: mass per volume at rest [kg/m³].
         critical_compression: θ_c; principal stretches below 1 - θ_c become plastic.
         critical_stretch: θ_s; principal stretches above 1 + θ_s become plastic.
         max_hardening: largest factor on the elastic moduli. It bounds the wave speed, hence the number of substeps.
-        memory_cells: as of ``Elastomer``; without it snow settles the higher the shorter substeps are.
+        memory_cells: as in ``Elastomer``. Without memory, snow settles at a greater height with shorter substeps.
     """
 
     youngs_modulus: Positive = 1.4e5
@@ -168,7 +168,7 @@ class Snow:
     law: ClassVar[int] = SNOW
 
     def constants(self, hardening_coefficient: np.ndarray, dim: int) -> np.ndarray:
-        """What the law reads [node, constant]."""
+        """Return the constants that the law reads [node, constant]."""
         lam, mu = lame_parameters(self.youngs_modulus, self.poisson_ratio)
         return _constants(
             len(hardening_coefficient),
@@ -192,10 +192,10 @@ class Elastomer:
     """Rubber: compressible neo-Hookean elasticity. Material parameter: Young's modulus [Pa].
 
     Attributes:
-        poisson_ratio: below 0.5.
+        poisson_ratio: Poisson's ratio, below 0.5.
         density: mass per volume at rest [kg/m³].
-        memory_cells: grid cells that a pressure wave crosses while what the grid does not hold of a particle's velocity decays to 1/e, however long the
-            substeps are; 0 drops it in every substep (APIC), and then shorter substeps lose more energy.
+        memory_cells: memory of the velocity that the grid does not represent. It decays to 1/e while a pressure wave crosses this many grid cells, for any
+            length of substeps. 0 drops it in every substep (APIC), and then shorter substeps lose more energy.
     """
 
     poisson_ratio: PoissonRatio = 0.3
@@ -204,7 +204,7 @@ class Elastomer:
     law: ClassVar[int] = ELASTOMER
 
     def constants(self, youngs_modulus: np.ndarray, dim: int) -> np.ndarray:
-        """What the law reads [node, constant]."""
+        """Return the constants that the law reads [node, constant]."""
         lam, mu = lame_parameters(youngs_modulus, self.poisson_ratio)
         return _constants(len(youngs_modulus), LAMBDA=lam, MU=mu, MEMORY=_memory(self.memory_cells, lam, mu, self.density))
 
@@ -216,13 +216,14 @@ class Elastomer:
 
 @dataclass(frozen=True, config={"extra": "forbid"})
 class Fluid:
-    """Liquid, for scenes in which it meets other materials: weakly compressible and viscous, and without tension, as sand that has no friction. Material
-    parameter: kinematic viscosity [m²/s]. Liquids alone are computed as incompressible by ``flip``.
+    """Liquid in scenes with other materials: weakly compressible, viscous and without tension, like sand without friction.
+
+    The material parameter is the kinematic viscosity [m²/s]. The solver ``flip`` computes liquids alone, as incompressible.
 
     Attributes:
-        bulk_modulus: [Pa]; a numerical choice: a column of height H is compressed by ρ g H over it at its foot.
+        bulk_modulus: bulk modulus [Pa]. It is a numerical choice: a column of height H is compressed by the fraction ρ g H / bulk_modulus at its foot.
         density: mass per volume at rest [kg/m³].
-        memory_cells: as of ``Elastomer``; the longer, the less viscosity the grid adds.
+        memory_cells: as in ``Elastomer``. A longer memory reduces the viscosity that the grid adds.
     """
 
     bulk_modulus: Positive = 5e5
@@ -231,17 +232,17 @@ class Fluid:
     law: ClassVar[int] = SAND
 
     def constants(self, kinematic_viscosity: np.ndarray, dim: int) -> np.ndarray:
-        """What the law reads [node, constant]."""
+        """Return the constants that the law reads [node, constant]."""
         return _constants(len(kinematic_viscosity), LAMBDA=self.bulk_modulus, VISCOSITY=kinematic_viscosity, MEMORY=self.memory)
 
     @property
     def memory(self) -> float:
-        """Time [s] per grid spacing [m] for which a particle keeps a velocity that the grid does not hold."""
+        """Time [s] per grid spacing [m] for which a particle keeps a velocity that the grid does not represent."""
         return _memory(self.memory_cells, self.bulk_modulus, 0.0, self.density)
 
     @property
     def smallest_stiffness(self) -> float:
-        """[Pa] at rest."""
+        """Bulk modulus at rest [Pa]."""
         return self.bulk_modulus
 
 

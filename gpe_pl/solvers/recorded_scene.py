@@ -1,12 +1,13 @@
-"""The first frame of a recording of another solver as a scene: the ground, and the liquid in it or a flood, scaled to the spacing of a trained model.
+"""Scenes from the first frame of a recording that another solver made.
 
-Gravity cannot be scaled, so a scene that is s times as long stays similar with equal Froude numbers v²/(g l)::
+A scene has the recorded ground and either the recorded liquid or a flood. It is scaled to the particle spacing of a trained model. Gravity cannot be scaled,
+so a scene that is s times as long stays similar at an equal Froude number v²/(g l)::
 
     length ∝ s      time ∝ √s      velocity ∝ √s      kinematic viscosity ∝ s^(3/2)
 
-Format, of the data of DMCF [Prantl et al. 2022, "Guaranteed Conservation of Momentum for Learning Particle-based Fluid Dynamics"]: msgpack compressed with
-zstandard; a list of frames, each a map of arrays as msgpack-numpy stores them. Every frame has ``pos``, ``vel``, ``m`` and ``viscosity`` of its particles; the
-first also has ``box`` and ``box_normals``, points and unit normals of the walls. The y axis points up.
+The file format is that of the data of DMCF [Prantl et al. 2022, "Guaranteed Conservation of Momentum for Learning Particle-based Fluid Dynamics"]: msgpack
+compressed with zstandard. A file holds a list of frames. Each frame is a map of arrays, stored as msgpack-numpy stores them. Every frame has ``pos``, ``vel``,
+``m`` and ``viscosity`` of its particles. The first frame also has ``box`` and ``box_normals``, the points and unit normals of the walls. The y axis points up.
 """
 
 from __future__ import annotations
@@ -34,15 +35,15 @@ from gpe_pl.trajectory.state import State
 PositiveFloat = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 MAX_BYTES = 2**31
-"""Of an unpacked recording."""
+"""Largest size of an unpacked recording [bytes]."""
 WATER = 1000.0
-"""Density of the recorded liquid [kg/m³], from which its spacing follows."""
+"""Density of the recorded liquid [kg/m³]. The particle spacing follows from it and from the particle mass."""
 HEADROOM = 0.25
-"""Height of the domain above the highest wall, of that of the walls."""
+"""Height of the domain above the highest wall, as a fraction of the height of the walls."""
 FASTEST = 10.0
-"""Largest speed of a recorded particle, in that of a free fall through the domain's height; without gravity there is none."""
+"""Largest speed of a recorded particle, in units of the speed of a free fall through the height of the domain; no limit applies without gravity."""
 UPSTREAM = 1 / 3
-"""Part of the domain at low x in which a flood starts."""
+"""Fraction of the domain, at low x, in which a flood starts."""
 
 
 class RecordingError(GpeError, ValueError):
@@ -54,10 +55,10 @@ class Recording:
     """A recorded scene with its vertical axis last.
 
     Attributes:
-        walls, normals: points on the ground [point, 3] in m, and unit normals into free space.
-        pos, vel: of the particles [node, 3] in m and m/s.
-        viscosity: kinematic [m²/s].
-        spacing: of the particles [m].
+        walls, normals: points on the ground [point, 3] in m, and unit normals into free space [point, 3].
+        pos, vel: positions and velocities of the particles [node, 3] in m and m/s.
+        viscosity: kinematic viscosity [m²/s].
+        spacing: spacing of the particles [m].
     """
 
     walls: np.ndarray
@@ -68,16 +69,16 @@ class Recording:
     spacing: float
 
     def scaled(self, s: float) -> Recording:
-        """The similar scene that is s times as long."""
+        """Return the similar scene that is s times as long."""
         return Recording(s * self.walls, self.normals, s * self.pos, math.sqrt(s) * self.vel, s**1.5 * self.viscosity, s * self.spacing)
 
     def moved(self, by: np.ndarray) -> Recording:
-        """The scene somewhere else."""
+        """Return the scene translated by a vector [3] in m."""
         return replace(self, walls=self.walls + by, pos=self.pos + by)
 
 
 def read_recording(path: Path | str) -> Recording:
-    """Read the first frame of a recording; nothing in the file is executed, and no more is unpacked than it needs.
+    """Read the first frame of a recording. Nothing in the file is executed, and only the first frame is unpacked.
 
     Raises:
         RecordingError: the file is missing, damaged or of another format, or holds numbers that no scene can have; or msgpack and zstandard are not installed.
@@ -97,7 +98,7 @@ def read_recording(path: Path | str) -> Recording:
                 raise ValueError("it has no frames")
             frame = unpacker.unpack()
         arrays = {name: _array(frame, name) for name in ("box", "box_normals", "pos", "vel", "m", "viscosity")}
-    except Exception as error:  # what these packages raise on damaged files is not one type
+    except Exception as error:  # these packages raise several types on damaged files
         raise RecordingError(f"{path}: not a recording in DMCF's format ({type(error).__name__}: {error})") from None
     points, nodes = len(arrays["box"]), len(arrays["pos"])
     wanted = {"box": (points, 3), "box_normals": (points, 3), "pos": (nodes, 3), "vel": (nodes, 3), "m": (nodes,), "viscosity": (nodes,)}
@@ -125,16 +126,17 @@ def _array(frame: Any, name: str) -> np.ndarray:
 class RecordedScene:
     """A recorded canyon, scaled so that its particles have the spacing of a trained model.
 
-    The walls are sampled anew at that spacing. Vertical walls stand around, the sky is open.
+    The walls are sampled again at that spacing. Vertical walls surround the scene, and its top is open.
 
     Attributes:
-        file: the recording, relative to the working directory.
-        grid_spacing: of the solver that made the training data [m].
-        particles_per_cell: along each axis; the rest spacing is ``grid_spacing / particles_per_cell``.
-        num_particles: fill the lowest free places of the upstream third with so many particles at rest; None takes those recorded.
-        density: [kg/m³].
-        gravity: [m/s²].
-        friction: of the ground.
+        file: path of the recording, relative to the working directory.
+        grid_spacing: grid spacing of the solver that made the training data [m].
+        particles_per_cell: particles along each axis of a cell; the rest spacing is ``grid_spacing / particles_per_cell``.
+        num_particles: number of particles of a flood, which fills the lowest free places of the upstream third and starts at rest; None takes the
+            recorded particles.
+        density: density of the liquid [kg/m³].
+        gravity: acceleration of gravity [m/s²].
+        friction: friction coefficient of the ground.
         connectivity_cells: recommended connectivity radius in grid cells.
     """
 
@@ -154,12 +156,12 @@ class RecordedScene:
 
     @property
     def scale(self) -> float:
-        """How many times as long the scene is as the recorded one; its times are √scale as long."""
+        """Length of the scene divided by that of the recording; times scale with the square root of it."""
         return self.spacing / _read(self.file).spacing
 
     @property
     def recording(self) -> Recording:
-        """The recorded scene in this one's place and size: the low corner of its walls is the origin."""
+        """The scaled recording, moved so that the low corner of its walls is the origin."""
         scaled = _read(self.file).scaled(self.scale)
         return scaled.moved(-scaled.walls.min(axis=0))
 
@@ -191,15 +193,15 @@ class RecordedScene:
         return {"file": self.file}
 
     def sample(self, values: Mapping[str, float], seed: int) -> State:
-        """The scene, as a pure function of its settings, the file and, for a flood, the seed.
+        """Make the scene. It depends only on the settings, the file and, for a flood, the seed.
 
         Args:
-            values: of ``fluid``, the kinematic viscosity [m²/s]; as recorded, scaled, where it is not given.
-            seed: of a flood's particles.
+            values: kinematic viscosity [m²/s] under the key ``fluid``; without it the scaled viscosity of the recording applies.
+            seed: seed of the positions of a flood's particles.
 
         Raises:
             ValueError: the flood does not fit.
-            RecordingError: the walls make no ground, or recorded particles lie in it or are beyond all measure fast.
+            RecordingError: the walls form no ground, or a recorded particle lies in the ground or moves implausibly fast.
         """
         recording, bounds = self.recording, self.bounds
         sides = domain_walls(bounds, self.friction)[:4]
@@ -226,7 +228,7 @@ class RecordedScene:
         )
 
     def _check(self, pos: np.ndarray, vel: np.ndarray, shapes: tuple[Shape, ...], height: float) -> None:
-        """Raise ``RecordingError`` for particles that no liquid has, which would make a solver or a model explode later, without a reason."""
+        """Raise ``RecordingError`` for implausible particles, which would make a solver or model fail later without a clear reason."""
         depth = -signed_distance(shapes, pos)
         speed, falling = np.linalg.norm(vel, axis=1), math.sqrt(2 * float(np.linalg.norm(self.gravity)) * height)
         for values, limit, text in (
@@ -251,7 +253,7 @@ class RecordedScene:
 
 
 def _read(file: str) -> Recording:
-    """``read_recording``, once per content of the file."""
+    """Call ``read_recording``, once per content of the file."""
     path = Path(file)
     stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else (0, 0)
     return _read_once(str(path.absolute()), stamp)

@@ -1,7 +1,7 @@
-"""The same scene at another resolution, and where its nodes were: what a study of a solver's convergence needs.
+"""Scenes at another resolution, and the map back to the original nodes, for studies of a solver's convergence.
 
-Particles are divided into 2^dim children or merged in groups as large, with their mass; meshes have their cells divided, or their outline meshed anew with
-longer edges. ``Resolved.restrict`` gives the positions of the nodes that the scene had before.
+Particles are divided into 2^dim children, or merged with their neighbours; mass is conserved. Meshes get divided cells, or their outline is meshed again with
+longer edges. ``Resolved.restrict`` returns the positions of the original nodes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Resolved:
 
     Attributes:
         state: initial state.
-        restrict: from positions of its nodes [m] to those of the nodes of the scene that it came from.
+        restrict: function from positions of the nodes of ``state`` [m] to positions of the nodes of the original scene [m].
     """
 
     state: State
@@ -34,19 +34,19 @@ class Resolved:
 
 
 def finer(state: State, spacing: float) -> Resolved:
-    """Half the spacing [m] between nodes.
+    """Return the scene with half the spacing between nodes; ``spacing`` is the present one [m].
 
     Raises:
-        ValueError: the mesh is of cells that are not triangles.
+        ValueError: the mesh has cells that are not triangles.
     """
     return _divided_particles(state, spacing) if state.cells is None or not len(state.cells) else _divided_triangles(state)
 
 
 def coarser(state: State, spacing: float, factor: float = 2.0) -> Resolved:
-    """So many times the spacing [m] between nodes.
+    """Return the scene with ``factor`` times the spacing between nodes; ``spacing`` is the present one [m].
 
     Raises:
-        ValueError: the mesh is of cells that are not triangles, or too coarse a mesh would be left.
+        ValueError: the mesh has cells that are not triangles, or the coarser mesh would be too coarse.
     """
     if state.cells is None or not len(state.cells):
         return _merged_particles(state, factor * spacing)
@@ -66,7 +66,7 @@ def _divided_particles(state: State, spacing: float) -> Resolved:
 
 
 def _merged_particles(state: State, size: float) -> Resolved:
-    """Particles of one type and parameters in one cell of a lattice become one at their centre of mass; each keeps its place beside it."""
+    """Merge particles of equal type and parameters within one lattice cell at their centre of mass; ``restrict`` keeps their offsets from it."""
     cell = np.floor(state.pos / size).astype(np.int64)
     kind = np.column_stack([cell, state.node_type, np.nan_to_num(state.material_params, nan=-1.0)])
     _, first, group = np.unique(kind, axis=0, return_index=True, return_inverse=True)
@@ -83,7 +83,7 @@ def _merged_particles(state: State, size: float) -> Resolved:
 
 
 def _rows(state: State, rows: np.ndarray, pos: np.ndarray, mass: np.ndarray) -> State:
-    """A state of particles made of these rows."""
+    """Return the particles of these rows with other positions [node, dim] in m and masses [node] in kg."""
     return replace(
         state,
         pos=pos,
@@ -103,13 +103,13 @@ def _rows(state: State, rows: np.ndarray, pos: np.ndarray, mass: np.ndarray) -> 
 
 def _check_triangles(state: State) -> None:
     if state.dim != 2 or state.cells is None or state.cells.shape[1] != 3:
-        raise ValueError("only meshes of triangles can be divided or meshed anew")
+        raise ValueError("only meshes of triangles can be divided or meshed again")
     if state.time > 0:
         raise ValueError(f"the mesh at {state.time:g} s is deformed; only the start of a scene can have another resolution")
 
 
 def _divided_triangles(state: State) -> Resolved:
-    """Every triangle becomes four; the old nodes come first and keep their numbers."""
+    """Divide every triangle into four; the original nodes come first and keep their numbers."""
     _check_triangles(state)
     count, cells = state.num_nodes, state.cells
     assert cells is not None
@@ -129,14 +129,14 @@ def _divided_triangles(state: State) -> Resolved:
 
 
 def _remeshed(state: State, spacing: float) -> Resolved:
-    """The outline of the mesh filled with new triangles; old nodes move with the triangle that is nearest to them."""
+    """Fill the outline of the mesh with new triangles; original nodes move with the nearest new triangle."""
     _check_triangles(state)
     assert state.cells is not None
     loops = [state.pos[loop] for loop in outline(state.cells)]
     points, cells = triangulate(loops, spacing, np.random.default_rng(0))
     nodes, weights = _locate(points, cells, state.pos)
     near = cKDTree(state.pos).query(points)[1]
-    # a velocity field that is linear in space, translation and spin, is taken over exactly
+    # a velocity field that is linear in space (translation and spin) is reproduced exactly
     linear = np.column_stack([np.ones(state.num_nodes), state.pos])
     field = np.linalg.lstsq(linear, state.vel, rcond=None)[0]
     rest = state.vel - linear @ field
@@ -146,7 +146,7 @@ def _remeshed(state: State, spacing: float) -> Resolved:
 
 
 def _mesh_state(state: State, pos: np.ndarray, cells: np.ndarray, vel: np.ndarray, params: np.ndarray) -> State:
-    """A state of another mesh of the same body, as heavy as before."""
+    """Return a state with another mesh of the same body and the same total mass."""
     corners = pos[cells]
     area = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 2
     share = np.bincount(cells.ravel(), np.repeat(area / 3, 3), minlength=len(pos))
@@ -167,7 +167,7 @@ def _mesh_state(state: State, pos: np.ndarray, cells: np.ndarray, vel: np.ndarra
 
 
 def outline(cells: Int[np.ndarray, "cell 3"]) -> list[list[int]]:
-    """The closed loops of nodes along the edges that only one triangle has.
+    """Return the closed loops of nodes along edges that belong to one triangle only.
 
     Raises:
         ValueError: loops touch in a node.
@@ -190,7 +190,7 @@ def outline(cells: Int[np.ndarray, "cell 3"]) -> list[list[int]]:
 
 
 def _locate(points: np.ndarray, cells: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The triangle [node, 3] that holds each wanted point, or of the nearest ones that from which it is least far outside, and its barycentric weights."""
+    """Return nodes [node, 3] and barycentric weights [node, 3] of the triangle that contains each wanted point, or that it is least far outside of."""
     a = points[cells[:, 0]]
     inverse = np.linalg.inv(np.stack([points[cells[:, 1]] - a, points[cells[:, 2]] - a], axis=2))
     num_near = min(12, len(cells))

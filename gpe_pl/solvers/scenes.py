@@ -1,6 +1,6 @@
-"""Seeded scenes of bodies that are thrown into a box with obstacles, and what every scene promises.
+"""Seeded scenes of bodies thrown into a box with obstacles, and the ``Scene`` protocol.
 
-``Scene.sample`` is a pure function of configuration, parameter values and seed.
+``Scene.sample`` depends only on configuration, parameter values and seed.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ Probability = Annotated[float, Field(ge=0, le=1)]
 ObstacleShapes = Literal["plain", "angular"]
 
 MAX_ATTEMPTS = 200
-"""Layouts to try before a scene counts as impossible."""
+"""Number of layouts to try before a scene counts as impossible."""
 
 CLEARANCE = 0.25
-"""Smallest distance of a liquid's particle from a solid at the start, in spacings; a jittered lattice beside a wall just keeps it."""
+"""Smallest initial distance between a liquid particle and a solid, in spacings; a jittered lattice beside a wall just satisfies it."""
 
 JITTER = 0.25
-"""Largest displacement from the seeding lattice per axis, in spacings; a plain lattice would crack along its rows when it spreads."""
+"""Largest displacement from the seeding lattice along each axis, in spacings; a regular lattice would crack along its rows when it spreads."""
 
 MESHED = ("elastomer",)
-"""Materials that keep their neighbours: their particles start on a plain lattice and carry its cells."""
+"""Materials whose particles keep their neighbours: they start on a regular lattice and carry its cells."""
 
 
 @runtime_checkable
@@ -66,14 +66,14 @@ class Scene(Protocol):
 
     @property
     def input_files(self) -> dict[str, str]:
-        """Files that scenes depend on, by the setting that names them."""
+        """Files that scenes depend on, keyed by the setting that names them."""
         ...
 
     def sample(self, values: Mapping[str, float], seed: int) -> State: ...
 
 
 def describe(scene: Scene, frame_dt: float, **provenance: Any) -> Metadata:
-    """Metadata of a scene's trajectories; ``provenance`` takes the other fields of ``Metadata``."""
+    """Return the metadata of a scene's trajectories; ``provenance`` takes the other fields of ``Metadata``."""
     return Metadata(
         **{
             "dataset": "-".join(scene.materials),
@@ -90,12 +90,12 @@ def describe(scene: Scene, frame_dt: float, **provenance: Any) -> Metadata:
     )
 
 
-# --- what several kinds of scenes draw and check --------------------------------------------------------------------------------------------
+# --- drawing and checks that several kinds of scenes share ----------------------------------------------------------------------------------
 
 
 @runtime_checkable
 class Surroundings(Protocol):
-    """Settings of a scene that decide the friction of its walls and obstacles."""
+    """Settings of a scene that determine the friction of its walls and obstacles."""
 
     @property
     def bounds(self) -> tuple[tuple[float, float], ...]: ...
@@ -111,7 +111,7 @@ class Surroundings(Protocol):
 
 
 def check_domain(bounds: tuple[tuple[float, float], ...], gravity: tuple[float, ...]) -> None:
-    """Raise ``ValueError`` unless bounds are sound and gravity is finite and has as many components."""
+    """Raise ``ValueError`` unless bounds are valid, and gravity is finite and has as many components as bounds has axes."""
     check_bounds(bounds)
     if len(gravity) != len(bounds):
         raise ValueError(f"gravity must have as many components as bounds have axes, got gravity {gravity} and bounds {bounds}")
@@ -135,7 +135,7 @@ def check_surroundings(scene: Surroundings) -> None:
 
 
 def draw_friction(scene: Surroundings, rng: np.random.Generator, may_slip: bool = True) -> float:
-    """Coulomb coefficient of a wall or obstacle: no-slip, frictionless or in between."""
+    """Draw the Coulomb coefficient of a wall or obstacle: no-slip, frictionless or in between."""
     kind, coulomb = rng.random(), rng.uniform(*scene.coulomb_friction)
     if kind < scene.sticky_probability:
         return STICKY
@@ -144,32 +144,32 @@ def draw_friction(scene: Surroundings, rng: np.random.Generator, may_slip: bool 
 
 
 def draw_walls(scene: Surroundings, rng: np.random.Generator) -> tuple[Shape, ...]:
-    """The walls of the domain, each with a friction of its own."""
+    """Draw the walls of the domain, each with its own friction."""
     axes = "xyz"[: len(scene.bounds)]
-    floor = f"{axes[-1]}_low"  # on a frictionless floor things slide for ever: no pile and no body comes to rest
+    floor = f"{axes[-1]}_low"  # on a frictionless floor bodies never come to rest
     names = [f"{axis}_{side}" for axis in axes for side in ("low", "high")]
     return domain_walls(scene.bounds, {name: draw_friction(scene, rng, may_slip=name != floor) for name in names})
 
 
 def draw_velocity(max_speed: float, dim: int, rng: np.random.Generator) -> np.ndarray:
-    """Velocity of a body [dim] in m/s: any horizontal direction, mostly downward."""
+    """Draw the velocity of a body [dim] in m/s: any horizontal direction, mostly downward."""
     return max_speed * np.array([*rng.uniform(-1.0, 1.0, dim - 1), rng.uniform(-1.0, 0.25)])
 
 
 def integer_lattice(first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Points [point, dim] of whole coordinates from ``first`` to ``last`` [dim]."""
+    """Return points [point, dim] with integer coordinates from ``first`` to ``last`` [dim]."""
     axes = [np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
 def jittered_lattice(first: np.ndarray, last: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Jittered points [point, dim] around the integer points from ``first`` to ``last``."""
+    """Return jittered points [point, dim] around the integer points from ``first`` to ``last`` [dim]."""
     lattice = integer_lattice(first, last)
     return lattice + rng.uniform(-JITTER, JITTER, lattice.shape)
 
 
 def filled_box(region: Sequence[tuple[float, float]], spacing: float, rng: np.random.Generator) -> np.ndarray:
-    """Jittered points of a rest spacing [point, dim] in a box of ``(low, high)`` per axis, half a spacing away from its low sides."""
+    """Fill a box ``(low, high)`` per axis with jittered points [point, dim] of a rest spacing, half a spacing away from its low sides."""
     low, high = np.array(region, float).T
     number = np.floor((high - low) / spacing + 1e-6)
     if np.any(number < 1):
@@ -178,7 +178,7 @@ def filled_box(region: Sequence[tuple[float, float]], spacing: float, rng: np.ra
 
 
 def floats(values: np.ndarray) -> tuple[float, ...]:
-    """Coordinates as shapes take them."""
+    """Return coordinates as a tuple, which shapes take."""
     return tuple(float(v) for v in values)
 
 
@@ -190,21 +190,21 @@ class BodyScene:
     """Bodies of random shape and material in a box with obstacles.
 
     Attributes:
-        bounds: ``(low, high)`` per axis of the domain [m]; 2 or 3 axes, gravity along the last.
-        materials: of the bodies, in random order; where there are several, a scene has two of them or more.
-        grid_spacing: of the solver [m].
-        num_particles: in all bodies together.
-        particles_per_cell: along each axis; the rest spacing is ``grid_spacing / particles_per_cell``.
-        density: at rest [kg/m³], per material.
-        gravity: [m/s²].
-        max_bodies: the number of bodies is uniform in 1 … max_bodies, with several materials in 2 … max_bodies.
-        max_obstacles: the number of obstacles is uniform in 0 … max_obstacles.
-        obstacle_radius: range of their circumscribed radii [m].
-        obstacle_shapes: ``plain`` are boxes, balls and convex polygons; ``angular``, in 2D, are stars and tilted ramps.
+        bounds: ``(low, high)`` of the domain along each axis [m]; 2 or 3 axes, gravity along the last.
+        materials: materials of the bodies; with several materials, a scene has at least two of them.
+        grid_spacing: grid spacing of the solver [m].
+        num_particles: number of particles in all bodies together.
+        particles_per_cell: particles along each axis of a cell; the rest spacing is ``grid_spacing / particles_per_cell``.
+        density: density at rest of each material [kg/m³].
+        gravity: acceleration of gravity [m/s²].
+        max_bodies: largest number of bodies; the number is uniform in 1 … max_bodies, with several materials in 2 … max_bodies.
+        max_obstacles: largest number of obstacles; the number is uniform in 0 … max_obstacles.
+        obstacle_radius: range of the obstacles' circumscribed radii [m].
+        obstacle_shapes: ``plain`` selects boxes, balls and convex polygons; ``angular``, in 2D only, selects stars and tilted ramps.
         drop_height: range of the gap between a body and the floor [m].
-        max_speed: of a body along each axis [m/s]; upward at most a quarter of it.
-        sticky_probability: of a wall or obstacle to be no-slip.
-        slip_probability: of a side wall, ceiling or obstacle to be frictionless; all others obey Coulomb's law.
+        max_speed: largest speed of a body along each axis [m/s]; upward at most a quarter of it.
+        sticky_probability: probability that a wall or obstacle is no-slip.
+        slip_probability: probability that a side wall, ceiling or obstacle is frictionless; all others obey Coulomb's law.
         coulomb_friction: range of Coulomb coefficients.
         connectivity_cells: recommended connectivity radius in grid cells.
     """
@@ -269,7 +269,7 @@ class BodyScene:
         """Draw a scene.
 
         Args:
-            values: of each material's parameter, in the unit that ``schema`` gives.
+            values: value of each material's parameter, in the unit that ``schema`` gives.
             seed: non-negative integer.
 
         Returns:
@@ -292,7 +292,7 @@ class BodyScene:
         vel = np.concatenate([np.broadcast_to(draw_velocity(self.max_speed, self.dim, rng), body.pos.shape) for body in bodies])
         pos = np.concatenate([body.pos for body in bodies])
         material = np.concatenate([np.full(len(body.pos), node_code(body.material), np.uint8) for body in bodies])
-        # labels must not tell where a particle started
+        # node numbers must not reveal where a particle started
         order = rng.permutation(self.num_particles)
         pos, material = pos[order], material[order]
         names = param_names(self.materials)
@@ -323,18 +323,18 @@ class _Body(NamedTuple):
 
 
 def _cells(bodies: list[_Body], order: np.ndarray) -> np.ndarray:
-    """Cells of all bodies in the numbers that their nodes have after the permutation ``order``."""
+    """Return the cells of all bodies in the node numbers after the permutation ``order``."""
     start = np.cumsum([0, *(len(body.pos) for body in bodies)])
     new_number = np.argsort(order)
     return new_number[np.concatenate([body.cells + first for body, first in zip(bodies, start, strict=False)])]
 
 
 def _obstacles(config: BodyScene, rng: np.random.Generator) -> tuple[Shape, ...]:
-    """Boxes, balls and, in 2D, convex polygons whose circumscribed balls stay clear of the walls and of each other."""
+    """Draw boxes, balls and, in 2D, convex polygons whose circumscribed balls stay clear of the walls and of each other."""
     obstacles: list[Shape] = []
     circles: list[tuple[np.ndarray, float]] = []
     low, high = np.array(config.bounds).T
-    gap = 2.0 * config.grid_spacing  # narrower gaps are invisible to the grid
+    gap = 2.0 * config.grid_spacing  # the grid does not resolve narrower gaps
     for _ in range(rng.integers(config.max_obstacles + 1)):
         radius, angle, sides = rng.uniform(*config.obstacle_radius), rng.uniform(0, 2 * math.pi), int(rng.integers(3, 7))
         kind, friction, share = rng.integers(3 if config.dim == 2 else 2), draw_friction(config, rng), rng.uniform(0.3, 0.7)
@@ -360,13 +360,13 @@ def _obstacles(config: BodyScene, rng: np.random.Generator) -> tuple[Shape, ...]
 
 
 def check_obstacle_shapes(shapes: ObstacleShapes, dim: int) -> None:
-    """Raise ``ValueError`` where obstacles of this kind do not exist."""
+    """Raise ``ValueError`` if obstacles of this kind do not exist in this dimension."""
     if shapes == "angular" and dim != 2:
         raise ValueError("obstacle_shapes='angular' are polygons, which exist in 2D only; use 'plain'")
 
 
 def angular_obstacle(center: np.ndarray, radius: float, friction: float, rng: np.random.Generator) -> Polygon:
-    """A star of four to six points or a tilted ramp four times as long as thick, within a circle."""
+    """Draw a star of four to six points, or a tilted ramp four times as long as thick, within a circle; lengths in m."""
     angle = rng.uniform(0, 2 * math.pi)
     if rng.random() < 0.5:
         points = 2 * int(rng.integers(4, 7))
@@ -379,9 +379,9 @@ def angular_obstacle(center: np.ndarray, radius: float, friction: float, rng: np
 
 
 def _bodies(config: BodyScene, shapes: tuple[Shape, ...], rng: np.random.Generator) -> list[_Body] | None:
-    """The bodies in their places, or None where this layout leaves no room."""
+    """Place the bodies; return None if this layout leaves no room."""
     low, high = np.array(config.bounds).T
-    several = len(config.materials) > 1  # then they meet: bodies of at least two
+    several = len(config.materials) > 1  # a scene then has bodies of at least two materials
     number = int(rng.integers(min(2, config.max_bodies) if several else 1, config.max_bodies + 1))
     order = rng.permutation(len(config.materials)) if several else np.zeros(1, dtype=int)
     share = rng.dirichlet(np.full(number, 4.0))
@@ -402,7 +402,7 @@ def _bodies(config: BodyScene, shapes: tuple[Shape, ...], rng: np.random.Generat
         offset = lowest.copy()
         offset[:-1] = [rng.uniform(a, b) for a, b in zip(lowest[:-1], highest[:-1], strict=True)]
         pos = body.pos + offset
-        # rise until nothing is in the way: bodies also start above obstacles and above each other
+        # raise the body until nothing is in the way; it may start above obstacles and other bodies
         for _ in range(math.floor((highest[-1] - lowest[-1]) / config.grid_spacing) + 1):
             box = (pos.min(axis=0) - config.grid_spacing, pos.max(axis=0) + config.grid_spacing)
             overlaps = any(np.all(box[0] < other[1]) and np.all(other[0] < box[1]) for other in boxes)
@@ -417,9 +417,9 @@ def _bodies(config: BodyScene, shapes: tuple[Shape, ...], rng: np.random.Generat
 
 
 def _body(count: int, spacing: float, material: str, dim: int, rng: np.random.Generator) -> _Body:
-    """A randomly turned body of ``count`` lattice points around the origin; jittered unless it is meshed.
+    """Return a randomly turned body of ``count`` lattice points around the origin, jittered unless it is meshed.
 
-    Every shape is a level set of a gauge, so the points of smallest gauge are the wanted number of points in the shape of the right size.
+    Every shape is a level set of a gauge, so the ``count`` points of smallest gauge fill the shape at the right size.
     """
     gauge = _gauge(rng, dim)
     reach = math.ceil(2.0 * count ** (1 / dim)) + 2
@@ -433,7 +433,7 @@ def _body(count: int, spacing: float, material: str, dim: int, rng: np.random.Ge
 
 
 def _rotation(rng: np.random.Generator, dim: int) -> np.ndarray:
-    """A uniformly distributed rotation [dim, dim]; in 3D from a random unit quaternion."""
+    """Draw a uniformly distributed rotation [dim, dim]; in 3D from a random unit quaternion."""
     if dim == 2:
         turn = rng.uniform(0, 2 * math.pi)
         return np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
@@ -448,9 +448,9 @@ def _rotation(rng: np.random.Generator, dim: int) -> np.ndarray:
 
 
 def _lattice_cells(sites: np.ndarray) -> np.ndarray:
-    """Simplices [cell, dim + 1] of positive orientation that fill every lattice cell whose corners are all among the sites [point, dim] (integers).
+    """Return simplices [cell, dim + 1] of positive orientation that fill every lattice cell with all corners among the integer sites [point, dim].
 
-    Each cell is cut along paths from its lowest to its highest corner, one simplex per order of the axes (Kuhn 1960), so neighbours share faces.
+    Each cell is cut along paths from its lowest to its highest corner, one simplex per order of the axes (Kuhn 1960), so that neighbours share faces.
     """
     dim = sites.shape[1]
     number = {tuple(site): k for k, site in enumerate(sites.tolist())}
@@ -467,7 +467,7 @@ def _lattice_cells(sites: np.ndarray) -> np.ndarray:
 
 
 def _gauge(rng: np.random.Generator, dim: int) -> Callable[[np.ndarray], np.ndarray]:
-    """A random convex shape as the factor [point] by which it must be scaled to reach each point [point, dim]."""
+    """Draw a convex shape, as the function that gives the factor [point] by which it must be scaled to reach each point [point, dim]."""
     kind = rng.integers(3)
     if kind == 0:
         half = _half_lengths(rng, dim)
@@ -478,14 +478,14 @@ def _gauge(rng: np.random.Generator, dim: int) -> Callable[[np.ndarray], np.ndar
     if dim == 2:
         angle = 2 * math.pi * (np.arange(sides) + rng.uniform(-0.2, 0.2, sides)) / sides
         normals = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    else:  # a tetrahedron's normals close the shape, further ones cut it
+    else:  # four normals of a tetrahedron close the shape, more normals cut it
         normals = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1], *rng.normal(size=(sides, 3))])
         normals /= np.linalg.norm(normals, axis=1)[:, None]
     return lambda x: np.max(x @ normals.T, axis=-1)
 
 
 def _half_lengths(rng: np.random.Generator, dim: int) -> np.ndarray:
-    """Half edge lengths [dim] of a box of volume 2^dim."""
+    """Draw half edge lengths [dim] of a box of volume 2^dim."""
     if dim == 2:
         stretch = math.sqrt(rng.uniform(1.0, 2.5))
         return np.array([stretch, 1.0 / stretch])

@@ -1,6 +1,6 @@
-"""Seeded random scenes of one meshed solid that falls on irregular obstacles. The last axis points up.
+"""Seeded random scenes of one meshed solid that falls on obstacles. The last axis points up.
 
-There is one body per scene: the finite element solver knows no contact of meshes with each other.
+A scene has one body because the finite element solver does not compute contact between meshes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ NonNegativeFloat = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Probability = Annotated[float, Field(ge=0, le=1)]
 
 MAX_BODIES = 20
-"""Bodies to try before the mesh counts as too coarse for all of them."""
+"""Number of bodies to try before the mesh counts as too coarse."""
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
@@ -46,24 +46,24 @@ class SolidScene:
     """Distribution of scenes with one solid body of random shape.
 
     Attributes:
-        bounds: ``(low, high)`` per axis of the domain [m].
-        cell: kind of mesh; tetrahedra in 3D, the others in 2D.
-        num_cells: about as many in every scene.
-        body_size: edge of the square (3D: cube) as large as the body [m].
-        density: at rest [kg/m³].
-        gravity: [m/s²].
-        num_obstacles: range of their number.
-        obstacle_radius: range of their circumscribed radii [m].
-        obstacle_shapes: ``plain`` are boxes, balls and, in 2D, irregular polygons; ``angular``, in 2D, are stars and tilted ramps.
-        obstacle_height: obstacles have their centres in this lowest fraction of the domain.
-        drop_height: range of the gap between the body and the floor, or more where obstacles are in the way [m].
-        max_speed: of the body along each axis [m/s]; upward at most a quarter of it.
+        bounds: ``(low, high)`` of the domain along each axis [m].
+        cell: kind of mesh cell; tetrahedra in 3D, the others in 2D.
+        num_cells: approximate number of cells, the same in every scene.
+        body_size: edge of the square (3D: cube) that has the area (volume) of the body [m].
+        density: density at rest [kg/m³].
+        gravity: acceleration of gravity [m/s²].
+        num_obstacles: range of the number of obstacles.
+        obstacle_radius: range of the obstacles' circumscribed radii [m].
+        obstacle_shapes: ``plain`` selects boxes, balls and, in 2D, irregular polygons; ``angular``, in 2D only, selects stars and tilted ramps.
+        obstacle_height: fraction of the domain's height below which obstacles have their centres.
+        drop_height: range of the gap between the body and the floor [m]; the gap is larger where obstacles are in the way.
+        max_speed: largest speed of the body along each axis [m/s]; upward at most a quarter of it.
         max_spin: largest angular velocity [rad/s].
-        sticky_probability: of a wall or obstacle to be no-slip.
-        slip_probability: of a side wall, ceiling or obstacle to be frictionless; all others obey Coulomb's law.
+        sticky_probability: probability that a wall or obstacle is no-slip.
+        slip_probability: probability that a side wall, ceiling or obstacle is frictionless; all others obey Coulomb's law.
         coulomb_friction: range of Coulomb coefficients.
         boundary_spacing: largest distance of boundary nodes in mesh spacings.
-        connectivity_cells: recommended connectivity radius in mesh spacings; it should exceed the way of a body in one frame.
+        connectivity_cells: recommended connectivity radius in mesh spacings; choose more than the distance that a body moves in one frame.
     """
 
     bounds: tuple[tuple[float, float], ...]
@@ -108,7 +108,7 @@ class SolidScene:
 
     @property
     def spacing(self) -> float:
-        """Edge length of the mesh in m, as if the body were filled with equal regular cells; the mean edge is up to 4 % longer."""
+        """Edge length of the mesh in m if equal regular cells filled the body; the mean edge is up to 4 % longer."""
         per_unit = {"triangle": 4 / math.sqrt(3), "quad": 1.0, "tetrahedron": TETRAHEDRA_PER_CUBE}[self.cell]
         return self.body_size * float((per_unit / self.num_cells) ** (1 / self.dim))
 
@@ -118,12 +118,12 @@ class SolidScene:
 
     @property
     def max_cells(self) -> int:
-        """Estimate from above."""
+        """Upper estimate of the number of cells."""
         return math.ceil((1.25 if self.dim == 3 else 1.1) * self.num_cells)
 
     @property
     def max_nodes(self) -> int:
-        """Estimate from above: Euler's formula with the longest outlines, or measured in 3D."""
+        """Upper estimate of the number of nodes: from Euler's formula with the longest outlines in 2D, measured in 3D."""
         if self.cell == "tetrahedron":
             return math.ceil(0.2 * self.num_cells + 1.7 * self.num_cells ** (2 / 3))
         outline = 7.5 * self.body_size / self.spacing
@@ -133,11 +133,11 @@ class SolidScene:
         """Draw a scene.
 
         Args:
-            values: Young's modulus [Pa] of ``solid``.
+            values: Young's modulus [Pa] under the key ``solid``.
             seed: non-negative integer.
 
         Returns:
-            State at time 0 in float64, undeformed and without stress.
+            State at time 0 in float64, undeformed and free of stress.
 
         Raises:
             ValueError: the body does not fit into the domain, or the mesh is too coarse for it (``MeshingError``).
@@ -172,7 +172,7 @@ class SolidScene:
 
 
 def _body(config: SolidScene, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Mesh of a random body around the origin, randomly turned; bodies too thin for the spacing are passed over."""
+    """Return nodes and cells of a random, randomly turned body around the origin. Bodies that are too thin for the spacing are rejected."""
     for attempt in range(MAX_BODIES):
         try:
             points, cells = _mesh(config, rng)
@@ -181,7 +181,7 @@ def _body(config: SolidScene, rng: np.random.Generator) -> tuple[np.ndarray, np.
             if attempt == MAX_BODIES - 1:
                 raise
     turn, _ = np.linalg.qr(rng.normal(size=(config.dim, config.dim)))
-    turn[:, 0] *= np.linalg.det(turn)  # a rotation, no reflection
+    turn[:, 0] *= np.linalg.det(turn)  # a rotation, not a reflection
     return config.body_size * points @ turn.T, cells
 
 
@@ -193,7 +193,7 @@ def _mesh(config: SolidScene, rng: np.random.Generator) -> tuple[np.ndarray, np.
 
 
 def _lumped_masses(points: np.ndarray, cells: np.ndarray, density: float) -> np.ndarray:
-    """Masses [node] in kg: each cell's, equally divided among its corners."""
+    """Return masses [node] in kg: each cell's mass, divided equally among its corners."""
     corners = points[cells]
     if cells.shape[1] == 4 and points.shape[1] == 2:
         a, b = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
@@ -204,7 +204,7 @@ def _lumped_masses(points: np.ndarray, cells: np.ndarray, density: float) -> np.
 
 
 def _obstacles(config: SolidScene, rng: np.random.Generator) -> tuple[Shape, ...]:
-    """Boxes, balls and, in 2D, irregular polygons in the lower part of the domain, clear of the walls and of each other."""
+    """Draw boxes, balls and, in 2D, irregular polygons in the lower part of the domain, clear of the walls and of each other."""
     obstacles: list[Shape] = []
     taken: list[tuple[np.ndarray, float]] = []
     low, high = np.array(config.bounds).T
@@ -240,7 +240,7 @@ def _obstacle(center: np.ndarray, radius: float, friction: float, rng: np.random
 
 
 def _placed(config: SolidScene, body: np.ndarray, shapes: tuple[Shape, ...], rng: np.random.Generator) -> np.ndarray | None:
-    """Node positions above the floor, in free space; None where this layout leaves no room."""
+    """Return node positions above the floor in free space, or None if this layout leaves no room."""
     low, high = np.array(config.bounds).T
     up = np.eye(config.dim)[-1]
     clearance = 0.5 * config.spacing
@@ -260,7 +260,7 @@ def _placed(config: SolidScene, body: np.ndarray, shapes: tuple[Shape, ...], rng
 
 
 def _velocity(config: SolidScene, pos: np.ndarray, mass: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Velocities [node, dim] in m/s of a rigid motion: any horizontal direction, mostly downward, with a spin about the centre of mass."""
+    """Draw velocities [node, dim] in m/s of a rigid motion: any horizontal direction, mostly downward, with a spin about the centre of mass."""
     dim = config.dim
     middle = draw_velocity(config.max_speed, dim, rng)
     arm = pos - mass @ pos / mass.sum()

@@ -1,4 +1,4 @@
-"""What surrounds particles and meshes in scenes that solvers compute: walls and obstacles at rest, known by their shapes, in space that does not repeat."""
+"""Checks that a solver supports the surroundings of a scene: walls and obstacles at rest, given by shapes, in a domain that is not periodic."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gpe_pl.trajectory.state import State
 
 
 def check_surroundings(state: State, solver: str) -> None:
-    """Refuse what a solver would otherwise leave out without a word.
+    """Refuse surroundings that a solver would otherwise ignore silently.
 
     Raises:
         SimulationError: with reason ``input``; names the solver and what it does not compute.
@@ -30,7 +30,7 @@ def check_surroundings(state: State, solver: str) -> None:
 
 
 def _moves(boundary: Boundary) -> bool:
-    """Whether any of its nodes moves, now or later."""
+    """Tell whether any boundary node moves, now or later."""
     motion = boundary.motion
     later = motion is not None and bool(np.any(motion.vel != 0) or np.any(motion.pos != motion.pos[:1]))
     return later or bool(np.any(np.asarray(boundary.vel) != 0))

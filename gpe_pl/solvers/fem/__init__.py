@@ -1,12 +1,12 @@
 """Explicit finite elements for a deformable solid that falls on rigid obstacles: symplectic Euler with lumped masses, in float64.
 
-One substep of length h, with internal forces f, damping included (``elements``) and contact (``contact``)::
+One substep of length h, with internal forces f including damping (``elements``), and contact (``contact``)::
 
     v ← v + h f(x, v) / m + h g / 2,   v ← contact(x, v),   x ← x + h v,   v ← v + h g / 2
 
-Gravity comes in halves, so that a free body falls along the exact parabola whatever the substeps are. A body at rest on a floor keeps a velocity of h g / 2.
-h follows from the current state alone: it stays below the stability limit of the mesh as deformed now, and no node moves further
-than half the smallest height of a cell. There is no contact of the solid with itself: a scene holds one body.
+Gravity is applied in halves, so that a free body falls along the exact parabola with any substeps. A body at rest on a floor keeps a velocity of h g / 2. The
+length h depends on the current state alone. It stays below the stability limit of the present mesh, and no node moves further than half the smallest height
+of a cell. Contact of the solid with itself is not computed: a scene holds one body.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ class FEM:
     Every step stores the elastic Cauchy stress.
 
     Attributes:
-        bounds: ``(low, high)`` per axis of the domain [m], two or three of them.
+        bounds: ``(low, high)`` of the domain along each of two or three axes [m].
         frame_dt: time between frames [s].
         materials: ``("solid",)``.
-        poisson_ratio: below 0.5; linear triangles and tetrahedra stiffen from about 0.45 on.
-        damping: fraction of critical damping that viscosity gives the fastest mode of the mesh; a mode n times slower gets 1/n of it.
-        cfl: fraction of the substep that is certainly stable.
-        max_substeps: per frame; more means that the state has exploded.
+        poisson_ratio: Poisson's ratio, below 0.5; linear triangles and tetrahedra stiffen from about 0.45 on.
+        damping: viscosity as a fraction of the critical damping of the fastest mode of the mesh; a mode n times slower gets 1/n of it.
+        cfl: fraction of the largest certainly stable substep.
+        max_substeps: largest number of substeps per frame; needing more counts as an explosion.
     """
 
     bounds: tuple[tuple[float, float], ...]
@@ -78,11 +78,11 @@ class FEM:
 
     @property
     def solver_dt(self) -> float:
-        """Upper bound of the substep in s: ``frame_dt``. The substep itself depends on mesh, stiffness and deformation; see ``substep``."""
+        """Upper bound of the substep in s: ``frame_dt``. The actual substep depends on mesh, stiffness and deformation; see ``substep``."""
         return self.frame_dt
 
     def substep(self, state: State) -> float:
-        """Largest substep in s that the solver takes from this state at rest; raises what ``step`` raises for a state that does not fit."""
+        """Return the largest substep in s that the solver takes from this state if it is at rest; raise the errors of ``step``."""
         mesh, lam, mu, eta, _ = self._prepare(state)
         pos = _three_dimensional(state.pos)
         stiffest, most_viscous = _add_forces(
@@ -104,7 +104,7 @@ class FEM:
         """Advance one frame.
 
         Raises:
-            SimulationError: with reason ``input`` (arrays, mesh or boundary that do not fit the solver), ``nan``, ``escape`` (a node left the domain
+            SimulationError: with reason ``input`` (arrays, mesh or boundary do not fit the solver), ``nan``, ``escape`` (a node left the domain
                 through an open side or started outside) or ``explosion`` (more than ``max_substeps``).
         """
         mesh, lam, mu, eta, obstacles = self._prepare(state)
@@ -112,7 +112,7 @@ class FEM:
         dim = state.dim
         bounds = np.zeros((3, 2))
         bounds[:dim] = self.bounds
-        # without cells, nothing may cross the domain in one substep
+        # without cells, limit the motion in one substep to the extent of the domain
         reach = mesh.reach if math.isfinite(mesh.reach) else float(np.max(bounds[:, 1] - bounds[:, 0]))
         status, node, substeps = _advance_frame(
             KINDS[mesh.kind], pos, vel, mesh.cells, mesh.gradient, mesh.weight, lam, mu, eta, mesh.scale, self.damping > 0,
@@ -134,7 +134,7 @@ class FEM:
         )
 
     def compile_kernels(self) -> None:
-        """Compile every kernel and fill Numba's cache on disk, so that worker processes started afterwards only load it."""
+        """Compile every kernel into Numba's disk cache, so that worker processes started later only load them."""
         dim = len(self.bounds)
         middle = np.array([(low + high) / 2 for low, high in self.bounds])
         size = 0.25 * min(high - low for low, high in self.bounds)
@@ -148,13 +148,13 @@ class FEM:
         )  # fmt: skip
 
     def energy(self, state: State) -> float:
-        """Kinetic, gravitational and elastic energy in J (per metre of depth in 2D)."""
+        """Return the sum of kinetic, gravitational and elastic energy in J (per metre of depth in 2D)."""
         mesh, lam, mu, _, _ = self._prepare(state)
         external = np.sum(state.mass * (np.sum(state.vel**2, axis=1) / 2 - state.pos @ state.gravity))
         return float(external) + elastic_energy(mesh, np.asarray(state.pos), lam, mu)
 
     def _prepare(self, state: State) -> tuple[Mesh, np.ndarray, np.ndarray, np.ndarray, Obstacles]:
-        """Mesh, Lamé parameters and viscosity of each cell, and obstacles, or an error that names what does not fit."""
+        """Return mesh, Lamé parameters and viscosity of each cell, and obstacles; raise an error that names what does not fit."""
         num_nodes, dim = state.num_nodes, len(self.bounds)
         if state.rest_pos is None or state.cells is None:
             raise SimulationError("the state has no mesh: rest_pos and cells are required", reason="input")
@@ -212,7 +212,7 @@ def _require(good: np.ndarray, message: str, reason: str = "input") -> None:
 
 
 def _three_dimensional(values: np.ndarray) -> np.ndarray:
-    """A copy [..., 3]; the third component is zero in 2D."""
+    """Return a copy [..., 3]; the third component is zero in 2D."""
     values = np.asarray(values, dtype=np.float64)
     result = np.zeros((*values.shape[:-1], 3))
     result[..., : values.shape[-1]] = values
@@ -232,7 +232,7 @@ def _add_forces(kind, pos, vel, cells, gradient, weight, lam, mu, eta, damped, f
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _critical_rate(frequency_squared, damping_rate):
-    """1/h of the largest stable substep: ``h² ω² + 2 h Γ = 4``."""
+    """Return 1/h of the largest stable substep, with ``h² ω² + 2 h Γ = 4``."""
     return 0.25 * (damping_rate + math.sqrt(damping_rate * damping_rate + 4.0 * frequency_squared))
 
 
@@ -242,7 +242,7 @@ def _advance_frame(
     kind, pos, vel, cells, gradient, weight, lam, mu, eta, scale, damped, mass, gravity, bounds, reach, edges,
     obstacles, frame_dt, cfl, max_substeps,
 ):  # fmt: skip
-    """Advance pos and vel in place by one frame; returns a status, the node that caused it, and the number of substeps."""
+    """Advance pos and vel in place by one frame; return a status, the node that caused it, and the number of substeps."""
     force, box = np.zeros(pos.shape), np.empty(6)
     touched, gaps = np.full(obstacles.corners.shape[0], -1), np.zeros(obstacles.corners.shape[0])
     weighs = math.sqrt(gravity[0] * gravity[0] + gravity[1] * gravity[1] + gravity[2] * gravity[2])
@@ -254,7 +254,7 @@ def _advance_frame(
         stiffest, most_viscous = _add_forces(kind, pos, vel, cells, gradient, weight, lam, mu, eta, damped, force)
         stable = _critical_rate(scale * stiffest, scale * most_viscous) / cfl
         needed = remaining * max(stable, speed / reach, math.sqrt(weighs / reach)) * (1.0 - 1e-12)
-        if needed > max_substeps - substeps:  # before it is rounded: an integer may not hold it
+        if needed > max_substeps - substeps:  # compare before rounding, because the number may exceed an integer
             return TOO_MANY_SUBSTEPS, node, substeps
         count = max(1, math.ceil(needed))
         h = remaining / count
@@ -296,7 +296,7 @@ def _drift(pos, vel, gravity, h):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _survey(pos, vel, bounds, reach, box):
-    """Check that every node is finite and in the domain; status, node at fault (or the fastest) and largest speed. Sets ``box`` to the nodes' extent."""
+    """Check that all nodes are finite and in the domain, and set ``box`` to their extent; return status, node at fault (or the fastest) and top speed."""
     x_low = y_low = z_low = math.inf
     x_high = y_high = z_high = -math.inf
     fastest, speed_squared = (0 if pos.shape[0] > 0 else -1), 0.0
@@ -311,7 +311,7 @@ def _survey(pos, vel, bounds, reach, box):
         z_low, z_high = min(z_low, z), max(z_high, z)
     box[0], box[1], box[2], box[3], box[4], box[5] = x_low, y_low, z_low, x_high, y_high, z_high
     for axis in range(3):
-        # a node may be a little outside an open side before it counts as escaped
+        # a node counts as escaped when it is further than ``reach`` outside an open side
         if box[axis] < bounds[axis, 0] - reach or box[axis + 3] > bounds[axis, 1] + reach:
             for p in range(pos.shape[0]):
                 if pos[p, axis] < bounds[axis, 0] - reach or pos[p, axis] > bounds[axis, 1] + reach:

@@ -1,11 +1,11 @@
 """Frictional contact of mesh nodes with rigid obstacles at rest, by impulses.
 
-In each substep a node that would enter an obstacle loses just so much of its normal velocity that it arrives on the surface, and up to μ times that
-impulse of its tangential velocity (Coulomb); no-slip obstacles take all of it. Contact never adds kinetic energy, needs no stiffness, and limits no
-substep. In 2D, convex corners of polygons and boxes also act on the edges of the mesh between nodes; their impulse is shared by the edge's two nodes in
-inverse proportion to their masses. Obstacles sharper than an edge is long are not resolved otherwise: small discs, and edges and corners in 3D.
+In each substep, a node that would enter an obstacle loses just enough normal velocity to arrive on the surface. It also loses tangential velocity by an
+impulse of up to μ times the normal one (Coulomb); no-slip obstacles remove all of it. Contact never adds kinetic energy, needs no stiffness, and does not
+limit the substep. In 2D, convex corners of polygons and boxes also act on the edges of the mesh between nodes; the two nodes of an edge divide the impulse in
+inverse proportion to their masses. Other obstacles sharper than the length of an edge are not resolved: small discs, and edges and corners in 3D.
 
-Kernels treat two dimensions as three without depth, so there is one contact law for both.
+Kernels treat two dimensions as three dimensions without depth, so one contact law serves both.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, Wall
 from gpe_pl.schema import STICKY
 
 FIELD_CELLS = 64
-"""Cells along the longest axis of the grid on which an obstacle of another kind is sampled."""
+"""Number of cells along the longest axis of the grid on which obstacles of other kinds are sampled."""
 
 
 class Obstacles(NamedTuple):
     """Boundary shapes in the form that the kernels take; every array of floats ends with the friction coefficient.
 
     Attributes:
-        planes: [wall, 5] normal, offset, friction.
-        spheres: [sphere, 5] centre, radius, friction.
-        boxes: [box, 7] low, high, friction; only in 3D.
-        polygons: [polygon, 5] low x, low y, high x, high y, friction; boxes in 2D are polygons.
-        edges: [edge, 5] of all polygons, counter-clockwise, one after the other: start, vector to the end, 1 / length².
-        first_edge: [polygon + 1] where each polygon starts.
-        corners: [corner, 3] convex polygon vertices: x, y, friction.
-        fields: signed distances [field, x, y, z] on a grid over the domain, of shapes of any other kind.
-        field_friction: [field].
-        grid: [4] low corner and spacing of that grid.
+        planes: normal, offset and friction of each wall [wall, 5].
+        spheres: centre, radius and friction of each sphere [sphere, 5].
+        boxes: low corner, high corner and friction of each box [box, 7]; 3D only.
+        polygons: low x, low y, high x, high y and friction of each polygon [polygon, 5]; boxes in 2D are polygons.
+        edges: start, vector to the end and 1 / length² of the edges of all polygons, counter-clockwise, one polygon after the other [edge, 5].
+        first_edge: index of the first edge of each polygon [polygon + 1].
+        corners: x, y and friction of convex polygon vertices [corner, 3].
+        fields: signed distances of shapes of any other kind on a grid over the domain [field, x, y, z] in m.
+        field_friction: friction of each field [field].
+        grid: low corner and spacing of that grid [4] in m.
     """
 
     planes: np.ndarray
@@ -54,7 +54,7 @@ class Obstacles(NamedTuple):
 
 @lru_cache(maxsize=8)
 def collect(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ...]) -> Obstacles:
-    """Prepare shapes for the kernels; ``bounds`` are ``(low, high)`` per axis of the domain [m]."""
+    """Prepare shapes for the kernels; ``bounds`` are ``(low, high)`` of the domain along each axis [m]."""
     dim = len(bounds)
     depth = (0.0,) * (3 - dim)
     low, high = np.array(bounds, dtype=np.float64).T
@@ -113,7 +113,7 @@ def _outline(shape: Box | Polygon) -> np.ndarray:
 
 
 def _sampled(shape: Shape, low: np.ndarray, high: np.ndarray, spacing: float) -> np.ndarray:
-    """Signed distance [x, y, z] on grid points that cover the domain; without depth in 2D."""
+    """Return the signed distance [x, y, z] in m on grid points that cover the domain; without depth in 2D."""
     axes = [a + spacing * np.arange(math.ceil((b - a) / spacing - 1e-9) + 1) for a, b in zip(low, high, strict=True)]
     distance = shape.signed_distance(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1))
     return distance if len(axes) == 3 else np.stack([distance, distance], axis=-1)
@@ -122,7 +122,7 @@ def _sampled(shape: Shape, low: np.ndarray, high: np.ndarray, spacing: float) ->
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _resist(u, v, w, gap, nx, ny, nz, friction, h):
-    """Velocity after contact with a surface at distance ``gap`` along the normal n, in a substep h."""
+    """Return the velocity after contact with a surface at distance ``gap`` along the normal n, over a substep h."""
     approach, slowest = u * nx + v * ny + w * nz, -max(gap, 0.0) / h
     if approach >= slowest:
         return u, v, w
@@ -191,7 +191,7 @@ def _polygon_gap(x, y, edges, start, stop):
     gap = -math.sqrt(nearest_square) if inside else math.sqrt(nearest_square)
     if nearest_square * edges[nearest, 4] > 1e-18:
         return gap, qx / gap, qy / gap
-    # within rounding of an edge, the direction to its nearest point means nothing
+    # the direction to the nearest point of an edge is meaningless within rounding of the edge
     inv = math.sqrt(edges[nearest, 4])
     return gap, edges[nearest, 3] * inv, -edges[nearest, 2] * inv
 
@@ -199,7 +199,7 @@ def _polygon_gap(x, y, edges, start, stop):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _field_gap(x, y, z, field, grid):
-    """Trilinear interpolation of a sampled distance and the direction of its gradient."""
+    """Interpolate a sampled distance trilinearly; return it and the direction of its gradient."""
     inv = 1.0 / grid[3]
     fx, fy, fz = (x - grid[0]) * inv, (y - grid[1]) * inv, (z - grid[2]) * inv
     i = min(max(int(fx), 0), field.shape[0] - 2)
@@ -227,7 +227,7 @@ def _field_gap(x, y, z, field, grid):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _apart(box, margin, x_low, y_low, z_low, x_high, y_high, z_high):
-    """Whether two extents are further apart than a margin."""
+    """Tell whether two extents are further apart than a margin."""
     if x_low > box[3] + margin or y_low > box[4] + margin or z_low > box[5] + margin:
         return True
     return x_high < box[0] - margin or y_high < box[1] - margin or z_high < box[2] - margin
@@ -236,7 +236,7 @@ def _apart(box, margin, x_low, y_low, z_low, x_high, y_high, z_high):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _beyond(box, margin, plane):
-    """Whether an extent is further in front of a plane than a margin."""
+    """Tell whether an extent is further in front of a plane than a margin."""
     nearest = -plane[3] - margin
     for axis in range(3):
         nearest += plane[axis] * (box[axis] if plane[axis] > 0.0 else box[axis + 3])
@@ -246,7 +246,7 @@ def _beyond(box, margin, plane):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def resist_nodes(pos, vel, box, reach, h, obstacles):
-    """Slow down the nodes that would enter an obstacle. ``box`` [6] is the extent of the nodes, ``reach`` the furthest that one may move."""
+    """Slow down nodes that would enter an obstacle; ``box`` [6] is the extent of the nodes, ``reach`` the furthest that a node may move."""
     for k in range(obstacles.polygons.shape[0]):
         xl, yl, xh, yh, friction = obstacles.polygons[k]
         if _apart(box, reach, xl, yl, 0.0, xh, yh, 0.0):
@@ -290,9 +290,9 @@ def resist_nodes(pos, vel, box, reach, h, obstacles):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def push_out_nodes(pos, box, reach, obstacles):
-    """Move nodes that are inside an obstacle, by rounding or around a curved surface, to its surface; walls last, so that they always hold.
+    """Move nodes inside an obstacle, due to rounding or curved surfaces, to its surface; walls come last, so that no node ends outside them.
 
-    ``box`` and ``reach`` are those before the nodes moved.
+    ``box`` and ``reach`` are the values before the nodes moved.
     """
     margin = 2.0 * reach
     for k in range(obstacles.polygons.shape[0]):
@@ -333,7 +333,7 @@ def push_out_nodes(pos, box, reach, obstacles):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _facing_edge(x, y, pos, edges, reach):
-    """The surface edge nearest to a point in front of it or less than half its length behind: edge (-1: none), gap, position along it, normal."""
+    """Return the surface edge nearest to a point in front of it or less than half its length behind: edge (-1: none), gap, position along it, normal."""
     best, gap, along, nx, ny = -1, math.inf, 0.0, 0.0, 0.0
     for e in range(edges.shape[0]):
         a, b = edges[e, 0], edges[e, 1]
@@ -353,7 +353,7 @@ def _facing_edge(x, y, pos, edges, reach):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def resist_corners(pos, vel, mass, edges, box, reach, h, corners, touched, gaps):
-    """Slow down the mesh edges that obstacle corners would cross; ``touched`` and ``gaps`` [corner] become the edge in reach (-1: none) and its gap."""
+    """Slow down mesh edges that obstacle corners would cross; write the edge in reach (-1: none) and its gap to ``touched`` and ``gaps`` [corner]."""
     for k in range(corners.shape[0]):
         touched[k] = -1
         x, y = corners[k, 0], corners[k, 1]
@@ -378,9 +378,9 @@ def resist_corners(pos, vel, mass, edges, box, reach, h, corners, touched, gaps)
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def push_out_corners(pos, mass, edges, corners, touched, gaps):
-    """Move the edges that a corner has crossed by turning or stretching back onto it; a corner that was inside before only gets no deeper.
+    """Move edges that a corner has crossed, by turning or stretching, back onto it; keep a corner that was inside before at its depth.
 
-    To push that out would store energy in the cells around it.
+    Pushing such a corner out would store energy in the cells around it.
     """
     for k in range(corners.shape[0]):
         e = touched[k]

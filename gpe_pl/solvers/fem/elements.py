@@ -4,12 +4,12 @@ Energy per reference volume, first Piola-Kirchhoff and Cauchy stress (Bonet & Wo
 
     Ψ = μ/2 (tr FᵀF - 3) - μ log J + λ/2 (log J)²,   P = μ F + (λ log J - μ)/J cof F,   σ = P Fᵀ / J
 
-Below ``J = SMALLEST_RATIO`` the logarithm goes on along its tangent, so a crushed or inverted cell is pushed back by a finite, conservative force. On top of P
-comes an optional viscous stress ``2η F Ė`` with E the Green-Lagrange strain: objective, and never a source of energy.
+Below ``J = SMALLEST_RATIO`` the tangent of the logarithm replaces it, so a finite, conservative force pushes a crushed or inverted cell back. An optional
+viscous stress ``2η F Ė`` is added to P, with E the Green-Lagrange strain. It is objective and never a source of energy.
 
 A substep is stable while ``h² ω² + 2 h Γ <= 4``, with ω the highest frequency and Γ the highest damping rate of the mesh. The stiffness matrix is
-``Σ V Gᵀ (∂P/∂F) G`` over the quadrature points, G being the gradient, so ``ω² <= s A`` and ``Γ <= s 2η |F|²``: s, fixed by the rest configuration, is the
-largest eigenvalue of the Laplacian ``Σ V Gᵀ G`` in the metric of the nodal masses, A the largest one of ``∂P/∂F`` in any cell as deformed now.
+``Σ V Gᵀ (∂P/∂F) G`` over the quadrature points, with G the gradient, so ``ω² <= s A`` and ``Γ <= s 2η |F|²``. The rest configuration fixes s, the largest
+eigenvalue of the Laplacian ``Σ V Gᵀ G`` in the metric of the nodal masses. A is the largest eigenvalue of ``∂P/∂F`` in any cell of the present mesh.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.trajectory.state import Stress
 
 SMALLEST_RATIO = 0.2
-"""Volume ratio J below which the logarithm is continued by its tangent."""
+"""Volume ratio J below which the tangent replaces the logarithm."""
 
 _LOG_SMALLEST = math.log(SMALLEST_RATIO)
 
@@ -40,17 +40,17 @@ _GAUSS = 1.0 / math.sqrt(3.0)
 
 @dataclass(frozen=True)
 class Mesh:
-    """What the kernels need to know about the rest configuration.
+    """Rest configuration in the form that the kernels take.
 
     Attributes:
-        kind: one of ``CELLS``.
-        cells: [cell, corner].
+        kind: kind of cell, one of ``CELLS``.
+        cells: node indices of the corners [cell, corner].
         gradient: shape function gradients at the quadrature points [cell, point, corner, dim] in 1/m.
         weight: rest volume of each quadrature point [cell, point] in m^dim.
-        scale: s in m/kg: a bound of ω² per modulus.
-        reach: half the smallest height of a cell [m]; no node may move further in one substep.
+        scale: bound s of ω² per modulus, in m/kg.
+        reach: half the smallest height of a cell [m]; the largest distance that a node may move in one substep.
         edges: surface edges in 2D [edge, 2], the body on their left; empty in 3D.
-        averaging: [node, cell], weights that average cell values around each node by rest volume.
+        averaging: weights [node, cell] that average cell values around each node by rest volume.
     """
 
     kind: str
@@ -64,15 +64,15 @@ class Mesh:
 
 
 def build_mesh(rest_pos: np.ndarray, cells: np.ndarray, mass: np.ndarray) -> Mesh:
-    """Prepare a mesh; the same arrays again cost nothing.
+    """Prepare a mesh; the result for the same arrays is cached.
 
     Args:
-        rest_pos: [node, dim] in m.
-        cells: [cell, corner], positively oriented.
+        rest_pos: positions at rest [node, dim] in m.
+        cells: node indices of the corners [cell, corner], positively oriented.
         mass: lumped masses [node] in kg.
 
     Raises:
-        SimulationError: with reason ``input``: cells that are no cells of these nodes, a node of no cell, a cell of no or negative volume.
+        SimulationError: with reason ``input``, if cells do not fit these nodes, a node belongs to no cell, or a cell has no or negative volume.
     """
     rest_pos, mass = np.array(rest_pos, dtype=np.float64, order="C"), np.array(mass, dtype=np.float64, order="C")
     cells = np.asarray(cells)
@@ -124,7 +124,7 @@ def _build_mesh(rest_bytes: bytes, rest_shape: tuple[int, int], cell_bytes: byte
 
 
 def _require_sound(cells: np.ndarray, num_nodes: int) -> None:
-    """Every cell has different, existing corners, and every node is one of them."""
+    """Check that the corners of every cell are different, existing nodes, and that every node belongs to a cell."""
     wrong = np.any((cells < 0) | (cells >= num_nodes), axis=1)
     wrong |= np.any(np.diff(np.sort(cells, axis=1), axis=1) == 0, axis=1)
     if np.any(wrong):
@@ -137,7 +137,7 @@ def _require_sound(cells: np.ndarray, num_nodes: int) -> None:
 
 
 def _shape_gradients(kind: str, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gradients [cell, point, corner, dim] of the shape functions, and volumes [cell, point], for corners [cell, corner, dim]."""
+    """Return gradients [cell, point, corner, dim] of the shape functions, and volumes [cell, point], for corners [cell, corner, dim]."""
     if kind == "quad":
         signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         points = signs * _GAUSS
@@ -157,7 +157,7 @@ def _shape_gradients(kind: str, corners: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _largest_eigenvalue(cells: np.ndarray, gradient: np.ndarray, weight: np.ndarray, mass: np.ndarray) -> float:
-    """The largest eigenvalue of the Laplacian in the metric of the masses."""
+    """Return the largest eigenvalue of the Laplacian in the metric of the masses."""
     if len(cells) == 0:
         return 0.0
     per_cell = np.einsum("cq,cqad,cqbd->cab", weight, gradient, gradient) / np.sqrt(mass[cells][:, :, None] * mass[cells][:, None, :])
@@ -166,12 +166,12 @@ def _largest_eigenvalue(cells: np.ndarray, gradient: np.ndarray, weight: np.ndar
     laplacian = csr_array((per_cell.ravel(), (rows, columns)), shape=(len(mass), len(mass)))
     if len(mass) < 50:
         return float(np.linalg.eigvalsh(laplacian.toarray())[-1])
-    start = np.cos(np.arange(len(mass)) ** 2)  # the same in every run, and of no symmetry
+    start = np.cos(np.arange(len(mass)) ** 2)  # reproducible, and without symmetry
     return float(eigsh(laplacian, k=1, which="LA", v0=start, tol=1e-9, return_eigenvectors=False)[0])
 
 
 def _surface_edges(cells: np.ndarray) -> np.ndarray:
-    """Edges of exactly one plane cell [edge, 2], with the body on their left."""
+    """Return edges that belong to exactly one plane cell [edge, 2], with the body on their left."""
     count = cells.shape[1]
     edges = np.concatenate([cells[:, [k, (k + 1) % count]] for k in range(count)])
     _, first, times = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
@@ -179,15 +179,15 @@ def _surface_edges(cells: np.ndarray) -> np.ndarray:
 
 
 def cauchy_stress(mesh: Mesh, pos: np.ndarray, lam: np.ndarray, mu: np.ndarray) -> Stress:
-    """Elastic Cauchy stress [Pa] at positions [node, dim]; where J is below ``SMALLEST_RATIO`` the stress is per that share of the rest volume.
+    """Return the elastic Cauchy stress [Pa]; where J is below ``SMALLEST_RATIO``, it is relative to that fraction of the rest volume.
 
     Args:
         mesh: rest configuration.
-        pos: [node, dim] in m.
+        pos: positions [node, dim] in m.
         lam, mu: Lamé parameters [cell] in Pa.
 
     Returns:
-        Cell stress, averaged over the quadrature points, and node stress, averaged over the cells around the node, both by rest volume.
+        Cell stress, averaged over the quadrature points, and node stress, averaged over the cells around the node; both averages by rest volume.
     """
     dim = pos.shape[1]
     cell = np.zeros((len(mesh.cells), 6))
@@ -198,7 +198,7 @@ def cauchy_stress(mesh: Mesh, pos: np.ndarray, lam: np.ndarray, mu: np.ndarray) 
 
 
 def elastic_energy(mesh: Mesh, pos: np.ndarray, lam: np.ndarray, mu: np.ndarray) -> float:
-    """Stored energy ∫ Ψ in J (per metre of depth in 2D); arguments as in ``cauchy_stress``."""
+    """Return the stored energy ∫ Ψ in J (per metre of depth in 2D); arguments as in ``cauchy_stress``."""
     corners = pos[mesh.cells]
     deformation = np.einsum("cai,cqaj->cqij", corners - corners[:, :1], mesh.gradient)
     ratio = np.linalg.det(deformation)
@@ -215,7 +215,7 @@ def elastic_energy(mesh: Mesh, pos: np.ndarray, lam: np.ndarray, mu: np.ndarray)
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _volume_response(ratio, lam, mu):
-    """First and second derivative by J of ``-μ log J + λ/2 (log J)²``."""
+    """Return the first and second derivative by J of ``-μ log J + λ/2 (log J)²``."""
     if ratio > SMALLEST_RATIO:
         slope = 1.0 / ratio
         excess = lam * math.log(ratio) - mu
@@ -271,7 +271,7 @@ def _average_stress(pos, cells, gradient, weight, lam, mu, stress):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _plane_response(f00, f01, f10, f11, lam, mu):
-    """P and the largest eigenvalue of ∂P/∂F in plane strain, from its values in principal stretches."""
+    """Return P and the largest eigenvalue of ∂P/∂F in plane strain, from its values in principal stretches."""
     ratio = f00 * f11 - f01 * f10
     first, second = _volume_response(ratio, lam, mu)
     trace = second * (f00 * f00 + f01 * f01 + f10 * f10 + f11 * f11)
@@ -283,7 +283,7 @@ def _plane_response(f00, f01, f10, f11, lam, mu):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _plane_viscous(f00, f01, f10, f11, d00, d01, d10, d11, eta):
-    """``2η F Ė`` for F and its rate, and its largest derivative by the rate."""
+    """Return ``2η F Ė`` for F and its rate, and its largest derivative by the rate."""
     e00, e11 = f00 * d00 + f10 * d10, f01 * d01 + f11 * d11
     e01 = 0.5 * (f00 * d01 + f10 * d11 + f01 * d00 + f11 * d10)
     twice, square, ratio = 2.0 * eta, f00 * f00 + f01 * f01 + f10 * f10 + f11 * f11, f00 * f11 - f01 * f10
@@ -300,7 +300,7 @@ def _plane_viscous(f00, f01, f10, f11, d00, d01, d10, d11, eta):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def add_triangle_forces(pos, vel, cells, gradient, weight, lam, mu, eta, damped, force):
-    """Add the internal forces of linear triangles to ``force`` [node, 3]; returns the largest A and 2η |F|² of any point."""
+    """Add the internal forces of linear triangles to ``force`` [node, 3]; return the largest A and 2η |F|² of any point."""
     stiffest = most_viscous = 0.0
     for c in range(cells.shape[0]):
         i, j, k = cells[c, 0], cells[c, 1], cells[c, 2]
@@ -330,7 +330,7 @@ def add_triangle_forces(pos, vel, cells, gradient, weight, lam, mu, eta, damped,
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def add_quad_forces(pos, vel, cells, gradient, weight, lam, mu, eta, damped, force):
-    """Add the internal forces of bilinear quadrilaterals, at 2 × 2 points to ``force`` [node, 3]; returns the largest A and 2η |F|² of any point."""
+    """Add the internal forces of bilinear quadrilaterals, at 2 × 2 points, to ``force`` [node, 3]; return the largest A and 2η |F|² of any point."""
     stiffest = most_viscous = 0.0
     for c in range(cells.shape[0]):
         i, j, k, n = cells[c, 0], cells[c, 1], cells[c, 2], cells[c, 3]
@@ -376,10 +376,10 @@ def _combine(x, a, y, b, z, c):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _largest_stretch_stiffness(fx, fy, fz, cx, cy, cz, first, second):
-    """Bound of the largest eigenvalue of ``first S + second c cᵀ``, the response to changes of the principal stretches s beside μ.
+    """Bound the largest eigenvalue of ``first S + second c cᵀ``, the response to changes of the principal stretches s apart from μ.
 
-    ``c = J/s`` and S has the third stretch at each pair of the two others. Mean and deviation of the eigenvalues, hence the bound (Wolkowicz & Styan
-    1980), follow from the rows of F and of its cofactor.
+    ``c = J/s``, and S has the third stretch at each pair of the two others. The mean and deviation of the eigenvalues follow from the rows of F and of its
+    cofactor, and give the bound (Wolkowicz & Styan 1980).
     """
     square = _dot(fx, fx) + _dot(fy, fy) + _dot(fz, fz)
     trace = second * (_dot(cx, cx) + _dot(cy, cy) + _dot(cz, cz))
@@ -390,7 +390,7 @@ def _largest_stretch_stiffness(fx, fy, fz, cx, cy, cz, first, second):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _viscous_row(eta, row, fx, fy, fz, dx, dy, dz):
-    """A row of ``2η F Ė = η (F Fᵀ Ḟ + F Ḟᵀ F)``, from the rows of F and its rate."""
+    """Return a row of ``2η F Ė = η (F Fᵀ Ḟ + F Ḟᵀ F)``, from the rows of F and its rate."""
     a = _combine(_dot(row, fx), dx, _dot(row, fy), dy, _dot(row, fz), dz)
     b = _combine(_dot(row, dx), fx, _dot(row, dy), fy, _dot(row, dz), fz)
     return eta * (a[0] + b[0]), eta * (a[1] + b[1]), eta * (a[2] + b[2])
@@ -405,7 +405,7 @@ def _edge(x, i, j):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def add_tetrahedron_forces(pos, vel, cells, gradient, weight, lam, mu, eta, damped, force):
-    """Add the internal forces of linear tetrahedra to ``force`` [node, 3]; returns the largest A and 2η |F|² of any point."""
+    """Add the internal forces of linear tetrahedra to ``force`` [node, 3]; return the largest A and 2η |F|² of any point."""
     stiffest = most_viscous = 0.0
     for c in range(cells.shape[0]):
         i = cells[c, 0]
@@ -421,7 +421,7 @@ def add_tetrahedron_forces(pos, vel, cells, gradient, weight, lam, mu, eta, damp
             _combine(mu[c], fy, first, cy, 0.0, fy),
             _combine(mu[c], fz, first, cz, 0.0, fz),
         )
-        # Gershgorin's bound of the largest squared stretch
+        # Gershgorin's bound on the largest squared stretch
         xy, xz, yz = abs(_dot(fx, fy)), abs(_dot(fx, fz)), abs(_dot(fy, fz))
         square = max(_dot(fx, fx) + xy + xz, _dot(fy, fy) + xy + yz, _dot(fz, fz) + xz + yz)
         stiffest = max(

@@ -1,7 +1,7 @@
-"""The staggered grid, and what rigid boundaries leave open of it.
+"""The staggered grid, and the space that rigid boundaries leave open in it.
 
-Cells are numbered in C order; one index addresses a cell, its lower face along each axis, its lower edge in each plane of axes and its lowest node, so
-every quantity is an array over cells and a neighbour is a stride away. Velocity components live on the faces, pressure and density at cell centres,
+Cells are numbered in C order. One index addresses a cell, its lower face along each axis, its lower edge in each plane of axes and its lowest node. Every
+quantity is therefore an array over cells, and a neighbour is one stride away. Velocity components live on the faces, pressure and density at cell centres,
 shear stress at edges (nodes in 2D), signed distances of solids at nodes. Lengths are in cells.
 """
 
@@ -17,34 +17,34 @@ from gpe_pl.geometry.shapes import Shape, signed_distance
 from gpe_pl.solvers.flip import transfer
 
 PADDING = 3
-"""Cells between the domain and the edge of the grid: room for the kernels of a particle that is up to one cell outside."""
+"""Number of cells between the domain and the edge of the grid, for the kernels of a particle up to one cell outside."""
 
 FAR = 1e3
-"""Largest signed distance in cells; stands for infinity where there is no solid."""
+"""Largest signed distance in cells; it also stands for infinity, in a domain without solids."""
 
 SMALLEST_OPENING = 1e-3
-"""Faces that are open by less are closed."""
+"""Open fraction below which a face counts as closed."""
 
 POINTS_PER_CELL = 4
-"""Points along each axis of a cell that measure the free space around it."""
+"""Number of points along each axis of a cell that measure the free space around it."""
 
 CELLS_AT_ONCE = 10_000
-"""So many cells are filled with points at a time, which takes some 50 MB."""
+"""Number of cells that are filled with points at a time; this takes about 50 MB."""
 
 HALF = 0.5
-"""The centre of a cell counts as solid where less of the kernel around it is open."""
+"""Open fraction of the kernel around a cell's centre below which the centre counts as solid."""
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Where the cells are.
+    """Geometry of the grid.
 
     Attributes:
-        counts: cells along each axis, padding included.
+        counts: number of cells along each axis, padding included.
         strides: index difference of neighbours along each axis [dim].
-        corners: index difference of the 2^dim corners of a cell, bit b of the number for axis b.
+        corners: index differences from a cell to its 2^dim corners; bit b of the corner's number belongs to axis b.
         origin: position of the lowest node [dim] in m.
-        spacing: Δ in m.
+        spacing: grid spacing Δ in m.
     """
 
     counts: np.ndarray
@@ -64,15 +64,15 @@ class Grid:
 
 @dataclass(frozen=True)
 class Solids:
-    """What boundaries leave open, in arrays over all cells.
+    """Open space that boundaries leave, in arrays over all cells.
 
     Attributes:
         distance: signed distance of nodes [cell] in cells, positive in free space.
-        face_distance: the same at face centres [axis, cell]; not positive for closed faces.
+        face_distance: signed distance of face centres [axis, cell] in cells; not positive for closed faces.
         area: open fraction of faces [axis, cell]; exactly 0 for closed faces.
         is_open: whether a cell has an open face [cell].
         cell_room: integral over free space of the kernel around each cell centre [cell]; 1 away from solids.
-        face_room: the same around face centres [axis, cell].
+        face_room: integral over free space of the kernel around each face centre [axis, cell].
     """
 
     distance: np.ndarray
@@ -85,7 +85,7 @@ class Solids:
 
 @lru_cache(maxsize=8)
 def make_grid(bounds: tuple[tuple[float, float], ...], spacing: float) -> Grid:
-    """The grid of a domain whose low corner is a node."""
+    """Make the grid of a domain whose low corner is a node."""
     counts = np.array([round((high - low) / spacing) + 2 * PADDING for low, high in bounds])
     strides = np.array([int(np.prod(counts[axis + 1 :])) for axis in range(len(counts))])
     corners = np.array([sum(int(s) for b, s in enumerate(strides) if k >> b & 1) for k in range(1 << len(counts))])
@@ -97,17 +97,17 @@ def make_solids(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ..
     """Sample the boundary on the grid of a domain."""
     grid = make_grid(bounds, spacing)
     dim, counts = grid.dim, grid.counts
-    # one layer of nodes more than cells, so that every cell has all its corners
+    # there is one more layer of nodes than of cells, so that every cell has all its corners
     lines = [o + spacing * np.arange(n + 1) for o, n in zip(grid.origin, counts, strict=True)]
     nodes = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1)
     distance = np.clip(signed_distance(shapes, nodes) / spacing, -FAR, FAR)
-    distance[np.abs(distance) < 1e-9] = 0.0  # a node on a wall, whatever the rounding
+    distance[np.abs(distance) < 1e-9] = 0.0  # a node on a wall, despite rounding
 
     def corner(bits: tuple[int, ...]) -> np.ndarray:
         return distance[tuple(slice(bit, bit + n) for bit, n in zip(bits, counts, strict=True))]
 
     def corners(free: list[int]) -> list[np.ndarray]:
-        """Values at the corners of the cell's lower facet along the free axes, the last axis fastest."""
+        """Return the values at the corners of the cell's lower facet along the free axes, the last axis fastest."""
         return [
             corner(tuple(dict(zip(free, bits, strict=True)).get(b, 0) for b in range(dim)))
             for bits in itertools.product((0, 1), repeat=len(free))
@@ -117,7 +117,7 @@ def make_solids(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ..
     area = np.stack([_open_fraction(corners(axes)) for axes in others])
     cell_room, face_room = _rooms(shapes, grid, np.stack(corners(list(range(dim)))))
     area[area < SMALLEST_OPENING] = 0.0
-    # a cell whose centre is solid gets its density from open neighbours whose centre is not; without one it is closed
+    # a cell with a solid centre gets its density from open neighbours with a free centre; without such a neighbour it is closed
     free = cell_room >= HALF
     reaches = [(area[k] > 0) & np.roll(free, 1, k) | (np.roll(area[k], -1, k) > 0) & np.roll(free, -1, k) for k in range(dim)]
     closed = ~free & ~np.any(reaches, axis=0)
@@ -137,7 +137,7 @@ def make_solids(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ..
 
 
 def _open_fraction(corners: list[np.ndarray], slices: int = 8) -> np.ndarray:
-    """Fraction of a segment, square or cube in free space, from the signed distances of its corners; exact along the last axis, else the midpoint rule."""
+    """Return the fraction of a segment, square or cube in free space from signed distances of its corners; exact along the last axis, else by midpoints."""
     if len(corners) == 2:
         high = np.maximum(*corners)
         return np.where(high > 0, high / np.where(high > 0, high - np.minimum(np.minimum(*corners), 0.0), 1.0), 0.0)
@@ -150,13 +150,13 @@ def _open_fraction(corners: list[np.ndarray], slices: int = 8) -> np.ndarray:
 
 
 def _rooms(shapes: tuple[Shape, ...], grid: Grid, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``cell_room`` and ``face_room`` of ``Solids``, from the signed distances of the corners of cells [corner, …].
+    """Return ``cell_room`` and ``face_room`` of ``Solids`` from the signed distances of the corners of cells [corner, …].
 
-    Cells that a surface may cut are filled with a fine lattice of points, which go through the kernel of the particles. So evenly spread particles have
-    density 1 also next to solids, whatever their direction.
+    Cells that a surface may cut are filled with a fine lattice of points, which are weighted with the particle kernel. Evenly spread particles therefore have
+    density 1 also next to solids of any direction.
     """
     dim, points = grid.dim, POINTS_PER_CELL
-    reach = 0.5 * dim**0.5  # every point of a cell is that close to a corner
+    reach = 0.5 * dim**0.5  # every point of a cell is within this distance of a corner
     whole = np.min(corners, axis=0) > reach
     cut = np.argwhere(~whole & (np.max(corners, axis=0) > -reach))
     offsets = (np.stack(np.meshgrid(*[np.arange(points)] * dim, indexing="ij"), axis=-1).reshape(-1, dim) + 0.5) / points
@@ -177,10 +177,10 @@ def _rooms(shapes: tuple[Shape, ...], grid: Grid, corners: np.ndarray) -> tuple[
 
 
 def _around_centers(x: np.ndarray, axis: int) -> np.ndarray:
-    """Integrate what is constant in cells against a hat of half-width 1 around cell centres, along one axis."""
+    """Integrate a quantity that is constant in cells against a hat of half-width 1 around cell centres, along one axis."""
     return 0.75 * x + 0.125 * (np.roll(x, 1, axis) + np.roll(x, -1, axis))
 
 
 def _around_faces(x: np.ndarray, axis: int) -> np.ndarray:
-    """The same around lower faces."""
+    """Integrate as ``_around_centers``, around lower faces."""
     return 0.5 * (x + np.roll(x, 1, axis))

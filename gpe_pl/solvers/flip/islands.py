@@ -1,4 +1,4 @@
-"""Connected bodies of liquid: which of them fly freely, and which fill a closed space."""
+"""Connected bodies of liquid (islands): which of them fly freely, and which fill a closed space."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def find_islands(active, strides, area, density, weight, liquid, island):
     Args:
         active: touched cells in ascending order.
         area, weight: open fraction and density of faces [axis, cell].
-        density: of cells [cell].
+        density: density of cells [cell].
         liquid: number of each liquid cell, 0 for the others [cell].
-        island: filled with the label of each cell that holds mass [cell].
+        island: output, the label of each cell that holds mass [cell].
 
     Returns:
-        For each island whether it touches no solid, and whether it has no free surface.
+        For each island, whether it touches no solid, and whether it has no free surface.
     """
     dim = strides.shape[0]
     for n in range(active.shape[0]):
@@ -59,22 +59,22 @@ def find_islands(active, strides, area, density, weight, liquid, island):
                 is_free[i] = False
             if area[a, face] > 0.0 and (liquid[c] == 0 or liquid[other] == 0):
                 is_full[i] = False
-    for n in range(active.shape[0]):  # the loops above needed the numbers of the cells
+    for n in range(active.shape[0]):  # comes last, because the loops above use the numbers of the cells
         island[active[n]] = _root(parent, n)
     return is_free, is_full
 
 
 @dataclass(frozen=True)
 class Flying:
-    """Particles of islands that touch no solid, as they were before a substep.
+    """Particles of islands that touch no solid, in their state before a substep.
 
-    Only gravity moves the centre of mass of such an island, which the pressure at a free surface respects only up to the accuracy of the grid.
+    Only gravity moves the centre of mass of such an island. The pressure at a free surface satisfies this only to the accuracy of the grid.
 
     Attributes:
-        node: which particles [flying].
-        island: their island, numbered from 0 [flying].
-        mass: [flying] in kg.
-        pos, vel: [flying, dim].
+        node: indices of the particles [flying].
+        island: island of each particle, numbered from 0 [flying].
+        mass: masses [flying] in kg.
+        pos, vel: positions and velocities [flying, dim] in m and m/s.
     """
 
     node: np.ndarray
@@ -85,12 +85,12 @@ class Flying:
 
     @classmethod
     def select(cls, island: np.ndarray, is_free: np.ndarray, pos: np.ndarray, vel: np.ndarray, mass: np.ndarray) -> Flying:
-        """Remember the particles whose island [node] is free."""
+        """Copy the particles whose island [node] is free."""
         node = np.flatnonzero(is_free[island])
         return cls(node, np.unique(island[node], return_inverse=True)[1], mass[node], pos[node], vel[node])
 
     def balance(self, pos: np.ndarray, vel: np.ndarray, gravity: np.ndarray, h: float) -> None:
-        """Move each island as a whole so that its centre of mass followed the parabola of free fall for a time h [s]."""
+        """Move each island as a whole so that its centre of mass follows the parabola of free fall over a time h [s]."""
         if len(self.node) == 0:
             return
         total = np.bincount(self.island, self.mass)

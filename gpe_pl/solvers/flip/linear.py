@@ -1,6 +1,7 @@
 """Preconditioned conjugate gradients for sparse symmetric positive (semi-)definite systems, shared by pressure and viscosity.
 
-A matrix is its diagonal and its strict lower triangle by rows: row i holds ``value[k]`` in column ``column[k] < i`` for k in ``start[i] … start[i + 1]``.
+A matrix is stored as its diagonal and its strict lower triangle by rows: row i has ``value[k]`` in column ``column[k] < i`` for k in
+``start[i] … start[i + 1]``.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from numba import njit
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def incomplete_cholesky(diagonal, start, column, value, modified):
-    """Inverse pivots 1/d of the preconditioner ``(D + L) D⁻¹ (D + Lᵀ)``, with L the strict lower triangle of the matrix itself.
+    """Return the inverse pivots 1/d of the preconditioner ``(D + L) D⁻¹ (D + Lᵀ)``, with L the strict lower triangle of the matrix.
 
-    With ``modified = 0`` its diagonal is that of the matrix. With ``modified = 1`` its row sums are, for matrices whose graph has no triangles: MIC(0) of
-    Gustafsson 1978; values just below 1 are safer. A pivot that would fall below a quarter of the diagonal is replaced by the diagonal (Bridson 2015,
-    section 5.3).
+    With ``modified = 0`` the preconditioner has the diagonal of the matrix. With ``modified = 1`` it has the row sums of the matrix, if the graph of the matrix
+    has no triangles: MIC(0) of Gustafsson 1978. Values just below 1 are safer. A pivot below a quarter of the diagonal is replaced by the diagonal (Bridson
+    2015, section 5.3).
     """
     n = diagonal.shape[0]
     inverse, below = np.empty(n), np.zeros(n)
@@ -37,7 +38,7 @@ def incomplete_cholesky(diagonal, start, column, value, modified):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _multiply(diagonal, start, column, value, x, out):
-    """Write the product with x to ``out``; returns its inner product with x."""
+    """Write the product with x to ``out``; return its inner product with x."""
     total = 0.0
     for i in range(x.shape[0]):
         xi = x[i]
@@ -53,7 +54,7 @@ def _multiply(diagonal, start, column, value, x, out):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _precondition(start, column, value, inverse, r, z, above):
-    """Solve ``(D + L) D⁻¹ (D + Lᵀ) z = r``; returns the inner product of r and z. ``above`` is scratch space."""
+    """Solve ``(D + L) D⁻¹ (D + Lᵀ) z = r``; return the inner product of r and z. ``above`` is scratch space."""
     n = r.shape[0]
     for i in range(n):
         total = r[i]
@@ -74,7 +75,7 @@ def _precondition(start, column, value, inverse, r, z, above):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def conjugate_gradients(diagonal, start, column, value, right, inverse, x, tolerance, max_iterations):
-    """Improve x in place until the largest residual is at most ``tolerance``; returns the number of iterations and the largest residual."""
+    """Improve x in place until the largest residual is at most ``tolerance``; return the number of iterations and the largest residual."""
     n = x.shape[0]
     r, z, s, q, above = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     _multiply(diagonal, start, column, value, x, q)

@@ -1,12 +1,12 @@
-"""Pressure: the projection onto velocities without divergence between curved solids and a free surface.
+"""Pressure: the projection onto divergence-free velocities between curved solids and a free surface.
 
-Solids enter by the open fractions A of the faces (Batty, Bertails and Bridson 2007; the finite-volume form of Ng, Min and Gibou 2009), the free surface by
-the ghost fluid method (Enright et al. 2003): where it cuts the line between a liquid and an empty cell at a share θ, pressure is zero there. With
-the scaled pressure ``p = h P / (ρ Δ)`` in m/s, the equations of the liquid cells and the update of their faces are ::
+Solids enter by the open fractions A of the faces (Batty, Bertails and Bridson 2007; the finite-volume form of Ng, Min and Gibou 2009). The free surface enters
+by the ghost fluid method (Enright et al. 2003): it cuts the line between a liquid and an empty cell at the fraction θ, and pressure is zero there. With the
+scaled pressure ``p = h P / (ρ Δ)`` in m/s, the equations of the liquid cells and the update of their faces are ::
 
     Σ_faces ± A (u - Δp) = 0,    u ← u - Δp,    Δp = p_c - p_n   or   p_c / θ towards an empty cell
 
-The same matrix serves the correction of the particle density (Kugelstadt et al. 2019).
+The correction of the particle density uses the same matrix (Kugelstadt et al. 2019).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SMALLEST_SHARE = 0.01
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def surface_distance(density):
-    """Signed distance to the free surface in cells, negative in the liquid, from the density at a cell centre; exact for a plane along the axes."""
+    """Return the signed distance to the free surface in cells, negative in the liquid, from the density at a cell centre; exact for axis-aligned planes."""
     if density >= 0.5:
         return math.sqrt(2.0 * max(0.0, 1.0 - density)) - 1.0
     return 1.0 - math.sqrt(2.0 * max(0.0, density))
@@ -33,14 +33,14 @@ def surface_distance(density):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _drop(inside, outside):
-    """1/θ of the face between a liquid and an empty cell."""
+    """Return 1/θ of the face between a liquid and an empty cell."""
     return 1.0 / max(SMALLEST_SHARE, inside / (inside - outside))
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def reach_into_solids(active, strides, area, cell_room, half, density, touched):
-    """Mark as touched the open cells whose centre is solid next to cells with mass whose centre is not."""
+    """Mark as touched the open cells with a solid centre that lie next to a cell with mass and a free centre."""
     for n in active:
         if not density[n] > 0.0 or cell_room[n] < half:
             continue
@@ -53,9 +53,10 @@ def reach_into_solids(active, strides, area, cell_room, half, density, touched):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def extend_into_solids(active, strides, area, cell_room, half, density, viscous):
-    """Give cells whose centre is solid their density together with as much liquid as ``half`` a cell of their open neighbours holds.
+    """Add liquid to cells with a solid centre: the amount in ``half`` a cell of their open neighbours.
 
-    Alone, too few particles measure it: liquid that seems empty would suck in its surroundings. Without its own mass, particles would gather in it.
+    Too few particles measure their density otherwise: liquid that seems empty would draw in its surroundings. The cell's own mass counts too; otherwise
+    particles would gather in it.
     """
     for c in active:
         if cell_room[c] >= half:
@@ -76,7 +77,7 @@ def extend_into_solids(active, strides, area, cell_room, half, density, viscous)
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def liquid_cells(active, is_open, density, unknown):
-    """Number the liquid cells from 1 in ``unknown`` [cell], which is 0 elsewhere; returns their list."""
+    """Number the liquid cells from 1 in ``unknown`` [cell], which is 0 elsewhere; return their list."""
     found = np.empty(active.shape[0], dtype=np.int64)
     n = 0
     for c in active:
@@ -110,7 +111,7 @@ def fill_open_faces(liquid, strides, area, weight, velocity, touch):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def pressure_matrix(liquid, unknown, strides, area, density):
-    """Matrix of the scaled pressure over the liquid cells: diagonal and lower triangle as in ``linear``."""
+    """Return the matrix of the scaled pressure over the liquid cells: diagonal and lower triangle as in ``linear``."""
     dim, n = strides.shape[0], liquid.shape[0]
     diagonal, start = np.zeros(n), np.zeros(n + 1, dtype=np.int64)
     column, value = np.empty(n * dim, dtype=np.int64), np.empty(n * dim)
@@ -138,7 +139,7 @@ def pressure_matrix(liquid, unknown, strides, area, density):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def inflow(liquid, strides, area, velocity):
-    """Sum of the velocities into each liquid cell [m/s]."""
+    """Return the sum of the velocities into each liquid cell [m/s]."""
     total = np.zeros(liquid.shape[0])
     for i in range(liquid.shape[0]):
         c = liquid[i]
@@ -150,7 +151,7 @@ def inflow(liquid, strides, area, velocity):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def subtract_gradient(liquid, unknown, strides, area, density, pressure, velocity):
-    """Update the open faces of the liquid cells with the scaled pressure."""
+    """Subtract the gradient of the scaled pressure from the velocities on the open faces of the liquid cells."""
     for i in range(liquid.shape[0]):
         c = liquid[i]
         inside = surface_distance(density[c])
@@ -169,7 +170,7 @@ def subtract_gradient(liquid, unknown, strides, area, density, pressure, velocit
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def excess_density(liquid, unknown, strides, is_open, density, largest):
-    """Relative volume by which each liquid cell should expand, within ``±largest``; cells next to empty ones never contract."""
+    """Return the relative volume by which each liquid cell should expand, within ``±largest``; cells next to empty ones never contract."""
     dim = strides.shape[0]
     excess = np.empty(liquid.shape[0])
     total = 1

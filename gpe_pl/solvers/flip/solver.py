@@ -1,4 +1,4 @@
-"""``FLIP``: the solver that steps states of liquid particles."""
+"""``FLIP``: the solver for states of liquid particles."""
 
 from __future__ import annotations
 
@@ -27,31 +27,31 @@ TOUCH = 1e-30
 """Weight of faces whose velocity is known although no particle reaches them."""
 
 SHARE_TIME = 0.01
-"""Time in s to which the shares ``pic`` and ``evening`` refer, whatever the frames and substeps are."""
+"""Time in s to which the fractions ``pic`` and ``evening`` refer, for any length of frames and substeps."""
 
 MODIFIED = 0.97
-"""How far the preconditioner of the pressure keeps row sums; see ``incomplete_cholesky``."""
+"""Degree to which the preconditioner of the pressure keeps row sums; see ``incomplete_cholesky``."""
 
 DENSITY_TOLERANCE = 1e-2
-"""Largest residual of the density correction, as a share of a cell's volume."""
+"""Largest residual of the density correction, as a fraction of a cell's volume."""
 
 NEAR = 3.0
-"""Particles whose cell is further from solids, in cells, are not inside any."""
+"""Distance of a cell from solids, in cells, beyond which its particles are inside no solid."""
 
 LARGEST_EXCESS = 0.5
-"""Relative change of a cell's volume that the density correction may ask for in one substep."""
+"""Largest relative change of a cell's volume in the density correction of one substep."""
 
 
 @dataclass(frozen=True)
 class Fields:
-    """The grid's arrays during a substep; unchanged outside the active cells.
+    """Arrays of the grid during a substep; they are unchanged outside the active cells.
 
     Attributes:
-        velocity: on faces [axis, cell] in m/s.
-        old: the same before the forces.
-        shift: displacement that corrects the density, on faces [axis, cell] in m.
+        velocity: velocities on faces [axis, cell] in m/s.
+        old: velocities on faces before the forces [axis, cell] in m/s.
+        shift: displacement on faces that corrects the density [axis, cell] in m.
         weight: density around faces, relative to that of the liquid [axis, cell].
-        density: the same around cell centres [cell].
+        density: density around cell centres, relative to that of the liquid [cell].
         viscous: density times kinematic viscosity [cell] in m²/s.
         touched: whether a particle reaches the cell or its lower faces [cell].
         liquid: number of each liquid cell from 1, else 0 [cell].
@@ -72,7 +72,7 @@ class Fields:
 
     @classmethod
     def empty(cls, grid: Grid) -> Fields:
-        """Arrays without liquid."""
+        """Return arrays without liquid."""
         faces, cells = (grid.dim, grid.num_cells), grid.num_cells
         return cls(
             np.zeros(faces), np.zeros(faces), np.zeros(faces), np.zeros(faces), np.zeros(cells), np.zeros(cells), np.zeros(cells, np.bool_),
@@ -81,20 +81,20 @@ class Fields:
 
 
 _idle: dict[tuple[tuple[tuple[float, float], ...], float], Fields] = {}
-"""Empty fields of the grid that was used last, by bounds and spacing: to fill new arrays with zeros would take longer than a substep. Who takes them out
-owns them, and puts them back only after success, so neither threads nor errors can meet fields that are not empty."""
+"""Empty fields of the grid used last, by bounds and spacing, because filling new arrays with zeros would take longer than a substep. A caller takes the fields
+out, owns them, and puts them back only after success, so that neither threads nor errors meet fields that are not empty."""
 
 
 @dataclass(frozen=True)
 class Liquid:
-    """The liquid cells with the matrix of their pressure.
+    """Liquid cells with the matrix of their pressure.
 
     Attributes:
-        cells: [liquid] as numbered in ``Fields.liquid``.
+        cells: indices of the liquid cells, in the order of ``Fields.liquid`` [liquid].
         is_free: whether a cell belongs to an island that touches no solid [liquid].
-        closed: label of the closed space that a cell is in, -1 where there is a free surface [liquid].
-        matrix: see ``linear``.
-        inverse: pivots of its preconditioner [liquid].
+        closed: label of the closed space of a cell, -1 if the cell's body has a free surface [liquid].
+        matrix: matrix in the form of ``linear``.
+        inverse: inverse pivots of its preconditioner [liquid].
     """
 
     cells: np.ndarray
@@ -106,29 +106,30 @@ class Liquid:
 
 @validated_dataclass(frozen=True, config={"extra": "forbid"})
 class FLIP:
-    """Incompressible liquid with a free surface by the fluid-implicit-particle method; a ``Simulator``.
+    """Solver for incompressible liquid with a free surface by the fluid-implicit-particle method; a ``Simulator``.
 
     A substep transfers the particles' velocities to a staggered grid (Zhu and Bridson 2005), adds gravity, solves for viscosity and then for pressure, and
-    moves the particles with the grid. Solids stop the liquid exactly at their surface: for pressure the liquid slips along them, for viscosity it does not
-    slip, whatever their friction; at a small viscosity the layer at rest is as thin as physics makes it. Bodies of liquid that touch no solid follow a
-    parabola exactly. Obstacles and gaps should be at least two cells wide.
+    moves the particles with the grid. Solids stop the liquid exactly at their surface. Pressure lets the liquid slip along solids, and viscosity is solved
+    with no slip, for any friction coefficient; at a small viscosity the layer at rest has its physical thickness. Bodies of liquid that touch no solid follow
+    a parabola exactly. Obstacles and gaps should be at least two cells wide.
 
-    The share ``pic`` acts like a further kinematic viscosity ``Δ²/(6τ)`` with ``τ = -10 ms / ln(1 - pic)``, however long the substeps are: a trip to the grid
-    and back spreads momentum with the variance Δ²/3 along each axis. It is ``numerical_viscosity``; flows of a liquid that is thinner differ little.
+    The fraction ``pic`` acts like an additional kinematic viscosity ``Δ²/(6τ)`` with ``τ = -10 ms / ln(1 - pic)``, for any length of substeps, because a
+    transfer to the grid and back spreads momentum with the variance Δ²/3 along each axis. ``numerical_viscosity`` gives its value. Below this value, the
+    viscosity of the liquid has little effect.
 
     Attributes:
-        bounds: ``(low, high)`` per axis of the domain [m], two or three axes; whole multiples of the grid spacing apart.
-        grid_spacing: Δ [m]; about two particles per cell and axis.
+        bounds: ``(low, high)`` of the domain along each of two or three axes [m]; each extent is a whole multiple of the grid spacing.
+        grid_spacing: grid spacing Δ [m]; choose it for about two particles per cell and axis.
         frame_dt: time between frames [s].
-        materials: every material of the data set, which fixes the columns of ``State.material_params``; only ``fluid`` can move.
-        density: [kg/m³]; with the particles' masses it says how much room each of them takes.
-        pic: share of the grid's velocity in a particle's velocity after 10 ms, which damps what the grid does not see.
-        evening: share of the error of the particles' density that is corrected in 10 ms, except in bodies that fly freely.
-        cfl: cells that a particle may cross in one substep.
-        max_substeps: per frame; more means that the state has exploded.
+        materials: every material of the data set; they determine the columns of ``State.material_params``. Only ``fluid`` is supported.
+        density: density of the liquid [kg/m³]; with the particles' masses it gives their volumes.
+        pic: fraction of the grid's velocity in a particle's velocity after 10 ms, which damps motion that the grid does not resolve.
+        evening: fraction of the error of the particle density that is corrected in 10 ms, except in bodies that fly freely.
+        cfl: number of cells that a particle may cross in one substep.
+        max_substeps: largest number of substeps per frame; needing more counts as an explosion.
         pressure_tolerance: largest relative change of a liquid cell's volume in a substep.
         viscosity_tolerance: largest residual of the viscous system over the largest speed.
-        max_iterations: of each linear solver.
+        max_iterations: largest number of iterations of each linear solver.
     """
 
     bounds: tuple[tuple[float, float], ...]
@@ -166,14 +167,14 @@ class FLIP:
 
     @property
     def smallest_resolved(self) -> dict[str, float]:
-        """Smallest parameter of each material that is not below what the grid adds to it."""
+        """Smallest parameter value of each material that exceeds the numerical contribution of the grid."""
         return {MATERIAL: self.numerical_viscosity}
 
     def compile_kernels(self) -> None:
-        """Compile every kernel and fill Numba's cache on disk, so that worker processes started afterwards only load it; good for 2D and 3D."""
+        """Compile every kernel, for 2D and 3D, into Numba's disk cache, so that worker processes started later only load them."""
         bounds = ((0.0, 1.0), (0.0, 1.0))
         boundary = Boundary.sample(domain_walls(bounds, 0.0), 0.25, 2)
-        # a cell full of liquid in a corner, so that no step is left out
+        # a cell full of liquid in a corner runs through every part of a step
         state = State(
             np.full((4, 2), 0.1), np.zeros((4, 2)), np.full(4, node_code(MATERIAL), np.uint8), np.full(4, 15.0), np.full((4, 1), 0.1), boundary,
             np.array([0.0, -9.81]),
@@ -184,12 +185,12 @@ class FLIP:
         """Advance one frame.
 
         Raises:
-            SimulationError: with reason ``input`` (arrays or boundaries that do not fit the solver), ``nan``, ``escape`` (a particle left the domain
+            SimulationError: with reason ``input`` (arrays or boundaries do not fit the solver), ``nan``, ``escape`` (a particle left the domain
                 through an open side or started outside) or ``explosion`` (more than ``max_substeps``, or a linear system that could not be solved).
         """
         viscosity_of_node = self._check(state)
         solids = self.solids(state.boundary)
-        # np.array copies: the kernels work in place and the caller's arrays must not change
+        # np.array copies: the kernels work in place, and the caller's arrays must not change
         pos, vel = np.array(state.pos, dtype=np.float64, order="C"), np.array(state.vel, dtype=np.float64, order="C")
         gravity, mass = np.array(state.gravity, dtype=np.float64), np.array(state.mass, dtype=np.float64)
         grid = self.bounds, self.grid_spacing
@@ -211,7 +212,7 @@ class FLIP:
     def rasterize(
         self, pos: np.ndarray, vel: np.ndarray, mass: np.ndarray, viscosity_of_node: np.ndarray, solids: Solids, fields: Fields
     ) -> np.ndarray:
-        """Transfer the particles to empty ``fields``; returns the active cells in ascending order."""
+        """Transfer the particles to empty ``fields``; return the active cells in ascending order."""
         grid = self.grid
         volume = mass / (self.density * grid.spacing**grid.dim)
         transfer.scatter(
@@ -228,7 +229,7 @@ class FLIP:
         return active
 
     def diffuse(self, active: np.ndarray, solids: Solids, fields: Fields, h: float) -> None:
-        """Let viscosity act on the grid's velocities for a time h [s]."""
+        """Apply viscosity to the grid's velocities for a time h [s]."""
         grid = self.grid
         axes, cells = viscosity.viscous_faces(active, solids.face_distance, fields.weight, fields.viscous_face)
         diagonal, start, column, value, right = viscosity.viscosity_system(
@@ -246,14 +247,14 @@ class FLIP:
         )
 
     def project(self, liquid: Liquid, solids: Solids, fields: Fields, h: float) -> np.ndarray:
-        """Make the grid's velocities free of divergence; returns the pressure [liquid] in Pa that this takes over a time h [s]."""
+        """Make the grid's velocities divergence-free; return the pressure [liquid] in Pa that acts over a time h [s]."""
         pressure.fill_open_faces(liquid.cells, self.grid.strides, solids.area, fields.weight, fields.velocity, TOUCH)
         right = pressure.inflow(liquid.cells, self.grid.strides, solids.area, fields.velocity)
         tolerance = self.pressure_tolerance * self.grid_spacing / h
         return self.density * self.grid_spacing / h * self._correct("pressure", liquid, right, tolerance, solids, fields, fields.velocity)
 
     def even_out(self, liquid: Liquid, solids: Solids, fields: Fields, h: float) -> None:
-        """Find the shift that expands cells with too many particles and contracts those with too few (Kugelstadt et al. 2019)."""
+        """Find the shift that expands cells with too many particles and contracts cells with too few (Kugelstadt et al. 2019)."""
         if np.all(liquid.is_free):
             return
         excess = pressure.excess_density(liquid.cells, fields.liquid, self.grid.strides, solids.is_open, fields.density, LARGEST_EXCESS)
@@ -264,8 +265,8 @@ class FLIP:
     def _correct(
         self, what: str, liquid: Liquid, right: np.ndarray, tolerance: float, solids: Solids, fields: Fields, target: np.ndarray
     ) -> np.ndarray:
-        """Subtract from ``target`` on faces the gradient whose divergence is ``right``; returns its potential."""
-        for label in np.unique(liquid.closed[liquid.closed >= 0]):  # what a closed space cannot take is shared out
+        """Subtract from ``target`` on faces the gradient whose divergence is ``right``; return its potential."""
+        for label in np.unique(liquid.closed[liquid.closed >= 0]):  # a closed space keeps its volume
             right[liquid.closed == label] -= np.mean(right[liquid.closed == label])
         x = np.zeros(len(right))
         iterations, residual = conjugate_gradients(*liquid.matrix, right, liquid.inverse, x, tolerance, self.max_iterations)
@@ -274,7 +275,7 @@ class FLIP:
         return x
 
     def liquid(self, active: np.ndarray, solids: Solids, fields: Fields) -> tuple[Liquid, np.ndarray]:
-        """Number the liquid cells; the second result says for each label of ``fields.island`` whether that island touches no solid."""
+        """Number the liquid cells; the second result tells for each label of ``fields.island`` whether that island touches no solid."""
         strides = self.grid.strides
         cells = pressure.liquid_cells(active, solids.is_open, fields.density, fields.liquid)
         is_free, is_closed = islands.find_islands(active, strides, solids.area, fields.density, fields.weight, fields.liquid, fields.island)
@@ -285,11 +286,11 @@ class FLIP:
 
     @property
     def grid(self) -> Grid:
-        """The solver's grid."""
+        """Return the solver's grid."""
         return make_grid(self.bounds, self.grid_spacing)
 
     def solids(self, boundary: Boundary) -> Solids:
-        """The boundary on the solver's grid."""
+        """Sample the boundary on the solver's grid."""
         for shape in boundary.shapes:
             if thickness(shape) < self.grid_spacing * (1 - 1e-6):
                 raise SimulationError(
@@ -307,7 +308,7 @@ class FLIP:
         active = self.rasterize(pos, vel, mass, viscosity_of_node, solids, fields)
         transfer.add_impulse(active, h * gravity, fields.weight, fields.velocity)
         liquid, is_free = self.liquid(active, solids, fields)
-        # viscosity must not see the part of gravity that pressure balances: it would drag a liquid at rest along the walls
+        # viscosity must not see the part of gravity that pressure balances, because it would drag a liquid at rest along the walls
         self.project(liquid, solids, fields, h)
         self.diffuse(active, solids, fields, h)
         self.project(liquid, solids, fields, h)
@@ -329,13 +330,13 @@ class FLIP:
         )  # fmt: skip
 
     def _leave_solids(self, boundary: Boundary, solids: Solids, pos: np.ndarray, vel: np.ndarray) -> None:
-        """Move particles out of the exact shapes, which the grid only interpolates; walls last, so that they always hold."""
+        """Move particles out of the exact shapes, which the grid only interpolates; walls come last, so that no particle ends outside them."""
         near = np.flatnonzero(solids.distance[self._cell(pos)] < NEAR)
         rows = near[signed_distance(boundary.shapes, pos[near]) < 0.0]
         if len(rows) == 0:
             return
         moved, velocity = pos[rows], vel[rows]
-        for _ in range(4):  # corners need a pass per surface
+        for _ in range(4):  # corners need one pass per surface
             for shape in sorted(boundary.shapes, key=lambda shape: isinstance(shape, Wall)):
                 depth = np.maximum(0.0, -shape.signed_distance(moved))[:, None]
                 normal = outward_normal(shape, moved, 1e-3 * self.grid_spacing)
@@ -345,16 +346,16 @@ class FLIP:
         pos[rows], vel[rows] = moved, velocity
 
     def _cell(self, pos: np.ndarray) -> np.ndarray:
-        """The cell of each particle [node]."""
+        """Return the cell of each particle [node]."""
         return ((pos - self.grid.origin) / self.grid_spacing).astype(np.int64) @ self.grid.strides
 
     def _substep(self, pos: np.ndarray, vel: np.ndarray, gravity: np.ndarray, remaining: float, done: int) -> float:
-        """Duration of the next substep in s, of equal ones for the rest of the frame."""
+        """Return the duration of the next substep in s; the rest of the frame is divided equally."""
         fastest, speed = self._survey(pos, vel)
         reach = self.cfl * self.grid_spacing
         with np.errstate(over="ignore"):
             fall = float(np.linalg.norm(gravity))
-        # neither a particle that keeps its speed nor one that falls from rest goes further than it may
+        # neither a particle at constant speed nor one that falls from rest may exceed its reach
         needed = remaining * max(speed / reach, math.sqrt(fall / (2.0 * reach))) * (1.0 - 1e-12)
         if needed > self.max_substeps - done:
             message = f"{_describe(fastest, pos, vel)} under gravity {gravity.tolist()} m/s² would need more than {self.max_substeps} substeps in one frame"
@@ -362,7 +363,7 @@ class FLIP:
         return remaining / max(1, math.ceil(needed))
 
     def _survey(self, pos: np.ndarray, vel: np.ndarray) -> tuple[int, float]:
-        """The fastest particle and its speed, or an error that names a particle that is not finite or outside the domain."""
+        """Return the fastest particle and its speed; raise an error that names a particle that is not finite or outside the domain."""
         if len(pos) == 0:
             return -1, 0.0
         with np.errstate(over="ignore", invalid="ignore"):
@@ -386,7 +387,7 @@ class FLIP:
             raise SimulationError(message, reason="explosion")
 
     def _check(self, state: State) -> np.ndarray:
-        """Kinematic viscosity per particle, or an error that names what does not fit."""
+        """Return the kinematic viscosity of each particle; raise an error that names what does not fit."""
         num_nodes, dim = state.num_nodes, len(self.bounds)
         shapes = {
             "pos": (state.pos, (num_nodes, dim)),
@@ -415,7 +416,7 @@ class FLIP:
 
 
 def _share(share: float, h: float) -> float:
-    """What a share per ``SHARE_TIME`` becomes in a time h [s]."""
+    """Convert a fraction per ``SHARE_TIME`` to a fraction per time h [s]."""
     return float(1.0 - (1.0 - share) ** (h / SHARE_TIME))
 
 

@@ -1,7 +1,7 @@
-"""Between particles and grid: multilinear kernels, the FLIP/PIC update, advection, and the push out of solids.
+"""Transfers between particles and grid: multilinear kernels, the FLIP/PIC update, advection, and pushing particles out of solids.
 
-All kernels work in two and three dimensions. Positions are in m, velocities in m/s; ``fraction`` and ``weight`` hold the position in a cell and the
-2^dim corner weights of the kernel.
+All kernels work in two and three dimensions. Positions are in m, velocities in m/s. ``fraction`` and ``weight`` hold the position in a cell and the 2^dim
+corner weights of the kernel.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ import numpy as np
 from numba import njit
 
 CONTACT = 0.01
-"""Particles keep this distance from solids, in cells."""
+"""Distance that particles keep from solids, in cells."""
 
 LONGEST_MOVE = 1.0
-"""No particle moves further in one substep, in cells: from the surface of a solid two cells thick, less than half-way through."""
+"""Largest distance in cells that a particle moves in one substep: less than half-way through a solid two cells thick."""
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _locate(x, p, origin, inverse, strides, counts, shift, axis, fraction):
-    """Index of the lowest sample around a particle and its position among the samples. Samples lie at nodes plus ``shift`` cells; on ``axis``, at nodes."""
+    """Return the index of the lowest sample around a particle, and its position among the samples at nodes plus ``shift`` cells (on ``axis``, at nodes)."""
     base = 0
     for b in range(strides.shape[0]):
         s = (x[p, b] - origin[b]) * inverse - (0.0 if b == axis else shift)
-        s = min(max(s, 1.0), counts[b] - 2.001)  # written so that even a position that is not a number gives a valid index
+        s = min(max(s, 1.0), counts[b] - 2.001)  # this order gives a valid index even for NaN
         i = int(s)
         fraction[b] = s - i
         base += i * strides[b]
@@ -50,12 +50,12 @@ def scatter(pos, vel, volume, viscosity, origin, inverse, strides, counts, corne
     """Add particles to the grid.
 
     Args:
-        pos, vel: [node, dim].
-        volume: of each particle, in cells [node].
-        viscosity: kinematic, [node] in m²/s.
+        pos, vel: positions and velocities [node, dim] in m and m/s.
+        volume: volume of each particle, in cells [node].
+        viscosity: kinematic viscosity [node] in m²/s.
         velocity, weight: Σ w V v and Σ w V on faces [axis, cell].
         density, viscous: Σ w V and Σ w V ν at cell centres [cell].
-        touched: set where any of them changes.
+        touched: set to True where any of these changes [cell].
     """
     dim = pos.shape[1]
     fraction, w = np.empty(dim), np.empty(1 << dim)
@@ -80,9 +80,9 @@ def scatter(pos, vel, volume, viscosity, origin, inverse, strides, counts, corne
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def normalize(active, cell_room, face_room, smallest_room, velocity, old, weight, density, viscous):
-    """Turn the sums of ``scatter`` into velocities, kept in ``old`` too, and into densities relative to the room that solids leave.
+    """Turn the sums of ``scatter`` into velocities, copied to ``old``, and into densities relative to the open space.
 
-    Cells with less than ``smallest_room`` keep their sums.
+    Cells with less open space than ``smallest_room`` keep their sums.
     """
     for c in active:
         if cell_room[c] >= smallest_room:
@@ -98,7 +98,7 @@ def normalize(active, cell_room, face_room, smallest_room, velocity, old, weight
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def add_impulse(active, impulse, weight, velocity):
-    """Change the velocity of all faces that particles reach."""
+    """Add an impulse to the velocity of all faces that particles reach."""
     for c in active:
         for a in range(velocity.shape[0]):
             if weight[a, c] > 0.0:
@@ -108,7 +108,7 @@ def add_impulse(active, impulse, weight, velocity):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _distance_and_normal(x, p, origin, inverse, strides, counts, corners, distance, fraction, w, normal):
-    """Interpolate the solids' signed distance [cells] at a particle; its normalised gradient is written to ``normal``."""
+    """Interpolate the solids' signed distance [cells] at a particle; write its normalised gradient to ``normal``."""
     dim = strides.shape[0]
     base = _locate(x, p, origin, inverse, strides, counts, 0.0, -1, fraction)
     _corner_weights(fraction, w)
@@ -136,10 +136,10 @@ def _distance_and_normal(x, p, origin, inverse, strides, counts, corners, distan
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def extend_into_solids(active, origin, spacing, strides, counts, corners, distance, face_distance, weight, velocity):
-    """Give faces whose centre is solid, where particles feel them, the velocity of the faces in free space around them, without its part along the normal.
+    """Extrapolate velocities to faces with a solid centre near particles: the velocity of faces in free space around them, without its normal part.
 
-    So the liquid slips along solids, whatever their direction, as far as the transfers are concerned (Batty et al. 2007, section 4.3), and what pressure
-    drives through the smallest openings, which may be fast, moves no particle.
+    In the transfers, the liquid then slips along solids of any direction (Batty et al. 2007, section 4.3). Pressure may drive fast flow through the smallest
+    openings; that flow then moves no particle.
     """
     dim = strides.shape[0]
     fraction, w, normal, point = np.empty(dim), np.empty(1 << dim), np.empty(dim), np.empty((1, dim))
@@ -187,13 +187,13 @@ def extend_into_solids(active, origin, spacing, strides, counts, corners, distan
 def gather(pos, vel, origin, spacing, strides, counts, corners, old, new, shift, weight, pic, h):
     """Move the particles with the grid for a time h, in place.
 
-    Velocities take the grid's change and a share ``pic`` of the grid's velocity; positions follow the grid's velocity by the midpoint rule, and ``shift``.
+    Velocities take the grid's change and the fraction ``pic`` of the grid's velocity. Positions follow the grid's velocity by the midpoint rule, and ``shift``.
 
     Args:
-        old, new: velocities on faces before and after the forces [axis, cell].
+        old, new: velocities on faces before and after the forces [axis, cell] in m/s.
         shift: displacement on faces [axis, cell] in m.
-        weight: of faces; the velocity is known where it is positive.
-        pic: share of the grid's velocity in the new velocity of a particle.
+        weight: weights of faces [axis, cell]; the velocity is known where the weight is positive.
+        pic: fraction of the grid's velocity in the new velocity of a particle.
     """
     dim = strides.shape[0]
     inverse = 1.0 / spacing
@@ -242,8 +242,8 @@ def push_out(pos, vel, origin, spacing, strides, counts, corners, distance):
     fraction, w, normal = np.empty(dim), np.empty(1 << dim), np.empty(dim)
     for p in range(pos.shape[0]):
         if distance[_locate(pos, p, origin, inverse, strides, counts, 0.0, -1, fraction)] > 2.0:
-            continue  # further away than a cell is long
-        for _ in range(3):  # corners need a pass per surface
+            continue  # more than a cell away
+        for _ in range(3):  # corners need one pass per surface
             room = _distance_and_normal(pos, p, origin, inverse, strides, counts, corners, distance, fraction, w, normal)
             if room >= CONTACT:
                 break

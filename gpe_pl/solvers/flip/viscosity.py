@@ -4,10 +4,10 @@ The velocities after a time h minimise, over all faces f and stress samples s (B
 
     Σ_f m_f (u_f - u*_f)² / 2  +  h Σ_s w_s ν_s ε_s : ε_s,     ε = (∇u + ∇uᵀ) / 2
 
-The free surface thus needs no condition, and velocities without strain, such as rigid rotations, stay as they are. Masses m and weights w are the
-densities that the particles give to the grid, so that momentum is conserved. Normal strains are sampled at cell centres, shear strains at edges.
-Where a difference quotient meets a face whose centre is solid, the solid's surface replaces it: velocity 0 at the share θ of the way, and θ times the
-weight, which is the finite-volume flux to a wall at that distance.
+The free surface thus needs no condition, and velocities without strain, such as rigid rotations, do not change. Masses m and weights w are the densities that
+the particles give to the grid, so momentum is conserved. Normal strains are sampled at cell centres, shear strains at edges. Where a difference quotient
+meets a face with a solid centre, the surface of the solid replaces it. Velocity is then 0 at the fraction θ of the distance, and the weight is multiplied by
+θ, which gives the finite-volume flux to a wall at that distance.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ SMALLEST_SHARE = 0.1
 """Lower limit of θ."""
 
 SMALLEST_MASS = 1e-6
-"""Faces with less density take no part."""
+"""Density below which faces are ignored."""
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def viscous_faces(active, face_distance, weight, unknown):
-    """Number the faces in free space that particles reach from 1 in ``unknown`` [axis, cell], which is 0 elsewhere; returns their axes and cells."""
+    """Number from 1 in ``unknown`` [axis, cell] (0 elsewhere) the faces in free space that particles reach; return their axes and cells."""
     dim = weight.shape[0]
     axes, cells = np.empty(dim * active.shape[0], dtype=np.int64), np.empty(dim * active.shape[0], dtype=np.int64)
     n = 0
@@ -43,7 +43,7 @@ def viscous_faces(active, face_distance, weight, unknown):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _theta(a, upper, lower, unknown, face_distance):
-    """Share θ of the difference between two faces; 0 where nothing is known, negative where both are solid."""
+    """Return the fraction θ of the distance between two faces; 0 if nothing is known, negative if both are solid."""
     if unknown[a, upper] > 0 and unknown[a, lower] > 0:
         return 1.0
     if face_distance[a, upper] > 0.0 and face_distance[a, lower] > 0.0:
@@ -60,17 +60,17 @@ def _theta(a, upper, lower, unknown, face_distance):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def viscosity_system(axes, cells, unknown, strides, is_open, face_distance, weight, viscous, velocity, step):
-    """Matrix over the viscous faces and its right-hand side m u*.
+    """Return the matrix over the viscous faces and its right-hand side m u*.
 
     Args:
-        axes, cells, unknown: of ``viscous_faces``.
+        axes, cells, unknown: results of ``viscous_faces``.
         weight: density of faces [axis, cell].
         viscous: density times kinematic viscosity of cells [cell] in m²/s.
-        velocity: on faces [axis, cell] in m/s.
+        velocity: velocities on faces [axis, cell] in m/s.
         step: h / Δ² in s/m².
     """
     n, dim = axes.shape[0], strides.shape[0]
-    most = 3 * dim  # lower neighbours of a face: its axis, and three at most per other axis
+    most = 3 * dim  # lower neighbours of a face: one along its own axis, and at most three per other axis
     diagonal, start, right = np.zeros(n), np.zeros(n + 1, dtype=np.int64), np.empty(n)
     column, value = np.empty(n * most, dtype=np.int64), np.empty(n * most)
     entries = 0
@@ -130,7 +130,7 @@ def viscosity_system(axes, cells, unknown, strides, is_open, face_distance, weig
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def drag_on_solids(active, strides, area, face_distance, density, viscous, velocity, step):
-    """Slow down open faces whose centre is solid, as between neighbours at rest: there the liquid is next to the wall."""
+    """Slow down open faces with a solid centre like the faces of neighbours at rest, because there the liquid is next to the wall."""
     dim = strides.shape[0]
     for c in active:
         for a in range(dim):

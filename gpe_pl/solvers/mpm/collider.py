@@ -1,8 +1,8 @@
-"""Walls and rigid obstacles of the material point method: conditions on the grid, and surfaces that no particle passes.
+"""Walls and rigid obstacles of the material point method: conditions on the grid, and surfaces that particles cannot cross.
 
-Grid nodes inside a shape obey its boundary condition. A particle that still gets into a shape moves to its surface and loses the inward part of its
-velocity: planes, balls, boxes and polygons are exact; any other shape is sampled at the grid nodes and interpolated (multilinear), which is exact where it
-is flat and off by up to ``Δ² / 4R`` where its radius of curvature is R.
+Grid nodes inside a shape obey its boundary condition. A particle that still enters a shape is moved to its surface and loses the inward part of its velocity.
+Planes, balls, boxes and polygons are exact. Any other shape is sampled at the grid nodes and interpolated multilinearly. This is exact where the shape is
+flat, and has an error of up to ``Δ² / 4R`` where its radius of curvature is R.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ class Collider(NamedTuple):
 
     Attributes:
         row: row of ``conditions`` for each grid node, -1 in free space.
-        conditions: [row, k, dim + 1] normal and friction of the k-th shape that holds the node; friction < 0: none.
+        conditions: normal and friction of the k-th shape that contains the node [row, k, dim + 1]; friction < 0 marks unused entries.
         distance: signed distance of each grid node to the nearest shape [m].
-        planes: [wall, dim + 1] normal and offset.
-        balls: [ball, dim + 1] centre and radius.
-        boxes: [box, 2, dim] low and high corner.
-        vertices: [vertex, 2] of all polygons, counter-clockwise, one after the other.
-        first_vertex: [polygon + 1] where each polygon starts.
-        sampled: [shape, node, dim + 1] signed distance and outward normal of every other shape.
+        planes: normal and offset of each wall [wall, dim + 1].
+        balls: centre and radius of each ball [ball, dim + 1] in m.
+        boxes: low and high corner of each box [box, 2, dim] in m.
+        vertices: vertices of all polygons, counter-clockwise, one polygon after the other [vertex, 2] in m.
+        first_vertex: index of the first vertex of each polygon [polygon + 1].
+        sampled: signed distance and outward normal of every other shape at each grid node [shape, node, dim + 1].
     """
 
     row: np.ndarray
@@ -52,16 +52,16 @@ def collider(shapes: tuple[Shape, ...], origin: tuple[float, ...], spacing: floa
     Args:
         shapes: walls and obstacles.
         origin: position of the first grid node [m].
-        spacing: of the grid [m].
+        spacing: grid spacing [m].
         counts: number of nodes along each axis.
 
     Raises:
-        SimulationError: with reason ``input`` for a shape of another dimension, or one that the grid does not resolve.
+        SimulationError: with reason ``input``, if a shape has another dimension or the grid does not resolve it.
     """
     dim = len(counts)
     axes = [o + spacing * np.arange(n) for o, n in zip(origin, counts, strict=True)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dim)
-    tolerance = 1e-9 * spacing  # a node on a wall belongs to the wall whatever the rounding
+    tolerance = 1e-9 * spacing  # a node on a wall belongs to the wall despite rounding
     inside = [_distance(shape, nodes) <= tolerance for shape in shapes]
     depth = np.sum(inside, axis=0) if shapes else np.zeros(len(nodes), dtype=np.int64)
     held = np.nonzero(depth)[0]
@@ -76,7 +76,7 @@ def collider(shapes: tuple[Shape, ...], origin: tuple[float, ...], spacing: floa
         if not isinstance(shape, Wall):
             _require_resolved(shape, mask, spacing, dim)
         normal = outward_normal(shape, nodes[mask], 1e-3 * spacing)
-        # deep inside a shape, where no direction leads out, the node sticks
+        # deep inside a shape the normal is undefined, so the node sticks
         friction = np.where(np.sum(normal * normal, axis=-1) > 0, shape.friction, STICKY)
         at = row[mask]
         conditions[at, filled[at]] = np.concatenate([normal, friction[:, None]], axis=-1)
@@ -107,13 +107,13 @@ def collider(shapes: tuple[Shape, ...], origin: tuple[float, ...], spacing: floa
 
 
 def _distance(shape: Shape, nodes: np.ndarray) -> np.ndarray:
-    """Signed distance of the nodes [node, dim], or an error if the shape has another dimension."""
+    """Return the signed distance of the nodes [node, dim] in m; raise an error if the shape has another dimension."""
     dim = nodes.shape[1]
     own = {Wall: "normal", Sphere: "center", Box: "low"}.get(type(shape))
     fits = dim == 2 if isinstance(shape, Polygon) else own is None or len(getattr(shape, own)) == dim
     try:
         distance = shape.signed_distance(nodes) if fits else None
-    except (ValueError, IndexError):  # any other shape, which does not say what its dimension is
+    except (ValueError, IndexError):  # other kinds of shapes do not state their dimension
         distance = None
     if distance is None:
         raise SimulationError(f"a boundary of kind {shape.kind!r} does not have the {dim} axes of the domain", reason="input")
@@ -121,7 +121,7 @@ def _distance(shape: Shape, nodes: np.ndarray) -> np.ndarray:
 
 
 def _require_resolved(shape: Shape, mask: np.ndarray, spacing: float, dim: int) -> None:
-    """Refuse an obstacle that particles could pass: a particle in the nearer half of a cell-thick obstacle is pushed back, not out at the far side."""
+    """Refuse obstacles thinner than a cell: a particle in the far half of a thin obstacle would be pushed out at the far side."""
     thin = thickness(shape)
     if thin < spacing * (1 - 1e-6):
         raise SimulationError(
@@ -138,14 +138,14 @@ def _require_resolved(shape: Shape, mask: np.ndarray, spacing: float, dim: int) 
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def keep_out(pos, vel, collider, counts, origin, inv):
-    """``push_out`` of all particles that may be inside a shape: whose nearest grid node is no further from one than from the particle."""
+    """Apply ``push_out`` to all particles that may be inside a shape, by the signed distance at their nearest grid node."""
     reach = 0.51 * math.sqrt(len(counts)) / inv
     for p in range(pos.shape[0]):
         node = 0
         for axis in range(len(counts)):
             place = (pos[p, axis] - origin[axis]) * inv + 0.5
             node *= counts[axis]
-            if place > 0.0:  # any index will do for a particle that left the grid or is not a number
+            if place > 0.0:  # for a particle outside the grid or at NaN, any valid index will do
                 node += int(min(place, counts[axis] - 0.5))
         if collider.distance[node] < reach:
             push_out(pos, vel, p, collider, counts, origin, inv)
@@ -154,7 +154,7 @@ def keep_out(pos, vel, collider, counts, origin, inv):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def push_out(pos, vel, p, collider, counts, origin, inv):
-    """Move particle ``p`` out of every shape that it is in, and remove the inward part of its velocity; walls last, so that they always hold."""
+    """Move particle ``p`` out of every shape and remove the inward part of its velocity; walls come last, so that no particle ends outside them."""
     solid = len(counts) == 3
     for k in range(collider.sampled.shape[0]):
         depth, nx, ny, nz = _sampled_depth(pos, p, collider.sampled, k, counts, origin, inv)
@@ -200,7 +200,7 @@ def _project(pos, vel, p, depth, nx, ny, nz, counts):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _sampled_depth(pos, p, sampled, shape, counts, origin, inv):
-    """Depth of a particle in a sampled shape and the shape's normal there; depth 0 outside, and outside of the grid."""
+    """Return the depth of a particle in a sampled shape and the shape's normal there; depth 0 outside the shape or the grid."""
     dim = len(counts)
     first, fx, fy, fz = 0, 0.0, 0.0, 0.0
     for axis in range(dim):
@@ -208,7 +208,7 @@ def _sampled_depth(pos, p, sampled, shape, counts, origin, inv):
         if not (x >= 0.0 and x < counts[axis] - 1):
             return 0.0, 0.0, 0.0, 0.0
         first, fx, fy, fz = first * counts[axis] + int(x), fy, fz, x - int(x)
-    # the fractions are now in the last dim of fx, fy and fz
+    # the fractions are in the last dim of fx, fy and fz
     distance = nx = ny = nz = 0.0
     for i in range(dim - 1):
         for j in range(2):
@@ -228,7 +228,7 @@ def _sampled_depth(pos, p, sampled, shape, counts, origin, inv):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _box_depth(pos, p, boxes, box, counts):
-    """Depth of a particle in a box, and axis and direction of the nearest face; depth 0 outside."""
+    """Return the depth of a particle in a box, and the axis and direction of the nearest face; depth 0 outside."""
     depth, nearest, side = math.inf, 0, 1.0
     for axis in range(len(counts)):
         above, below = pos[p, axis] - boxes[box, 0, axis], boxes[box, 1, axis] - pos[p, axis]
@@ -244,7 +244,7 @@ def _box_depth(pos, p, boxes, box, counts):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _polygon_depth(x, y, vertices, start, stop):
-    """Depth of a point inside a simple counter-clockwise polygon and the normal of the nearest edge; depth 0 outside."""
+    """Return the depth of a point inside a simple counter-clockwise polygon and the normal of the nearest edge; depth 0 outside."""
     inside = False
     nearest, nx, ny = math.inf, 0.0, 1.0
     for k in range(start, stop):
@@ -260,6 +260,6 @@ def _polygon_depth(x, y, vertices, start, stop):
         d = math.sqrt(qx * qx + qy * qy)
         if d < nearest:
             nearest = d
-            # from inside, the way out leads to the nearest point of the surface; on the surface, along the edge's normal
+            # inside, the direction to the nearest point of the surface; on the surface, the normal of the edge
             nx, ny = (-qx / d, -qy / d) if d > 1e-12 * length else (ey / length, -ex / length)
     return (nearest if inside else 0.0), nx, ny

@@ -1,6 +1,6 @@
 """The time loop of one frame, on compiled kernels; the same in 2D and 3D.
 
-``counts``, the numbers of grid nodes along the axes, is a tuple, so that the dimension is known when a kernel is compiled.
+``counts``, the number of grid nodes along each axis, is a tuple, so that kernels know the dimension at compile time.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ OK, NOT_FINITE, ESCAPE, TOO_MANY_SUBSTEPS = 0, 1, 2, 3
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame_dt, cfl, max_substeps, last_substep):
-    """Advance the particles in place by one frame; returns a status, the node that caused it, the number of substeps and the last one's length.
+    """Advance the particles in place by one frame; return a status, the node that caused it, the number of substeps and the length of the last one.
 
-    Positions follow velocities half a substep later, so gravity acts over the mean of a substep and the one before: then a body in free flight stays on its
-    parabola although substeps change. Particles are deformed by as much time as they have moved, which is the substep before.
+    Positions follow velocities half a substep later, so gravity acts over the mean of a substep and the one before. A body in free flight then stays on its
+    parabola although substeps change. Particles deform over the time for which they have moved, which is the previous substep.
     """
     inv, dim, gravity_squared = 1.0 / spacing, len(counts), 0.0
     for axis in range(dim):
         gravity_squared += gravity[axis] * gravity[axis]
-    # a particle at rest may fall by no more than a quarter of cfl cells, so with its speed it moves at most 1.25 cfl cells
+    # a particle at rest may fall by at most a quarter of cfl cells, so together with its velocity it moves at most 1.25 cfl cells
     fall_rate = 2.0 * math.sqrt(math.sqrt(gravity_squared) / (cfl * spacing))
-    # what a viscosity makes of the rate of deformation of a particle's surroundings must not change its sign (see ``transfer_2d.deform``)
+    # viscosity must not reverse the sign of the local rate of deformation (see ``transfer_2d.deform``)
     diffusion_rate, remembers = 0.0, False
     for p in range(particles.pos.shape[0]):
         diffusion_rate = max(diffusion_rate, 8.0 * inv * inv * particles.constants[p, VISCOSITY])
@@ -52,7 +52,7 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
         needed = max(remaining * (math.sqrt(squared) + speed) / (cfl * spacing), remaining * fall_rate, remaining * diffusion_rate) * (
             1.0 - 1e-12
         )
-        if not needed <= max_substeps - substeps:  # before it is rounded: an integer may not hold it
+        if not needed <= max_substeps - substeps:  # compare before rounding, because the number may exceed an integer
             return TOO_MANY_SUBSTEPS, node, substeps, last_substep
         count = max(1, math.ceil(needed))
         h = remaining / count
@@ -82,10 +82,10 @@ def advance(particles, collider, gravity, bounds, origin, counts, spacing, frame
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _survey(pos, vel, bounds, origin, counts, spacing, active):
-    """Check that every particle can be indexed; status, node at fault (or the fastest) and largest speed.
+    """Check that every particle can be indexed; return a status, the node at fault (or the fastest) and the largest speed [m/s].
 
-    Writes to ``active`` the half-open ranges of grid nodes that the particles reach along x, y and z; in 2D the first row is left out, so that the last
-    two are x and y.
+    Write to ``active`` the half-open ranges of grid nodes that the particles reach along x, y and z. In 2D the first row is unused, and the last two are x
+    and y.
     """
     dim = len(counts)
     fastest, speed_squared = (0 if pos.shape[0] > 0 else -1), 0.0
@@ -100,7 +100,7 @@ def _survey(pos, vel, bounds, origin, counts, spacing, active):
     active[0, 0], active[0, 1] = 0, 1
     for axis in range(dim):
         low, high = math.inf, -math.inf
-        # a particle may be up to a cell outside an open side before it counts as escaped
+        # a particle counts as escaped when it is more than one cell outside an open side
         lowest, highest = bounds[axis, 0] - spacing, bounds[axis, 1] + spacing
         for p in range(pos.shape[0]):
             x = pos[p, axis]
@@ -129,7 +129,7 @@ def _clear(grid, active, counts):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _move_grid(grid, collider, gravity, h, active, counts):
-    """Momenta to velocities, gravity, and the boundary conditions of the nodes inside walls and obstacles."""
+    """Turn momenta into velocities, add gravity, and apply the boundary conditions of the nodes inside walls and obstacles."""
     dim = len(counts)
     for i in range(active[0, 0], active[0, 1]):
         for j in range(active[1, 0], active[1, 1]):
@@ -146,7 +146,7 @@ def _move_grid(grid, collider, gravity, h, active, counts):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _obey(grid, node, conditions, row, counts):
-    """Remove the inward part of a node's velocity, and slow it by friction in proportion, for each shape that holds the node."""
+    """Remove the inward part of a node's velocity, and apply the proportional friction, for each shape that contains the node."""
     dim = len(counts)
     for k in range(conditions.shape[1]):
         friction = conditions[row, k, dim]

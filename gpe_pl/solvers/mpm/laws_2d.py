@@ -1,14 +1,14 @@
 """Constitutive laws in plane strain, compiled with Numba in float64.
 
-A law is a function from the trial deformation gradient F of one particle to its return-mapped F, its plastic state, its Kirchhoff stress τ and its stiffness:
-density at rest times the square of the fastest elastic wave's speed, from the second derivative of the energy along the principal axes,
-``∂²ψ/∂(log σᵢ)² - ∂ψ/∂(log σᵢ)``, or more. All laws are isotropic, so they act on the principal values of the left Cauchy-Green tensor ``b = F Fᵀ``; an
-isotropic function of a symmetric 2x2 tensor with principal values f₁ >= f₂ is ::
+A law takes the trial deformation gradient F of one particle and returns its return-mapped F, plastic state, Kirchhoff stress τ and stiffness. The stiffness
+is an upper bound of the density at rest times the squared speed of the fastest elastic wave. It follows from the second derivative of the energy along the
+principal axes, ``∂²ψ/∂(log σᵢ)² - ∂ψ/∂(log σᵢ)``. All laws are isotropic, so they act on the principal values of the left Cauchy-Green tensor ``b = F Fᵀ``.
+An isotropic function of a symmetric 2x2 tensor with principal values f₁ >= f₂ is ::
 
     f(b) = (f₁ + f₂)/2 I + (f₁ - f₂)/2 [[c, s], [s, -c]],   (c, s) = (cos 2θ, sin 2θ)
 
-with θ the principal angle, so neither a singular value decomposition nor an angle is ever computed. Only b matters to them, so a law may drop the rotation
-of F, and does so for a particle that is flat (where the rotation is undefined).
+with θ the principal angle, so neither a singular value decomposition nor an angle is computed. Only b matters to the laws, so a law may drop the rotation of
+F. It does so for a flat particle, where the rotation is undefined.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numba import njit
 from gpe_pl.solvers.materials import COEFFICIENT, ELASTOMER, LAMBDA, LARGEST, MAX_HARDENING, MU, SAND, SMALLEST, SNOW
 
 SMALLEST_STRETCH = 1e-4
-"""Principal stretches below this are treated as this: the logarithmic strain of a flattened particle stays finite."""
+"""Lower bound of the principal stretches; it keeps the logarithmic strain of a flattened particle finite."""
 
 SMALLEST_SQUARE = SMALLEST_STRETCH**2
 
@@ -29,13 +29,13 @@ SMALLEST_SQUARE = SMALLEST_STRETCH**2
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def left_cauchy_green(f00, f01, f10, f11):
-    """Principal values of ``F Fᵀ``, larger first, and the direction ``(cos 2θ, sin 2θ)`` of the larger one."""
+    """Return the principal values of ``F Fᵀ``, larger first, and the direction ``(cos 2θ, sin 2θ)`` of the larger one."""
     b00, b01, b11 = f00 * f00 + f01 * f01, f00 * f10 + f01 * f11, f10 * f10 + f11 * f11
     half_difference = 0.5 * (b00 - b11)
     radius = math.sqrt(half_difference * half_difference + b01 * b01)
     larger = 0.5 * (b00 + b11) + radius
     determinant = f00 * f11 - f01 * f10
-    # det²/b₁ instead of mean - radius: no cancellation when the particle is flat
+    # det²/b₁ instead of mean - radius: avoids cancellation when the particle is flat
     smaller = determinant * determinant / larger if larger > 0.0 else 0.0
     if radius > 0.0:
         inverse = 1.0 / radius
@@ -46,7 +46,7 @@ def left_cauchy_green(f00, f01, f10, f11):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _isotropic(first, second, c, s):
-    """The entries 00, 01 and 11 of the symmetric tensor with these principal values."""
+    """Return the entries 00, 01 and 11 of the symmetric tensor with these principal values."""
     mean, half = 0.5 * (first + second), 0.5 * (first - second)
     return mean + half * c, half * s, mean - half * c
 
@@ -54,7 +54,7 @@ def _isotropic(first, second, c, s):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _stretched(f00, f01, f10, f11, ratio_1, ratio_2, c, s, flat, square_1, square_2):
-    """F with its principal stretches multiplied by ratios; of a flat particle, the left stretch tensor with stretches ``ratio √square``."""
+    """Multiply the principal stretches of F by ratios; for a flat particle, return the left stretch tensor with stretches ``ratio √square``."""
     if flat:
         ratio_1, ratio_2 = ratio_1 * math.sqrt(square_1), ratio_2 * math.sqrt(square_2)
         f00, f01, f10, f11 = 1.0, 0.0, 0.0, 1.0
@@ -65,14 +65,14 @@ def _stretched(f00, f01, f10, f11, ratio_1, ratio_2, c, s, flat, square_1, squar
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _hencky(f00, f01, f10, f11):
-    """Logarithmic strain ``log(b) / 2``: F (of a flat particle, its left stretch tensor), ``log |det F|`` and the entries 00 and 01 of the deviator."""
+    """Compute the logarithmic strain ``log(b) / 2``; return F (its left stretch tensor if flat), ``log |det F|``, and entries 00 and 01 of the deviator."""
     b00, b01, b11 = f00 * f00 + f01 * f01, f00 * f10 + f01 * f11, f10 * f10 + f11 * f11
     half_difference, mean = 0.5 * (b00 - b11), 0.5 * (b00 + b11)
     determinant = f00 * f11 - f01 * f10
     inverse = 1.0 / mean
     x = (half_difference * half_difference + b01 * b01) * (inverse * inverse)
     if x < 1e-3 and determinant > 0.01:
-        # little distortion, as nearly always: (log b₁ - log b₂)/4 = atanh(√x)/2, and the series of atanh(√x)/√x to rounding
+        # distortion is nearly always small: (log b₁ - log b₂)/4 = atanh(√x)/2, and the series of atanh(√x)/√x to rounding
         scale = 0.5 * inverse * (1.0 + x * (1.0 / 3.0 + x * (1.0 / 5.0 + x * (1.0 / 7.0 + x * (1.0 / 9.0)))))
         return f00, f01, f10, f11, math.log(determinant), scale * half_difference, scale * b01
     larger, smaller, c, s = left_cauchy_green(f00, f01, f10, f11)
@@ -89,19 +89,18 @@ def _hencky(f00, f01, f10, f11):
 def sand(f00, f01, f10, f11, volume_correction, lam, mu, slope):
     """Hencky elasticity with a Drucker-Prager return mapping without dilation (Klar et al. 2016, sections 5 and 6.3).
 
-    ``ε = log σ + v/2`` are the principal logarithmic strains, where ``v`` is the volume that the particle gained while it was in tension and must
-    lose again before it can bear pressure. In expansion (``tr ε >= 0``) the particle is stress-free. Otherwise the deviatoric strain is
-    scaled back to the cone ``|dev ε| = -α (2λ + 2μ)/(2μ) tr ε`` at constant volume, and ``τ = 2μ ε + λ tr ε``.
+    ``ε = log σ + v/2`` are the principal logarithmic strains. ``v`` is the volume that the particle gained in tension and must lose before it can bear
+    pressure. In expansion (``tr ε >= 0``) the particle is stress-free. Otherwise the deviatoric strain is scaled back to the cone
+    ``|dev ε| = -α (2λ + 2μ)/(2μ) tr ε`` at constant volume, and ``τ = 2μ ε + λ tr ε``.
 
     Args:
         f00, f01, f10, f11: trial elastic deformation gradient.
-        volume_correction: v of the particle.
+        volume_correction: volume v of the particle.
         lam, mu: Lamé parameters [Pa].
-        slope: of the cone, ``|dev ε| / -tr ε``.
+        slope: slope of the cone, ``|dev ε| / -tr ε``.
 
     Returns:
-        The four entries of the return-mapped F, the new v, τ₀₀, τ₀₁, τ₁₁ and the stiffness [Pa]. A trial F that is not finite gives a stress that is not
-        finite.
+        The four entries of the return-mapped F, the new v, τ₀₀, τ₀₁, τ₁₁ and the stiffness [Pa]. If the trial F is not finite, neither is the stress.
     """
     f00, f01, f10, f11, trace, e0, e1 = _hencky(f00, f01, f10, f11)
     trace += volume_correction
@@ -126,7 +125,7 @@ def sand(f00, f01, f10, f11, volume_correction, lam, mu, slope):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def hardening(compaction, xi, largest):
-    """Factor on snow's elastic moduli, ``exp(ξ (1 - J_P))``, at most ``largest`` (Stomakhin et al. 2013, equation 2)."""
+    """Return the factor on snow's elastic moduli, ``exp(ξ (1 - J_P))``, at most ``largest`` (Stomakhin et al. 2013, equation 2)."""
     return math.exp(min(-xi * compaction, math.log(largest)))
 
 
@@ -135,8 +134,8 @@ def hardening(compaction, xi, largest):
 def snow(f00, f01, f10, f11, compaction, lam, mu, xi, smallest, largest, max_hardening):
     """Fixed-corotated elasticity with hardening; principal stretches are clamped (Stomakhin et al. 2013, sections 4 and 7).
 
-    ``τ = 2μ (F - R) Fᵀ + λ (J - 1) J`` with both moduli multiplied by ``hardening``, which is that of the plastic state before the return mapping: the
-    state that the substep's length was chosen for.
+    ``τ = 2μ (F - R) Fᵀ + λ (J - 1) J`` with both moduli multiplied by ``hardening`` of the plastic state before the return mapping. The length of the substep
+    was chosen for that state.
 
     Args:
         f00, f01, f10, f11: trial elastic deformation gradient.

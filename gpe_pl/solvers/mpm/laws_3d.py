@@ -1,6 +1,6 @@
-"""Constitutive laws in three dimensions; the same laws as in ``laws_2d``, on tuples.
+"""Constitutive laws in three dimensions: the laws of ``laws_2d``, on tuples.
 
-A tensor is a tuple of its nine entries by rows, a symmetric one of the six of its upper triangle by rows: 00, 01, 02, 11, 12, 22.
+A tensor is a tuple of its nine entries by rows. A symmetric tensor is a tuple of the six entries of its upper triangle by rows: 00, 01, 02, 11, 12, 22.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from gpe_pl.solvers.mpm.laws_2d import SMALLEST_SQUARE, hardening
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def left_cauchy_green(f):
-    """The symmetric tensor ``F Fᵀ``."""
+    """Return the symmetric tensor ``F Fᵀ``."""
     return (
         f[0] * f[0] + f[1] * f[1] + f[2] * f[2],
         f[0] * f[3] + f[1] * f[4] + f[2] * f[5],
@@ -31,10 +31,10 @@ def left_cauchy_green(f):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def spectral(b):
-    """Principal values of a symmetric tensor, in no particular order, and their orthonormal axes (as rows, nine entries).
+    """Return the principal values of a symmetric tensor, in no particular order, and their orthonormal axes (as rows, nine entries).
 
-    Closed form in the order of Eberly 2014 ("A robust eigensolver for 3x3 symmetric matrices"): the cubic for the deviator has one well separated root,
-    whose axis is a cross product; in the plane normal to it remains a problem of two dimensions. That works for repeated and for tiny principal values.
+    This is a closed form in the order of Eberly 2014 ("A robust eigensolver for 3x3 symmetric matrices"). The cubic for the deviator has one well separated
+    root, whose axis is a cross product. A two-dimensional problem remains in the plane normal to it. The method works for repeated and tiny principal values.
     """
     q = (b[0] + b[3] + b[5]) / 3.0
     d00, d01, d02, d11, d12, d22 = b[0] - q, b[1], b[2], b[3] - q, b[4], b[5] - q
@@ -100,7 +100,7 @@ def spectral(b):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _isotropic(u, v, w, a):
-    """The symmetric tensor with principal values u, v and w along the axes."""
+    """Return the symmetric tensor with principal values u, v and w along the axes."""
     return (
         u * a[0] * a[0] + v * a[3] * a[3] + w * a[6] * a[6],
         u * a[0] * a[1] + v * a[3] * a[4] + w * a[6] * a[7],
@@ -114,7 +114,7 @@ def _isotropic(u, v, w, a):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _stretched(f, u, v, w, axes):
-    """F with its principal stretches multiplied by u, v and w."""
+    """Return F with its principal stretches multiplied by u, v and w."""
     m = _isotropic(u, v, w, axes)
     return (
         m[0] * f[0] + m[1] * f[3] + m[2] * f[6],
@@ -132,7 +132,7 @@ def _stretched(f, u, v, w, axes):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _squared_stretches(f):
-    """Squares of the principal stretches, bounded from below; their axes; F, replaced by the left stretch tensor where a bound took effect."""
+    """Return the squared principal stretches with a lower bound, their axes, and F, or its left stretch tensor if the bound took effect."""
     (b1, b2, b3), axes = spectral(left_cauchy_green(f))
     if min(b1, b2, b3) < SMALLEST_SQUARE:
         b1, b2, b3 = max(b1, SMALLEST_SQUARE), max(b2, SMALLEST_SQUARE), max(b3, SMALLEST_SQUARE)
@@ -148,9 +148,9 @@ def sand(f, volume_correction, lam, mu, slope):
 
     Args:
         f: trial elastic deformation gradient.
-        volume_correction: v of the particle.
+        volume_correction: volume v of the particle, as in ``laws_2d``.
         lam, mu: Lamé parameters [Pa].
-        slope: of the cone, ``|dev ε| / -tr ε``.
+        slope: slope of the cone, ``|dev ε| / -tr ε``.
 
     Returns:
         The return-mapped F, the new v, τ and the stiffness [Pa].

@@ -1,4 +1,4 @@
-"""``Particles``: all that the compiled kernels know of the particles."""
+"""``Particles``: all arrays of the particles that the compiled kernels use."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ class Particles(NamedTuple):
     """Arrays of all particles, C-contiguous; the first six change in place.
 
     Attributes:
-        pos, vel: [node, dim] in m and m/s.
+        pos, vel: positions and velocities [node, dim] in m and m/s.
         deformation, affine, gradient, plastic: as in ``MPMInternal``; ``gradient`` is the same array as ``affine`` where no particle has a ``MEMORY``.
-        mass: [node] in kg.
+        mass: masses [node] in kg.
         specific_volume: volume per mass at rest [node] in m³/kg.
         law: code of the constitutive law [node].
-        constants: what the law reads [node, constant], see ``materials``.
+        constants: constants that the law reads [node, constant], see ``materials``.
     """
 
     pos: np.ndarray

@@ -1,17 +1,17 @@
-"""What a trip to the grid and back takes from the velocities of particles, and how much of it they keep.
+"""The loss of particle velocities in a transfer to the grid and back, and how much of it particles keep.
 
-The grid holds fewer numbers than the particles, so a trip to it and back smooths their velocities. APIC applies that filter in every substep, and the energy
-that it takes per second grows without bound as substeps get shorter. Here the remainder of the filter, ``s - G P s`` with the velocity and the affine part of
-all particles in ``s``, decays at a rate r, so that the loss per second has a limit::
+The grid holds fewer numbers than the particles, so a transfer to it and back smooths their velocities. APIC applies this filter in every substep, so its loss
+of energy per second grows without bound as substeps get shorter. Here the remainder of the filter, ``s - G P s`` with the velocity and the affine part of all
+particles in ``s``, decays at a rate r, so that the loss per second has a limit::
 
     γ_p = 1 / (1 + h r_p),   r_p = 1 / (MEMORY Δ) + SHOCK |∇v + ∇vᵀ| / 2
     u_i = Σ_p γ_p w_ip m_p [v_p + C_p (x_i - x_p)] / Σ_p γ_p w_ip m_p                                                   (P)
     k_p = γ_p (v_p - Σ_i w_ip u_i),   K_p = γ_p (C_p - Σ_i w_ip u_i (x_i - x_p)ᵀ / D)                                   (G)
     v_p ← v'_p + k_p,   C_p ← C'_p + K_p + h/2 (M - Mᵀ),   M = (v'_p - v_p) k_pᵀ / D - C_p K_pᵀ
 
-with v' and C' from the grid after the forces. The remainder of a rigid motion is zero, and that of all particles has no linear and no angular momentum. M makes
-up for the torque that follows from particles moving with the grid, by ``h v'``, although they have the velocity ``v' + k``; it is local and the same in
-all inertial frames.
+v' and C' come from the grid after the forces. The remainder of a rigid motion is zero, and the remainder of all particles has no linear and no angular
+momentum. Particles move with the grid, by ``h v'``, although their velocity is ``v' + k``. M compensates the torque that follows from this; it is local and
+the same in all inertial frames.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from gpe_pl.solvers.mpm import transfer_2d, transfer_3d
 from gpe_pl.solvers.mpm.particles import Particles
 
 SHOCK = 0.2
-"""Part of its rate of deformation by which a particle forgets faster: the damping that strong shocks need to be stable (von Neumann and Richtmyer 1950)."""
+"""Rate at which a particle forgets faster, per rate of deformation: the damping that keeps strong shocks stable (von Neumann and Richtmyer 1950)."""
 
 
 class Remainder(NamedTuple):
-    """Arrays that outlive a substep only to be reused.
+    """Work arrays that are allocated once and reused in every substep.
 
     Attributes:
         vel, affine: k and K of the particles [node, dim] in m/s and [node, dim, dim] in 1/s.
         before: velocities before the substep [node, dim] in m/s.
         mass: ``γ m`` [node] in kg.
-        grid: momentum and mass in that sense, then u and mass [grid node, dim + 1].
-        no_stress: zeros, as the transfers take them.
+        grid: momentum and mass weighted with γ, then u and mass [grid node, dim + 1].
+        no_stress: zeros that stand for the stress in the transfers.
     """
 
     vel: np.ndarray
@@ -52,7 +52,7 @@ class Remainder(NamedTuple):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def set_aside(particles, remainder, active, counts, origin, inv, h):
-    """Write what the particles keep over a substep of length h, before they change; ``remainder.grid`` is zero within ``active`` before."""
+    """Store what the particles keep over a substep of length h, before they change; on entry ``remainder.grid`` must be zero within ``active``."""
     dim = len(counts)
     grid, flat, kept, rest = remainder.grid, remainder.grid.reshape(-1), remainder.vel, remainder.affine
     for p in range(kept.shape[0]):
@@ -92,7 +92,7 @@ def set_aside(particles, remainder, active, counts, origin, inv, h):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def give_back(particles, remainder, counts, inv, h):
-    """Add the remainder to what the grid gave the particles, whose ``affine`` is still that of before."""
+    """Add the remainder to the particles after the transfer from the grid; their ``affine`` must still be that before the substep."""
     dim = len(counts)
     vel, affine, gradient, kept, rest, before = (
         particles.vel, particles.affine, particles.gradient, remainder.vel, remainder.affine, remainder.before,

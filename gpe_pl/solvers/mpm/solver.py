@@ -1,4 +1,4 @@
-"""``MPM``, the simulator: settings, checks of the state, and errors that say what is wrong."""
+"""``MPM``, the material point simulator: settings, checks of the state, and errors that say what is wrong."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 
 PADDING = 3
-"""Cells between the domain and the edge of the grid: room for the kernel of a particle on a wall, or one cell behind it."""
+"""Number of cells between the domain and the edge of the grid, for the kernel of a particle up to one cell behind a wall."""
 
 UNDEFORMED = 1e-3
-"""Relative change of the distance between two nodes of a cell up to which a mesh counts as undeformed: far more than the rounding of stored positions."""
+"""Relative change of the distances within a cell up to which a mesh counts as undeformed; it far exceeds the rounding of stored positions."""
 
 KNOWN = ("sand", "snow", "elastomer", "fluid")
-"""Materials that have a law; also the names of the solver's settings that hold their constants."""
+"""Materials that have a law, and names of the settings that hold their constants."""
 
 
 @dataclass(frozen=True)
 class MPMInternal:
-    """What the solver knows about its particles besides position and velocity.
+    """State of the solver's particles besides position and velocity.
 
     Attributes:
         deformation: elastic deformation gradient F [node, dim, dim].
-        affine: affine part of the velocity that the particle brings to the grid [node, dim, dim] in 1/s, C of APIC.
-        gradient: velocity gradient of the grid at the particle [node, dim, dim] in 1/s, by which it deforms.
+        affine: affine part of the velocity that the particle transfers to the grid, C of APIC [node, dim, dim] in 1/s.
+        gradient: velocity gradient of the grid at the particle, by which it deforms [node, dim, dim] in 1/s.
         plastic: plastic state [node]: the volume correction of sand, ``J_P - 1`` of snow.
-        last_substep: length of the substep before [s]; 0 where there is none.
+        last_substep: length of the previous substep [s]; 0 if none.
     """
 
     deformation: np.ndarray
@@ -52,7 +52,7 @@ class MPMInternal:
 
     @classmethod
     def at_rest(cls, num_nodes: int, dim: int) -> MPMInternal:
-        """Undeformed particles that do not rotate."""
+        """Return the state of undeformed particles that do not rotate."""
         still = np.zeros((num_nodes, dim, dim))
         return cls(np.tile(np.eye(dim), (num_nodes, 1, 1)), still, still.copy(), np.zeros(num_nodes))
 
@@ -61,21 +61,21 @@ class MPMInternal:
 class MPM:
     """Material point solver; a ``Simulator``.
 
-    How particles are deformed cannot be told from their positions, so a state is either the start of a scene, where nothing is deformed, or one that ``step``
-    returned, with its ``internal`` part. Frames of a stored or predicted trajectory after the first one are refused.
+    Positions do not tell how particles are deformed. A state must therefore be either the start of a scene, where nothing is deformed, or a state that ``step``
+    returned, with its ``internal`` part. Later frames of a stored or predicted trajectory are refused.
 
-    Each step advances one frame by substeps that satisfy ``h (c + |v|_max) <= cfl Δ``, with c the fastest elastic wave in any particle as it is deformed and
-    hardened now, ``h² |g| <= cfl Δ / 4`` and ``8 h ν <= Δ²``. They are chosen from the current state alone, so a restart repeats a run-through bit by bit.
+    Each step advances one frame by substeps that satisfy ``h (c + |v|_max) <= cfl Δ``, ``h² |g| <= cfl Δ / 4`` and ``8 h ν <= Δ²``. Here c is the speed of the
+    fastest elastic wave at the present deformation and hardening. Substeps depend on the current state alone, so a restart repeats a run bit by bit.
     Obstacles must be at least one grid cell thick.
 
     Attributes:
-        bounds: ``(low, high)`` per axis of the domain [m]; whole multiples of the grid spacing apart.
-        grid_spacing: Δ [m].
+        bounds: ``(low, high)`` of the domain along each axis [m]; each extent is a whole multiple of the grid spacing.
+        grid_spacing: grid spacing Δ [m].
         frame_dt: time between frames [s].
-        materials: every material of the data set, which fixes the columns of ``State.material_params``.
-        sand, snow, elastomer, fluid: constants of each material, of liquid the usual ones if None. Particles carry mass, so the density tells their volume.
+        materials: every material of the data set; they determine the columns of ``State.material_params``.
+        sand, snow, elastomer, fluid: constants of each material; None selects the defaults of liquid. The density gives the volume of a particle of given mass.
         cfl: fraction of a cell that a wave or a particle may cross in one substep.
-        max_substeps: per frame; more means that the state has exploded.
+        max_substeps: largest number of substeps per frame; needing more counts as an explosion.
     """
 
     bounds: tuple[tuple[float, float], ...]
@@ -101,15 +101,15 @@ class MPM:
 
     @property
     def solver_dt(self) -> float:
-        """Largest substep in s: that of particles at rest of the material with the slowest waves."""
+        """Largest substep in s: that of particles at rest, of the material with the slowest waves."""
         slowest = min(m.smallest_stiffness / m.density for m in (self.constants_of(name) for name in self.materials))
         return min(self.frame_dt, self.cfl * self.grid_spacing / math.sqrt(slowest))
 
     @property
     def numerical_viscosity(self) -> float:
-        """Kinematic viscosity in m²/s that the transfers add to that of liquid in waves of 16 cells, ``Δ²/(256 (τ + h))``.
+        """Kinematic viscosity in m²/s that the transfers add to a liquid's own in waves of 16 cells, ``Δ²/(256 (τ + h))``.
 
-        τ is the time for which particles keep what the grid does not hold, and h a substep. It is less in longer waves.
+        τ is the time for which particles keep a velocity that the grid does not represent, and h a substep. Longer waves get less.
         """
         fluid: Fluid = self.fluid or Fluid()
         substep = self.cfl * self.grid_spacing / math.sqrt(fluid.bulk_modulus / fluid.density)
@@ -117,15 +117,15 @@ class MPM:
 
     @property
     def smallest_resolved(self) -> dict[str, float]:
-        """Smallest parameter of each material that is not below what the grid adds to it."""
+        """Smallest parameter value of each material that exceeds the numerical contribution of the grid."""
         return {"fluid": self.numerical_viscosity} if "fluid" in self.materials else {}
 
     def constants_of(self, material: str) -> Sand | Snow | Elastomer | Fluid:
-        """Of a material by its name."""
+        """Return the constants of a material, given its name."""
         return getattr(self, material) or Fluid()
 
     def compile_kernels(self) -> None:
-        """Compile what this solver's dimension needs and fill Numba's cache on disk, so that worker processes started afterwards only load it."""
+        """Compile the kernels for this solver's dimension into Numba's disk cache, so that worker processes started later only load them."""
         material, dim = self.materials[0], len(self.bounds)
         params = np.full((1, len(param_names(self.materials))), LIMITS[material].low)
         middle = np.array([[(low + high) / 2 for low, high in self.bounds]])
@@ -136,7 +136,7 @@ class MPM:
         """Advance one frame.
 
         Raises:
-            SimulationError: with reason ``input`` (arrays or obstacles that do not fit the solver, or no ``internal`` where it is needed), ``nan``,
+            SimulationError: with reason ``input`` (arrays or obstacles do not fit the solver, or ``internal`` is needed and missing), ``nan``,
                 ``escape`` (a particle left the domain through an open side or started outside) or ``explosion`` (more than ``max_substeps``).
         """
         check_surroundings(state, "MPM")
@@ -191,7 +191,7 @@ class MPM:
         return collider(tuple(boundary.shapes), origin, self.grid_spacing, counts)
 
     def _particles(self, state: State, internal: object) -> Particles:
-        """The particles in the form that the kernels take, or an error that names what does not fit."""
+        """Return the particles in the form that the kernels take; raise an error that names what does not fit."""
         num_nodes, dim = state.num_nodes, len(self.bounds)
         names = param_names(self.materials)
         shapes = {
@@ -227,7 +227,7 @@ class MPM:
             constants[chosen] = material.constants(values[chosen], dim)
             known |= chosen
         self._require(known, f"node_type is none of the solver's materials {', '.join(self.materials)} (codes of {', '.join(NODE_TYPES)})")
-        # np.array copies: the kernels work in place and the caller's arrays must not change
+        # np.array copies: the kernels work in place, and the caller's arrays must not change
         changing = (state.pos, state.vel, internal.deformation, internal.affine, internal.plastic)
         pos, vel, deformation, affine, plastic = (np.array(x, dtype=np.float64, order="C") for x in changing)
         gradient = np.array(internal.gradient, dtype=np.float64, order="C") if np.any(constants[:, MEMORY] > 0) else affine
@@ -256,7 +256,7 @@ class MPM:
 
 
 def _largest_stretch(pos: np.ndarray, rest_pos: np.ndarray, cells: np.ndarray) -> tuple[float, int]:
-    """Largest relative change of a distance between two nodes of a cell, and one of the nodes."""
+    """Return the largest relative change of a distance between two nodes of a cell, and one of the two nodes."""
     pairs = np.concatenate([cells[:, pair] for pair in itertools.combinations(range(cells.shape[1]), 2)])
     rest, now = (np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1) for x in (rest_pos, pos))
     change = np.abs(now - rest) / np.where(rest > 0, rest, math.inf)

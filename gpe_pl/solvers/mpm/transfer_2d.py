@@ -1,11 +1,11 @@
 """Transfers between particles and grid in 2D.
 
-``grid`` has three numbers for each node, momentum or velocity and then mass, one after the other; node ``(i, j)`` is the ``(i n_y + j)``-th. Indices are
-unsigned, which spares the test for negative ones.
+``grid`` holds three numbers for each node, one after the other: momentum or velocity, then mass. Node ``(i, j)`` has the index ``i n_y + j``. Indices are
+unsigned, which saves the test for negative ones.
 
-Stresses have a pass of their own: their logarithms, roots and divisions then overlap from one particle to the next. Floor, per particle and substep of
-sand: 450 floating-point operations, of which a scalar core does about two per cycle, and 400 bytes from the second-level cache; at 3 GHz 75 ns, all of it
-arithmetic.
+Stresses have a separate pass, so that their logarithms, roots and divisions overlap between particles. The lower bound of the cost per particle and substep of
+sand is 450 floating-point operations, of which a scalar core does about two per cycle, and 400 bytes from the second-level cache. At 3 GHz this takes 75 ns,
+all of it arithmetic.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from gpe_pl.solvers.mpm import laws_2d
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def weights(f):
-    """Quadratic B-spline weights of three nodes; ``f`` in [0.5, 1.5) is the distance from the first, in cells."""
+    """Return the quadratic B-spline weights of three nodes; ``f`` in [0.5, 1.5) is the distance from the first, in cells."""
     return 0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def squared_wave_speed(particles):
-    """Of the fastest elastic wave in any particle, in m²/s²."""
+    """Return the squared speed of the fastest elastic wave in any particle, in m²/s²."""
     squared = 0.0
     for p in range(particles.pos.shape[0]):
         f = particles.deformation[p]
@@ -41,9 +41,9 @@ def squared_wave_speed(particles):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def deform(particles, stress, h):
-    """Deform the particles by ``h ∇v`` and write their Kirchhoff stress [node, 3] in Pa; returns the new ``squared_wave_speed``.
+    """Deform the particles by ``h ∇v`` and write their Kirchhoff stress [node, 3] in Pa; return the new ``squared_wave_speed``.
 
-    Viscosity ν adds ``2 ρ ν dev ∇v``, symmetrised and in plane strain. The transfer that follows takes ``8 h ν / Δ²`` of it away, whatever the positions.
+    Viscosity ν adds ``2 ρ ν dev ∇v``, symmetrised and in plane strain. The next transfer removes ``8 h ν / Δ²`` of it, for any positions.
     """
     deformation, gradient, plastic, specific_volume = (
         particles.deformation,
@@ -78,7 +78,7 @@ def deform(particles, stress, h):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def particles_to_grid(particles, stress, grid, counts, origin, inv, h):
-    """Add momentum, impulse of the stress and mass of the particles to the grid."""
+    """Add momentum, stress impulse and mass of the particles to the grid."""
     pos, vel, affine, mass, specific_volume = particles.pos, particles.vel, particles.affine, particles.mass, particles.specific_volume
     spacing, stride = 1.0 / inv, counts[1]
     for p in range(pos.shape[0]):
@@ -108,7 +108,7 @@ def particles_to_grid(particles, stress, grid, counts, origin, inv, h):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def grid_to_particles(particles, grid, counts, origin, inv, h):
-    """Velocities and their gradients from the grid, and new positions."""
+    """Interpolate velocities and their gradients from the grid, and move the particles."""
     pos, vel, gradient = particles.pos, particles.vel, particles.gradient
     stride = counts[1]
     for p in range(pos.shape[0]):

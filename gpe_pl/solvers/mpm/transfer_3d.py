@@ -1,4 +1,4 @@
-"""Transfers between particles and grid in 3D, as in ``transfer_2d``: four numbers for each node, and node ``(i, j, k)`` is the ``((i n_y + j) n_z + k)``-th."""
+"""Transfers between particles and grid in 3D, as in ``transfer_2d``; a node has four numbers, and node ``(i, j, k)`` has the index ``(i n_y + j) n_z + k``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gpe_pl.solvers.mpm.transfer_2d import weights
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _matrix(stack, p):
-    """The p-th 3x3 matrix of an array as a tuple."""
+    """Return the p-th 3x3 matrix of an array as a tuple."""
     return (
         stack[p, 0, 0], stack[p, 0, 1], stack[p, 0, 2],
         stack[p, 1, 0], stack[p, 1, 1], stack[p, 1, 2],
@@ -34,7 +34,7 @@ def _store(stack, p, m):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def squared_wave_speed(particles):
-    """Of the fastest elastic wave in any particle, in m²/s²."""
+    """Return the squared speed of the fastest elastic wave in any particle, in m²/s²."""
     squared = 0.0
     for p in range(particles.pos.shape[0]):
         out = laws_3d.respond(particles.law[p], _matrix(particles.deformation, p), particles.plastic[p], particles.constants, p)
@@ -45,7 +45,7 @@ def squared_wave_speed(particles):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def deform(particles, stress, h):
-    """Deform the particles by ``h ∇v`` and write their Kirchhoff stress [node, 6] in Pa; returns the new ``squared_wave_speed``."""
+    """Deform the particles by ``h ∇v`` and write their Kirchhoff stress [node, 6] in Pa; return the new ``squared_wave_speed``."""
     deformation, gradient, plastic, specific_volume = (
         particles.deformation,
         particles.gradient,
@@ -84,7 +84,7 @@ def deform(particles, stress, h):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def particles_to_grid(particles, stress, grid, counts, origin, inv, h):
-    """Add momentum, impulse of the stress and mass of the particles to the grid."""
+    """Add momentum, stress impulse and mass of the particles to the grid."""
     pos, vel, affine, mass, specific_volume = particles.pos, particles.vel, particles.affine, particles.mass, particles.specific_volume
     spacing, stride_x, stride_y = 1.0 / inv, counts[1] * counts[2], counts[2]
     for p in range(pos.shape[0]):
@@ -120,7 +120,7 @@ def particles_to_grid(particles, stress, grid, counts, origin, inv, h):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def grid_to_particles(particles, grid, counts, origin, inv, h):
-    """Velocities and their gradients from the grid, and new positions."""
+    """Interpolate velocities and their gradients from the grid, and move the particles."""
     pos, vel, gradient = particles.pos, particles.vel, particles.gradient
     stride_x, stride_y = counts[1] * counts[2], counts[2]
     for p in range(pos.shape[0]):
