@@ -1,4 +1,4 @@
-"""Random bodies: outlines of unit area in the plane and signed distances of unit volume in space, around the origin."""
+"""Random bodies around the origin: outlines of unit area in 2D, and signed distances of bodies of unit volume in 3D."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def _polar(radius: np.ndarray) -> Loop:
 
 
 def _rounded(corners: np.ndarray, radius: float) -> Loop:
-    """A counter-clockwise polygon with its corners replaced by arcs of this radius, or as large as the edges allow."""
+    """Replace the corners of a counter-clockwise polygon by arcs of this radius, or of the largest radius that the edges allow."""
     pieces = []
     for before, at, after in zip(np.roll(corners, 1, axis=0), corners, np.roll(corners, -1, axis=0), strict=True):
         a, b = before - at, after - at
@@ -83,7 +83,7 @@ def _gear(rng: np.random.Generator) -> list[Loop]:
 
 
 def _letter(rng: np.random.Generator) -> list[Loop]:
-    """L, T, U or plus, with arms of a random width."""
+    """Outline of an L, T, U or plus with arms of random width."""
     t = rng.uniform(0.34, 0.45)
     w, kind = rng.uniform(1.0, 1.4), int(rng.integers(4))
     m, r = w / 2, t / 2
@@ -110,11 +110,11 @@ OUTLINES: dict[str, Callable[[np.random.Generator], list[Loop]]] = {
     "gear": _gear,
     "letter": _letter,
 }
-"""Families of plane bodies."""
+"""Families of bodies in 2D."""
 
 
 def random_outline(rng: np.random.Generator, family: str | None = None) -> list[Loop]:
-    """A body of unit area around the origin, of a given or random family."""
+    """Create a body of unit area around the origin, of a given or random family."""
     names = tuple(OUTLINES)
     loops = OUTLINES[family or names[rng.integers(len(names))]](rng)
     size = 1 / math.sqrt(sum(_area(loop) for loop in loops))
@@ -163,7 +163,7 @@ def _torus(rng: np.random.Generator) -> Distance:
 
 
 def _bend(rng: np.random.Generator) -> Distance:
-    """Two arms at a right angle."""
+    """Signed distance of two arms at a right angle."""
     arm = rng.uniform(1.0, 1.3)
     a, b = np.array([arm, 0.5, 0.5]), np.array([0.5, arm, 0.5])
 
@@ -175,7 +175,7 @@ def _bend(rng: np.random.Generator) -> Distance:
 
 
 def _dumbbell(rng: np.random.Generator) -> Distance:
-    """Two balls on a rod, with smooth transitions."""
+    """Signed distance of two balls on a rod, with smooth transitions."""
     span, second = rng.uniform(0.7, 0.9), rng.uniform(0.5, 0.7)
 
     def distance(x: np.ndarray) -> np.ndarray:
@@ -194,11 +194,15 @@ SOLIDS: dict[str, Callable[[np.random.Generator], Distance]] = {
     "bend": _bend,
     "dumbbell": _dumbbell,
 }
-"""Families of bodies in space."""
+"""Families of bodies in 3D."""
 
 
 def random_solid(rng: np.random.Generator, family: str | None = None) -> tuple[Distance, float]:
-    """A body of unit volume, of a given or random family: its signed distance, and half the width of a cube around the origin that holds it."""
+    """Create a body of unit volume, of a given or random family.
+
+    Returns:
+        The signed distance of the body, and half the width of a cube around the origin that contains it.
+    """
     names = tuple(SOLIDS)
     distance = SOLIDS[family or names[rng.integers(len(names))]](rng)
     reach, count = 2.2, 40

@@ -1,4 +1,4 @@
-"""A random canyon for scenes of liquid. The last axis points up."""
+"""Random canyons for scenes of liquid. The last axis points up."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class Canyon:
     """A canyon along x: a river bed that descends from a reservoir at low x, a waterfall, and a pool at high x.
 
     Attributes:
-        terrain: the rock.
-        reservoir: ``(low, high)`` per axis [m] of the region where the water starts, held by the headwall and the banks.
-        fall: x [m] of the edge of the waterfall.
-        pool: height [m] of the deepest ground below it.
+        terrain: the solid ground.
+        reservoir: ``(low, high)`` per axis [m] of the region where the water starts. The headwall and the banks enclose it.
+        fall: x coordinate of the edge of the waterfall [m].
+        pool: height of the deepest ground below the waterfall [m].
     """
 
     terrain: DistanceGrid
@@ -30,12 +30,12 @@ class Canyon:
 
 
 def canyon(seed: int, bounds: Bounds, spacing: float, friction: float = STICKY) -> Canyon:
-    """A random canyon; the same for any spacing.
+    """Create a random canyon. The same seed gives the same canyon at any spacing.
 
     Args:
         seed: non-negative integer.
         bounds: ``(low, high)`` of the domain along x, y and z [m].
-        spacing: of the grid of distances [m].
+        spacing: spacing of the grid of signed distances [m].
         friction: Coulomb coefficient of the rock.
     """
     low, counts = lattice(bounds, spacing)
@@ -47,7 +47,7 @@ def canyon(seed: int, bounds: Bounds, spacing: float, friction: float = STICKY) 
     bend, turns, phase = rng.uniform(0.05, 0.12), rng.uniform(0.8, 1.4), rng.uniform(0, 2 * math.pi)
     narrow, narrows = rng.uniform(0.13, 0.18), rng.uniform(0.34, 0.4)
 
-    step = 0.03  # length of the fall, of the domain's
+    step = 0.03  # length of the fall, as a fraction of the domain's
     upper = lip + 0.15 * (edge - x) + 0.006 * _waves(rng, x, 0 * x, 3.0)
     lower = sink + 0.03 * _waves(rng, x, y, 5.0) * (1 - _rise(edge, edge + 0.2, x)) + 0.02
     bed = upper + (lower - upper) * _rise(edge, edge + step, x)
@@ -60,7 +60,7 @@ def canyon(seed: int, bounds: Bounds, spacing: float, friction: float = STICKY) 
     share = bed + (plateau - bed) * bank + 0.015 * _waves(rng, x, y, 25.0) * (0.3 + bank)
     heights = low[2] + room[2] * np.clip(share, 0.03, 0.97)
     terrain = DistanceGrid.from_values(low, spacing, below_heights(heights, low, spacing, counts), friction)
-    # the banks hold water up to the lowest place of their crests
+    # The banks enclose water up to the lowest place of their crests.
     banks = heights[: int(np.sum(x[:, 0] <= narrows))]
     level = min(bank.max(axis=1).min() for bank in np.array_split(banks, 2, axis=1))
     first, across, floor = (float(v) for v in low)
@@ -73,13 +73,13 @@ def canyon(seed: int, bounds: Bounds, spacing: float, friction: float = STICKY) 
 
 
 def _rise(start: float, end: float, x: np.ndarray) -> np.ndarray:
-    """A smooth step from 0 at ``start`` to 1 at ``end``."""
+    """Smooth step from 0 at ``start`` to 1 at ``end``."""
     t = np.clip((x - start) / (end - start), 0.0, 1.0)
     return np.asarray(t * t * (3 - 2 * t))
 
 
 def _waves(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, frequency: float, number: int = 8) -> np.ndarray:
-    """Random smooth noise of about unit size: a sum of waves of up to ``frequency`` per unit length."""
+    """Random smooth noise of about unit size: a sum of ``number`` waves with at most ``frequency`` periods per unit length."""
     total: np.ndarray = np.zeros(np.broadcast_shapes(x.shape, y.shape))
     for _ in range(number):
         angle, phase, k = rng.uniform(0, 2 * math.pi), rng.uniform(0, 2 * math.pi), 2 * math.pi * frequency * rng.uniform(0.3, 1.0)

@@ -1,4 +1,7 @@
-"""Signed distances at the nodes of a grid, negative inside: to a ground given by heights, to triangles, to oriented points. The last axis points up."""
+"""Signed distances at the nodes of a grid, negative inside the solid.
+
+The surface is given by heights of the ground, by triangles or by oriented points. The last axis points up.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +18,17 @@ Solid = Literal["inside", "outside", "below"]
 """Which side of a surface is solid."""
 
 _BAND = 2
-"""Cells around a triangle whose distances are exact by construction; farther ones inherit the nearest triangle of a neighbour."""
+"""Width of the band around a triangle in which distances are exact [cells]. Nodes farther away inherit the nearest triangle of a neighbour."""
 MAX_PAIRS = 2**30
-"""Of triangles and grid nodes near them, whose distances are computed: about half a minute."""
+"""Maximum number of pairs of a triangle and a nearby grid node. Computing that many distances takes about half a minute."""
 
 
 def lattice(bounds: Bounds, spacing: float) -> tuple[np.ndarray, tuple[int, ...]]:
-    """First node and number of nodes of the grid that covers the domain."""
+    """Position of the first node [m] and number of nodes per axis of the grid that covers the domain.
+
+    Raises:
+        ValueError: bounds or spacing are invalid, or the grid would have more than ``MAX_GRID_NODES`` nodes.
+    """
     if len(bounds) != 3 or any(not -math.inf < low < high < math.inf for low, high in bounds):
         raise ValueError(f"terrain needs bounds (low, high) with low < high along 3 axes, got {bounds}")
     if not 0 < spacing < math.inf:
@@ -33,36 +40,36 @@ def lattice(bounds: Bounds, spacing: float) -> tuple[np.ndarray, tuple[int, ...]
 
 
 def columns_of(low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
-    """Positions of the grid's vertical lines [along x, along y, 2]."""
+    """Positions [along x, along y, 2] of the grid's vertical lines in m."""
     axes = [low[k] + spacing * np.arange(counts[k]) for k in range(2)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
 def below_heights(heights: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
-    """Signed distances to the ground under heights [m] at the grid's vertical lines."""
+    """Signed distances [m] to the ground, whose heights [m] are given at the grid's vertical lines."""
     corners = _ground(heights, low, spacing, np.ones((counts[0] - 1, counts[1] - 1), dtype=bool))
     z = low[2] + spacing * np.arange(counts[2])
     return np.where(z < heights[..., None], -1.0, 1.0) * unsigned(corners, low, spacing, counts)
 
 
 def _ground(heights: np.ndarray, low: np.ndarray, spacing: float, cells: np.ndarray) -> np.ndarray:
-    """Corners [triangle, 3, 3] of two triangles in each of these cells between vertical lines."""
+    """Corners [triangle, 3, 3] of the ground's triangles, two in each cell of the mask ``cells`` between vertical lines."""
     place = np.concatenate([columns_of(low, spacing, heights.shape), heights[..., None]], axis=-1)
     a, b, c, d = place[:-1, :-1][cells], place[1:, :-1][cells], place[1:, 1:][cells], place[:-1, 1:][cells]
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
 def mesh_distances(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...], solid: Solid) -> np.ndarray:
-    """Signed distances to triangles [triangle, 3, 3].
+    """Signed distances [m] to triangles [triangle, 3, 3].
 
     Raises:
-        ValueError: nothing lies ``below`` them, or so many are so large that it would take minutes.
+        ValueError: with ``solid="below"``, no triangle lies over the domain; or there are more than ``MAX_PAIRS`` pairs, which would take minutes.
     """
     from scipy.ndimage import distance_transform_edt
 
     if (count := _num_pairs(corners, low, spacing, counts)) > MAX_PAIRS:
         raise ValueError(
-            f"{len(corners)} triangles have together {count:.3g} grid nodes beside them, at most {MAX_PAIRS:.3g}; simplify the mesh, or use a wider spacing"
+            f"{len(corners)} triangles have together {count:.3g} grid nodes near them, at most {MAX_PAIRS:.3g}; simplify the mesh, or use a wider spacing"
         )
     if solid == "below":
         above, top = _crossings(corners, low, spacing, counts, 2)
@@ -75,16 +82,16 @@ def mesh_distances(corners: np.ndarray, low: np.ndarray, spacing: float, counts:
         inside = np.where(covered[..., None], above % 2 == 1, z < top[..., None])
         full = covered[:-1, :-1] & covered[1:, :-1] & covered[1:, 1:] & covered[:-1, 1:]
         corners = np.concatenate([corners, _ground(top, low, spacing, ~full)])
-    else:  # two of three rays decide, so a crack that one ray slips through does no harm
+    else:  # a majority of three rays decides, so that a crack which one ray passes through does no harm
         votes = sum((_crossings(corners, low, spacing, counts, axis)[0] % 2).astype(int) for axis in range(3))
         inside = (np.asarray(votes) >= 2) == (solid == "inside")
     return np.where(inside, -1.0, 1.0) * unsigned(corners, low, spacing, counts)
 
 
 def cloud_distances(points: np.ndarray, normals: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
-    """Signed distances to an oriented point cloud: weighted mean of the distances to the tangent planes of the nearest points.
+    """Signed distances [m] to an oriented point cloud: weighted means of the distances to the tangent planes of the nearest points.
 
-    Far from the cloud, where planes mean little, it is the distance to the nearest point with the sign of that mean.
+    Far from the cloud, tangent planes say little. There it is the distance to the nearest point, with the sign of the weighted mean.
     """
     from scipy.spatial import cKDTree
 
@@ -101,7 +108,7 @@ def cloud_distances(points: np.ndarray, normals: np.ndarray, low: np.ndarray, sp
 
 
 def unsigned(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
-    """Distances [m] of grid nodes to the nearest of these triangles [triangle, 3, 3]."""
+    """Unsigned distances [m] of grid nodes to the nearest of the triangles [triangle, 3, 3]."""
     triangles = np.ascontiguousarray(corners, dtype=np.float64).reshape(-1, 9)
     distance = np.full(counts, np.inf)
     nearest = np.full(counts, -1, dtype=np.int64)
@@ -112,7 +119,7 @@ def unsigned(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple
 
 
 def _num_pairs(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> float:
-    """Triangles and grid nodes that ``unsigned`` compares: those in the box around each triangle, wider by ``_BAND`` cells."""
+    """Number of pairs of triangle and grid node that ``unsigned`` compares: nodes in the box around each triangle, extended by ``_BAND`` cells."""
     place = (corners - low) / spacing
     last = np.array(counts) - 1.0
     first = np.floor(np.clip(place.min(axis=1) - _BAND, 0.0, last))
@@ -120,7 +127,7 @@ def _num_pairs(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tup
 
 
 def _crossings(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...], axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """How many triangles lie beyond each grid node along an axis, and for each line of nodes the last crossing (-inf: none)."""
+    """Number of triangles beyond each grid node along an axis, and the last crossing on each line of nodes [m] (-inf: none)."""
     order = [(axis + 1) % 3, (axis + 2) % 3, axis]
     hits = np.zeros([counts[k] for k in order], dtype=np.int64)
     last = np.full(hits.shape[:2], -np.inf)
@@ -149,7 +156,7 @@ def _to_edge(px, py, pz, ax, ay, az, bx, by, bz):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _to_triangle(px, py, pz, t):
-    """Squared distance of p to a triangle: to its plane above the inside, else to the nearest edge."""
+    """Squared distance of p to a triangle: to its plane if the foot point lies inside, else to the nearest edge."""
     ux, uy, uz, vx, vy, vz = t[3] - t[0], t[4] - t[1], t[5] - t[2], t[6] - t[0], t[7] - t[1], t[8] - t[2]
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
     wx, wy, wz = px - t[0], py - t[1], pz - t[2]
@@ -168,14 +175,14 @@ def _to_triangle(px, py, pz, t):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _node(x, count):
-    """A place along an axis as the index of a node that exists; also where it lies far outside of the grid."""
+    """Index of the node at a place along an axis; clamped to the grid."""
     return int(min(max(x, 0.0), count - 1.0))
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _near(triangles, origin, spacing, band, distance, nearest):
-    """Squared distances of the nodes within ``band`` cells of a triangle; one outside of the grid counts for the nodes at the rim."""
+    """Compute squared distances of the nodes within ``band`` cells of a triangle. A triangle outside the grid counts for the nodes at the rim."""
     nx, ny, nz = distance.shape
     for f in range(len(triangles)):
         t = triangles[f]
@@ -194,7 +201,7 @@ def _near(triangles, origin, spacing, band, distance, nearest):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _spread(triangles, origin, spacing, distance, nearest):
-    """Fast sweeping: every node tries the nearest triangles of its neighbours, in all eight orders, twice."""
+    """Fast sweeping: every node tries the nearest triangles of its neighbours, in two rounds of all eight orders."""
     nx, ny, nz = distance.shape
     for sweep in range(16):
         di, dj, dk = 1 - 2 * (sweep & 1), 1 - (sweep & 2), 1 - (sweep & 4) // 2
@@ -222,10 +229,10 @@ def _spread(triangles, origin, spacing, distance, nearest):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _cast(triangles, origin, spacing, hits, last):
-    """Count for each node the triangles that its line along the third axis crosses between it and the next node (after the last: anywhere).
+    """Count the triangles that cross the line along the third axis between each node and the next one (after the last node: anywhere).
 
-    Lines are moved towards the middle by a millionth of a cell and less, so that none runs through an edge of a mesh that is aligned with
-    the grid or just fills it.
+    Lines are moved towards the middle by at most a millionth of a cell. Otherwise they could run through edges of a mesh that is aligned with the grid or
+    exactly fills it.
     """
     nx, ny, nz = hits.shape
     for f in range(len(triangles)):

@@ -1,12 +1,12 @@
-"""Meshes of bodies: triangles and quadrilaterals of outlines in the plane, tetrahedra of bodies given by a signed distance.
+"""Meshes of bodies: triangles and quadrilaterals of outlines in 2D, tetrahedra of bodies given by a signed distance in 3D.
 
-Every mesh is a pair ``(points [node, dim], cells [cell, corner])`` in which each cell is positively oriented, no node is unused, and faces match. An explicit
-solver's time step follows from the flattest cell, so all meshes end with an optimisation of their cells' shapes.
+Every mesh is a pair ``(points [node, dim], cells [cell, corner])``. Each cell is positively oriented, every node is used, and faces match. The flattest cell
+limits the time step of an explicit solver, so the last step is always an optimisation of the cells' shapes.
 
-Triangles: evenly spaced nodes on the outline, a hexagonal lattice inside, Delaunay triangulation, and centroidal patch smoothing (Chen & Holst 2011).
-Quadrilaterals: triangles of a square lattice of twice the spacing, merged in pairs where that makes a good quadrilateral, then each merged pair split
-into four and each triangle left over into three quadrilaterals. Tetrahedra: those of a body-centred cubic lattice inside the body, their surface then
-moved onto that of the body.
+* Triangles: evenly spaced nodes on the outline, a hexagonal lattice inside, Delaunay triangulation, and centroidal patch smoothing (Chen & Holst 2011).
+* Quadrilaterals: triangles of a square lattice of twice the spacing are merged in pairs where this makes a good quadrilateral. Each merged pair is then split
+  into four quadrilaterals, and each remaining triangle into three.
+* Tetrahedra: cells of a body-centred cubic lattice inside the body. Their surface is then moved onto the surface of the body.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ Distance = Callable[[np.ndarray], np.ndarray]
 """Signed distance [point] of points [point, 3], negative inside."""
 
 CORNER = math.radians(30.0)
-"""An outline that turns more than this at a point has a corner there, which the mesh keeps."""
+"""Angle [rad]. A point where an outline turns more than this is a corner, which the mesh keeps."""
 
 ATTEMPTS = 8
-"""Lattices to try before an outline counts as too fine for the spacing."""
+"""Number of random lattices to try before an outline counts as too fine for the spacing."""
 
 SMALLEST_QUALITY = 0.25
-"""Mean ratio of the worst cell of a good mesh."""
+"""Smallest accepted mean ratio of the worst cell (see ``shape_quality``)."""
 
 TETRAHEDRA_PER_CUBE = 9.44
-"""Cells of a body-centred cubic lattice in a cube as wide as its mean edge."""
+"""Number of cells of a body-centred cubic lattice in a cube as wide as the lattice's mean edge."""
 
 
 class MeshingError(GpeError, ValueError):
-    """The body has details that are too fine for the spacing; the message says so."""
+    """Raised when details of a body are too fine for the spacing."""
 
 
 # --- meshes in the plane --------------------------------------------------------------------------------------------------------------------
 
 
 def triangulate(loops: list[Loop], spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles of edge length ``spacing`` [m] inside an outline with holes.
+    """Mesh an outline with holes by triangles of edge length ``spacing`` [m].
 
     Raises:
         MeshingError: details of the outline are finer than the spacing.
@@ -65,7 +65,11 @@ def triangulate(loops: list[Loop], spacing: float, rng: np.random.Generator) -> 
 
 
 def quadrangulate(loops: list[Loop], spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Quadrilaterals of edge length ``spacing`` [m] inside an outline with holes; errors as in ``triangulate``."""
+    """Mesh an outline with holes by quadrilaterals of edge length ``spacing`` [m].
+
+    Raises:
+        MeshingError: details of the outline are finer than the spacing.
+    """
     fine = [_resample(loop, spacing, multiple=2) for loop in loops]
     outline = [loop[::2] for loop in fine]
     for _ in range(ATTEMPTS):
@@ -81,7 +85,7 @@ def quadrangulate(loops: list[Loop], spacing: float, rng: np.random.Generator) -
 
 
 def _resample(loop: Loop, spacing: float, multiple: int = 1) -> Loop:
-    """Evenly spaced points on a loop that keep its corners; a whole ``multiple`` of them between corners."""
+    """Place evenly spaced points on a loop and keep its corners. The number of points between corners is divisible by ``multiple``."""
     before, after = loop - np.roll(loop, 1, axis=0), np.roll(loop, -1, axis=0) - loop
     turn = np.arctan2(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], np.sum(before * after, axis=1))
     corners = np.nonzero(np.abs(turn) > CORNER)[0]
@@ -99,7 +103,7 @@ def _resample(loop: Loop, spacing: float, multiple: int = 1) -> Loop:
 
 
 def _inside(points: np.ndarray, loops: list[Loop]) -> np.ndarray:
-    """Even-odd rule: which points [point, 2] are inside the outer loop and in no hole."""
+    """Mask [point] of the points [point, 2] inside the outer loop and outside all holes, by the even-odd rule."""
     crossings = np.zeros(len(points), dtype=int)
     for loop in loops:
         a, b = loop, np.roll(loop, -1, axis=0)
@@ -110,7 +114,7 @@ def _inside(points: np.ndarray, loops: list[Loop]) -> np.ndarray:
 
 
 def _distance(points: np.ndarray, loops: list[Loop]) -> np.ndarray:
-    """Distance of points to the nearest loop."""
+    """Distances [point] of points [point, 2] to the nearest loop."""
     nearest = np.full(len(points), math.inf)
     for loop in loops:
         edge = np.roll(loop, -1, axis=0) - loop
@@ -121,7 +125,7 @@ def _distance(points: np.ndarray, loops: list[Loop]) -> np.ndarray:
 
 
 def _lattice(loops: list[Loop], spacing: float, rng: np.random.Generator, hexagonal: bool) -> np.ndarray:
-    """Points of a randomly turned and shifted lattice inside an outline, not too close to it."""
+    """Points [point, 2] of a randomly turned and shifted lattice inside an outline, more than 0.62 spacings away from it."""
     low, high = loops[0].min(axis=0), loops[0].max(axis=0)
     middle, reach = (low + high) / 2, math.ceil(0.5 * float(np.linalg.norm(high - low)) / spacing * 1.2) + 1
     index = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1.0)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -136,7 +140,10 @@ def _lattice(loops: list[Loop], spacing: float, rng: np.random.Generator, hexago
 
 
 def _triangles(loops: list[Loop], inner: np.ndarray, smooth: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Delaunay triangles of the loops' points, which come first, and of inner points that move; None unless their surface is the loops."""
+    """Delaunay triangles of the points on the loops, which come first, and of inner points, which are smoothed.
+
+    Returns None if the surface of the triangles differs from the loops.
+    """
     rim = np.concatenate(loops)
     points = np.concatenate([rim, inner])
     cells = np.empty((0, 3), dtype=np.int64)
@@ -149,7 +156,7 @@ def _triangles(loops: list[Loop], inner: np.ndarray, smooth: int) -> tuple[np.nd
         area = _signed_volumes(points, cells)
         cells[area < 0] = cells[area < 0][:, ::-1]
         cells = cells[np.abs(area) > 1e-6 * np.mean(np.abs(area))]
-        if k < smooth:  # inner points to the weighted mean of the centroids around them
+        if k < smooth:  # move inner points to the weighted mean of the surrounding centroids
             weight, pull = np.zeros(len(points)), np.zeros_like(points)
             area = np.repeat(_signed_volumes(points, cells), 3)
             np.add.at(weight, cells.ravel(), area)
@@ -168,13 +175,13 @@ def _triangles(loops: list[Loop], inner: np.ndarray, smooth: int) -> tuple[np.nd
 
 
 def _is_on_outline(points: np.ndarray, loops: list[Loop]) -> np.ndarray:
-    """Mask of the nodes of the loops, by position."""
+    """Mask [node] of the nodes that lie on the loops, found by position."""
     rim = {point.tobytes() for loop in loops for point in np.ascontiguousarray(loop)}
     return np.array([point.tobytes() in rim for point in np.ascontiguousarray(points)])
 
 
 def _without_ears(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Triangles without cells that alone fill a wide angle of the outline: their inner edge is flipped to end in that angle."""
+    """Divide triangles that alone fill a wide angle of the outline, by flipping their inner edge so that it ends in that angle."""
     cells = cells.copy()
     owners: dict[frozenset[int], list[int]] = {}
     for number, cell in enumerate(cells.tolist()):
@@ -198,7 +205,7 @@ def _without_ears(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
 
 
 def _split(points: np.ndarray, cells: np.ndarray, outline: list[Loop], fine: list[Loop]) -> tuple[np.ndarray, np.ndarray]:
-    """Merge triangles into quadrilaterals where they fit, and split everything into quadrilaterals around its middle."""
+    """Merge pairs of triangles where this makes a good quadrilateral, and split every cell into quadrilaterals around its centre."""
     pairs: dict[tuple[int, int], list[int]] = {}
     for number, cell in enumerate(cells.tolist()):
         for k in range(3):
@@ -218,7 +225,7 @@ def _split(points: np.ndarray, cells: np.ndarray, outline: list[Loop], fine: lis
             merged[[a, b]] = True
             polygons.append(shapes[k])
     polygons += cells[~merged].tolist()
-    # the middle of an edge of the outline is the outline's own point there
+    # The middle of an edge on the outline is a point of the fine outline.
     middles: dict[tuple[int, int], np.ndarray] = {}
     first = 0
     for coarse, loop in zip(outline, fine, strict=True):
@@ -245,13 +252,13 @@ def _split(points: np.ndarray, cells: np.ndarray, outline: list[Loop], fine: lis
 
 
 def tetrahedralise(distance: Distance, reach: float, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Tetrahedra of mean edge length ``spacing`` [m] in a body; its edges and corners are rounded at that scale.
+    """Mesh a body by tetrahedra. The body's edges and corners are rounded at the scale of ``spacing``.
 
     Args:
         distance: signed distance of the body, at least near its surface.
-        reach: half the width [m] of a cube around the origin that holds the body.
+        reach: half the width of a cube around the origin that contains the body [m].
         spacing: mean edge length [m].
-        rng: turns and shifts the lattice.
+        rng: random numbers that turn and shift the lattice.
 
     Raises:
         MeshingError: the body is thinner than about two spacings somewhere.
@@ -260,7 +267,7 @@ def tetrahedralise(distance: Distance, reach: float, spacing: float, rng: np.ran
         points, cells = _cubic_lattice(reach, spacing, rng)
         depth = -distance(points[cells].mean(axis=1))
         volume = np.sum(_signed_volumes(points, cells[depth > 0]))
-        # peeling takes as much away at the surface as this leaves too much
+        # Peeling removes about as much volume at the surface as this threshold adds.
         cells = _largest_part(_peeled(cells[depth > -0.15 * spacing]))
         if len(cells) == 0:
             continue
@@ -273,7 +280,7 @@ def tetrahedralise(distance: Distance, reach: float, spacing: float, rng: np.ran
 
 
 def _cubic_lattice(reach: float, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Delaunay tetrahedra of a body-centred cubic lattice, randomly turned and shifted, that covers a cube."""
+    """Delaunay tetrahedra of a randomly turned and shifted body-centred cubic lattice that covers a cube."""
     width = spacing / ((8 * math.sqrt(0.75) + 6) / 14)
     count = math.ceil(math.sqrt(3.0) * reach / width) + 1
     index = np.stack(np.meshgrid(*[np.arange(-count, count + 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -281,7 +288,7 @@ def _cubic_lattice(reach: float, spacing: float, rng: np.random.Generator) -> tu
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     points = width * (index + rng.uniform(-0.5, 0.5, 3)) @ turn.T
     points = points[np.all(np.abs(points) < reach + 1.5 * width, axis=1)]
-    # the lattice is its own Delaunay triangulation, but four ways to cut each octahedron are equally good: shake it to choose one
+    # Delaunay triangulation can cut each octahedron of the lattice in several equally good ways. Small random shifts choose one.
     cells = Delaunay(points + 1e-4 * width * rng.uniform(-1, 1, points.shape)).simplices.astype(np.int64)
     volume = _signed_volumes(points, cells)
     cells[volume < 0] = cells[volume < 0][:, [1, 0, 2, 3]]
@@ -289,7 +296,7 @@ def _cubic_lattice(reach: float, spacing: float, rng: np.random.Generator) -> tu
 
 
 def _peeled(cells: np.ndarray) -> np.ndarray:
-    """Without the cells of two or more surface faces: on a smooth surface they would become flat."""
+    """Remove cells with two or more surface faces, which would become flat on a smooth surface."""
     while len(cells):
         faces = np.sort(np.concatenate([np.delete(cells, k, axis=1) for k in range(4)]), axis=1)
         _, which, times = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
@@ -301,7 +308,7 @@ def _peeled(cells: np.ndarray) -> np.ndarray:
 
 
 def _largest_part(cells: np.ndarray) -> np.ndarray:
-    """The cells of the largest part that hangs together by faces."""
+    """Return the cells of the largest part that is connected through faces."""
     if len(cells) == 0:
         return cells
     faces = np.sort(np.concatenate([np.delete(cells, k, axis=1) for k in range(4)]), axis=1)
@@ -326,7 +333,7 @@ def _compact(points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _pull_to_surface(points: np.ndarray, cells: np.ndarray, surface: np.ndarray, distance: Distance, spacing: float) -> np.ndarray:
-    """Nodes for which the cells have a good shape and the surface nodes lie on the surface of the body."""
+    """Move nodes so that the cells have good shapes and the surface nodes lie on the surface of the body."""
 
     def misfit(at: np.ndarray) -> tuple[float, np.ndarray]:
         gap, slope = distance(at[surface]) / spacing, np.zeros_like(at)
@@ -342,7 +349,7 @@ def _pull_to_surface(points: np.ndarray, cells: np.ndarray, surface: np.ndarray,
 
 
 def _gradient(distance: Distance, points: np.ndarray, spacing: float) -> np.ndarray:
-    """Direction away from the body [point, 3]."""
+    """Unit vectors [point, 3] away from the body."""
     step = 1e-4 * spacing
     slope = np.stack([distance(points + step * e) - distance(points - step * e) for e in np.eye(3)], axis=-1)
     return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-300)
@@ -352,21 +359,24 @@ def _gradient(distance: Distance, points: np.ndarray, spacing: float) -> np.ndar
 
 
 def _signed_volumes(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Volume [cell] of simplices, negative where inverted."""
+    """Volumes (areas in 2D) of simplices [cell], negative for inverted ones."""
     dim = points.shape[1]
     corners = points[cells]
     return np.linalg.det(corners[:, 1:] - corners[:, :1]) / math.factorial(dim)
 
 
 def surface_faces(cells: np.ndarray) -> np.ndarray:
-    """Faces [face, corner] that only one of the triangles or tetrahedra ``cells`` [cell, corner] has."""
+    """Faces [face, corner] that belong to only one of the triangles or tetrahedra ``cells`` [cell, corner]."""
     faces = np.concatenate([np.delete(cells, k, axis=1) for k in range(cells.shape[1])])
     _, first, times = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return faces[first[times == 1]]
 
 
 def _simplices(cells: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
-    """Simplices whose shapes stand for those of the cells, and the inverse of the edge matrix of an ideal one: a quadrilateral has four right corners."""
+    """Simplices that measure the shapes of cells, and the inverse edge matrix of the ideal simplex.
+
+    A quadrilateral is measured by the triangles at its four corners, which are right-angled in the ideal case.
+    """
     if dim == 3:
         ideal = np.array([[1.0, 0.0, 0.0], [0.5, math.sqrt(0.75), 0.0], [0.5, math.sqrt(1 / 12), math.sqrt(2 / 3)]])
         return cells, np.linalg.inv(ideal)
@@ -379,7 +389,7 @@ def _simplices(cells: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
 def shape_quality(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Mean ratio of each cell [cell]: 1 for a regular simplex or a square, 0 for a flat cell, negative for an inverted one (Knupp 2001).
 
-    ``d det(A)^(2/d) / |A|²`` with A the map from the ideal cell; for quadrilaterals, of the worst corner.
+    The mean ratio is ``d det(A)^(2/d) / |A|²`` with A the map from the ideal cell. For a quadrilateral it is the value at the worst corner.
     """
     dim = points.shape[1]
     simplices, inverse = _simplices(cells, dim)
@@ -396,9 +406,16 @@ def optimise_shapes(
     iterations: int = 30,
     penalty: Callable[[np.ndarray], tuple[float, np.ndarray]] | None = None,
 ) -> np.ndarray:
-    """Move the nodes that are not ``fixed`` [node] to minimise the sum of the squared inverse mean ratios, plus a ``penalty`` with its gradient.
+    """Move nodes to minimise the sum of the squared inverse mean ratios of the cells, plus a penalty.
 
     The determinant is regularised, ``(det + √(det² + δ²))/2``, so that inverted cells are turned back (Escobar et al. 2003).
+
+    Args:
+        points: positions of the nodes [node, dim].
+        cells: corners of the cells [cell, corner].
+        fixed: mask of nodes that do not move [node].
+        iterations: maximum number of iterations of L-BFGS-B.
+        penalty: function of the positions that returns an additional cost and its gradient [node, dim].
     """
     points = np.array(points)
     if np.all(fixed) or len(cells) == 0:
@@ -440,7 +457,7 @@ def optimise_shapes(
 
 
 def _cofactor(matrices: np.ndarray) -> np.ndarray:
-    """Derivatives of the determinant by the entries."""
+    """Derivatives of determinants with respect to the matrices' entries [matrix, dim, dim]."""
     if matrices.shape[-1] == 2:
         return np.stack([matrices[:, 1, ::-1] * [1, -1], matrices[:, 0, ::-1] * [-1, 1]], axis=1)
     a, b, c = matrices[:, 0], matrices[:, 1], matrices[:, 2]

@@ -1,4 +1,4 @@
-"""Axes along which space repeats: what leaves the domain on one side enters it on the other.
+"""Periodic axes. A node that leaves the domain on one side enters it on the other.
 
 With L the period and low the lower bound of an axis::
 
@@ -24,16 +24,16 @@ Array = Any
 
 
 class PeriodicityError(GpeError, ValueError):
-    """A length that does not fit a periodic domain; the message names axis and period."""
+    """Raised for a length that does not fit a periodic domain; the message names axis and period."""
 
 
 @dataclass(frozen=True)
 class Periodicity:
-    """Which axes repeat, and after what length; false where none does.
+    """The periodic axes of a domain and their periods. The object is false if no axis is periodic.
 
     Attributes:
-        bounds: ``(low, high)`` per axis [m].
-        periodic: per axis.
+        bounds: ``(low, high)`` of the domain per axis [m].
+        periodic: whether space repeats, per axis.
     """
 
     bounds: tuple[tuple[float, float], ...] = ()
@@ -44,41 +44,41 @@ class Periodicity:
 
     @cached_property
     def axes(self) -> tuple[int, ...]:
-        """The axes that repeat."""
+        """Indices of the periodic axes."""
         return tuple(axis for axis, repeats in enumerate(self.periodic) if repeats)
 
     @cached_property
     def period(self) -> np.ndarray:
-        """Length after which each axis repeats [m], 0 where it does not."""
+        """Period of each axis [dim] in m; 0 for axes that are not periodic."""
         return np.array([high - low if repeats else 0.0 for (low, high), repeats in zip(self.bounds, self.periodic, strict=True)])
 
     def shortest(self, difference: Array) -> Array:
-        """Differences of positions [..., dim] in m, by the shortest way around; the same object where no axis repeats."""
+        """Minimum images of differences of positions [..., dim] in m; returns the same object if no axis is periodic."""
         return difference - self._turns(difference, round_down=False) if self else difference
 
     def wrapped(self, pos: Array) -> Array:
-        """Positions [..., dim] in m inside the domain, ``low <= x < high`` in their own precision, along periodic axes; the same object where no axis repeats.
+        """Images of positions [..., dim] in m that satisfy ``low <= x < high`` along periodic axes, in the precision of ``pos``.
 
-        What is inside stays bit for bit.
+        Positions inside the domain are unchanged to the bit. The same object is returned if no axis is periodic.
         """
         if not self:
             return pos
         xp = array_namespace(pos)
         low, high = (self._row([b[side] for b in self.bounds], pos) for side in (0, 1))
         folded = pos - self._turns(pos - low, round_down=True)
-        folded = xp.where((folded < low) | (folded >= high), low, folded)  # where rounding led out, beside a bound: one place on a torus
+        folded = xp.where((folded < low) | (folded >= high), low, folded)  # rounding can lead outside; both bounds are one place
         folds = (self._row([float(p) for p in self.periodic], pos) > 0) & ~((pos >= low) & (pos < high))
         return xp.where(folds, folded, pos)
 
     def from_corner(self, pos: Array) -> Array:
-        """Positions [..., dim] in m from the domain's lower corner, below the period along periodic axes: what a k-d tree takes."""
+        """Wrapped positions [..., dim] in m relative to the domain's lower corner, below the period along periodic axes, as a k-d tree needs them."""
         xp = array_namespace(pos)
         low, period = self._row([low for low, _ in self.bounds], pos), self._row(self.period, pos)
         inside = self.wrapped(pos) - low
-        return xp.where((period > 0) & (inside >= period), 0.0 * inside, inside)  # rounded up
+        return xp.where((period > 0) & (inside >= period), 0.0 * inside, inside)  # the subtraction may round up to the period
 
     def check_radius(self, radius: float) -> None:
-        """Raise ``PeriodicityError`` unless a node's nearest image is the only one within the radius [m]."""
+        """Raise ``PeriodicityError`` if a node can have more than one image within the radius [m]."""
         for axis in self.axes:
             if not 2 * radius < self.period[axis]:
                 raise PeriodicityError(
@@ -87,7 +87,7 @@ class Periodicity:
                 )
 
     def _turns(self, length: Array, round_down: bool) -> Array:
-        """Whole periods in lengths along each axis [m]."""
+        """Multiples of the period nearest to lengths along each axis, or below them [m]."""
         xp = array_namespace(length)
         period = self._row(self.period, length)
         turns = length / self._row(np.where(self.period > 0, self.period, 1.0), length)
@@ -99,4 +99,4 @@ class Periodicity:
 
 
 NOWHERE = Periodicity()
-"""No axis repeats."""
+"""Periodicity of a domain without periodic axes."""

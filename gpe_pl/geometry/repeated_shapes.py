@@ -1,4 +1,4 @@
-"""Shapes in periodic domains, where each stands for all its images: an obstacle across a seam has its other part on the other side."""
+"""Shapes in periodic domains. A shape stands for all its images, so an obstacle across a seam continues on the other side."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from gpe_pl.geometry.shapes import Box, Polygon, Shape, Wall, signed_distance, s
 Array = Any
 
 ON_SEAM = 1e-9
-"""Fraction of a period by which ends of shapes may miss a seam."""
+"""Tolerance for the ends of shapes on a seam, as a fraction of the period."""
 
 
 @dataclass(frozen=True)
 class Repeated:
-    """A shape with its images along the axes that repeat.
+    """A shape together with its images along the periodic axes.
 
     Attributes:
-        shape: one of them, no wider than a period along these axes, except boxes. What is as wide as a period meets its images without a gap.
-        periodicity: where space repeats.
+        shape: one of the images. Along periodic axes only boxes may be wider than a period. A shape as wide as a period joins its images without a gap.
+        periodicity: periodicity of the domain.
     """
 
     shape: Shape
@@ -45,11 +45,11 @@ class Repeated:
         return self.shape.extent
 
     def signed_distance(self, points: Array) -> Array:
-        """Distance [...] in m to the nearest image."""
+        """Signed distance [...] in m to the nearest image."""
         xp, space = array_namespace(points), self.periodicity
         centre = xp.asarray(self._centre, dtype=points.dtype, device=device(points))
         near = centre + space.shortest(points - centre)
-        if not isinstance(self.shape, Polygon):  # symmetric, or with an inside of which each image has its own part
+        if not isinstance(self.shape, Polygon):  # the image with the nearest centre is the nearest image
             return self._whole.signed_distance(near)
         distance = self._whole.signed_distance(near)
         axes = [axis for axis in space.axes if axis != self._spanned]
@@ -62,7 +62,7 @@ class Repeated:
         return distance
 
     def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-        """Boundary nodes inside the domain, each once, and their normals; faces at which an image meets the next one have none."""
+        """Boundary nodes inside the domain and their normals, each node once. Faces where two images join have no nodes."""
         pos, normal = self.shape.sample(spacing)
         free = ~is_covered(pos, normal, (self.shape,), (self,))
         return self.periodicity.wrapped(pos[free]), normal[free]
@@ -74,7 +74,7 @@ class Repeated:
             return np.array(values["center"], dtype=float)
         if "vertices" in values:
             corners = np.array(values["vertices"], dtype=float)
-        elif "origin" in values:  # of a grid
+        elif "origin" in values:  # a DistanceGrid
             corners = np.stack([values["origin"], np.asarray(values["origin"]) + values["spacing"] * (np.asarray(values["counts"]) - 1)])
         else:
             corners = np.array([values["low"], values["high"]], dtype=float)
@@ -82,7 +82,7 @@ class Repeated:
 
     @cached_property
     def _whole(self) -> Shape:
-        """The shape without the faces at which it meets its own images."""
+        """The shape, extended so that it has no faces where it joins its own images."""
         if isinstance(self.shape, Polygon) and self._spanned is not None:
             return self._chained(self.shape, self._spanned)
         if not isinstance(self.shape, Box):
@@ -93,7 +93,7 @@ class Repeated:
 
     @cached_property
     def _spanned(self) -> int | None:
-        """The axis along which a polygon reaches from seam to seam, with one edge on each."""
+        """The axis along which a polygon spans a whole period with one edge on each seam, or None."""
         if isinstance(self.shape, Polygon):
             corners = np.array(self.shape.vertices, dtype=float)
             for axis in self.periodicity.axes:
@@ -103,12 +103,12 @@ class Repeated:
         return None
 
     def _on_seams(self, corners: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-        """Which corners [corner] lie at the lower end of a shape, and which at its upper end."""
+        """Masks [corner] of the corners at the lower end of a shape and at its upper end."""
         x, close = corners[:, axis], ON_SEAM * self.periodicity.period[axis]
         return x <= x.min() + close, x >= x.max() - close
 
     def _chained(self, polygon: Polygon, axis: int) -> Polygon:
-        """A polygon that spans an axis, in one with its images on both sides."""
+        """Join a polygon that spans an axis with its images on both sides."""
         corners = np.array(polygon.vertices, dtype=float)
         low, _ = self._on_seams(corners, axis)
         corners = np.roll(corners, -int(np.flatnonzero(low & ~np.roll(low, -1))[0]), axis=0)  # begins where the edge on the lower seam ends
@@ -121,7 +121,17 @@ class Repeated:
 
 
 def is_covered(pos: np.ndarray, normal: np.ndarray, shapes: tuple[Shape, ...], images: tuple[Shape, ...]) -> np.ndarray:
-    """On which nodes of ``shapes`` [node], with normals [node, dim], one of their images lies: there is no free space in front of them."""
+    """Mask of boundary nodes of ``shapes`` that are covered by one of ``images``, so that there is no free space in front of them.
+
+    Args:
+        pos: positions of the boundary nodes [node, dim] in m.
+        normal: unit normals into free space [node, dim].
+        shapes: shapes that the nodes belong to.
+        images: the same shapes with their images.
+
+    Returns:
+        Mask [node].
+    """
     ahead = surface_tolerance(shapes)
     points = pos.astype(np.float64) + ahead * normal
     here, there = signed_distance(shapes, points), signed_distance(images, points)
@@ -129,7 +139,10 @@ def is_covered(pos: np.ndarray, normal: np.ndarray, shapes: tuple[Shape, ...], i
 
 
 def repeated(shapes: tuple[Shape, ...], periodicity: Periodicity) -> tuple[Shape, ...]:
-    """Shapes that know their images; walls are plane, so they have no further ones along themselves. The same object where no axis repeats."""
+    """Wrap shapes so that they include their images. Walls stay, because their planes already extend along periodic axes.
+
+    The same object is returned if no axis is periodic.
+    """
     if not periodicity:
         return shapes
     return tuple(shape if isinstance(shape, (Wall, Repeated)) else Repeated(shape, periodicity) for shape in shapes)

@@ -1,4 +1,4 @@
-"""Shapes as plain values, in which they are stored."""
+"""Conversion of shapes to the plain values that are stored, and checks of these values."""
 
 from __future__ import annotations
 
@@ -14,17 +14,22 @@ from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Polygon, Shape, Sphe
 from gpe_pl.schema import LARGEST
 
 SHAPES: dict[str, type] = {cls.kind: cls for cls in (Wall, Sphere, Bowl, Box, Polygon, DistanceGrid, Repeated)}
+"""Classes of shapes that can be stored, by their ``kind``."""
 
 
 def shape_to_dict(shape: Shape) -> dict[str, Any]:
-    """Plain values from which ``shape_from_dict`` rebuilds the shape."""
+    """Convert a shape to plain values, from which ``shape_from_dict`` rebuilds it."""
     if isinstance(shape, Repeated):
         return {"kind": shape.kind, "shape": shape_to_dict(shape.shape), **asdict(shape.periodicity)}
     return {"kind": shape.kind, **asdict(shape)}  # type: ignore[call-overload]
 
 
 def shape_from_dict(values: dict[str, Any]) -> Shape:
-    """Rebuild a shape; raises ``ValueError`` that names an unknown kind or key."""
+    """Rebuild a shape from plain values.
+
+    Raises:
+        ValueError: the kind or a key is unknown (the message names it), or the shape refuses a value.
+    """
     values = dict(values)
     kind = values.pop("kind", None)
     if kind not in SHAPES:
@@ -45,10 +50,10 @@ def shape_from_dict(values: dict[str, Any]) -> Shape:
 
 
 def shapes_fault(shapes: Sequence[Shape], space: Periodicity) -> str | None:
-    """What is wrong with the first of the shapes that breaks a rule, or None. Files may hold anything, so whoever reads one asks.
+    """Describe the first shape that breaks a rule; None if all are valid. Every reader of files calls it, because a file can contain anything.
 
-    Numbers are finite, vectors have a component per axis of ``space``, friction is at least 0, restitution between 0 and 1, radii are positive, boxes and
-    walls wider than nothing, and normals of walls along one axis. Shapes that are no stored ones are not looked at.
+    The rules: numbers are finite, vectors have one component per axis of ``space``, friction is at least 0, restitution lies between 0 and 1, radii are
+    positive, boxes and walls have positive widths, and normals of walls are unit vectors along one axis. Shapes of other classes are not checked.
     """
     for k, shape in enumerate(shapes):
         if isinstance(shape, Repeated) and shape.periodicity != space:
@@ -90,7 +95,7 @@ def _fault(shape: Shape, dim: int) -> str | None:
 
 
 def moved(shape: Shape, by: np.ndarray) -> Shape:
-    """The shape displaced by ``by`` [dim] in m."""
+    """Return the shape displaced by ``by`` [dim] in m."""
     if isinstance(shape, Repeated):
         bounds = tuple((low + x, high + x) for (low, high), x in zip(shape.periodicity.bounds, by.tolist(), strict=True))
         return Repeated(moved(shape.shape, by), replace(shape.periodicity, bounds=bounds))

@@ -1,7 +1,7 @@
-"""Signed distances of boundaries, the same for solvers, containment and pictures.
+"""Shapes of walls and obstacles with their signed distances, which solvers, containment and pictures share.
 
-A ``Shape`` answers ``signed_distance(points)`` in m (positive in free space, negative inside the wall or obstacle) and samples its surface
-into boundary nodes. All shapes take NumPy arrays or torch tensors [..., dim].
+``Shape.signed_distance(points)`` is in m, positive in free space and negative inside the wall or obstacle. ``Shape.sample(spacing)`` places boundary nodes on
+the surface. All shapes take NumPy arrays or torch tensors [..., dim].
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ Array = Any
 
 
 ON_SURFACE = 1e-6
-"""Fraction of the extent of a boundary within which a point lies on its surface: some ten roundings of a position in single precision."""
+"""A point this close to a boundary, as a fraction of the boundary's extent, lies on its surface. About ten rounding errors of a float32 position."""
 
 
 MOST_SAMPLED = 10_000_000
-"""Nodes on one surface."""
+"""Maximum number of boundary nodes on one surface."""
 
 
 class SamplingError(GpeError, ValueError):
-    """A surface would have more nodes than fit into memory."""
+    """Raised when a surface would have more than ``MOST_SAMPLED`` boundary nodes, which do not fit into memory."""
 
 
 @runtime_checkable
@@ -42,23 +42,31 @@ class Shape(Protocol):
     kind: ClassVar[str]
 
     @property
-    def friction(self) -> float: ...
+    def friction(self) -> float:
+        """Coulomb friction coefficient."""
+        ...
 
     @property
-    def restitution(self) -> float: ...
+    def restitution(self) -> float:
+        """Fraction of the normal velocity that a bounce returns, 0 to 1."""
+        ...
 
     @property
     def extent(self) -> float:
-        """Largest side of the box around it [m]."""
+        """Largest side of the bounding box [m]."""
         ...
 
-    def signed_distance(self, points: Array) -> Array: ...
+    def signed_distance(self, points: Array) -> Array:
+        """Signed distances [...] of points [..., dim] in m, negative inside the solid."""
+        ...
 
-    def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]: ...
+    def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+        """Positions [node, dim] in m and unit normals [node, dim] into free space of boundary nodes about ``spacing`` [m] apart."""
+        ...
 
 
 def _like(values: Sequence[float] | np.ndarray, points: Array) -> Array:
-    """``values`` with the backend, precision and device of ``points``."""
+    """Convert ``values`` to the array library, precision and device of ``points``."""
     return array_namespace(points).asarray(values, dtype=points.dtype, device=device(points))
 
 
@@ -78,7 +86,7 @@ def _segment(start: np.ndarray, end: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def _count(nodes: float | int) -> int:
-    """A number of nodes, rounded up."""
+    """Round a number of nodes up; raises ``SamplingError`` above ``MOST_SAMPLED``."""
     if not nodes <= MOST_SAMPLED:
         raise SamplingError(
             f"a wall or obstacle would have {nodes:.3g} boundary nodes, at most {MOST_SAMPLED} are made; choose a larger spacing"
@@ -87,7 +95,7 @@ def _count(nodes: float | int) -> int:
 
 
 def _grid(low: list[float], high: list[float], spacing: float) -> np.ndarray:
-    """A regular grid over an axis-aligned face, corners included; shape [points, len(low)]."""
+    """Points [point, len(low)] of a regular grid over an axis-aligned face, corners included."""
     counts = [_count((b - a) / spacing - 1e-9) for a, b in zip(low, high, strict=True)]
     _count(math.prod(counts))
     axes = [np.linspace(a, b, max(2, count + 1)) for a, b, count in zip(low, high, counts, strict=True)]
@@ -95,7 +103,7 @@ def _grid(low: list[float], high: list[float], spacing: float) -> np.ndarray:
 
 
 def _directions(dim: int, radius: float, spacing: float) -> np.ndarray:
-    """Unit vectors [points, dim] to points of a circle or sphere that are about ``spacing`` [m] apart at the distance ``radius``."""
+    """Unit vectors [point, dim] to points of a circle or sphere of this ``radius`` [m], which are about ``spacing`` [m] apart."""
     if dim == 2:
         count = max(6, _count(2 * math.pi * radius / spacing))
         angle: np.ndarray = 2 * math.pi * np.arange(count) / count
@@ -168,7 +176,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Bowl:
-    """A closed spherical (2D: circular) container: solid is everything outside of it."""
+    """A closed spherical (2D: circular) container. Everything outside of it is solid."""
 
     center: tuple[float, ...]
     radius: float
@@ -223,7 +231,7 @@ class Box:
                 normal[:, axis] = side
                 pos.append(points)
                 normals.append(normal)
-        # faces share the nodes of their edges and corners, whose normal is the mean of the faces' normals
+        # Faces share the nodes on edges and corners. Such a node has the mean normal of its faces.
         points, which = np.unique(np.concatenate(pos), axis=0, return_inverse=True)
         normal = np.zeros_like(points)
         np.add.at(normal, which.ravel(), np.concatenate(normals))
@@ -231,7 +239,7 @@ class Box:
 
 
 def _require_simple(vertices: np.ndarray) -> None:
-    """Raise ``ValueError`` if the outline [vertex, 2] has an edge without length, or edges that touch elsewhere than at their common vertex."""
+    """Raise ``ValueError`` if an edge of the outline [vertex, 2] has no length, or two edges touch anywhere but at their common vertex."""
     count, shortest = len(vertices), 1e-12 * float(np.max(np.ptp(vertices, axis=0)))
     edges = np.roll(vertices, -1, axis=0) - vertices
     for k in range(count):
@@ -239,7 +247,7 @@ def _require_simple(vertices: np.ndarray) -> None:
             raise ValueError(f"polygon vertices {k} and {(k + 1) % count} coincide at {vertices[k].tolist()}")
 
     def side(k: int, point: np.ndarray) -> float:
-        """On which side of edge k the point lies: left (1), right (-1) or on its line (0)."""
+        """Side of edge k on which the point lies: left (1), right (-1) or on its line (0)."""
         x, y = point - vertices[k]
         return float(np.sign(edges[k, 0] * y - edges[k, 1] * x))
 
@@ -312,19 +320,21 @@ class Polygon:
 
 
 MAX_GRID_NODES = 2**24
-"""Largest number of nodes of a ``DistanceGrid``; a file that asks for more is refused before anything is unpacked."""
+"""Maximum number of nodes of a ``DistanceGrid``. A file with more is refused before anything is unpacked."""
 
 
 @dataclass(frozen=True)
 class DistanceGrid:
-    """Any solid, given by signed distances at the nodes of a regular grid: multilinear between them, continued linearly outside.
+    """A solid of any shape, given by signed distances at the nodes of a regular grid.
+
+    Distances are interpolated multilinearly between the nodes and extrapolated linearly outside the grid.
 
     Attributes:
         origin: position of the first node [m].
-        spacing: of the nodes along each axis [m].
+        spacing: distance of neighbouring nodes along each axis [m].
         counts: number of nodes along each axis, at least 2.
-        encoded: the distances [m] as little-endian float32 in C order, all first bytes before all second bytes and so on, compressed
-            with zlib, as base64; ``from_values`` makes it.
+        encoded: the distances [m] as base64 text of zlib-compressed bytes. The bytes are little-endian float32 in C order, rearranged so that all first
+            bytes come before all second bytes, and so on. ``from_values`` creates it.
 
     Raises:
         ValueError: sizes do not fit together, or ``encoded`` is damaged.
@@ -347,16 +357,16 @@ class DistanceGrid:
             raise ValueError(
                 f"spacing and origin of a distance grid must be finite and spacing positive, got {self.spacing} and {self.origin}"
             )
-        object.__setattr__(self, "_values", _decode(self.encoded, self.counts))  # no field: no part of equality, hash or dictionary
+        object.__setattr__(self, "_values", _decode(self.encoded, self.counts))  # not a field, so that equality, hash and asdict ignore it
 
     @classmethod
     def from_values(
         cls, origin: Sequence[float] | np.ndarray, spacing: float, values: np.ndarray, friction: float, restitution: float = 0.0
     ) -> DistanceGrid:
-        """A grid of these signed distances [node along x, node along y(, node along z)] in m, rounded to about 1/4096 of ``spacing``.
+        """Create a grid from signed distances [node along x, node along y(, node along z)] in m, rounded to about 1/4096 of ``spacing``.
 
         Raises:
-            ValueError: fewer than 2 nodes along an axis, too many nodes, not finite, or not 2 or 3 axes.
+            ValueError: an axis has fewer than 2 nodes, there are too many nodes, values are not finite, or there are not 2 or 3 axes.
         """
         values = np.asarray(values, np.float64)
         if not np.isfinite(values).all():
@@ -382,14 +392,14 @@ class DistanceGrid:
         return self._interpolate(points)[0]
 
     def _interpolate(self, points: Array) -> tuple[Array, Array]:
-        """Distance [...] in m and its gradient [..., dim]."""
+        """Interpolated distance [...] in m and its gradient [..., dim]."""
         xp = array_namespace(points)
         dim, values = len(self.counts), _like(self.values.ravel(), points)
         place = (points - _like(self.origin, points)) / self.spacing
         nearest = xp.minimum(xp.maximum(place, xp.zeros_like(place)), _like([n - 1.0 for n in self.counts], points))
         cell = xp.minimum(xp.floor(nearest), _like([n - 2.0 for n in self.counts], points))
         upper = nearest - cell
-        cell = xp.astype(xp.where(cell == cell, cell, xp.zeros_like(cell)), xp.int64)  # a NaN stays one in the weights
+        cell = xp.astype(xp.where(cell == cell, cell, xp.zeros_like(cell)), xp.int64)  # a NaN position still gives NaN, through the weights
         distance = xp.zeros_like(place[..., 0])
         slope = [xp.zeros_like(distance) for _ in range(dim)]
         for corner in itertools.product((0, 1), repeat=dim):
@@ -406,23 +416,23 @@ class DistanceGrid:
         return distance + xp.sum(gradient * (place - nearest), axis=-1), gradient / self.spacing
 
     def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes on the surface inside the grid, such that every point of it has a node within ``spacing``."""
+        """Nodes on the part of the surface inside the grid. Every point of it has a node within ``spacing`` [m]."""
         points = self._surface(spacing)
         if len(points) == 0:
             return points, points.copy()
         gradient = self._interpolate(points)[1]
-        # on a curve, half of the spacing bounds the gaps; on a surface, 0.8 gives the density of a square lattice and a fifth more
+        # In 2D, half of the spacing limits the gaps. In 3D, 0.8 gives the density of a square lattice and a fifth more.
         keep = _thin(points, gradient / np.maximum(_norm(gradient), 1e-9)[:, None], (0.5 if len(self.counts) == 2 else 0.8) * spacing)
         return points[keep], np.asarray(outward_normal(self, points[keep], 0.5 * min(spacing, self.spacing)))
 
     def _surface(self, spacing: float) -> np.ndarray:
-        """Points [point, dim] on the surface, no further apart than about a third of ``spacing`` or a grid cell."""
+        """Points [point, dim] on the surface, at most about a third of ``spacing`` or one grid cell apart."""
         dim = len(self.counts)
         corners = [
             self.values[tuple(slice(c, n - 1 + c) for c, n in zip(corner, self.counts, strict=True))]
             for corner in itertools.product((0, 1), repeat=dim)
         ]
-        # a multilinear function has a zero in a cell only where its corners differ in sign
+        # A multilinear function has a zero in a cell only if the values at the corners differ in sign.
         cells = np.argwhere((np.minimum.reduce(corners) <= 0) & (np.maximum.reduce(corners) > 0))
         if len(cells) == 0:
             return np.empty((0, dim))
@@ -445,7 +455,7 @@ class DistanceGrid:
 
 
 def _decode(encoded: str, counts: tuple[int, ...]) -> np.ndarray:
-    """The values behind ``DistanceGrid.encoded``; never unpacks more than ``counts`` asks for."""
+    """Decode ``DistanceGrid.encoded``; never unpacks more bytes than ``counts`` requires."""
     size = 4 * math.prod(counts)
     unpack = zlib.decompressobj()
     try:
@@ -462,7 +472,10 @@ def _decode(encoded: str, counts: tuple[int, ...]) -> np.ndarray:
 
 
 def _thin(points: np.ndarray, normals: np.ndarray, distance: float) -> np.ndarray:
-    """Indices of a maximal subset of points that are ``distance`` apart, taken in order; those on the other side of a thin sheet do not count."""
+    """Indices of a maximal subset of points that are at least ``distance`` [m] apart, chosen in order.
+
+    Points on the other side of a thin sheet, with an opposite normal, do not exclude each other.
+    """
     from scipy.spatial import cKDTree
 
     tree, free, kept = cKDTree(points), np.ones(len(points), dtype=bool), []
@@ -475,7 +488,7 @@ def _thin(points: np.ndarray, normals: np.ndarray, distance: float) -> np.ndarra
 
 
 def signed_distance(shapes: tuple[Shape, ...], points: Array) -> Array:
-    """Distance [m] to the nearest of several shapes, negative inside any of them; +inf without shapes."""
+    """Signed distance [m] to the nearest of several shapes, negative inside any of them; +inf without shapes."""
     xp = array_namespace(points)
     distance = xp.full(points.shape[:-1], math.inf, dtype=points.dtype, device=device(points))
     for shape in shapes:
@@ -484,14 +497,15 @@ def signed_distance(shapes: tuple[Shape, ...], points: Array) -> Array:
 
 
 def surface_tolerance(shapes: tuple[Shape, ...]) -> float:
-    """Distance [m] below which a point counts as being on a surface: ``ON_SURFACE`` of the largest shape's extent, so that it is the same in any unit."""
+    """Distance [m] below which a point counts as on a surface: ``ON_SURFACE`` times the largest shape's extent, so that units do not matter."""
     return ON_SURFACE * max((shape.extent for shape in shapes), default=0.0)
 
 
 def thickness(shape: Shape) -> float:
-    """Smallest thickness in m: diameter, shortest side, or shortest way through a polygon from the middle of an edge along its inward normal.
+    """Smallest thickness of a shape [m].
 
-    Infinite for a shape that does not tell.
+    It is the diameter of a sphere and the shortest side of a box. In a polygon it is the shortest way through it from the middle of an edge along the inward
+    normal. It is infinite for all other shapes.
     """
     if isinstance(shape, Sphere):
         return 2.0 * shape.radius
@@ -503,13 +517,13 @@ def thickness(shape: Shape) -> float:
     before, after = vertices - np.roll(vertices, 1, axis=0), np.roll(vertices, -1, axis=0) - vertices
     turn = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
     straight = np.abs(turn) <= 1e-9 * np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
-    a = vertices[~straight]  # vertices along a straight edge do not divide it
+    a = vertices[~straight]  # a vertex on a straight line does not divide an edge
     edge = np.roll(a, -1, axis=0) - a
     tangent = edge / np.linalg.norm(edge, axis=1)[:, None]
     thinnest = math.inf
     for k, middle in enumerate(a + edge / 2):
         inward = np.array([-tangent[k, 1], tangent[k, 0]])
-        # every other edge in this edge's frame: its ends' distances along the edge and into the polygon
+        # Coordinates of all vertices in the frame of this edge: along it and into the polygon.
         along, depth = (a - middle) @ tangent[k], (a - middle) @ inward
         for j in range(len(a)):
             n = (j + 1) % len(a)
@@ -521,7 +535,7 @@ def thickness(shape: Shape) -> float:
 
 
 def outward_normal(shape: Shape, points: Array, step: float) -> Array:
-    """Direction into free space: the signed distance's gradient by central differences of ``step`` [m], unit length where defined."""
+    """Unit vectors [..., dim] into free space: gradients of the signed distance by central differences of ``step`` [m]; zero where undefined."""
     xp = array_namespace(points)
     columns = []
     for axis in range(points.shape[-1]):
@@ -542,7 +556,7 @@ def check_bounds(bounds: tuple[tuple[float, float], ...]) -> None:
 
 
 def check_whole_cells(bounds: tuple[tuple[float, float], ...], spacing: float) -> None:
-    """Raise ``ValueError`` unless bounds are sound and span a whole number of grid cells of ``spacing`` [m] along each axis."""
+    """Raise ``ValueError`` unless bounds are valid and span a whole number of grid cells of ``spacing`` [m] along each axis."""
     check_bounds(bounds)
     for axis, (low, high) in enumerate(bounds):
         cells = (high - low) / spacing
@@ -551,7 +565,7 @@ def check_whole_cells(bounds: tuple[tuple[float, float], ...], spacing: float) -
 
 
 def domain_walls(bounds: tuple[tuple[float, float], ...], friction: dict[str, float] | float) -> tuple[Wall, ...]:
-    """The walls of a box-shaped domain.
+    """Create the walls of a box-shaped domain.
 
     Args:
         bounds: ``(low, high)`` per axis [m].

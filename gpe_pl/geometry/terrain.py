@@ -1,4 +1,4 @@
-"""Terrain for scenes, as signed distances on a grid, read from a mesh, a point cloud or a height map. The last axis of a scene points up."""
+"""Terrain for scenes, read from a mesh, a point cloud or a height map into signed distances on a grid. The last axis of a scene points up."""
 
 from __future__ import annotations
 
@@ -33,32 +33,32 @@ def read_terrain(
     relief: float | None = None,
     friction: float = STICKY,
 ) -> DistanceGrid:
-    """Signed distances of the terrain in a file, at grid nodes that cover the domain.
+    """Read the terrain in a file as signed distances at grid nodes that cover the domain.
 
     * Triangle meshes: OBJ, STL, PLY.
-    * Point clouds: PLY without faces; XYZ (text) and NPY with 3 columns, or 6 with normals into free space; NPZ with ``points`` and
-      perhaps ``normals``. Without normals the ground is the height field through the points.
+    * Point clouds: PLY without faces; XYZ (text) and NPY with 3 columns, or with 6 columns that include normals into free space; NPZ with ``points`` and
+      optionally ``normals``. Without normals the ground is the height field through the points.
     * Height maps, seen from above with north up (columns along x, rows against y): NPY with another number of columns, NPZ with
-      ``heights``, CSV, PNG (its largest grey value is 1).
+      ``heights``, CSV, PNG (the largest possible grey value is 1).
 
     Args:
-        path: the file; its extension tells the format.
+        path: the file; its extension determines the format.
         bounds: ``(low, high)`` of the domain along x, y and z [m].
-        spacing: of the grid [m].
-        fit: ``contain`` scales by one factor until the terrain fits into the domain, ``stretch`` along each axis until it fills it; both put it
-            in the middle of the floor. ``none`` takes coordinates as they are, in m (pixels of a height map are 1 m wide).
+        spacing: spacing of the grid [m].
+        fit: how to place the terrain. ``contain`` scales it by one factor until it fits into the domain. ``stretch`` scales each axis until it fills the
+            domain. Both put it in the middle of the floor. ``none`` uses the coordinates of the file in m (a pixel of a height map is 1 m wide).
         up: axis of a mesh or point cloud that points up.
-        solid: what is solid: the ``inside`` of a closed mesh (behind the normals of a point cloud), the ``outside`` (a container), or
-            what is ``below`` an open surface, which continues beyond its rim at the height of the rim. ``auto``: ``inside`` for watertight meshes
-            and clouds with normals, ``below`` for all others; the choice is logged.
-        relief: height [m] between the lowest and the highest point; by default as it comes with ``fit``, and half the domain's height for a
-            height map that is not taken as it is.
+        solid: which side is solid. ``inside``: inside a closed mesh, or behind the normals of a point cloud. ``outside``: the opposite side, for a
+            container. ``below``: below an open surface, which continues beyond its rim at the height of the rim. ``auto`` chooses ``inside`` for
+            watertight meshes and clouds with normals, and ``below`` for all others; the choice is logged.
+        relief: height between the lowest and the highest point [m]. By default it follows from ``fit``; for a height map it is then half the domain's
+            height, unless ``fit`` is ``none``.
         friction: Coulomb coefficient of the surface.
 
     Raises:
-        TerrainError: the file cannot be read, holds nothing usable, is too large, or does not fit the options; or it is an OBJ, STL or PLY and the package
-            trimesh is not installed.
-        ValueError: options or bounds that no file could fit.
+        TerrainError: the file cannot be read, contains nothing usable, is too large, or does not fit the options; or it is an OBJ, STL or PLY file and the
+            package trimesh is not installed.
+        ValueError: the options or bounds are invalid for every file.
     """
     path = Path(path)
     low, counts = lattice(bounds, spacing)
@@ -71,7 +71,7 @@ def read_terrain(
     if solid == "auto":
         closed = source.watertight if isinstance(source, Mesh) else isinstance(source, Cloud) and source.normals is not None
         solid = "inside" if closed else "below"
-        log.info("%s: took what is %s the surface as solid; solid=inside|outside|below says otherwise", path, solid)
+        log.info("%s: the solid is %s the surface; choose with solid=inside|outside|below", path, solid)
     if solid != "below" and (isinstance(source, Heights) or (isinstance(source, Cloud) and source.normals is None)):
         raise TerrainError(f"{path}: solid={solid!r} needs a mesh or normals; this file is a height field, use solid='below'")
     if isinstance(source, Heights):
@@ -96,15 +96,16 @@ def read_terrain(
 
 
 def ground_of(points: np.ndarray, normals: np.ndarray, bounds: Bounds, spacing: float, friction: float = STICKY) -> DistanceGrid:
-    """What is solid below an open surface given by points [point, 3] in m with unit normals into free space, at grid nodes that cover the domain.
+    """Create the solid ground below an open surface given by points, as signed distances at grid nodes that cover the domain.
 
-    Near the surface the normals tell which side is free. Farther away, where the nearest normal may belong to the rim of a cliff, it is what lies above the
-    height field through the points.
+    Near the surface, the normals determine which side is free. Farther away the nearest normal may belong to the rim of a cliff, so there the free side lies
+    above the height field through the points.
 
     Args:
-        points, normals: of the surface.
+        points: points of the surface [point, 3] in m.
+        normals: unit normals into free space [point, 3].
         bounds: ``(low, high)`` of the domain along x, y and z [m].
-        spacing: of the grid [m].
+        spacing: spacing of the grid [m].
         friction: Coulomb coefficient of the surface.
 
     Raises:
@@ -121,7 +122,7 @@ def ground_of(points: np.ndarray, normals: np.ndarray, bounds: Bounds, spacing: 
 def _placed(
     path: Path, points: np.ndarray, normals: np.ndarray | None, bounds: Bounds, fit: Fit, up: Up, relief: float | None
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points and normals in the frame of the scene."""
+    """Move points [point, 3] and their normals into the frame of the scene; returns positions in m."""
     turn = np.asarray(_TO_Z_UP[up], float).T
     points, normals = points @ turn, None if normals is None else normals @ turn
     if fit == "none":
@@ -146,7 +147,7 @@ def _placed(
 
 
 def _resampled(path: Path, values: np.ndarray, bounds: Bounds, spacing: float, fit: Fit, relief: float | None) -> np.ndarray:
-    """A height map placed in the scene: height [m] of the ground at the grid's vertical lines."""
+    """Place a height map in the scene: heights of the ground [along x, along y] in m at the grid's vertical lines."""
     from scipy.ndimage import map_coordinates
 
     low, counts = lattice(bounds, spacing)
@@ -163,7 +164,10 @@ def _resampled(path: Path, values: np.ndarray, bounds: Bounds, spacing: float, f
 
 
 def _heights_of(path: Path, points: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
-    """Height [m] of a cloud's surface at the grid's vertical lines: linear between the points, that of the nearest point around them."""
+    """Heights [along x, along y] in m of a cloud's surface at the grid's vertical lines.
+
+    Heights are interpolated linearly between the points. Outside of them the height of the nearest point is used.
+    """
     from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
     from scipy.spatial import QhullError
 

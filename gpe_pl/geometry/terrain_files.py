@@ -1,6 +1,6 @@
-"""Surfaces in files: triangle meshes, point clouds and height maps.
+"""Reading of surfaces from files: triangle meshes, point clouds and height maps.
 
-Nothing that is read is executed, and no file but the named one is opened.
+Nothing in a file is executed, and no other file is opened.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAX_HEIGHTS = 2**25
 MAX_MEMBERS = MAX_PARTS = 1000
 MAX_TEXT_TRIANGLES, MAX_TEXT_VERTICES, MAX_TEXT_VALUES = 1_000_000, 2_000_000, 10_000_000
 MAX_ASCII_TRIANGLES, MAX_ASCII_ELEMENTS, MAX_ASCII_BYTES = 300_000, 1_000_000, 2**24
-"""What readers of text get through in some seconds."""
+"""Limits for text files, which are read in some seconds."""
 BINARY = {
     ".obj": "write it as a binary .stl or .ply",
     ".stl": "write it as a binary .stl",
@@ -37,39 +37,58 @@ BINARY = {
     ".csv": "write it as .npy",
 }
 HEADER_BYTES = 2**16
-"""In which a PLY file says how many elements it has."""
+"""Number of bytes at the start of a PLY file that are searched for the numbers of elements."""
 
 
 class TerrainError(GpeError, ValueError):
-    """A terrain file cannot be used; the message names the file and what to do."""
+    """Raised when a terrain file cannot be used; the message names the file and what to do."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles between vertices."""
+    """A triangle mesh.
 
-    vertices: np.ndarray  # [vertex, 3]
-    faces: np.ndarray  # [triangle, 3]
+    Attributes:
+        vertices: positions [vertex, 3].
+        faces: vertex indices [triangle, 3].
+        watertight: whether the triangles enclose a volume.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
     watertight: bool
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points of a surface, perhaps with normals."""
+    """A point cloud of a surface.
 
-    points: np.ndarray  # [point, 3]
-    normals: np.ndarray | None  # [point, 3] into free space
+    Attributes:
+        points: positions [point, 3].
+        normals: unit normals into free space [point, 3], or None.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray | None
 
 
 @dataclass(frozen=True)
 class Heights:
-    """Heights on a square lattice."""
+    """A height map on a square lattice.
 
-    values: np.ndarray  # [along x, along y]
+    Attributes:
+        values: heights [along x, along y].
+    """
+
+    values: np.ndarray
 
 
 def read_surface(path: Path) -> Mesh | Cloud | Heights:
-    """What a file holds, as its extension says; raises ``TerrainError``."""
+    """Read the surface in a file. The extension determines the format.
+
+    Raises:
+        TerrainError: the file cannot be read, contains nothing usable, or is too large; or a package that its format needs is not installed.
+    """
     extension = path.suffix.lower()
     if extension not in (*MESHES, *POINT_CLOUDS, *HEIGHT_MAPS):
         raise TerrainError(
@@ -88,7 +107,7 @@ def read_surface(path: Path) -> Mesh | Cloud | Heights:
         raise
     except ModuleNotFoundError as error:
         raise TerrainError(f"{path}: needs the package {error.name}; install it with `pip install 'gpe_pl[terrain]'`") from None
-    except Exception as error:  # the readers raise anything on damaged files
+    except Exception as error:  # readers raise errors of any type on damaged files
         raise TerrainError(f"{path}: cannot be read as {extension[1:].upper()}: {type(error).__name__}: {error}") from error
     return source
 
@@ -105,14 +124,15 @@ COUNTED: dict[str, tuple[tuple[tuple[bytes, ...], int, str], ...]] = {
     ".ply": (),
     ".csv": (((b"\n", b"\r", b","), MAX_TEXT_VALUES, "heights"),),
 }
-"""What begins or separates the parts of a text format, by extension: readers take far longer than counting these."""
+"""Byte strings to count in text files, by extension: marks that begin or separate parts, the limit, and the name of the parts. Counting is far faster than
+reading."""
 
 
 def _require_countable(path: Path, extension: str) -> None:
-    """Refuse what would take minutes to read before it turns out to be too much."""
+    """Refuse files that would take minutes to read before their size is known."""
     content = path.read_bytes()
     if extension == ".stl" and not content[:512].lstrip().lower().startswith(b"solid"):
-        return  # its header says how many, which the reader compares with the size
+        return  # a binary file: the reader compares the number in its header with the size
     for marks, most, what in COUNTED[extension]:
         if (count := sum(map(content.count, marks))) > most:
             raise TerrainError(
@@ -126,7 +146,7 @@ def _require_countable_elements(path: Path, content: bytes) -> None:
     head = content[:HEADER_BYTES].partition(b"end_header")[0]
     counts = [(kind, int(count)) for kind, count in re.findall(rb"element\s+(\S{1,100})\s+(\d{1,20})", head)]
     for kind, count in counts:
-        if (MAX_TRIANGLES if kind == b"face" else MAX_POINTS) < count <= len(content):  # a header that promises more is damaged
+        if (MAX_TRIANGLES if kind == b"face" else MAX_POINTS) < count <= len(content):  # the reader reports a damaged header
             raise TerrainError(f"{path}: {count} elements of kind {kind.decode(errors='replace')} are too many; simplify it first")
     is_text = re.search(rb"format\s+ascii", head) is not None
     if is_text and (len(content) > MAX_ASCII_BYTES or MAX_ASCII_ELEMENTS < sum(count for _, count in counts) <= len(content)):
@@ -138,7 +158,7 @@ def _require_countable_elements(path: Path, content: bytes) -> None:
 def _read_mesh(path: Path) -> Mesh | Cloud:
     import trimesh
 
-    # from memory, so that the reader cannot follow references to materials and textures
+    # The file is read from memory, so that the reader cannot follow references to materials and textures.
     scene = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type=path.suffix[1:].lower(), skip_materials=True, process=False)
     meshes = [g for g in scene.geometry.values() if isinstance(g, trimesh.Trimesh) and len(g.faces)]
     if not meshes:
@@ -150,7 +170,7 @@ def _read_mesh(path: Path) -> Mesh | Cloud:
     if len(mesh.faces) > MAX_TRIANGLES:
         raise TerrainError(f"{path}: {len(mesh.faces)} triangles are too many, at most {MAX_TRIANGLES}; decimate the mesh first")
     _require_finite(path, mesh.vertices)
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # texture seams are no holes
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)  # texture seams are not holes
     corners = np.asarray(mesh.triangles, np.float64)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     faces = np.asarray(mesh.faces, np.int64)[area > 1e-14 * np.max(np.ptp(corners.reshape(-1, 3), axis=0)) ** 2]
@@ -195,7 +215,7 @@ def _columns(path: Path, values: np.ndarray) -> Cloud:
 
 
 def _height_map(path: Path, rows: np.ndarray) -> Heights:
-    """Heights of an image, its rows from north to south."""
+    """Create a height map from the rows of an image, which run from north to south."""
     if rows.ndim != 2 or min(rows.shape) < 2:
         raise TerrainError(f"{path}: a height map has at least 2 rows and 2 columns, got an array {list(rows.shape)}")
     if rows.size > MAX_HEIGHTS:
@@ -206,7 +226,7 @@ def _height_map(path: Path, rows: np.ndarray) -> Heights:
 
 
 def _read_npy(path: Path) -> Cloud | Heights:
-    values = np.load(path, mmap_mode="r", allow_pickle=False)  # a header that promises more than the file holds is an error here
+    values = np.load(path, mmap_mode="r", allow_pickle=False)  # raises if the header promises more than the file contains
     return _columns(path, values) if values.ndim == 2 and values.shape[1] in (3, 6) else _height_map(path, values)
 
 

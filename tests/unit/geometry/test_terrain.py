@@ -480,7 +480,7 @@ def stl(path: Path, corners: np.ndarray) -> Path:
 def test_a_mesh_of_many_large_triangles_is_refused_before_the_work(tmp_path: Path) -> None:
     path = stl(tmp_path / "soup.stl", np.random.default_rng(0).random((30_000, 3, 3)))
     with pytest.raises(
-        TerrainError, match=r"soup.stl: 30000 triangles have together .* grid nodes beside them, at most 1.07e\+09; simplify the mesh"
+        TerrainError, match=r"soup.stl: 30000 triangles have together .* grid nodes near them, at most 1.07e\+09; simplify the mesh"
     ):
         read_terrain(path, UNIT, 1 / 120, solid="inside")
 
