@@ -88,7 +88,7 @@ def test_ball_from_every_mesh_format(tmp_path: Path, extension: str, caplog: pyt
     ball.export(path)
     with caplog.at_level(logging.INFO, logger="gpe_pl.geometry.terrain"):
         grid = read_terrain(path, UNIT, 1 / 24)
-    assert "inside the surface as solid" in caplog.text
+    assert "the solid is inside the surface" in caplog.text
     exact = np.linalg.norm(nodes_of(grid) - 0.5, axis=-1) - 0.5  # scaled to fit
     assert_distances(grid.values, exact)
     np.testing.assert_array_equal(read_terrain(path, UNIT, 1 / 24, solid="outside").values, -grid.values)
@@ -146,7 +146,7 @@ def test_open_surface_is_solid_below(tmp_path: Path, extension: str, caplog: pyt
     trimesh.Trimesh(vertices, faces, process=False).export(path)
     with caplog.at_level(logging.INFO, logger="gpe_pl.geometry.terrain"):
         grid = read_terrain(path, UNIT, 1 / 20, fit="none")
-    assert "below the surface as solid" in caplog.text
+    assert "the solid is below the surface" in caplog.text
     x = nodes_of(grid)
     gap = x[..., 2] - hills(x[..., 0], x[..., 1])
     clear = np.abs(gap) > 2e-3
