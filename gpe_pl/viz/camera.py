@@ -1,4 +1,4 @@
-"""Where points of a scene lie on paper."""
+"""The camera: projection of points of a scene onto the picture."""
 
 import math
 
@@ -12,22 +12,22 @@ ELEVATION, AZIMUTH = math.radians(24), math.radians(-60)
 """Direction from a 3D scene to the viewer: angle above the ground, and angle around the vertical."""
 
 MARGIN = 0.015
-"""Room for the lines of walls, in parts of the longer side."""
+"""Margin for the lines of walls, as a fraction of the longer side."""
 
 
 def vertical_axis(trajectory: Trajectory) -> int:
-    """The axis along which gravity acts; the last one without gravity."""
+    """Return the axis along which gravity acts; the last axis without gravity."""
     gravity = np.abs(trajectory.metadata.gravity)
     return int(np.argmax(gravity)) if gravity.any() else trajectory.metadata.dim - 1
 
 
 class Camera:
-    """A 2D scene as it is, or a 3D scene in parallel projection, obliquely from above: sizes on paper do not depend on the distance.
+    """Unchanged view of a 2D scene, or oblique parallel projection of a 3D scene from above, so that sizes do not depend on the distance.
 
     Attributes:
-        plane: unit vectors to the right and upward on paper [2, dim].
+        plane: unit vectors to the right and upward in the picture [2, dim].
         toward: unit vector to the viewer [dim]; zero in 2D.
-        low, high: corners on paper [2] of the domain, or of the bowl in it, and a margin [m].
+        low, high: corners in the picture [2] of the domain, or of the bowl in it, with a margin [m].
     """
 
     def __init__(self, trajectory: Trajectory) -> None:
@@ -36,7 +36,7 @@ class Camera:
             self.plane, self.toward = np.eye(2), np.zeros(2)
         else:
             up = vertical_axis(trajectory)
-            order = np.roll(np.arange(3), 2 - up)  # right-handed, with the vertical last
+            order = np.roll(np.arange(3), 2 - up)  # right-handed, with the vertical axis last
             sin, cos, rise = math.sin(AZIMUTH), math.cos(AZIMUTH), math.sin(ELEVATION)
             frame = np.zeros((3, 3))
             flat = math.cos(ELEVATION)
@@ -46,30 +46,30 @@ class Camera:
         on_paper, depth = self.project(corners)
         low, high = on_paper.min(axis=0), on_paper.max(axis=0)
         for shape in trajectory.boundary.shapes:
-            if isinstance(shape, Bowl):  # all that happens, happens inside
+            if isinstance(shape, Bowl):  # everything happens inside the bowl
                 center, _ = self.project(np.asarray(shape.center, float))
                 low, high = np.maximum(low, center - shape.radius), np.minimum(high, center + shape.radius)
         margin = MARGIN * (high - low).max()
-        if trajectory.metadata.periodicity:  # particles come up to the edge
+        if trajectory.metadata.periodicity:  # particles reach the edge
             margin = max(margin, 0.5 * trajectory.metadata.spacing)
         self.low, self.high = low - margin, high + margin
         self._depth_range = float(depth.min()), float(depth.max())
 
     @property
     def aspect(self) -> float:
-        """Height of the picture by its width."""
+        """Height of the picture divided by its width."""
         width, height = self.high - self.low
         return float(height / width)
 
     def project(self, points: Float[np.ndarray, "*shape dim"]) -> tuple[Float[np.ndarray, "*shape 2"], Float[np.ndarray, "*shape"]]:
-        """Place on paper, and how far in front of the origin towards the viewer [m]."""
+        """Return the position in the picture [m], and the distance in front of the origin towards the viewer [m]."""
         return points @ self.plane.T, np.asarray(points @ self.toward)
 
     def turn(self, directions: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 3"]:
-        """Components to the right, upward and towards the viewer."""
+        """Return the components to the right, upward and towards the viewer."""
         return directions @ np.stack([*self.plane, self.toward]).T
 
     def haze(self, depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-        """From 1 at the far end of the domain to 0 at the near end; 0 in 2D."""
+        """Return 1 at the far end of the domain to 0 at the near end; 0 in 2D."""
         far, near = self._depth_range
         return np.clip((near - depth) / (near - far), 0, 1) if near > far else np.zeros_like(depth)

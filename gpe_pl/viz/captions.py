@@ -1,4 +1,4 @@
-"""What pictures say in words: what a trajectory is, and which materials and parameter values it has."""
+"""Captions of pictures: names of trajectories, their materials and parameter values."""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,33 +9,33 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 UNITS = {"1": "", "deg": "°", "m^2/s": " m²/s"}
 PREFIXES = (("G", 1e9), ("M", 1e6), ("k", 1e3))
-"""Of pascals."""
+"""Prefixes of pascals and their factors."""
 
 
 def heading(trajectory: Trajectory) -> str:
-    """Whether a trajectory is the ground truth or a prediction."""
+    """Tell whether a trajectory is the ground truth or a prediction."""
     return "prediction" if trajectory.is_prediction else "ground truth"
 
 
 def with_heading(first: Trajectory, others: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
-    """All trajectories by what to call them, the first under its heading.
+    """Return all trajectories by name; the first is named by its heading.
 
     Raises:
-        ValueError: one of the others has the name of the first.
+        ValueError: another trajectory has the name of the first.
     """
     name = heading(first)
     if name in others:
-        raise ValueError(f"{name!r} is what the first trajectory is called; give another name to the one beside it")
+        raise ValueError(f"{name!r} is the name of the first trajectory; give the other trajectory another name")
     return {name: first, **others}
 
 
 def parameter_name(material: str) -> str:
-    """Name of a material's parameter in words."""
+    """Return the name of a material's parameter in words."""
     return MATERIALS[material].name.replace("_", " ").replace("youngs", "Young’s")
 
 
 def parameter_value(material: str, low: float, high: float | None = None) -> str:
-    """Value of a material's parameter, or its range, with the unit: ``27.5°``, ``0.6 … 1 MPa``."""
+    """Return the value of a material's parameter, or its range, with the unit: ``27.5°``, ``0.6 … 1 MPa``."""
     high, unit = low if high is None else high, MATERIALS[material].unit
     prefix, scale = next(((p, s) for p, s in PREFIXES if unit == "Pa" and high >= s), ("", 1.0))
     numbers = [f"{value / scale:.4g}" for value in (low, high)]
@@ -43,12 +43,12 @@ def parameter_value(material: str, low: float, high: float | None = None) -> str
 
 
 def materials_of(trajectory: Trajectory) -> list[str]:
-    """Materials that occur."""
+    """Return the materials that occur."""
     return [material for material in trajectory.metadata.materials if (trajectory.node_type == node_code(material)).any()]
 
 
 def describe(trajectory: Trajectory) -> str:
-    """Materials that occur, and the value of each one's parameter: ``sand, friction angle 27.5°``."""
+    """Return the materials that occur with their parameter values: ``sand, friction angle 27.5°``."""
     parts = []
     for material in materials_of(trajectory):
         columns = [name == MATERIALS[material].name for name in trajectory.metadata.param_names]
@@ -60,13 +60,13 @@ def describe(trajectory: Trajectory) -> str:
 
 
 def in_common(trajectories: Sequence[Trajectory]) -> str:
-    """``describe`` where it is the same for all trajectories, else the materials that occur."""
+    """Return ``describe`` if it is the same for all trajectories, else the materials that occur."""
     texts = list(dict.fromkeys(describe(trajectory) for trajectory in trajectories))
     return texts[0] if len(texts) == 1 else ", ".join(dict.fromkeys(m for t in trajectories for m in materials_of(t)))
 
 
 def row_label(values: Mapping[str, float]) -> str:
-    """Parameter values by material as the label of a row, on lines of their own."""
+    """Return parameter values by material as the label of a row, one per line."""
     if len(values) > 1:
         return "\n".join(f"{material} {parameter_value(material, value)}" for material, value in values.items())
     return "\n".join(f"{parameter_name(material)}\n{parameter_value(material, value)}" for material, value in values.items())

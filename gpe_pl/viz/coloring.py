@@ -1,4 +1,4 @@
-"""What the colours of particles and mesh cells mean."""
+"""Meaning of the colours of particles and mesh cells."""
 
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal
@@ -16,18 +16,18 @@ from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import vertical_axis
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Colours that stay apart with colour-blind readers (Okabe and Ito, Color universal design, 2008)."""
+"""Colours that colour-blind readers can distinguish (Okabe and Ito, Color universal design, 2008)."""
 
 MATERIAL_COLORS = {"sand": "#E69F00", "snow": "#56B4E9", "fluid": "#0072B2", "elastomer": "#D55E00", "solid": "#009E73"}
 
 REFERENCE = "#7A8B99"
-"""What has no value of its own: particles of the ground truth where colour means error, particles outside of meshes where it means stress, walls that move."""
+"""Colour of items without a value: ground-truth particles under ``error``, particles outside meshes under ``von_mises``, and moving walls."""
 
 ColorBy = Literal["error", "height", "material", "speed", "von_mises"]
 
 
 def _shortened(name: str, low: float, high: float) -> Colormap:
-    """The part of a colour map that shows on white paper."""
+    """Return the part of a colour map that is visible on white paper."""
     return LinearSegmentedColormap.from_list(f"{name}_shortened", mpl.colormaps[name](np.linspace(low, high, 256)))
 
 
@@ -40,11 +40,11 @@ COLOR_MAPS: dict[ColorBy, Colormap] = {
 }
 
 BAR_LABELS: dict[ColorBy, str] = {"error": "position error [m]", "speed": "speed [m/s]", "von_mises": "von Mises stress"}
-"""Colours whose values a reader wants to look up."""
+"""Labels of the colours that need a scale."""
 
 
 def position_error(prediction: Trajectory, truth: Trajectory, frame: int) -> Float[np.ndarray, "node"]:
-    """Distance [m] of every particle from its place in the ground truth."""
+    """Return the distance [m] of every particle from its position in the ground truth."""
     return np.linalg.norm(displacement(prediction.pos[frame], truth.pos[frame], truth.metadata), axis=-1)
 
 
@@ -52,14 +52,14 @@ class Coloring:
     """Colours of all trajectories in one figure, on a common scale.
 
     Args:
-        by: ``error`` is the distance from ``truth``; ``height`` that in the first frame, by which material can be followed; ``material``,
-            ``speed`` and ``von_mises`` (of a mesh) are what they say.
-        trajectories: all that the figure shows.
-        frames: those that it shows.
+        by: quantity. ``error`` is the distance from ``truth``; ``height`` is the height in the first frame, which makes mixing visible; ``material``,
+            ``speed`` and ``von_mises`` (of a mesh) are named after their quantities.
+        trajectories: all trajectories in the figure.
+        frames: the frames in the figure.
         truth: ground truth, for ``error``.
 
     Raises:
-        ValueError: ``von_mises`` where no trajectory knows a stress, or ``error`` without ground truth.
+        ValueError: ``von_mises`` if no trajectory has a stress, or ``error`` without ground truth.
     """
 
     def __init__(self, by: ColorBy, trajectories: Sequence[Trajectory], frames: Iterable[int], truth: Trajectory | None = None) -> None:
@@ -82,19 +82,19 @@ class Coloring:
         values = values[np.isfinite(values)]
         if self.by == "height":
             return Normalize(float(values.min()), float(values.max()))
-        # Ends at the 99th percentile, or a single lost particle would take all colour from the others.
+        # End at the 99th percentile: otherwise a single lost particle would take all contrast from the others.
         top = float(np.quantile(np.append(values, 0.0), 0.99))
         return Normalize(0.0, top if top > 0 else trajectories[0].metadata.spacing)
 
     @property
     def bar_label(self) -> str | None:
-        """Label of a colour bar, where one helps."""
+        """Label of the colour bar, or None if the colours need no bar."""
         if self.by == "error" and self._truth is not None and self._truth.is_prediction:
             return "distance from the first row [m]"
         return BAR_LABELS.get(self.by)
 
     def values(self, trajectory: Trajectory, frame: int) -> tuple[Float[np.ndarray, "node"], Float[np.ndarray, "cell"]]:
-        """What nodes and mesh cells are coloured by; NaN where there is nothing to say."""
+        """Return the values that colour nodes and mesh cells; NaN where there is none."""
         cells = np.empty((0, 1), int) if trajectory.cells is None else trajectory.cells
         unknown = np.full(trajectory.num_nodes, np.nan)
         if self.by == "von_mises":
@@ -116,12 +116,12 @@ class Coloring:
         return nodes, mean_over_corners(nodes, cells)
 
     def __call__(self, trajectory: Trajectory, frame: int) -> tuple[Float[np.ndarray, "node 4"], Float[np.ndarray, "cell 4"]]:
-        """Red, green, blue and opacity of every node and mesh cell."""
+        """Return red, green, blue and opacity of every node and mesh cell."""
         nodes, cells = (self.color_map(self.scale(values)) for values in self.values(trajectory, frame))
         return nodes, cells
 
     def legend(self, trajectories: Iterable[Trajectory]) -> dict[str, Any]:
-        """Colour of every material that occurs, where colour means material; empty otherwise."""
+        """Return the colour of every material that occurs if colours mean materials; otherwise an empty dictionary."""
         if self.by != "material":
             return {}
         codes = {int(code) for t in trajectories for code in np.unique(t.node_type)}

@@ -1,4 +1,4 @@
-"""Figures that compare models over domains: errors with their intervals, and errors against the material parameter."""
+"""Figures that compare models over domains: errors with intervals, and errors against the material parameter."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -15,14 +15,14 @@ from gpe_pl.viz.film_strip import TEXT_WIDTH, new_figure
 
 
 def comparison_figure(intervals: Mapping[str, Mapping[str, Interval]], references: Mapping[str, Mapping[str, float]], label: str) -> Figure:
-    """A group per domain, a mark with its interval per model, on a logarithmic axis; a line across each group marks each reference.
+    """Draw errors with intervals on a logarithmic axis, a group per domain and a mark per model; a line across each group marks each reference.
 
-    An interval without an upper end reaches out of the figure, and a mark that is itself infinite stands as a triangle at its top.
+    An interval without an upper end runs to the top of the figure. An infinite mark is a triangle at the top.
 
     Args:
-        intervals: by domain and model.
-        references: by name and domain, such as the error of ballistic flight.
-        label: of the vertical axis.
+        intervals: intervals by domain and model.
+        references: values by name and domain, such as the error of ballistic flight.
+        label: label of the vertical axis.
     """
     figure = new_figure(TEXT_WIDTH, 2.6)
     figure.set_layout_engine("constrained")
@@ -64,12 +64,12 @@ def parameter_figure(
     label: str,
     parameters: Mapping[str, str] = MappingProxyType({}),
 ) -> Figure:
-    """One panel per domain: median error over trajectories and seeds against the material parameter; ticks at the bottom mark trained values.
+    """Draw median error over trajectories and seeds against the material parameter, a panel per domain; ticks at the bottom mark trained values.
 
     Args:
         curves: errors by domain, model and parameter value.
         seen: trained values by domain.
-        label: of the vertical axis.
+        label: label of the vertical axis.
         parameters: labels of the horizontal axes by domain.
     """
     figure = new_figure(TEXT_WIDTH, 2.4)
@@ -114,12 +114,12 @@ def parameter_figure(
 
 @dataclass(frozen=True)
 class CostAndError:
-    """What a panel shows, by label: infinite errors are left out.
+    """Content of a panel, by label; infinite errors are left out.
 
     Attributes:
-        lines: costs and errors that belong together, such as the resolutions of a solver.
-        marks: costs and errors each for itself; hollow where the label is that of an earlier one and an addition after a comma.
-        levels: errors of what costs nothing.
+        lines: costs and errors that form a line, such as the resolutions of a solver.
+        marks: separate costs and errors; a mark is hollow if its label is an earlier label with an addition after a comma.
+        levels: errors without a cost.
     """
 
     lines: Mapping[str, Sequence[tuple[float, float]]]
@@ -128,12 +128,12 @@ class CostAndError:
 
 
 def cost_error_figure(panels: Mapping[str, CostAndError], x_label: str, y_label: str) -> Figure:
-    """Cost against error on logarithmic axes, a panel per horizon.
+    """Draw cost against error on logarithmic axes, a panel per horizon.
 
     Args:
-        panels: by title.
-        x_label: of the costs.
-        y_label: of the errors.
+        panels: contents by title.
+        x_label: label of the costs.
+        y_label: label of the errors.
     """
     figure = new_figure(TEXT_WIDTH, 2.8)
     figure.set_layout_engine("constrained")
@@ -152,7 +152,7 @@ def cost_error_figure(panels: Mapping[str, CostAndError], x_label: str, y_label:
         for style, (label, error) in zip((":", "--"), panel.levels.items(), strict=False):
             axes.axhline(error, linestyle=style, linewidth=1, color="0.6", label=label)
         low, high = np.log10(axes.get_xlim())
-        axes.set_xlim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))  # whole decades, since labels of their parts would overlap
+        axes.set_xlim(10.0 ** np.floor(low), 10.0 ** np.ceil(high))  # whole decades, because labels between them would overlap
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_title(title, fontsize=8)
         axes.set_xlabel(x_label, fontsize=7)

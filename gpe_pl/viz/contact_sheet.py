@@ -1,4 +1,4 @@
-"""A data set at a glance: one scene under several parameter values, so that a person sees at once whether the data is right."""
+"""The contact sheet of a data set: one scene under several parameter values, to check the data by eye."""
 
 from collections.abc import Mapping, Sequence
 
@@ -9,21 +9,21 @@ from gpe_pl.viz.coloring import ColorBy, Coloring
 from gpe_pl.viz.film_strip import evenly_spaced_frames, film_strip
 
 DPI = 220
-"""A sheet is looked at on a screen: single particles should be visible."""
+"""Resolution in dots per inch; a sheet is viewed on a screen, and single particles should be visible."""
 
 
 def telling_color(trajectories: Sequence[Trajectory]) -> ColorBy:
-    """Stress where a mesh has it, else the material where there are several, else the height at the start."""
+    """Choose stress if a mesh has it, else material if there are several, else the height at the start."""
     if any(trajectory.stress is not None for trajectory in trajectories):
         return "von_mises"
     return "material" if len(trajectories[0].metadata.materials) > 1 else "height"
 
 
 def contact_sheet(trajectories: Mapping[str, Trajectory], num_columns: int = 6) -> Figure:
-    """A row for each trajectory, evenly spaced times to the right.
+    """Draw a row for each trajectory, with evenly spaced times to the right.
 
     Args:
-        trajectories: by the label of their row, of scenes in the same domain; they may differ in the number of nodes.
+        trajectories: trajectories of scenes in the same domain by the label of their row; their numbers of nodes may differ.
         num_columns: number of times; fewer if there are fewer frames.
 
     Raises:

@@ -1,7 +1,7 @@
 """Figures for print: rollouts as film strips, error over time, validation loss over training.
 
-Every function returns a ``Figure`` with its own Agg canvas. Nothing touches pyplot, so figures can be made in threads and without a
-display, and are collected like any other object; save one with ``figure.savefig(path, dpi=300)``.
+Every function returns a ``Figure`` with its own Agg canvas. Figures do not use pyplot, so they can be made in threads and without a display, and are freed
+like any other object. Save one with ``figure.savefig(path, dpi=300)``.
 """
 
 import math
@@ -21,7 +21,7 @@ from gpe_pl.viz.film_strip import evenly_spaced_frames, film_strip, new_figure
 Numbers = Sequence[int | float] | np.ndarray
 
 FIRST_DECADES = 6
-"""An axis of errors reaches this far below the lowest error at the end: free fall starts with 1e-14 m², which is rounding."""
+"""Number of decades that an axis of errors shows below the lowest final error; free fall starts at rounding errors of 1e-14 m²."""
 
 COLUMN_WIDTH = 3.4
 """Width [inch] of a figure in one column of a paper."""
@@ -30,22 +30,22 @@ COLUMN_WIDTH = 3.4
 def rollout_figure(
     ground_truth: Trajectory, predictions: Mapping[str, Trajectory], num_columns: int = 6, color: ColorBy = "error"
 ) -> Figure:
-    """Film strip of a rollout: time runs to the right, the ground truth is the top row, each prediction has a row below, and materials stand under them.
+    """Draw a rollout as a film strip: ground truth in the top row, one row per prediction below, time to the right, materials at the bottom.
 
     Args:
-        ground_truth: sets the times, evenly spaced from its first to its last frame; a prediction in its place is called so.
-        predictions: rollouts from frame 0 of the ground truth, by the name of their row. One that stopped early says so in
-            place of its missing frames.
+        ground_truth: trajectory that sets the times, evenly spaced from its first to its last frame; a prediction in its place is labelled so.
+        predictions: rollouts from frame 0 of the ground truth, by the name of their row. A rollout that stopped early shows its reason in
+            place of the missing frames.
         num_columns: number of times; fewer if there are fewer frames.
         color: ``error`` is the distance of predicted particles from the ground truth; others as in ``Coloring``.
 
     Raises:
-        ValueError: ``num_columns`` is not positive, no trajectory has what ``color`` needs, or a prediction has the name of the first row.
+        ValueError: ``num_columns`` is not positive, no trajectory has the values for ``color``, or a prediction has the name of the first row.
     """
     rows = {name: trajectory.with_moving_boundary() for name, trajectory in with_heading(ground_truth, predictions).items()}
     frames = evenly_spaced_frames(ground_truth.num_frames, num_columns)
     coloring = Coloring(color, list(rows.values()), frames, next(iter(rows.values())))
-    # A row may be lower than its name is long.
+    # A name may be longer than its row is high.
     return film_strip([(name.replace(" ", "\n"), trajectory) for name, trajectory in rows.items()], frames, coloring)
 
 
@@ -55,16 +55,16 @@ def error_curve_figure(
     quantiles: tuple[float, float] = (0.1, 0.9),
     label: str = "position MSE [m²]",
 ) -> Figure:
-    """Error against time on a logarithmic axis: median over the trajectories that last so long, and a band between two quantiles, as the legend says.
+    """Draw error against time on a logarithmic axis: the median over the trajectories that reach each time, and a band between two quantiles.
 
-    Infinite errors (rollouts that failed) leave the top of the axes, and errors far below that of every curve's end the bottom. Frame 0, the shared start, is
-    not drawn.
+    Infinite errors (failed rollouts) leave the axes at the top, and errors far below the final error of every curve leave them at the bottom. Frame 0, the
+    shared start, is not drawn.
 
     Args:
         curves: per-frame errors [frame] of the trajectories (``metrics.per_frame_mse``), of any lengths, by the name of the simulator.
         frame_dt: time between frames [s].
         quantiles: edges of the band.
-        label: of the vertical axis.
+        label: label of the vertical axis.
     """
     figure = new_figure(COLUMN_WIDTH, 2.5)
     axes = _plain_axes(figure)
@@ -73,12 +73,12 @@ def error_curve_figure(
         table = np.full((len(errors), max(map(len, errors)) - 1), np.nan)
         for row, values in zip(table, errors, strict=True):
             row[: len(values) - 1] = values[1:]
-        # Order statistics: interpolation between infinities is not a number.
+        # Use order statistics, because interpolation between infinities gives NaN.
         low, high = np.nanquantile(table, quantiles, axis=0, method="inverted_cdf")
         bands[name] = np.stack([low, np.nanmedian(table, axis=0), high])
     ceiling = _set_log_limits(axes, np.concatenate([b.ravel() for b in bands.values()]))
     ends = [band[1, -1] for band in bands.values() if 0 < band[1, -1] < np.inf]
-    if ends:  # what is rounding at first may be no error to look at
+    if ends:  # the first errors may be mere rounding
         axes.set_ylim(bottom=max(axes.get_ylim()[0], 10.0**-FIRST_DECADES * min(ends)))
     for (name, band), (color, dash) in zip(bands.items(), _styles(len(bands)), strict=True):
         time = frame_dt * np.arange(1, band.shape[1] + 1)
@@ -95,13 +95,13 @@ def error_curve_figure(
 
 
 def validation_loss_figure(curves: Mapping[str, Sequence[tuple[Numbers, Numbers]]], label: str = "validation loss") -> Figure:
-    """Validation loss against training step on a logarithmic axis: every seed thin, their median thick.
+    """Draw validation loss against training step on a logarithmic axis: every seed thin, their median thick.
 
-    Seeds that were validated at different steps are interpolated, in the logarithm, for the median, over the steps that all of them cover.
+    For the median, seeds that were validated at different steps are interpolated in the logarithm, over the steps that all of them cover.
 
     Args:
-        curves: per label, one ``(steps, values)`` for each seed. Values that are not finite count as infinite.
-        label: of the vertical axis.
+        curves: one ``(steps, values)`` for each seed, by label. Values that are not finite count as infinite.
+        label: label of the vertical axis.
     """
     figure = new_figure(COLUMN_WIDTH, 2.5)
     axes = _plain_axes(figure)
@@ -131,9 +131,9 @@ def _clean(steps: Numbers, values: Numbers) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _styles(count: int) -> list[tuple[str, str]]:
-    """Colour and line style of every curve; neighbours differ in both, so that both show where they coincide."""
+    """Return colour and line style of every curve; neighbours differ in both, so that coinciding curves can be told apart."""
     dashes = ("-", "--", ":", "-.")
-    most = math.lcm(len(PALETTE), len(dashes))  # no pair comes twice before
+    most = math.lcm(len(PALETTE), len(dashes))  # pairs do not repeat before this number
     if count > most:
         raise ValueError(f"{count} curves, but no more than {most} can be told apart in one figure")
     return [(PALETTE[k % len(PALETTE)], dashes[k % len(dashes)]) for k in range(count)]
@@ -152,7 +152,7 @@ def _plain_axes(figure: Figure) -> Axes:
 
 
 def _set_log_limits(axes: Axes, values: np.ndarray) -> float:
-    """Fit a logarithmic axis to the positive finite values; return the value at which to draw infinity, above the top."""
+    """Fit a logarithmic axis to the positive finite values; return the value above the top at which to draw infinity."""
     positive = values[np.isfinite(values) & (values > 0)]
     low, high = (positive.min(), positive.max()) if positive.size else (1e-1, 1.0)
     axes.set_ylim(low / 1.5, high * 1.5)
@@ -162,13 +162,13 @@ def _set_log_limits(axes: Axes, values: np.ndarray) -> float:
 def scaling_figure(
     left: Mapping[str, Mapping[int, float]], left_label: str, right: Mapping[str, Mapping[int, float]], right_label: str
 ) -> Figure:
-    """Two quantities against the number of nodes on logarithmic axes, a curve per name, beside a line of slope one.
+    """Draw two quantities against the number of nodes on logarithmic axes, a curve per name, and a line of slope one.
 
     Args:
-        left: of the left axes, by name and number of nodes.
-        left_label: with the unit.
-        right: of the right axes.
-        right_label: with the unit.
+        left: values of the left axes, by name and number of nodes.
+        left_label: label of the left axis, with the unit.
+        right: values of the right axes, by name and number of nodes.
+        right_label: label of the right axis, with the unit.
     """
     figure = new_figure(2 * COLUMN_WIDTH, 2.6)
     figure.set_layout_engine("constrained")

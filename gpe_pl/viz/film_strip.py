@@ -1,4 +1,4 @@
-"""The layout that figures of trajectories share: one row each, time runs to the right."""
+"""The layout of trajectory figures: one row per trajectory, time to the right."""
 
 import textwrap
 from collections.abc import Sequence
@@ -22,18 +22,18 @@ TEXT_WIDTH = 7.0
 """Width [inch] of a figure that spans both columns of a paper."""
 
 LINE, CHARACTER = 0.14, 0.062
-"""Height of a line and about the width of a character of a row's label [inch]."""
+"""Height of a line and approximate width of a character of a row's label [inch]."""
 
 
 def new_figure(width: float, height: float, dpi: int = 150) -> Figure:
-    """An empty figure [inch] with a canvas of its own, unknown to pyplot."""
+    """Return an empty figure [inch] with its own canvas, unknown to pyplot."""
     figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 
 
 def evenly_spaced_frames(num_frames: int, num_columns: int) -> list[int]:
-    """Up to ``num_columns`` different frames from the first to the last.
+    """Return up to ``num_columns`` different frames from the first to the last.
 
     Raises:
         ValueError: ``num_columns`` is not positive.
@@ -44,21 +44,21 @@ def evenly_spaced_frames(num_frames: int, num_columns: int) -> list[int]:
 
 
 def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], coloring: Coloring, dpi: int = 150) -> Figure:
-    """A panel per trajectory and frame, times above the columns, and below materials with what the colours mean; other colours have a bar or legend.
+    """Draw a panel per trajectory and frame, times above the columns, materials and the meaning of colours below, and a colour bar or legend.
 
     Args:
-        rows: label and trajectory, from top to bottom, of scenes in the same domain.
-        frames: one per column; a trajectory that ended before says so.
-        coloring: of all rows.
-        dpi: dots per inch, unless ``savefig`` is given others.
+        rows: label and trajectory of each row, from top to bottom, of scenes in the same domain.
+        frames: one frame per column; a trajectory that ended earlier shows a note.
+        coloring: colours of all rows.
+        dpi: dots per inch, unless ``savefig`` sets another value.
     """
     trajectories = [trajectory for _, trajectory in rows]
-    # The ground truth has no error to look up: the bar stands beside the rows below it.
+    # The ground truth has no error, so the bar stands beside the rows below it.
     first_with_bar = 1 if coloring.by == "error" else 0
     has_bar = coloring.bar_label is not None and len(rows) > first_with_bar
     legend = coloring.legend(trajectories)
     aspect = Camera(trajectories[0]).aspect
-    right = 0.04 if not has_bar else 0.62 if coloring.by == "error" else 0.9  # inch; a stress comes with its unit
+    right = 0.04 if not has_bar else 0.62 if coloring.by == "error" else 0.9  # inch; the label of a stress includes its unit
     caption = textwrap.fill(
         "; ".join([in_common(trajectories), *["colour: height at the start"] * (coloring.by == "height")]), int(TEXT_WIDTH / CHARACTER)
     )
@@ -110,7 +110,7 @@ def film_strip(rows: Sequence[tuple[str, Trajectory]], frames: Sequence[int], co
 
 
 def _times(frames: Sequence[int], frame_dt: float) -> list[str]:
-    """Times with as many decimals as tell them apart."""
+    """Format times with enough decimals to tell them apart."""
     times = [frame * frame_dt for frame in frames]
     decimals = next((d for d in range(2, 6) if len({f"{t:.{d}f}" for t in times}) == len(times)), 6)
     return [("$t$ = " if k == 0 else "") + f"{time:.{decimals}f} s" for k, time in enumerate(times)]

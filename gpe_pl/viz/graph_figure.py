@@ -1,4 +1,4 @@
-"""The multi-scale graph of a mesh, level by level: what a model sees of a body (paper, figure 1 b)."""
+"""The multi-scale graph of a mesh, level by level: the input of a model for a meshed body (paper, figure 1 b)."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ PANEL = 1.8
 
 
 def multiscale_figure(trajectory: Trajectory, frame: int = 0) -> Figure:
-    """One panel for the cell edges and one for each level of virtual nodes, with its ``same`` edges and, faint, those ``down`` to its children.
+    """Draw one panel for the cell edges and one for each level of virtual nodes, with its ``same`` edges and, faint, the ``down`` edges to its children.
 
-    Above them stand materials and parameter values. A scene in space is seen along y.
+    Materials and parameter values stand above the panels. A 3D scene is viewed along y.
 
     Raises:
         ValueError: the trajectory has no mesh.

@@ -1,4 +1,4 @@
-"""One view of a scene: its boundary, and particles and meshes that move from frame to frame."""
+"""One view of a scene: its boundary, and moving particles and meshes."""
 
 from typing import Any
 
@@ -15,28 +15,28 @@ from gpe_pl.viz.coloring import Coloring
 from gpe_pl.viz.scenery import INK, LIGHT, draw_scenery
 
 DOT = 1.3
-"""Diameter of a particle in rest spacings: neighbours overlap a little."""
+"""Diameter of a particle in rest spacings; neighbours overlap a little."""
 
 APART, APART_SPACING = 0.9, 3.0
-"""Diameter in 2D where neighbours are at least so many points apart on paper: each is seen by itself, with a thin edge."""
+"""Diameter of 2D particles whose neighbours are at least this many points apart on paper; they are drawn apart, with a thin edge."""
 
 DISC = np.stack([np.cos(np.arange(12) * np.pi / 6), np.sin(np.arange(12) * np.pi / 6)], axis=-1)
 
 MAX_FACES = 30_000
-"""A 3D mesh with more faces on its surface is shown by its nodes."""
+"""Number of surface faces above which a 3D mesh is shown by its nodes."""
 
 HAZE, HIDDEN = 0.3, 0.25
-"""How much white the far end of a 3D scene gets, and the opacity of what lies behind an obstacle."""
+"""Fraction of white at the far end of a 3D scene, and opacity of items behind an obstacle."""
 
 FACES = {
     "tetrahedron": np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]),
     "hexahedron": np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]]),
 }
-"""Corners of each face of a volume."""
+"""Corners of each face of a volume cell."""
 
 
 def drawn_faces(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Polygons that show a mesh, as nodes [face, corner], and the cell of each: of surfaces the cells, of volumes the faces that only one cell has."""
+    """Return polygons that show a mesh, as nodes [face, corner], and the cell of each: cells of surface meshes, boundary faces of volume meshes."""
     cells = trajectory.cells
     if cells is None or len(cells) == 0:
         return np.empty((0, 3), int), np.empty(0, int)
@@ -54,7 +54,7 @@ def drawn_faces(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
 
 
 def outline(trajectory: Trajectory) -> np.ndarray:
-    """Edges that only one cell of a 2D mesh has, as nodes [edge, 2]."""
+    """Return the edges that belong to only one cell of a 2D mesh, as nodes [edge, 2]."""
     if trajectory.cells is None or trajectory.metadata.dim == 3:
         return np.empty((0, 2), int)
     edges = polygon_edges(trajectory.cells)
@@ -62,13 +62,13 @@ def outline(trajectory: Trajectory) -> np.ndarray:
 
 
 def polygon_edges(polygons: np.ndarray) -> np.ndarray:
-    """Edges [edge, 2] of polygons [polygon, corner]; one with fewer corners than others repeats its last."""
+    """Return the edges [edge, 2] of polygons [polygon, corner]; a polygon with fewer corners than others repeats its last."""
     edges = np.stack([polygons, np.roll(polygons, -1, axis=1)], axis=-1).reshape(-1, 2)
     return edges[edges[:, 0] != edges[:, 1]]
 
 
 def _that_occur_once(groups: np.ndarray) -> np.ndarray:
-    """Indices of groups of nodes [group, node] that no other group equals in any order; it does not matter which node a group repeats."""
+    """Return the indices of groups of nodes [group, node] that no other group equals in any order, whichever node a group repeats."""
     nodes = np.sort(groups, axis=1).astype(np.int64)
     again = nodes[:, 1:] == nodes[:, :-1]
     nodes[:, 1:][again] = np.broadcast_to(nodes[:, -1:], again.shape)[again]
@@ -84,10 +84,10 @@ class Panel:
     """Axes that show one scene.
 
     Args:
-        figure: figure to draw into; its size must be final, since it fixes how large a particle is.
-        rectangle: left, bottom, width, height in parts of the figure; with the aspect ratio of ``Camera``.
-        trajectory: what is shown.
-        coloring: of its particles and mesh cells.
+        figure: figure to draw into; its size must be final, because it determines the size of particles.
+        rectangle: left, bottom, width and height as fractions of the figure; the aspect ratio must be that of ``Camera``.
+        trajectory: trajectory to show.
+        coloring: colours of its particles and mesh cells.
     """
 
     def __init__(self, figure: Figure, rectangle: tuple[float, float, float, float], trajectory: Trajectory, coloring: Coloring) -> None:
@@ -110,7 +110,7 @@ class Panel:
         self.particles: Any = self.axes.scatter(
             [], [], s=diameter**2, linewidths=0.06 * diameter if self._is_3d or is_apart else 0, zorder=3, rasterized=many
         )
-        # Edges as wide as cover the seams between cells; among small cells they must not be darker, or there would be nothing else.
+        # Wide edges cover the seams between cells. Among small cells they must not be darker, or they would hide the cells.
         self._edge = 1 - 0.3 * float(np.clip((diameter - 1.5) / 3, 0.0, 1.0))
         self.mesh: Any = PolyCollection([], linewidths=0.35, snap=False, joinstyle="round", zorder=3, rasterized=many)
         self.axes.add_collection(self.mesh, autolim=False)
@@ -125,11 +125,11 @@ class Panel:
 
     @property
     def artists(self) -> tuple[Any, ...]:
-        """The artists that ``show_frame`` changes, in the order in which to draw them."""
+        """Artists that ``show_frame`` changes, in drawing order."""
         return (self.mesh, self.outline, self.particles, self.note)
 
     def show_frame(self, frame: int) -> None:
-        """Show a frame of the trajectory, or why there is none."""
+        """Show a frame of the trajectory, or the reason why it is missing."""
         if frame < self.trajectory.num_frames:
             pos = self.trajectory.metadata.periodicity.wrapped(self.trajectory.pos[frame].astype(np.float64))
             self._show(pos, *self.coloring(self.trajectory, frame))
@@ -145,7 +145,7 @@ class Panel:
     def _show(
         self, pos: Float[np.ndarray, "node dim"], node_colors: Float[np.ndarray, "node 4"], cell_colors: Float[np.ndarray, "cell 4"]
     ) -> None:
-        """Move everything to positions [m]; what is not finite is left out."""
+        """Move everything to positions [m]; items that are not finite are left out."""
         finite = np.isfinite(pos).all(axis=-1)
         pos = np.where(finite[:, None], pos, 0.0)
         on_paper, depth = self.camera.project(pos)
@@ -155,7 +155,7 @@ class Panel:
         face_colors = cell_colors[self._cell_of_face[whole][shown]]
         outlines = list(self.camera.project(corners)[0])
         if self._is_3d and len(faces):
-            # Dots among faces become polygons, so that all together can be drawn from far to near.
+            # Dots among faces become polygons, so that everything can be drawn from far to near.
             outlines += list(on_paper[dots, None] + self._radius * DISC)
             face_colors[:, :3] *= self._shade(corners)[:, None]
             face_colors = np.concatenate([face_colors, node_colors[dots]])
@@ -170,11 +170,11 @@ class Panel:
         self.outline.set_segments(self.camera.project(segments)[0])
         dots = dots[np.argsort(depth[dots], kind="stable")]
         self.particles.set_offsets(on_paper[dots])
-        # One colour per particle even where all are equal: a single one makes Agg round positions to whole pixels.
+        # Give every particle its own colour: with a single colour Agg rounds positions to whole pixels.
         self._paint(self.particles, self._seen_from_afar(node_colors[dots], on_paper[dots], depth[dots]), 0.7)
 
     def _corners(self, pos: Float[np.ndarray, "node dim"], groups: np.ndarray) -> tuple[Float[np.ndarray, "drawn corner dim"], np.ndarray]:
-        """Positions of the nodes of faces or edges, and which of them each is: those at the seam of a periodic domain appear on both of its sides."""
+        """Return positions of the nodes of faces or edges, and the index of each; those at the seam of a periodic domain appear on both sides."""
         corners, which = pos[groups], np.arange(len(groups))
         periodicity = self.trajectory.metadata.periodicity
         if periodicity:
@@ -192,7 +192,7 @@ class Panel:
         artist.set_edgecolor(colors * (edge, edge, edge, 1.0))
 
     def _shade(self, corners: Float[np.ndarray, "face corner 3"]) -> Float[np.ndarray, "face"]:
-        """Brightness of triangles under the light, which falls on either side."""
+        """Return the brightness of triangles under light that falls on either side."""
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normal /= np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)[:, None]
         normal = self.camera.turn(normal)
@@ -201,7 +201,7 @@ class Panel:
     def _seen_from_afar(
         self, colors: Float[np.ndarray, "item 4"], on_paper: Float[np.ndarray, "item 2"], depth: Float[np.ndarray, "item"]
     ) -> Float[np.ndarray, "item 4"]:
-        """Paler with distance, and faint behind obstacles."""
+        """Fade colours with distance, and behind obstacles."""
         colors = colors.copy()
         colors[:, :3] += HAZE * self.camera.haze(depth)[:, None] * (1 - colors[:, :3])
         colors[self._cover.hides(on_paper, depth), 3] = HIDDEN

@@ -1,4 +1,4 @@
-"""Figures in files that appear complete or not at all."""
+"""Figure files that appear complete or not at all."""
 
 from __future__ import annotations
 
@@ -11,6 +11,6 @@ from gpe_pl.files.atomic import replacing
 
 
 def save_figure(figure: Figure, path: Path, **options: Any) -> None:
-    """Write a figure; options are those of ``savefig``. Raises ``FullDiskError``."""
+    """Write a figure; options are those of ``savefig``. Raise ``FullDiskError`` if the disk is full."""
     with replacing(path) as part:
         figure.savefig(part, **options)

@@ -1,6 +1,6 @@
 """Walls, obstacles, containers and terrain behind the particles.
 
-In 3D a surface is shown where its free side faces the viewer, so that one looks into a container from outside, and through the near bank of a river.
+In 3D, a surface is shown if its free side faces the viewer. The view goes into a container from outside, and through the near bank of a river.
 """
 
 from collections.abc import Sequence
@@ -20,19 +20,19 @@ SOLID = "0.82"
 BACKDROP = "0.965"
 
 GRID = 240
-"""Points along the longer side of a 2D scene at which a shape without outline of its own is asked for its signed distance."""
+"""Points along the longer side of a 2D scene at which signed distances are sampled, for shapes without a simple outline."""
 
 LIGHT = np.array([-0.45, 0.75, 0.5]) / np.linalg.norm([-0.45, 0.75, 0.5])
 """Direction to the light: to the right, upward and towards the viewer."""
 
 
 class Cover:
-    """What the surfaces of a 3D scene hide: the depth of the nearest one, on a raster of the picture.
+    """Depth of the nearest surface of a 3D scene, on a raster of the picture; it tells which points are hidden.
 
     Args:
-        camera: of the picture.
-        pos: points of surfaces that the viewer sees [point, dim].
-        spacing: between them [m].
+        camera: camera of the picture.
+        pos: points on visible surfaces [point, dim] in m.
+        spacing: distance between them [m].
     """
 
     def __init__(self, camera: Camera, pos: Float[np.ndarray, "point dim"], spacing: float) -> None:
@@ -45,12 +45,12 @@ class Cover:
         return tuple(np.clip((on_paper - self._low) / self._pixel, 0, np.array(self._depth.shape) - 1).astype(int).T)
 
     def hides(self, on_paper: Float[np.ndarray, "point 2"], depth: Float[np.ndarray, "point"]) -> Bool[np.ndarray, "point"]:
-        """Whether a surface lies in front of points."""
+        """Tell whether a surface lies in front of points."""
         return depth + self._slack < self._depth[self._index(on_paper)]
 
 
 def draw_scenery(axes: Any, camera: Camera, trajectory: Trajectory, points_per_metre: float) -> Cover:
-    """Draw the boundary of a trajectory; return what it hides."""
+    """Draw the boundary of a trajectory; return the cover of its surfaces."""
     if trajectory.metadata.dim == 2:
         _draw_2d(axes, trajectory)
         return Cover(camera, np.empty((0, 2)), trajectory.metadata.spacing)
@@ -78,12 +78,12 @@ def _draw_2d(axes: Any, trajectory: Trajectory) -> None:
     pos = trajectory.boundary.pos
     distances = [np.abs(shape.signed_distance(pos)) for shape in shapes]
     loose = pos[np.min(distances, axis=0) > 0.1 * trajectory.metadata.spacing] if shapes else pos
-    if len(loose):  # imported data know some boundaries by nodes only
+    if len(loose):  # imported data give some boundaries by nodes only
         axes.scatter(*loose.T, s=1.0, color=INK, linewidths=0, zorder=2)
 
 
 def _patch(shape: Any) -> Patch | None:
-    """A solid with a simple outline as a filled area."""
+    """Return a solid with a simple outline as a filled area."""
     style: dict[str, Any] = {"facecolor": SOLID, "edgecolor": INK, "linewidth": 0.6, "zorder": 2}
     if shape.kind == "sphere":
         return Circle(shape.center, shape.radius, **style)
@@ -95,7 +95,7 @@ def _patch(shape: Any) -> Patch | None:
 
 
 def _fill_solid(axes: Any, shape: Shape, bounds: Float[np.ndarray, "2 2"]) -> None:
-    """Whatever has a signed distance: fill where it is negative, and trace where it is zero."""
+    """Draw any shape by its signed distance: fill where it is negative, and trace where it is zero."""
     step = np.ptp(bounds, axis=1).max() / GRID
     x, y = (np.linspace(low, high, max(2, round((high - low) / step) + 1)) for low, high in bounds)
     distance = shape.signed_distance(np.stack(np.meshgrid(x, y), axis=-1))
@@ -111,7 +111,7 @@ def _draw_3d(axes: Any, camera: Camera, trajectory: Trajectory, points_per_metre
     shapes: tuple[Any, ...] = boundary.shapes
     walls, boxes, bowls = (tuple(s for s in shapes if s.kind == kind) for kind in ("wall", "box", "bowl"))
     style: dict[str, Any] = {"linewidth": 0.5, "joinstyle": "round"}
-    for wall in () if bowls else walls:  # around a bowl they would be mere packaging
+    for wall in () if bowls else walls:  # a bowl hides the walls around it
         axis = int(np.argmax(np.abs(wall.normal)))
         if wall.normal[axis] * camera.toward[axis] > 0:
             outline = _face(camera, wall.low, wall.high, axis, wall.offset * wall.normal[axis])
@@ -121,7 +121,7 @@ def _draw_3d(axes: Any, camera: Camera, trajectory: Trajectory, points_per_metre
             outline = _face(camera, box.low, box.high, axis, (box.high if side > 0 else box.low)[axis])
             grey = str(_brightness(camera, side * np.eye(3)[axis]))
             axes.add_patch(Polygon(outline, facecolor=grey, edgecolor=grey, zorder=1, **style))
-    # Discs that overlap look like a surface; its shape shows by the light that falls on it. They end where the solid does.
+    # Overlapping discs look like a surface, and the light on them shows its shape. They end where the solid does.
     pos, normal, gap = surface_points(boundary, spacing)
     seen = (normal @ camera.toward >= 0) & (signed_distance(walls, pos) > 1e-6 * spacing)
     pos, normal, radius = pos[seen], normal[seen], 0.85 * gap[seen]
@@ -140,12 +140,12 @@ def _draw_3d(axes: Any, camera: Camera, trajectory: Trajectory, points_per_metre
 
 
 def surface_points(boundary: Boundary, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions and normals [point, 3] of all that is not flat, and distances between neighbours [point] in m."""
+    """Return positions and normals [point, 3] on all surfaces that are not flat, and distances between neighbours [point] in m."""
     flat_or_round: tuple[Any, ...] = tuple(s for s in boundary.shapes if s.kind in ("box", "sphere", "bowl"))
     rest = np.abs(signed_distance(flat_or_round, boundary.pos)) > 1e-6 * spacing
     parts = [(boundary.pos[rest], boundary.normal[rest], np.full(np.count_nonzero(rest), spacing))]
     for shape in flat_or_round:
-        if shape.kind != "box":  # as smooth as it is, whatever its nodes
+        if shape.kind != "box":  # sampled from the smooth shape, not from its nodes
             gap = min(spacing, shape.radius / 16)
             pos, normal = shape.sample(gap)
             parts.append((pos, normal, np.full(len(pos), gap)))
@@ -154,12 +154,12 @@ def surface_points(boundary: Boundary, spacing: float) -> tuple[np.ndarray, np.n
 
 
 def _brightness(camera: Camera, normal: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape"]:
-    """Grey of a surface under the light."""
+    """Return the grey of a surface under the light."""
     return np.asarray(0.7 + 0.24 * np.clip(camera.turn(normal) @ LIGHT, -0.4, 1))
 
 
 def _face(camera: Camera, low: Sequence[float], high: Sequence[float], axis: int, value: float) -> Float[np.ndarray, "4 2"]:
-    """Where on paper the face of a box lies on which a coordinate has this value."""
+    """Return the corners in the picture [4, 2] of the face of a box on which a coordinate has this value."""
     first, second = (k for k in range(3) if k != axis)
     corners = np.full((4, 3), value)
     corners[:, first] = np.take([low[first], high[first]], [0, 1, 1, 0])

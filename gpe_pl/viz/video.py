@@ -1,4 +1,4 @@
-"""Animations of a rollout beside the ground truth: GIF always, MP4 where imageio-ffmpeg is installed."""
+"""Animations of a rollout beside the ground truth: GIF, or MP4 if imageio-ffmpeg is installed."""
 
 import textwrap
 from collections.abc import Iterator, Mapping
@@ -22,12 +22,12 @@ from gpe_pl.viz.scenery import INK
 
 PANEL_PIXELS, FILM_PIXELS = 360, 960
 CHARACTER_PIXELS = 7
-"""About the width of a character of the line that names materials."""
+"""Approximate width of a character of the line that names materials, in pixels."""
 DPI = 100
 
 
 class FilmError(GpeError):
-    """A film is not whole; ffmpeg says nothing of it to the program that calls it."""
+    """A film is incomplete; ffmpeg does not report this to the program that calls it."""
 
 
 def write_animation(
@@ -41,18 +41,19 @@ def write_animation(
     """Write the ground truth and predictions side by side; the file appears complete or not at all.
 
     Args:
-        path: ends in ``.gif`` or ``.mp4``.
-        ground_truth: sets the length; a prediction in its place is called so.
+        path: file that ends in ``.gif`` or ``.mp4``.
+        ground_truth: trajectory that sets the length; a prediction in its place is labelled so.
         predictions: rollouts from frame 0 of the ground truth, by the name of their panel.
         fps: frames per second of the animation; a GIF rounds the time of a frame to 10 ms.
-        stride: show every so many frames of the trajectory.
-        color: ``height`` colours particles by where they started, ``error`` predicted ones by their distance from the ground truth; others as in
-            ``Coloring``.
+        stride: step between shown frames of the trajectory.
+        color: ``height`` colours particles by their height at the start, ``error`` predicted particles by their distance from the ground truth; others as
+            in ``Coloring``.
 
     Raises:
-        ValueError: another file type, a stride or frame rate that is not positive, or a GIF with more than 50 frames per
-            second, no trajectory has what ``color`` needs, or a prediction has the name of the first panel.
-        FilmError: ffmpeg could not write the whole MP4. FullDiskError: there is no room for a GIF.
+        ValueError: the file type is unknown, the stride or frame rate is not positive, a GIF has more than 50 frames per second, no trajectory
+            has the values for ``color``, or a prediction has the name of the first panel.
+        FilmError: ffmpeg could not write the whole MP4.
+        FullDiskError: there is no room for a GIF.
         ModuleNotFoundError: MP4 without imageio-ffmpeg.
     """
     frames = range(0, ground_truth.num_frames, stride) if stride >= 1 else range(0)
@@ -61,7 +62,7 @@ def write_animation(
 
 
 def write_film(path: Path | str, name: str, trajectory: Trajectory, fps: int | float = 25, color: ColorBy = "height") -> None:
-    """``write_animation`` of a single trajectory, larger, under a name."""
+    """Write an animation of a single trajectory under a name, larger than in ``write_animation``."""
     _write(Path(path), {name: trajectory.with_moving_boundary()}, range(trajectory.num_frames), fps, color, None, FILM_PIXELS)
 
 
@@ -81,7 +82,7 @@ def _write(
 
 
 def _images(rows: dict[str, Trajectory], frames: range, coloring: Coloring, panel_pixels: int) -> Iterator[np.ndarray]:
-    """RGB images [height, width, 3], one per shown frame. Boundaries and titles are drawn once and restored below the particles."""
+    """Yield RGB images [height, width, 3], one per shown frame. Boundaries and titles are drawn once and restored below the particles."""
     first = next(iter(rows.values()))
     aspect = Camera(first).aspect
 
@@ -90,7 +91,7 @@ def _images(rows: dict[str, Trajectory], frames: range, coloring: Coloring, pane
     title = line * (1 + len(caption))
     width = len(rows) * panel_pixels + (len(rows) + 1) * gap
     height = round(panel_pixels * aspect) + title + gap
-    width, height = width + width % 2, height + height % 2  # H.264 wants even sizes
+    width, height = width + width % 2, height + height % 2  # H.264 needs even sizes
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
     canvas = FigureCanvasAgg(figure)
     panels = []
@@ -119,13 +120,13 @@ def _images(rows: dict[str, Trajectory], frames: range, coloring: Coloring, pane
 
 
 def _palette(color: ColorBy) -> Image.Image:
-    """The 256 colours of a GIF: greys, and the colours of particles, whole, mixed with white as at their edges, and darkened as on edges of a mesh.
+    """Return the 256 colours of a GIF: greys, and the colours of particles, pure, mixed with white as at their edges, and darkened as on mesh edges.
 
-    Fixed beforehand, because a palette made from the first frame lacks what appears later, and one for every frame flickers.
+    The palette is fixed, because a palette of the first frame lacks later colours, and one palette per frame flickers.
     """
     hues = np.concatenate([COLOR_MAPS[color](np.linspace(0, 1, 50))[:, :3], [to_rgb(REFERENCE)]])
     mixed = [*(1 - part * (1 - hues) for part in (1.0, 0.65, 0.3)), 0.75 * hues]
-    # Nearest colours are looked up approximately: nothing next to white, so that paper stays white.
+    # Pillow finds nearest colours approximately: the palette has no colour next to white, so that paper stays white.
     greys = np.append(np.linspace(0, 0.9, 255 - 4 * len(hues)), 1.0)[:, None].repeat(3, axis=1)
     image = Image.new("P", (1, 1))
     image.putpalette(np.round(255 * np.concatenate([*mixed, greys])).astype(np.uint8).tobytes())
@@ -136,19 +137,19 @@ def _write_gif(path: Path, images: Iterator[np.ndarray], fps: int | float, palet
     if fps > 50:
         raise ValueError(f"a GIF shows at most 50 frames per second, got {fps:g}; raise stride or write an MP4")
     pictures = (Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
-    # The format counts in hundredths of a second.
+    # The format stores times in hundredths of a second.
     next(pictures).save(path, format="GIF", save_all=True, append_images=pictures, duration=10 * round(100 / fps), loop=0)
 
 
 def _write_mp4(path: Path, images: Iterator[np.ndarray], fps: int | float, shown: Path) -> None:
-    """Write images to a path that errors call ``shown``."""
+    """Write images to a path; errors call it ``shown``."""
     try:
         import imageio_ffmpeg
     except ImportError:
         raise ModuleNotFoundError("MP4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or write a .gif") from None
     first = next(images)
     size = (first.shape[1], first.shape[0])
-    # With its index in front a browser starts playing before the end has arrived.
+    # With the index at the front, a browser starts playing before the file is complete.
     writer = imageio_ffmpeg.write_frames(
         str(path),
         size,
@@ -170,7 +171,7 @@ def _write_mp4(path: Path, images: Iterator[np.ndarray], fps: int | float, shown
         if written == count:
             return
         reason = f"{written} of {count} frames are in the file"
-    except (OSError, RuntimeError, IndexError):  # the last one of a file without frames
+    except (OSError, RuntimeError, IndexError):  # IndexError is raised for a file without frames
         pass
     finally:
         writer.close()

@@ -1,11 +1,11 @@
-"""One HTML file that plays a rollout beside the ground truth: no server, no network, nothing to install.
+"""An HTML viewer: one file that plays a rollout beside the ground truth, without server, network or installation.
 
-The page draws with WebGL 2; its parts are in ``page/``. Arrays are stored in it as base64 of zlib. Positions are rounded to 16 bits per axis,
+The page draws with WebGL 2; its parts are in ``page/``. It stores arrays as base64 of zlib. Positions are rounded to 16 bits per axis over the region where
+nodes are shown::
 
     x = low + step q,   q = 0 … 65534,   |rounding| ≤ step / 2
 
-over the region where nodes are shown, so by 8 µm in a domain of 1 m; the page says by how much. Speed and stress have 16 bits as well. The colours
-of errors follow from the positions.
+In a domain of 1 m the rounding is 8 µm; the page states it. Speed and stress have 16 bits as well. The colours of errors follow from the positions.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ from gpe_pl.viz.scenery import BACKDROP, surface_points
 PAGE = Path(__file__).parent / "page"
 
 LEVELS = 65535
-"""Values that 16 bits hold besides the one that means none."""
+"""Number of 16-bit values that stand for a quantity; one more stands for no value."""
 
 FASTEST = 50.0
-"""Speeds and stresses are stored up to this many times the end of their colours: one that exploded must not take all levels."""
+"""Largest stored speed or stress, as a multiple of the end of its colour scale, so that an exploded value does not use up all levels."""
 
 UNITS: dict[ColorBy, tuple[str, str]] = {
     "error": ("position error", "m"),
@@ -51,16 +51,16 @@ UNITS: dict[ColorBy, tuple[str, str]] = {
     "speed": ("speed", "m/s"),
     "von_mises": ("von Mises stress", "Pa"),
 }
-"""Name and unit of what colours mean."""
+"""Name and unit of each quantity that colours show."""
 
 SOLID_GRID = 512
-"""Points along the longer side of a 2D scene at which obstacles are asked for their signed distance, …"""
+"""Number of points along the longer side of a 2D scene at which the signed distance of obstacles is sampled."""
 SOLID_CELLS = 4
-"""… which is stored up to this many of its cells."""
+"""Number of these grid cells up to which signed distances are stored."""
 
 
 class ViewerError(GpeError, ValueError):
-    """Trajectories that do not show the same scene."""
+    """Trajectories do not show the same scene."""
 
 
 def write_viewer(
@@ -73,18 +73,18 @@ def write_viewer(
     """Write a page with ground truth, prediction and error side by side; the file appears complete or not at all.
 
     Args:
-        path: ends in ``.html``.
-        ground_truth: sets the length; a prediction in its place is called so.
-        predictions: of the same frames, by name; one of them is shown at a time. Without any, the ground truth stands alone.
-        stride: every so many frames.
-        title: of the page; by default data set and split.
+        path: file that ends in ``.html``.
+        ground_truth: trajectory that sets the length; a prediction in its place is labelled so.
+        predictions: rollouts of the same frames, by name; the page shows one at a time. Without predictions it shows the ground truth alone.
+        stride: step between shown frames.
+        title: title of the page; by default data set and split.
 
     Returns:
-        The largest rounding of a position that is shown [m]. Nodes more than the domain's size outside of it are not shown.
+        The largest rounding of a shown position [m]. Nodes further outside the domain than its size are not shown.
 
     Raises:
         ViewerError: a prediction has other nodes than the ground truth.
-        ValueError: another file type, a stride that is not positive, or a prediction with the name of the first panel.
+        ValueError: the file type is wrong, the stride is not positive, or a prediction has the name of the first panel.
     """
     path = Path(path)
     if path.suffix != ".html":
@@ -115,11 +115,11 @@ def write_viewer(
 
 
 Arrays = dict[str, tuple[str, np.ndarray]]
-"""Arrays of a page: kind (``frames`` of 16 bits, or a NumPy type) and values, by name."""
+"""Arrays of a page by name: kind (``frames`` of 16 bits, or a NumPy type) and values."""
 
 
 def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, Any], Arrays]:
-    """What the page knows, as plain values and arrays."""
+    """Return the content of the page as plain values and arrays."""
     first, truth = next(iter(trajectories.items()))
     about = truth.metadata
     frames = range(0, truth.num_frames, stride)
@@ -182,12 +182,12 @@ def _scene(trajectories: dict[str, Trajectory], stride: int) -> tuple[dict[str, 
 
 
 def _inside(trajectory: Trajectory) -> Trajectory:
-    """The same with all nodes inside the domain along its periodic axes."""
+    """Return the trajectory with all nodes wrapped into the domain along its periodic axes."""
     return replace(trajectory, pos=trajectory.metadata.periodicity.wrapped(trajectory.pos))
 
 
 def _colors(trajectories: Mapping[str, Trajectory]) -> list[ColorBy]:
-    """What nodes can be coloured by, the most telling first."""
+    """Return the quantities that can colour nodes, the most informative first."""
     shown = [*trajectories.values()]
     colors: list[ColorBy] = ["height", "speed", "material"]
     if any(trajectory.stress is not None for trajectory in shown):
@@ -199,11 +199,11 @@ def _colors(trajectories: Mapping[str, Trajectory]) -> list[ColorBy]:
 
 @dataclass(frozen=True)
 class Raster:
-    """Positions as 16-bit integers.
+    """Encoding of positions as 16-bit integers.
 
     Attributes:
-        low: of the region that is shown [dim] in m.
-        step: between neighbouring values [dim] in m.
+        low: low corner of the region that is shown [dim] in m.
+        step: difference of neighbouring values [dim] in m.
     """
 
     low: Float[np.ndarray, " dim"]
@@ -211,18 +211,18 @@ class Raster:
 
     @classmethod
     def of(cls, positions: Sequence[Float[np.ndarray, "_ node dim"]], bounds: Float[np.ndarray, "dim 2"]) -> Raster:
-        """The smallest region with the domain and all nodes that are less than the domain's size outside of it."""
+        """Return the smallest region with the domain and all nodes outside it by less than its size."""
         low, high = bounds.T.copy()
         size = float(np.max(high - low))
         for pos in positions:
             for axis, values in enumerate(np.moveaxis(pos, -1, 0)):
-                near = values[(values >= bounds[axis, 0] - size) & (values <= bounds[axis, 1] + size)]  # a NaN is not
+                near = values[(values >= bounds[axis, 0] - size) & (values <= bounds[axis, 1] + size)]  # NaN compares as false
                 if near.size:
                     low[axis], high[axis] = min(low[axis], float(near.min())), max(high[axis], float(near.max()))
         return cls(low, (high - low) / (LEVELS - 1))
 
     def __call__(self, pos: Float[np.ndarray, "frame node dim"]) -> UInt16[np.ndarray, "frame node dim"]:
-        """Rounded positions; all axes of a node outside of the region have the value 65535."""
+        """Return rounded positions; all axes of a node outside the region have the value 65535."""
         with np.errstate(invalid="ignore"):
             level = np.round((pos - self.low) / self.step)
             outside = ~((level >= 0) & (level < LEVELS)).all(axis=-1)
@@ -230,7 +230,7 @@ class Raster:
 
 
 def _step(by: ColorBy, coloring: Coloring, trajectories: Mapping[str, Trajectory], frames: Sequence[int]) -> float:
-    """Difference of neighbouring 16-bit values of a quantity."""
+    """Return the difference of neighbouring 16-bit values of a quantity."""
     values = [coloring.values(t, f)[0] for t in trajectories.values() for f in frames if f < t.num_frames]
     finite = [v[np.isfinite(v)].max(initial=0.0) for v in values]
     top = min(max(finite), FASTEST * coloring.scale.vmax)  # type: ignore[operator]
@@ -238,13 +238,13 @@ def _step(by: ColorBy, coloring: Coloring, trajectories: Mapping[str, Trajectory
 
 
 def _levels(values: Float[np.ndarray, "frame node"], step: float) -> UInt16[np.ndarray, "frame node"]:
-    """A quantity in 16 bits; 65535 where there is none."""
+    """Encode a quantity in 16 bits; 65535 stands for no value."""
     known = np.isfinite(values)
     return np.where(known, np.clip(np.round(np.where(known, values, 0.0) / step), 0, LEVELS - 1), LEVELS).astype(np.uint16)
 
 
 def _rmse(prediction: Trajectory, truth: Trajectory, frames: Sequence[int]) -> list[float | None]:
-    """Root mean square of the position error [m] in each frame, or None where there is no prediction."""
+    """Return the root mean square of the position error [m] in each frame, or None where the prediction has ended."""
     free = truth.node_type != node_code(BOUNDARY)
     known = [f for f in frames if f < prediction.num_frames]
     errors = [float(np.sqrt(np.mean(position_error(prediction, truth, f)[free] ** 2))) for f in known] + [np.nan] * (
@@ -267,13 +267,13 @@ def _in_3d(values: np.ndarray) -> list[float]:
 
 
 def _focus(trajectory: Trajectory) -> dict[str, Any]:
-    """The part of the scene that fills a panel, whether it is a bowl, and how far anything in it lies from its middle at most [m]."""
+    """Return the part of the scene that fills a panel, whether it is a bowl, and the largest distance from its middle [m]."""
     low, high = np.asarray(trajectory.metadata.bounds, float).T
     bowls = [shape for shape in trajectory.boundary.shapes if isinstance(shape, Bowl)]
     if bowls:
         center, radius = np.asarray(bowls[0].center, float), bowls[0].radius
         low, high = np.maximum(low, center - radius), np.minimum(high, center + radius)
-    if trajectory.metadata.periodicity:  # nodes come up to the edge
+    if trajectory.metadata.periodicity:  # nodes reach the edge
         low, high = low - 0.5 * trajectory.metadata.spacing, high + 0.5 * trajectory.metadata.spacing
     bounds = np.asarray(trajectory.metadata.bounds, float)
     return {
@@ -284,13 +284,13 @@ def _focus(trajectory: Trajectory) -> dict[str, Any]:
 
 
 def _mesh(trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """Triangles and edges of meshes, outlines of 2D meshes, and the nodes that stand for themselves."""
+    """Return triangles and edges of meshes, outlines of 2D meshes, and the nodes outside meshes."""
     faces, _ = drawn_faces(trajectory)
     meshed = np.empty(0, int) if trajectory.cells is None or len(faces) == 0 else trajectory.cells
     fans = [faces[:, [0, k, k + 1]] for k in range(1, faces.shape[1] - 1)]
     triangles = np.concatenate([np.empty((0, 3), int), *fans])
     return {
-        "triangles": triangles[triangles[:, 1] != triangles[:, 2]],  # a triangle among quadrilaterals repeats its last corner
+        "triangles": triangles[triangles[:, 1] != triangles[:, 2]],  # a triangle in a mesh of quadrilaterals repeats its last corner
         "edges": np.unique(np.sort(polygon_edges(faces), axis=1), axis=0),
         "outline": outline(trajectory),
         "loose": np.setdiff1d(np.arange(trajectory.num_nodes), meshed),
@@ -301,7 +301,7 @@ INK_RGB, SEAM_RGB = (0.15, 0.15, 0.15), (0.7, 0.7, 0.7)
 
 
 def _scenery_2d(trajectory: Trajectory) -> tuple[dict[str, Any], Arrays]:
-    """Walls as lines, and all solids as one picture of their signed distance."""
+    """Return walls as lines, and all solids as one picture of their signed distance."""
     shapes: tuple[Any, ...] = trajectory.boundary.shapes
     walls, solids = [s for s in shapes if s.kind == "wall"], tuple(s for s in shapes if s.kind != "wall")
     lines = []
@@ -310,7 +310,7 @@ def _scenery_2d(trajectory: Trajectory) -> tuple[dict[str, Any], Arrays]:
         ends = np.array([wall.low, wall.high], float)
         ends[:, axis] = wall.offset * wall.normal[axis]
         lines += [(*end, 0.0, 0.0, 0.0, 0.0, *INK_RGB) for end in ends]
-    if not shapes:  # imported data knows its boundary by nodes only: a cross each
+    if not shapes:  # imported data give the boundary by nodes only; draw a cross for each
         arm = 0.25 * trajectory.metadata.spacing
         for x, y in trajectory.boundary.pos:
             for dx, dy in ((arm, 0.0), (0.0, arm)):
@@ -334,12 +334,12 @@ def _scenery_2d(trajectory: Trajectory) -> tuple[dict[str, Any], Arrays]:
 
 
 def _scenery_3d(trajectory: Trajectory) -> Arrays:
-    """Walls and boxes as triangles, every other surface as discs on it; each visible from its free side."""
+    """Return walls and boxes as triangles, and every other surface as discs; each is visible from its free side."""
     bounds, spacing = np.asarray(trajectory.metadata.bounds, float), trajectory.metadata.spacing
     shapes: tuple[Any, ...] = trajectory.boundary.shapes
     bowls = [s for s in shapes if s.kind == "bowl"]
     flats, lines = [], []
-    for wall in [] if bowls else [s for s in shapes if s.kind == "wall"]:  # around a bowl they would be mere packaging
+    for wall in [] if bowls else [s for s in shapes if s.kind == "wall"]:  # a bowl hides the walls around it
         axis = int(np.argmax(np.abs(wall.normal)))
         corners = _face(wall.low, wall.high, axis, wall.offset * wall.normal[axis])
         flats += _facet(corners, wall.normal, float(BACKDROP))
@@ -364,7 +364,7 @@ def _scenery_3d(trajectory: Trajectory) -> Arrays:
 
 
 def _face(low: Sequence[float], high: Sequence[float], axis: int, value: float) -> Float[np.ndarray, "4 3"]:
-    """Corners of the face of a box on which a coordinate has this value, in order."""
+    """Return the corners of the face of a box on which a coordinate has this value, in order."""
     first, second = (k for k in range(3) if k != axis)
     corners = np.full((4, 3), value)
     corners[:, first] = np.take([low[first], high[first]], [0, 1, 1, 0])
@@ -373,15 +373,15 @@ def _face(low: Sequence[float], high: Sequence[float], axis: int, value: float) 
 
 
 def _facet(corners: Float[np.ndarray, "4 3"], normal: Any, grey: float) -> list[tuple[float, ...]]:
-    """Two triangles, as vertices with normal and colour."""
+    """Return two triangles, as vertices with normal and colour."""
     return [(*corners[k], *normal, grey, grey, grey) for k in (0, 1, 2, 0, 2, 3)]
 
 
 def _element(name: str, kind: str, values: np.ndarray) -> str:
-    """An array as an element of the page: little-endian, compressed, as base64."""
+    """Return an array as an element of the page: little-endian, compressed, in base64."""
     width = 0
     if kind == "frames":
-        # Differences from frame to frame are small; all their low bytes before all high bytes compress best.
+        # Store differences between frames, all low bytes before all high bytes: they are small and compress best this way.
         width = int(np.prod(values.shape[1:]))
         flat = values.reshape(len(values), width)
         change = np.concatenate([flat[:1], np.diff(flat, axis=0)])  # modulo 2^16

@@ -75,7 +75,7 @@ def test_a_prediction_alone_is_called_so(tmp_path: Path) -> None:
     write_viewer(tmp_path / "a.html", predicted())
     assert page(tmp_path / "a.html") == ("test: prediction", f"test {SAND}", ["prediction"])
     for name, value in (("ground truth", truth()), ("prediction", predicted())):
-        with pytest.raises(ValueError, match=f"'{name}' is what the first trajectory is called"):
+        with pytest.raises(ValueError, match=f"'{name}' is the name of the first trajectory"):
             rollout_figure(value, {name: predicted()})
 
 
