@@ -1,13 +1,14 @@
-"""A trained model without this package: one frame as a ``torch.export`` program, which PyTorch alone loads and runs.
+"""Export of a trained model as a ``torch.export`` program of one frame, which needs PyTorch but not this package.
 
-The program takes a scene as a dictionary of tensors and returns what changes; everything but the search for neighbours is inside. In Python::
+The program takes a scene as a dictionary of tensors and returns the changed tensors. The caller searches for neighbours; the program does everything else. In
+Python::
 
     program = torch.export.load("model.pt2").module()
     scene["edges.sand.radius.sand"] = …           pairs within the radius, each once; row 0 source, row 1 target
     moved, predicted = program(scene)             positions and velocity history; accelerations [m/s²] and stress [Pa]
     scene |= moved
 
-``description.json`` in the file says which tensors there are, with their shapes and units (``torch.export.load`` reads it with ``extra_files``). Numbers of
+The file contains ``description.json``, which lists the tensors with their shapes and units (``torch.export.load`` reads it with ``extra_files``). Numbers of
 nodes, edges and islands may change from call to call.
 """
 
@@ -40,23 +41,23 @@ from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 
 Scene = dict[str, Tensor]
-"""Tensors by the names of ``describe``."""
+"""Tensors of a scene by the names of ``describe``."""
 
 DESCRIPTION = "description.json"
 EVERYTHING = Skips(absent_types=False, isolated_nodes=False, edges_at_once=None, sorted_from=None)
-"""What a program computes cannot depend on the values in its scene."""
+"""Skips that do not depend on the values of the scene, because an exported program cannot."""
 BOUNDARY_FIELDS = ("pos", "vel", "normal", "friction", "restitution")
 
 
 @dataclass(frozen=True)
 class Input:
-    """One tensor of a scene.
+    """Description of one tensor of a scene.
 
     Attributes:
-        shape: lengths, or names of those that may differ from call to call.
-        dtype: ``float64`` or ``int64`` or ``bool``.
-        unit: of its values.
-        doc: what it is.
+        shape: lengths, or names of lengths that may differ from call to call.
+        dtype: ``float64``, ``int64`` or ``bool``.
+        unit: unit of the values.
+        doc: meaning of the values.
     """
 
     shape: tuple[int | str, ...]
@@ -66,10 +67,10 @@ class Input:
 
 
 class PortableStep(nn.Module):
-    """A learned simulator's step on plain tensors.
+    """Step of a learned simulator on plain tensors.
 
     Args:
-        simulator: with any model of this package.
+        simulator: simulator with any model of this package.
     """
 
     def __init__(self, simulator: LearnedSimulator) -> None:
@@ -80,7 +81,7 @@ class PortableStep(nn.Module):
         self.frame_dt, self.periodicity, self.config = metadata.frame_dt, metadata.periodicity, simulator.builder.config
 
     def forward(self, scene: Scene) -> tuple[Scene, Scene]:
-        """The next positions and velocity history; acceleration [m/s²], gravity included, and stress [Pa] at nodes where the model has one."""
+        """Return next positions and velocity history; and acceleration with gravity [m/s²] and stress [Pa] at nodes for which the model predicts one."""
         graph = self.graph(scene)
         predicted = self.simulator(graph)
         is_supported = self.simulator.supported(graph) if self.simulator.static_friction else None
@@ -103,7 +104,7 @@ class PortableStep(nn.Module):
         return moved, further
 
     def graph(self, scene: Scene) -> HeteroData:
-        """The graph that the builder makes of the same state."""
+        """Return the graph that the builder makes of the same state."""
         data = HeteroData()
         for material in self.spec.materials:
             store = data[material]
@@ -116,7 +117,7 @@ class PortableStep(nn.Module):
             data.num_islands = torch.full((1,), scene["island_is_free"].shape[0])
             for m in self.meshes:
                 data[m].body = scene[f"body.{m}"]
-            data.num_bodies = torch.full((1,), sum(scene[f"body.{m}"].shape[0] for m in self.meshes))  # at most
+            data.num_bodies = torch.full((1,), sum(scene[f"body.{m}"].shape[0] for m in self.meshes))  # upper bound
         pos, vel, normal, friction, restitution = (scene[f"boundary.{name}"] for name in BOUNDARY_FIELDS)
         boundary = Boundary(pos, vel, normal, friction, restitution)
         data[BOUNDARY].x = boundary_features(self.config, boundary, self.scales).float()
@@ -125,7 +126,7 @@ class PortableStep(nn.Module):
         return data
 
     def _arms(self, scene: Scene) -> Scene:
-        """Positions relative to the mean of the island, by material."""
+        """Return positions relative to the mean of the island, by material."""
         if self.periodicity:
             return {m: scene[f"arm.{m}"] for m in self.spec.materials}
         pos, island = (torch.cat([scene[f"{name}.{m}"] for m in self.spec.materials]) for name in ("pos", "island"))
@@ -152,7 +153,7 @@ class PortableStep(nn.Module):
             store.offset = store.odd[:, : self.spec.dim]
 
     def _add_mesh(self, data: HeteroData, scene: Scene) -> None:
-        """Virtual nodes, each moving as the mean of its children, and the edges of meshes."""
+        """Add virtual nodes, which move as the mean of their children, and the edges of meshes."""
         relations = [r for r in self.spec.relations if r[1] != RADIUS]
         if not relations:
             return
@@ -186,12 +187,12 @@ class PortableStep(nn.Module):
 
 
 def _meshes(spec: FeatureSpec) -> tuple[str, ...]:
-    """Materials that are connected along their cells."""
+    """Return the materials that are connected along their cells."""
     return tuple(target for _, name, target in spec.relations if name == CELL)
 
 
 def describe(simulator: LearnedSimulator) -> dict[str, Input]:
-    """The tensors that a program of this simulator takes, by name."""
+    """Return the tensors that a program of this simulator takes, by name."""
     builder, spec, dim = simulator.builder, simulator.builder.spec, simulator.builder.spec.dim
     history = builder.config.history
     inputs = {"gravity": Input((dim,), "float64", "m/s^2", "external acceleration")}
@@ -243,7 +244,7 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
 
 
 def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
-    """The tensors that a program of this simulator takes, for a state with velocity history."""
+    """Return the tensors that a program of this simulator takes, for a state with velocity history."""
     builder, spec = simulator.builder, simulator.builder.spec
     graph = GraphBuilder(replace(builder.config, trim_boundary=False), builder.metadata)(state)
     pos, rest_pos = (_kept_together(x, state, graph, spec) for x in (state.pos, state.pos if state.rest_pos is None else state.rest_pos))
@@ -270,7 +271,7 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
 
 
 def _kept_together(pos: Tensor, state: State, graph: HeteroData, spec: FeatureSpec) -> Tensor:
-    """Images of positions that do not tear meshes apart at the seams of a periodic domain."""
+    """Return periodic images of positions that do not tear meshes apart at the seams of the domain."""
     if not state.periodicity:
         return pos
     along_cells = [graph[r[2]].node_id[graph[r].edge_index] for r in spec.relations if r[1] == CELL]
@@ -283,7 +284,7 @@ def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
     """Write a simulator's step as a ``torch.export`` program, atomically; ``path`` ends in ``.pt2``.
 
     Raises:
-        ValueError: another file type.
+        ValueError: ``path`` has another file type.
     """
     path = Path(path)
     if path.suffix != ".pt2":
@@ -296,13 +297,13 @@ def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
     shapes = {name: {k: dims[n] for k, n in enumerate(i.shape) if isinstance(n, str)} for name, i in inputs.items()}
     with torch.no_grad():
         program = torch.export.export(step, (example,), dynamic_shapes=(shapes,))
-    content = io.BytesIO()  # PyTorch's own writer aborts the process on a full disk
+    content = io.BytesIO()  # PyTorch's writer aborts the process on a full disk
     torch.export.save(program, content, extra_files={DESCRIPTION: json.dumps(_description(simulator, inputs), indent=1)})
     replace_bytes(path, content.getbuffer())
 
 
 def _description(simulator: LearnedSimulator, inputs: dict[str, Input]) -> dict[str, Any]:
-    """What one has to know to use a program, as plain values."""
+    """Return what a caller needs to know about a program, as plain values."""
     builder = simulator.builder
     return {
         "model": type(simulator.model).__name__,
@@ -318,7 +319,7 @@ def _description(simulator: LearnedSimulator, inputs: dict[str, Input]) -> dict[
 
 
 def _example(inputs: dict[str, Input]) -> tuple[Scene, dict[str, int]]:
-    """Some scene, from which ``torch.export`` learns the operations, and its sizes: all different, so that none seems to depend on another."""
+    """Return an example scene, from which ``torch.export`` traces the operations, and its sizes, all different so that none seems to depend on another."""
     names = dict.fromkeys(n for i in inputs.values() for n in i.shape if isinstance(n, str))
     sizes = {name: 5 + 2 * k for k, name in enumerate(names)}
     random = torch.Generator().manual_seed(0)

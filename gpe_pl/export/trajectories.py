@@ -1,7 +1,7 @@
-"""Trajectories in other programs' formats: VTK series for ParaView, and NumPy archives.
+"""Export of trajectories to other programs: VTK series for ParaView, and NumPy archives.
 
-A series is ``NAME.pvd``, which one opens, and a folder ``NAME`` with an unstructured grid per frame (``.vtu``, zlib-compressed, base64). Format: VTK file
-formats, XML part [Kitware, docs.vtk.org]. Nodes of meshes belong to their cells; every other node is a cell of its own, so particles show as points.
+A series is a file ``NAME.pvd``, which the user opens, and a folder ``NAME`` with an unstructured grid per frame (``.vtu``, zlib-compressed, base64). Format:
+VTK file formats, XML part [Kitware, docs.vtk.org]. Nodes of meshes belong to their cells. Every other node is a cell, so particles appear as points.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 VERTEX = 1
 CELL_TYPES = {"triangle": 5, "quadrilateral": 9, "tetrahedron": 10, "hexahedron": 12}
-"""VTK's numbers of kinds of cells."""
+"""VTK's codes for kinds of cells."""
 
 SYMMETRIC = {4: (0, 2, 3, 1), 6: (0, 3, 5, 1, 4, 2)}
-"""Where VTK's components XX, YY, ZZ, XY, YZ, XZ stand in a stress of so many components; in plane strain the last two are zero."""
+"""Positions of VTK's components XX, YY, ZZ, XY, YZ, XZ in a stress with this number of components; in plane strain the last two are zero."""
 
 VTK_TYPES = {"float32": "Float32", "float64": "Float64", "int32": "Int32", "int64": "Int64", "uint8": "UInt8"}
 
@@ -55,25 +55,24 @@ def write_npz(path: Path | str, trajectory: Trajectory) -> None:
 
 
 def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory | None = None, stride: int = 1) -> None:
-    """Write a series for ParaView: ``path`` (``.pvd``), a folder of the same name with a file per frame, and the boundary in it.
+    """Write a series for ParaView: ``path`` (``.pvd``), and a folder of the same name with a file per frame and the boundary.
 
-    Points carry ``velocity`` [m/s], ``material`` (index into ``schema.NODE_TYPES``), ``mass`` [kg], the material parameters by their names and, where
-    they are known, ``displacement`` from rest [m], ``error`` (distance from the ground truth [m]), and ``stress`` and ``von_mises`` [Pa]; cells carry the
-    last two as well, NaN on particles. Boundary nodes that move are points like others; ``boundary.vtu`` has the rest, with ``normal``, ``friction`` and
-    ``restitution``.
+    Points have ``velocity`` [m/s], ``material`` (index into ``schema.NODE_TYPES``), ``mass`` [kg] and the material parameters by name. If available, they also
+    have ``displacement`` from rest [m], ``error`` (distance from the ground truth [m]), ``stress`` [Pa] and ``von_mises`` [Pa]. Cells have the last two as
+    well, NaN on particles. Moving boundary nodes are points like others; ``boundary.vtu`` has the rest, with ``normal``, ``friction`` and ``restitution``.
 
-    In a periodic domain a mesh is drawn where its first node is, so that its cells stay whole at the seam, unless it reaches around the domain;
-    ``displacement`` follows the way that nodes have gone.
+    In a periodic domain a mesh is drawn at its first node, so that its cells stay whole at the seam, unless it reaches around the domain. ``displacement``
+    follows the path of the nodes.
 
     Args:
-        path: ends in ``.pvd``.
-        trajectory: a ground truth or a prediction.
-        ground_truth: of the same frames and nodes, for ``error``; its later frames are ignored.
-        stride: every so many frames.
+        path: file that ends in ``.pvd``.
+        trajectory: ground truth or prediction.
+        ground_truth: ground truth with the same frames and nodes, for ``error``; its later frames are ignored.
+        stride: step between written frames.
 
     Raises:
-        ValueError: another file type, a stride that is not positive, a ground truth with other nodes, or a cell of no kind in ``schema.CELL_KINDS``.
-        FullDiskError: there is no room; what has been written of a new series is removed.
+        ValueError: the file type is wrong, the stride is not positive, the ground truth has other nodes, or a cell has no kind in ``schema.CELL_KINDS``.
+        FullDiskError: there is no room; the written part of a new series is removed.
     """
     path = Path(path)
     if path.suffix != ".pvd":
@@ -111,7 +110,7 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
 
 @contextlib.contextmanager
 def _whole(folder: Path) -> Iterator[None]:
-    """What is written to a new folder stays if the block ends well."""
+    """Keep a new folder if the block succeeds, and remove it otherwise."""
     is_new = not folder.exists()
     try:
         yield
@@ -122,7 +121,7 @@ def _whole(folder: Path) -> Iterator[None]:
 
 
 class _Cells(NamedTuple):
-    """Cells as VTK has them: nodes of one after the other, and the number of corners and VTK type of each [cell]."""
+    """Cells in VTK's layout: nodes of one cell after the other, and the number of corners and VTK type of each [cell]."""
 
     nodes: np.ndarray
     corners: np.ndarray
@@ -130,12 +129,12 @@ class _Cells(NamedTuple):
 
 
 def _vertices(nodes: np.ndarray) -> _Cells:
-    """A cell for each particle."""
+    """Return a cell for each particle."""
     return _Cells(nodes, np.ones(len(nodes), int), np.full(len(nodes), VERTEX))
 
 
 def _cells(trajectory: Trajectory) -> tuple[_Cells, int]:
-    """All cells, those of the mesh first, and the number of particles, which come after them."""
+    """Return all cells, those of the mesh first, and the number of particles, which come last."""
     loose = _vertices(np.arange(trajectory.num_nodes))
     if trajectory.cells is None or len(trajectory.cells) == 0:
         return loose, len(loose.nodes)
@@ -150,7 +149,7 @@ def _cells(trajectory: Trajectory) -> tuple[_Cells, int]:
 
 
 def _displacements(trajectory: Trajectory, edges: np.ndarray) -> np.ndarray | None:
-    """From rest [frame, node, dim] in m; in a periodic domain the sum of the shortest ways from frame to frame, with one start for all nodes of a mesh."""
+    """Return displacements from rest [frame, node, dim] in m; in a periodic domain, sums of shortest steps, with a common start for all nodes of a mesh."""
     if trajectory.rest_pos is None:
         return None
     where = trajectory.metadata.periodicity
@@ -194,7 +193,7 @@ def _in_3d(values: Float[np.ndarray, "row dim"]) -> Float[np.ndarray, "row 3"]:
 
 
 def _grid(pos: np.ndarray, cells: _Cells, points: Mapping[str, np.ndarray], in_cells: Mapping[str, np.ndarray]) -> str:
-    """A ``.vtu`` document."""
+    """Return a ``.vtu`` document."""
     parts = [
         _array("Points", _in_3d(pos)).join(("<Points>", "</Points>")),
         "<Cells>",
@@ -214,7 +213,7 @@ def _grid(pos: np.ndarray, cells: _Cells, points: Mapping[str, np.ndarray], in_c
 
 
 def _array(name: str, values: np.ndarray) -> str:
-    """Values as one compressed block, after a header of four numbers: blocks, block size, size of a last partial block, compressed size."""
+    """Return values as one compressed block after a header of four numbers: blocks, block size, size of a last partial block, compressed size."""
     values = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
     data = zlib.compress(values.tobytes(), 1)
     header = np.array([1, values.nbytes, 0, len(data)] if values.nbytes else [0, 0, 0], "<u8").tobytes()

@@ -1,4 +1,4 @@
-"""The contract of every model: a graph in, one prediction per dynamic node type out."""
+"""The contract of all models: they map a graph to one prediction per dynamic node type."""
 
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -12,10 +12,10 @@ from gpe_pl.schema import FeatureSpec
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a model says about a graph; materials without nodes are absent.
+    """Predictions of a model for a graph; materials without nodes are absent.
 
     Attributes:
-        acceleration: without gravity, per material [node, dim], in units of the data set's acceleration scale.
+        acceleration: acceleration without gravity, per material [node, dim], in units of the data set's acceleration scale.
         stress: Cauchy stress after the step, per material with a stress decoder [node, component], in units of the data set's stress scale.
     """
 
@@ -24,12 +24,12 @@ class Prediction:
 
 
 class Model(Protocol):
-    """A network whose constructor takes a ``FeatureSpec`` first and keyword settings after it.
+    """Network whose constructor takes a ``FeatureSpec`` first and keyword settings after it.
 
-    ``forward`` gets a graph with standardised features. ``settings`` holds the constructor's keyword arguments as plain values, so a checkpoint can rebuild
-    the model. ``compute`` does the work of ``forward`` on tensors, in dictionaries and tuples: the part that ``torch.compile`` sees. ``skips`` says what
-    ``forward`` may leave out in evaluation mode; a model need not know any of it. ``num_hops`` is how many ``radius`` edges lead to the farthest node that
-    an answer can depend on, apart from paths inside of meshes.
+    ``forward`` takes a graph with standardised features. ``settings`` holds the keyword arguments of the constructor as plain values, so a checkpoint can rebuild
+    the model. ``compute`` does the work of ``forward`` on tensors in dictionaries and tuples; ``torch.compile`` compiles this part. ``skips`` lists what
+    ``forward`` may leave out in evaluation mode; a model may ignore it. ``num_hops`` is the number of ``radius`` edges to the farthest node that can influence
+    a prediction, apart from paths inside meshes.
     """
 
     spec: FeatureSpec

@@ -1,18 +1,18 @@
 """ConvNet: continuous convolutions over particles [Ummenhofer et al. 2020, "Lagrangian Fluid Simulation with Continuous Convolutions", ICLR, section 4;
 code: github.com/isl-org/DeepLagrangianFluids, ``models/default_torch.py``].
 
-Layers of the paper, with features f of particles and g of boundary nodes, ReLU φ and channels 32, 64, 64, d::
+Layers of the paper, with features f of particles and g of boundary nodes, ReLU φ, and channels 32, 64, 64, d::
 
     f¹ = [conv(g), conv(f), dense(f)]            f^{k+1} = conv(φ(f^k)) + dense(φ(f^k)) (+ f^k where the widths agree)
 
-Filters have 4^d points and the radius of the graph; a particle is no neighbour of itself, the dense layers stand for that.
+Filters have 4^d points and the radius of the graph. A particle is no neighbour of itself; the dense layers take that role.
 
-Where this differs from the paper, because all models here share graphs, inputs and targets:
+Differences from the paper, because all models here share graphs, inputs and targets:
 
-- the output is the acceleration without gravity in units of its standard deviation, not 1/128 of a position correction after a step under gravity;
-- particles carry the standardised features of the graph (velocity history, gravity, material parameter) and one column per material, which is the paper's
-  constant 1 if there is one material; boundary nodes carry velocity, normal and boundary condition, the paper's the normal;
-- all materials share filters; edges join all pairs within the radius, which is 4.5 particle radii in the paper.
+- The output is the acceleration without gravity in units of its standard deviation. The paper's is 1/128 of a position correction after a step with gravity.
+- Particles carry the standardised features of the graph (velocity history, gravity, material parameter) and one column per material, which is the paper's
+  constant 1 if there is one material. Boundary nodes carry velocity, normal and boundary condition; the paper's carry the normal.
+- All materials share filters. Edges join all pairs within the radius, which is 4.5 particle radii in the paper.
 """
 
 import itertools
@@ -31,20 +31,20 @@ from gpe_pl.nn.homogeneous import Homogeneous, first_rows
 from gpe_pl.schema import BOUNDARY, RADIUS, EdgeType, FeatureSpec
 
 Offsets = dict[EdgeType, tuple[Tensor, Tensor]]
-"""``edge_index`` and (x_target − x_source) / R of the relations that have edges."""
+"""``edge_index`` and (x_target − x_source) / R of each relation that has edges."""
 
 
 class NotAParticleGraphError(GpeError, ValueError):
-    """The graph has relations over which nothing can be convolved."""
+    """The graph has relations that cannot be convolved."""
 
 
 class ContinuousConvNet(nn.Module):
-    """The paper's network.
+    """Network of the paper.
 
     Args:
         spec: channels of the graphs, which have ``radius`` relations only.
-        num_convolutions: layers, the first and the last included; 4 in the paper.
-        hidden_channels: width between them, half of it in each of the three parts of the first layer; 64 in the paper.
+        num_convolutions: number of layers, the first and the last included; 4 in the paper.
+        hidden_channels: width between layers; each of the three parts of the first layer has half of it; 64 in the paper.
         kernel_size: filter points per axis; 4 in the paper.
 
     Raises:
@@ -81,14 +81,14 @@ class ContinuousConvNet(nn.Module):
         return 1 + len(self.convs)
 
     def forward(self, data: HeteroData) -> Prediction:
-        """Accelerations without gravity per material, in units of the data set's acceleration scale."""
+        """Return accelerations without gravity per material [node, dim], in units of the data set's acceleration scale."""
         x = {t: data[t].x for t in self.spec.node_types if data[t].x.shape[0]}
         params = {m: data[m].material_params for m in self.spec.materials if m in x}
         edges = {r: (data[r].edge_index, data[r].offset) for r in self.spec.relations if data[r].edge_index.shape[1]}
         return Prediction(self.compute(x, params, edges) if params else {})
 
     def compute(self, x: dict[str, Tensor], params: dict[str, Tensor], edges: Offsets) -> dict[str, Tensor]:
-        """``forward`` on plain tensors: the part that ``torch.compile`` sees."""
+        """Compute ``forward`` on plain tensors; ``torch.compile`` compiles this part."""
         particles = {m: x[m] for m in params}
         features, kind = self.particles.nodes(particles, params)
         features = torch.cat([features, functional.one_hot(kind, self.particles.num_kinds).to(features.dtype)], dim=1)
@@ -108,7 +108,7 @@ class ContinuousConvNet(nn.Module):
         return dict(zip(params, f.split([x[m].shape[0] for m in params]), strict=True))
 
     def _neighbors(self, edges: Offsets, start: dict[str, int], like: Tensor) -> tuple[Tensor, Tensor]:
-        """Both directions of all edges between particles, and (x_source − x_target) / R."""
+        """Return both directions of all edges between particles, and (x_source − x_target) / R."""
         indices, offsets = [torch.empty((2, 0), dtype=torch.int64, device=like.device)], [like.new_empty((0, self.spec.dim))]
         for (source, _, target), (edge_index, offset) in edges.items():
             if source != BOUNDARY:
@@ -118,7 +118,7 @@ class ContinuousConvNet(nn.Module):
         return torch.cat(indices, dim=1), torch.cat(offsets)
 
     def _boundary(self, edges: Offsets, start: dict[str, int], like: Tensor) -> tuple[Tensor, Tensor]:
-        """Edges from boundary nodes to particles, and (x_source − x_target) / R."""
+        """Return edges from boundary nodes to particles, and (x_source − x_target) / R."""
         indices, offsets = [torch.empty((2, 0), dtype=torch.int64, device=like.device)], [like.new_empty((0, self.spec.dim))]
         for (source, _, target), (edge_index, offset) in edges.items():
             if source == BOUNDARY:
@@ -128,7 +128,7 @@ class ContinuousConvNet(nn.Module):
 
 
 def _dense(in_channels: int, out_channels: int) -> nn.Linear:
-    """A linear layer that starts as the authors': Xavier-uniform weights, no bias."""
+    """Return a linear layer with the authors' initial values: Xavier-uniform weights, no bias."""
     layer = nn.Linear(in_channels, out_channels)
     nn.init.xavier_uniform_(layer.weight)
     nn.init.zeros_(layer.bias)

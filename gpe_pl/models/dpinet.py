@@ -1,26 +1,26 @@
 """DPI-Net, dynamic particle interaction networks [Li et al. 2019, "Learning Particle Dynamics for Manipulating Rigid Bodies, Deformable Objects, and Fluids",
 ICLR, section 3; code: github.com/YunzhuLi/DPI-Net, ``models.py`` and ``data.py``].
 
-Effects spread through the graph in stages. A stage has networks of its own, encodes once, and repeats L times, from the effects that the last one left::
+Effects spread through the graph in stages. Each stage has separate networks, encodes once, and repeats L times, starting from the last stage's effects::
 
     c_i  = Enc_p(x_i)                                   c_ij = Enc_r([x_i, x_j, relation])
     e_ij = ReLU(P_r [c_ij, h_i, h_j])                   h_i  = ReLU(P_p [c_i, Σ_j e_ij] + h_i)           for the stage's receivers i
 
-Enc_p has two and Enc_r three linear layers, each followed by a ReLU; three linear layers predict the motion from the last effects. The stages:
+Enc_p has two and Enc_r three linear layers, each followed by a ReLU. Three linear layers predict the motion from the last effects. The stages are:
 
 1. between leaves: ``radius`` and ``cell`` edges, into materials only (boundary nodes send, as the paper's walls do), L times;
 2. per level of virtual nodes, lowest first: from the children ``up``, once, then among the ``same`` level, L times;
 3. per level, highest first: ``down`` to the children, once.
 
-A graph without virtual nodes has the first stage alone, as the paper's fluids have.
+A graph without virtual nodes has only the first stage, like the paper's fluids.
 
-Where this differs from the paper, because all models here share graphs, inputs and targets:
+Differences from the paper, because all models here share graphs, inputs and targets:
 
-- it predicts the acceleration without gravity, the paper's the velocity, and that of rigid bodies through a rigid motion;
-- particles carry the standardised features of the graph and a one-hot type, relations its edge features, in the place of absolute positions and of a flag,
-  so that the result does not depend on where the scene lies; there are no edges from a particle to itself;
-- virtual nodes are the multi-scale grid of the mesh instead of clusters of k-means, and those of one level see their grid neighbours instead of all others;
-  a stage's weights are shared by its levels, so that a deeper mesh than trained on still runs.
+- The model predicts the acceleration without gravity. The paper's predicts the velocity, and the motion of rigid bodies through a rigid motion.
+- Particles carry the standardised features of the graph and a one-hot type, and relations its edge features. These replace absolute positions and a flag, so
+  that the result does not depend on the position of the scene. There are no edges from a particle to itself.
+- Virtual nodes are the multi-scale grid of the mesh instead of clusters of k-means, and those of one level have edges to their grid neighbours instead of all
+  others. All levels share the weights of a stage, so that a mesh deeper than in training still runs.
 """
 
 from typing import Annotated, cast
@@ -53,9 +53,9 @@ class Stage(nn.Module):
         self.particle_propagator = nn.Linear(2 * hidden, hidden)
 
     def forward(self, x: Tensor, h: Tensor, index: Tensor, features: Tensor, receivers: slice, num_steps: int) -> Tensor:
-        """The effects [node, hidden] after ``num_steps`` propagations along directed edges into the rows ``receivers``; other rows keep theirs.
+        """Return the effects [node, hidden] after ``num_steps`` propagations along directed edges into the rows ``receivers``; other rows do not change.
 
-        Products with codes do not change from step to step, so each is computed once.
+        Products with codes are the same in every step, so each is computed once.
         """
         codes = self.relation_encoder_out(self.relation_encoder_in(features, x, index))
         of_relation = self.relation_propagator.edges(codes)
@@ -71,12 +71,12 @@ class Stage(nn.Module):
 
 
 class DPINet(nn.Module):
-    """The paper's model.
+    """Model of the paper.
 
     Args:
         spec: channels of the graphs.
-        num_propagation_steps: L; 2 in the code.
-        hidden_channels: width of particle codes and effects; relation codes are half as wide again; 200 and 300 in the code.
+        num_propagation_steps: L; 2 in the authors' code.
+        hidden_channels: width of particle codes and effects; relation codes are 1.5 times as wide; 200 and 300 in the authors' code.
     """
 
     def __init__(
@@ -99,12 +99,12 @@ class DPINet(nn.Module):
         return self.num_propagation_steps
 
     def forward(self, data: HeteroData) -> Prediction:
-        """Accelerations without gravity per material, in units of the data set's acceleration scale."""
+        """Return accelerations without gravity per material [node, dim], in units of the data set's acceleration scale."""
         x, params, edges = present(data, self.spec)
         return Prediction(self.compute(x, params, edges) if params else {})
 
     def compute(self, x: dict[str, Tensor], params: dict[str, Tensor], edges: Edges) -> dict[str, Tensor]:
-        """``forward`` on plain tensors: the part that ``torch.compile`` sees."""
+        """Compute ``forward`` on plain tensors; ``torch.compile`` compiles this part."""
         features, kind = self.graph.nodes(x, params)
         features = torch.cat([features, functional.one_hot(kind, self.graph.num_kinds).to(features.dtype)], dim=1)
         h = features.new_zeros(features.shape[0], self.hidden_channels)
@@ -115,7 +115,7 @@ class DPINet(nn.Module):
         return dict(zip(params, self.predictor(h[: sum(sizes)]).split(sizes), strict=True))
 
     def _plan(self, x: dict[str, Tensor], params: dict[str, Tensor], edges: Edges) -> list[tuple[str, Relations, Relations, slice, int]]:
-        """The stages in their order: name, relations as stored, relations turned around, rows that receive, propagation steps."""
+        """Return the stages in order: name, relations as stored, relations reversed, rows that receive, propagation steps."""
         start, steps = first_rows(x), self.num_propagation_steps
         rows = {t: slice(start[t], start[t] + x[t].shape[0]) for t in x}
         levels = [t for t in x if t not in (*params, BOUNDARY)]

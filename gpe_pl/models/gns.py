@@ -1,21 +1,21 @@
 """GNS, the Graph Network-based Simulator [Sanchez-Gonzalez et al. 2020, "Learning to Simulate Complex Physics with Graph Networks", section 4 and
 supplement B; code: github.com/google-deepmind/deepmind-research, ``learning_to_simulate``].
 
-Encode, process, decode on one graph of all particles, with every function shared by all types; MLPs of two hidden layers with ReLU, LayerNorm after each but
-the decoder::
+The model encodes, processes and decodes on one graph of all particles, and all types share every function. MLPs have two hidden layers with ReLU, and a
+LayerNorm after each MLP but the decoder::
 
     h_i  = MLP([features, embedding of the type])       e_ij = MLP([displacement, its length])       both directions of every edge
     e'   = MLP([e_ij, h_i, h_j])                        h'   = MLP([h_i, Σ_j e'])
-    e_ij += e',  h_i += h'                              M times, with weights of their own
+    e_ij += e',  h_i += h'                              M times, each time with separate weights
     a_i  = MLP(h_i)
 
-Where this differs from the paper, because all models here share graphs, inputs and targets:
+Differences from the paper, because all models here share graphs, inputs and targets:
 
-- edges carry the channels that ``graph.features`` asks for, and the length of the standardised displacement; relations of meshes, if the graph has any, carry
-  theirs (the paper's topology is ``graph.mesh=false``);
-- walls are boundary nodes with velocity, normal and boundary condition, as in the other models, instead of distances to the box; they have no edges among
-  themselves;
-- gravity and the material parameter are inputs, and the target is the acceleration without gravity.
+- Edges carry the channels that ``graph.features`` selects, and the length of the standardised displacement. Relations of meshes, if any, carry their features
+  (``graph.mesh=false`` gives the paper's topology).
+- Walls are boundary nodes with velocity, normal and boundary condition, as in the other models, instead of distances to the box. They have no edges among
+  themselves.
+- Gravity and the material parameter are inputs, and the target is the acceleration without gravity.
 """
 
 from typing import Annotated
@@ -34,7 +34,7 @@ TINY = 1e-12
 
 
 class InteractionNetwork(nn.Module):
-    """e' and h' of one processor step."""
+    """Network that computes e' and h' of one processor step."""
 
     def __init__(self, hidden_channels: int, num_hidden_layers: int) -> None:
         super().__init__()
@@ -50,13 +50,13 @@ class InteractionNetwork(nn.Module):
 
 
 class GNS(nn.Module):
-    """The paper's model.
+    """Model of the paper.
 
     Args:
         spec: channels of the graphs.
         num_message_passing_steps: M; 10 in the paper.
-        hidden_channels: width of everything; 128 in the paper.
-        num_hidden_layers: of every MLP; 2 in the paper, 1 in LagrangeBench's GNS-10-128.
+        hidden_channels: width of all hidden states and layers; 128 in the paper.
+        num_hidden_layers: number of hidden layers of every MLP; 2 in the paper, 1 in LagrangeBench's GNS-10-128.
         type_channels: width of the embedding of the particle type; 16 in the paper.
     """
 
@@ -89,12 +89,12 @@ class GNS(nn.Module):
         return len(self.processor)
 
     def forward(self, data: HeteroData) -> Prediction:
-        """Accelerations without gravity per material, in units of the data set's acceleration scale."""
+        """Return accelerations without gravity per material [node, dim], in units of the data set's acceleration scale."""
         x, params, edges = present(data, self.spec)
         return Prediction(self.compute(x, params, edges) if params else {})
 
     def compute(self, x: dict[str, Tensor], params: dict[str, Tensor], edges: Edges) -> dict[str, Tensor]:
-        """``forward`` on plain tensors: the part that ``torch.compile`` sees."""
+        """Compute ``forward`` on plain tensors; ``torch.compile`` compiles this part."""
         features, kind = self.graph.nodes(x, params)
         edge_index, edge_features = self.graph.edges(x, edges, edges, edges)
         length = self._lengths(edges, edge_features)
@@ -107,6 +107,6 @@ class GNS(nn.Module):
         return dict(zip(params, self.decoder(h[: sum(sizes)]).split(sizes), strict=True))
 
     def _lengths(self, edges: Edges, like: Tensor) -> Tensor:
-        """Length of the displacement, which is the first odd channels, per directed edge."""
+        """Return the length of the displacement (the first odd channels) per directed edge."""
         lengths = [(odd[:, : self.spec.dim].square().sum(dim=1, keepdim=True) + TINY**2).sqrt() for _, odd, _ in edges.values()]
         return torch.cat([*lengths, *lengths]) if lengths else like.new_empty((0, 1))

@@ -1,14 +1,14 @@
 """GPE, the Graph-based Physics Engine [Yang et al. 2022, "Learning to Simulate Unseen Physical Systems with Graph Neural Networks", Algorithm 1].
 
-Encoder, processor and decoder over typed nodes and relations, one parameter set per node type and per pair of types. A forward pass::
+The model is an encoder, processor and decoder over typed nodes and relations, with one parameter set per node type and per pair of types. A forward pass::
 
     h_i   = f_v0(x_i, Θ(material parameters))            e_ij = f_e0(edge features)
     m_ij  = f_e(h_i, h_j, e_ij),  m_ji = −m_ij           (nn.momentum_conv)
     h_i  += f_v(Σ_j m_ij)                                e_ij += m_ij
     a_i   = f_d(h_i)                                     or a sum of antisymmetric pair forces over the true mass, or both (``contact``)
 
-Virtual nodes above meshes take part as nodes of their own types and carry hidden messages only. ``simultaneous``, as in Algorithm 1, lets a message climb one
-level per step; ``sweep`` climbs all levels, passes messages within each, and comes down again, so that every step couples the whole body.
+Virtual nodes above meshes are nodes of separate types and carry hidden messages only. With ``simultaneous``, as in Algorithm 1, a message climbs one level per
+step. ``sweep`` climbs all levels, passes messages within each, and descends again, so that every step couples the whole body.
 """
 
 from collections.abc import Iterable
@@ -38,20 +38,20 @@ NodeNorm = Literal["none", "layer"]
 
 
 class StressError(GpeError, ValueError):
-    """A stress decoder was asked for where the data set stores no stress."""
+    """A stress decoder was requested, but the data set stores no stress."""
 
 
 class IslandError(GpeError, ValueError):
-    """Islands or bodies are to move as a whole in graphs that do not know them."""
+    """Islands or bodies should move as a whole, but the graphs do not contain them."""
 
 
 class Decoded(NamedTuple):
-    """What the network says, per material.
+    """Output of the network, per material.
 
     Attributes:
-        acceleration: without gravity [node, dim].
-        stress: where it is decoded [node, component].
-        contact: what contacts alone would accelerate nodes of bodies by [node, dim], with the ``contact`` decoder.
+        acceleration: acceleration without gravity [node, dim].
+        stress: stress, if decoded [node, component].
+        contact: acceleration of nodes of bodies by contacts alone [node, dim], with the ``contact`` decoder.
     """
 
     acceleration: dict[str, Tensor]
@@ -60,7 +60,7 @@ class Decoded(NamedTuple):
 
 
 class MaterialEmbedding(nn.Module):
-    """Θ(v) of the paper, section 2.1: ``affine`` satisfies Θ(λv₁ + (1−λ)v₂) = λΘ(v₁) + (1−λ)Θ(v₂); ``mlp`` is the comparison."""
+    """Θ(v) of the paper, section 2.1; ``affine`` satisfies Θ(λv₁ + (1−λ)v₂) = λΘ(v₁) + (1−λ)Θ(v₂), ``mlp`` serves for comparison."""
 
     def __init__(self, param_channels: int, hidden_channels: int, kind: MaterialEmbeddingKind, is_fused: bool) -> None:
         super().__init__()
@@ -74,7 +74,7 @@ class MaterialEmbedding(nn.Module):
 
 
 class OddEncoder(nn.Module):
-    """The odd edge state: C (φ(W o + S s + b) − φ(−W o + S s + b)) of odd features o and even features s; without bias, so it stays odd."""
+    """Encoder of the odd edge state: C (φ(W o + S s + b) − φ(−W o + S s + b)) of odd features o and even features s; no outer bias, so it stays odd."""
 
     def __init__(self, odd_channels: int, even_channels: int, hidden_channels: int) -> None:
         super().__init__()
@@ -92,7 +92,7 @@ class OddEncoder(nn.Module):
 
 
 class PairForce(nn.Module):
-    """One force per edge from the final node states: antisymmetric within a type, negated across types, so Σ F = 0 to rounding.
+    """Decoder of one force per edge from the final node states: antisymmetric within a type, negated across types, so Σ F = 0 to rounding.
 
     F_ij = C (φ(z_ij) − φ(z_ji)) with z_ij = A h_i + B h_j + W o_ij + S s_ij + b.
     """
@@ -110,7 +110,7 @@ class PairForce(nn.Module):
     def forward(
         self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, odd: Tensor, even: Tensor, chunk: int | None = None
     ) -> Float[Tensor, "edge dim"]:
-        """Force on the target of every edge, computed for ``chunk`` edges at a time; the source feels the opposite."""
+        """Return the force on the target of every edge, for ``chunk`` edges at a time; the source feels the opposite force."""
         a, b = self.lin_target(h_target), self.lin_source(h_source)
         if chunk is None:
             return self._force(a, b, edge_index, odd, even)
@@ -123,12 +123,12 @@ class PairForce(nn.Module):
         forward = self.act(a[i] + b[j] + s + w)
         if self.bipartite:
             return self.lin_out(forward)
-        reverse = self.act(a[j] + b[i] + s - w)  # both ends are of one type, so their rows are the same
+        reverse = self.act(a[j] + b[i] + s - w)  # both ends have one type, so they index the same rows
         return self.lin_out(forward - reverse)
 
 
 def _merge_levels(x: dict[str, Tensor], edges: Edges) -> tuple[dict[str, Tensor], Edges]:
-    """All levels of virtual nodes as one node type: the same messages in fewer calls, for weights that all levels share."""
+    """Merge all levels of virtual nodes into one node type, for weights that all levels share: the same messages in fewer calls."""
     first: dict[str, int] = {}
     nodes: dict[str, list[Tensor]] = {}
     for node_type, value in x.items():
@@ -147,7 +147,7 @@ def _merge_levels(x: dict[str, Tensor], edges: Edges) -> tuple[dict[str, Tensor]
 
 
 def _grouped(data: HeteroData, materials: Iterable[str], name: str, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mass, position and group (``island`` or ``body``) of the nodes of these materials; graphs of a batch number their groups from 0."""
+    """Return mass, position and group (``island`` or ``body``) of the nodes of these materials; graphs of a batch number their groups from 0."""
     stores = [data[m] for m in materials]
     start = torch.cumsum(count, dim=0) - count
     group = torch.cat([s[name] + start[s.batch] if "batch" in s else s[name] for s in stores])
@@ -155,31 +155,32 @@ def _grouped(data: HeteroData, materials: Iterable[str], name: str, count: Tenso
 
 
 class GPE(nn.Module):
-    """The paper's model and its variants.
+    """Model of the paper and its variants.
 
     Args:
         spec: channels of the graphs.
-        interaction: how a message and its reverse relate; see ``nn.momentum_conv``.
-        decoder: ``node`` decodes an acceleration per node (paper); ``pair`` an antisymmetric force per edge, divided by the node's mass; ``contact`` decodes
-            both in meshes: a body moves and turns as a whole by the forces of its ``radius`` edges to others alone, which are where it touches something, and
-            each node adds only what deforms it. Nodes of no cell are part of the body beside them. Forces between bodies have no sum. What is no mesh has
-            an acceleration per node, and beside it ``island_momentum`` has to keep the sum.
+        interaction: relation between a message and its reverse; see ``nn.momentum_conv``.
+        decoder: ``node`` decodes an acceleration per node (paper). ``pair`` decodes an antisymmetric force per edge, divided by the node's mass. ``contact``
+            decodes both in meshes: the forces of a body's ``radius`` edges to others, which exist where it touches something, move and rotate it as a whole,
+            and each node adds only its deformation. Nodes without a cell belong to the body beside them. Forces between bodies sum to zero. Materials
+            without a mesh have an acceleration per node; beside a mesh they need ``island_momentum`` to conserve the sum of momentum.
         edge_state: ``latent`` updates a hidden state per edge (Algorithm 1); ``geometry`` feeds the raw edge features to every layer.
         material_embedding: ``affine`` (the paper's interpolation rule) or ``mlp``.
-        num_message_passing_steps: processor layers; 12 in the paper.
-        hidden_channels: width of everything; 128 in the paper.
-        implementation: ``factored`` or ``plain``; the same function of the same parameters.
-        level_weights: one set for all levels of virtual nodes, which then serves any number of levels, or one per level (paper).
-        schedule: the order of messages between levels; ``simultaneous`` (paper) or ``sweep``.
+        num_message_passing_steps: number of processor layers; 12 in the paper.
+        hidden_channels: width of all hidden states and layers; 128 in the paper.
+        implementation: ``factored`` or ``plain``; both compute the same function of the same parameters.
+        level_weights: one set of weights for all levels of virtual nodes, which then serves any number of levels, or one set per level (paper).
+        schedule: order of messages between levels; ``simultaneous`` (paper) or ``sweep``.
         stress: also decode the stress of materials that have one.
-        node_norm: ``layer`` normalises the encoded state of every node, and what each step adds to it, as GNS does; however far a rollout strays, its
-            accelerations stay bounded. ``none`` as in the paper.
-        island_momentum: of what flies freely, keep the ``linear``, or also the ``angular`` momentum exactly (see ``nn.island_momentum``); or ``ignored``.
+        node_norm: ``layer`` normalises the encoded state of every node, and the update of each step, as GNS does. Accelerations then stay bounded however far
+            a rollout deviates. ``none`` follows the paper.
+        island_momentum: conserve the ``linear``, or also the ``angular``, momentum of freely flying islands exactly (see ``nn.island_momentum``); or
+            ``ignored``.
 
     Raises:
-        StressError: ``stress`` without a material that has one.
-        IslandError: ``island_momentum``, or meshes with the ``contact`` decoder, with graphs that do not know islands and bodies; or meshes beside other
-            materials with the ``contact`` decoder and nothing that keeps the sum of momentum.
+        StressError: ``stress`` without a material that has a stress.
+        IslandError: ``island_momentum``, or the ``contact`` decoder with meshes, with graphs that do not contain islands and bodies; or the ``contact``
+            decoder with meshes beside other materials, and nothing that conserves the sum of momentum.
     """
 
     skips = Skips()
@@ -228,7 +229,7 @@ class GPE(nn.Module):
             )
         if stress and not spec.stress_channels:
             raise StressError(
-                f"model.stress=true, but no stress is stored of {', '.join(spec.materials)}; choose model.stress=false or data=fem"
+                f"model.stress=true, but the data set stores no stress of {', '.join(spec.materials)}; choose model.stress=false or data=fem"
             )
         self.spec, self.interaction, self.decoder, self.edge_state = spec, interaction, decoder, edge_state
         self.level_weights, self.schedule = level_weights, schedule
@@ -278,19 +279,19 @@ class GPE(nn.Module):
     def num_hops(self) -> int:
         return self.num_message_passing_steps + (
             self.decoder == "pair" or bool(self.bodies)
-        )  # a pair force reads the state of the other end
+        )  # a pair force reads the states of both ends
 
     @property
     def is_fused(self) -> bool:
-        """Whether messages have code of their own for a CPU (see ``nn.fused_messages`` and ``nn.fused_latent``)."""
+        """Whether messages use the fused passes for CPUs (see ``nn.fused_messages`` and ``nn.fused_latent``)."""
         return self.interaction in ("negated", "odd") and self.settings["implementation"] == "factored"
 
     def type_key(self, node_type: str) -> str:
-        """Under which name the weights of a node type are kept."""
+        """Return the name under which the weights of a node type are stored."""
         return role(node_type) if self.level_weights == "shared" else node_type
 
     def key(self, relation: EdgeType) -> str:
-        """Under which name the weights of a relation are kept."""
+        """Return the name under which the weights of a relation are stored."""
         source, name, target = relation
         return f"{self.type_key(source)}__{name}__{self.type_key(target)}"
 
@@ -298,8 +299,8 @@ class GPE(nn.Module):
         return self.interaction if is_symmetric(relation) or self.interaction == "directed" else "negated"
 
     def _readable(self) -> list[set[str]]:
-        """For every step, the node types whose state after it can still reach a material."""
-        if self.schedule == "sweep":  # within a step, messages go everywhere; only the boundary's last state has no reader
+        """Return for every step the node types whose state after it can still influence a material."""
+        if self.schedule == "sweep":  # messages reach everything within a step; only the last state of the boundary is unused
             virtual = {grid(level) for level in range(1, self.spec.num_levels + 1)}
             return [{*self.spec.node_types}] * (self.num_message_passing_steps - 1) + [{*self.spec.materials} | virtual]
         readable = [{*self.spec.materials}]
@@ -309,9 +310,9 @@ class GPE(nn.Module):
         return readable[::-1]
 
     def forward(self, data: HeteroData) -> Prediction:
-        """Accelerations without gravity per material, in units of the data set's acceleration scale, and stresses.
+        """Return accelerations without gravity per material, in units of the data set's acceleration scale, and stresses.
 
-        Node types and relations that have no members, or cannot reach a material in so many steps, are skipped.
+        Node types and relations are skipped if they are empty or cannot influence a material within the number of steps.
         """
         keep_absent = not (self.training or self.skips.absent_types)
         x = {t: data[t].x for t in self.spec.node_types if self.type_key(t) in self.node_encoder and (keep_absent or data[t].x.shape[0])}
@@ -333,10 +334,10 @@ class GPE(nn.Module):
 
     @staticmethod
     def _moved_by_contacts(data: HeteroData, acceleration: dict[str, Tensor], contact: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Accelerations whose rigid part in each body is that of its contacts; graphs without cells have no bodies."""
+        """Replace the rigid part of the accelerations of each body by that of its contacts; graphs without cells have no bodies."""
         mass, pos, body = _grouped(data, contact, "body", data.num_bodies)
         in_body = torch.cat([data[m].body for m in contact]) >= 0
-        count = body.shape[0] if torch.compiler.is_exporting() else int(data.num_bodies.sum())  # of as many at most
+        count = body.shape[0] if torch.compiler.is_exporting() else int(data.num_bodies.sum())  # upper bound of the number
         change = torch.cat([contact[m] - acceleration[m] for m in contact])
         change = rigid_part(change, mass, pos, torch.where(in_body, body, count), count + 1)
         parts = torch.where(in_body[:, None], change, 0.0).split([a.shape[0] for a in contact.values()])
@@ -351,7 +352,7 @@ class GPE(nn.Module):
     def _compute_in_order(
         self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], body: dict[str, Tensor], edges: Edges
     ) -> Decoded:
-        """``compute``, in large scenes of nodes that stand in the order of their edges: what belongs together is found in the cache."""
+        """Run ``compute`` with nodes in the order of their edges; in large scenes, data of neighbours then stay in the cache."""
         limit = None if self.training else self.skips.sorted_from
         if limit is None or sum(values.shape[0] for values in x.values()) < limit:
             return self.compute(x, params, mass, body, edges)
@@ -369,7 +370,7 @@ class GPE(nn.Module):
     def _compute_apart(
         self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], body: dict[str, Tensor], edges: Edges
     ) -> Decoded:
-        """``compute``, but nodes without an edge pass no messages: what they would receive is nothing."""
+        """Run ``compute`` without message passing for nodes that have no edge, because they would receive no message."""
         has_edge = touched({t: values.shape[0] for t, values in x.items()}, edges)
         if has_edge.keys() >= x.keys() and all(bool(mask.all()) for mask in has_edge.values()):
             return self._compute_in_order(x, params, mass, body, edges)
@@ -392,7 +393,7 @@ class GPE(nn.Module):
         return whole
 
     def _isolated(self, material: str, x: Tensor, params: Tensor | None) -> tuple[Tensor, Tensor | None, Tensor | None]:
-        """What ``Decoded`` has of a material, for nodes without an edge: every step adds the same to all of them, an update by no message."""
+        """Return the entries of ``Decoded`` for nodes of a material without edges; every step applies the update of an empty sum of messages."""
         falls_freely, with_stress = self.decoder == "pair", self._decodes_stress(material)
         nothing = x.new_zeros(x.shape[0], self.spec.dim)
         if falls_freely and not with_stress:
@@ -414,7 +415,7 @@ class GPE(nn.Module):
         body: dict[str, Tensor],
         edges: Edges,
     ) -> Decoded:
-        """``forward`` on plain tensors: the part that ``torch.compile`` sees."""
+        """Compute ``forward`` on plain tensors; ``torch.compile`` compiles this part."""
         if self.interaction == "negated":
             edges = {r: (*orient(index, odd), even) if is_symmetric(r) else (index, odd, even) for r, (index, odd, even) in edges.items()}
         is_inference = not torch.is_grad_enabled()
@@ -456,7 +457,7 @@ class GPE(nn.Module):
         return Decoded({m: self.node_decoder[m](h[m]) for m in mass}, stress, contact)
 
     def _phases(self, types: list[str], edges: Edges) -> list[tuple[list[EdgeType], dict[str, Tensor | None]]]:
-        """What happens one after the other within a step: relations that compute messages, and node types that receive them, or only these rows."""
+        """Return the phases of a step in order: relations that compute messages, and node types that receive them, with the rows to update or None for all."""
         if self.schedule == "simultaneous":
             return [([*edges], dict.fromkeys(types))]
         levels = [grid(level) for level in range(1, self.spec.num_levels + 1) if grid(level) in types]
@@ -473,11 +474,11 @@ class GPE(nn.Module):
         return self.node_encoder[self.type_key(node_type)](x)
 
     def _encode_edges(self, relation: EdgeType, odd: Tensor, even: Tensor, chunk: int | None) -> Tensor:
-        """The edge states, computed for ``chunk`` edges at a time."""
+        """Return the edge states, computed for ``chunk`` edges at a time."""
         if chunk is None or odd.shape[0] <= chunk:
             return self._encode_edge(relation, odd, even)
         parts = [self._encode_edge(relation, *part) for part in zip(odd.split(chunk), even.split(chunk), strict=True)]
-        if self._interaction(relation) == "directed":  # each part has both directions
+        if self._interaction(relation) == "directed":  # each part contains both directions
             return torch.cat([half for direction in range(2) for half in (part.chunk(2)[direction] for part in parts)])
         return torch.cat(parts)
 
@@ -494,7 +495,7 @@ class GPE(nn.Module):
     def _pair_accelerations(
         self, h: dict[str, Tensor], mass: dict[str, Tensor], body: dict[str, Tensor], edges: Edges, chunk: int | None
     ) -> dict[str, Tensor]:
-        """What pair forces accelerate the materials in ``mass`` by; without those within a ``body``, which could turn it, as they need not be central."""
+        """Return accelerations by pair forces of the materials in ``mass``, without forces within a ``body``: they are not central, so they could turn it."""
         force = {m: h[m].new_zeros(h[m].shape[0], self.spec.dim) for m in mass}
         for relation, (edge_index, odd, even) in edges.items():
             if self.key(relation) not in self.pair_decoder:

@@ -1,4 +1,4 @@
-"""Small building blocks shared by all models."""
+"""Small building blocks that all models share."""
 
 from collections.abc import Iterable
 from typing import cast
@@ -13,10 +13,10 @@ from gpe_pl.nn.fused_mlp import fused_mlp
 
 
 class MLP(nn.Sequential):
-    """Two linear layers with a PReLU between them: every function of the paper (section 3.2); then LayerNorm if asked for.
+    """Two linear layers with a PReLU between them, then an optional LayerNorm: the form of every function of the paper (section 3.2).
 
     Args:
-        is_fused: on a CPU, use the code of its own that ``nn.fused_mlp`` has for it; the same function of the same parameters.
+        is_fused: on a CPU, use ``nn.fused_mlp``, which computes the same function of the same parameters.
     """
 
     def __init__(self, in_channels: int, hidden_channels: int, out_channels: int, norm: bool = False, is_fused: bool = False) -> None:
@@ -25,7 +25,7 @@ class MLP(nn.Sequential):
         self.is_fused = is_fused
 
     def forward(self, x: Float[Tensor, "*row in"], residual: Float[Tensor, "*row out"] | None = None) -> Float[Tensor, "*row out"]:
-        """The function of every row, added to that of ``residual``."""
+        """Apply the function to every row, and add ``residual``."""
         first, act, last, *norm = self
         first, act, last = cast(nn.Linear, first), cast(nn.PReLU, act), cast(nn.Linear, last)
         if not (self.is_fused and x.dim() == 2 and works_on(x, first.weight)):
@@ -38,7 +38,7 @@ class MLP(nn.Sequential):
 
 
 class ReluMLP(nn.Sequential):
-    """Hidden linear layers with a ReLU after each, then a linear layer, then LayerNorm if asked for: the baselines' networks."""
+    """Hidden linear layers with a ReLU after each, a linear layer, then an optional LayerNorm: the networks of the baselines."""
 
     def __init__(self, in_channels: int, hidden_channels: int, out_channels: int, num_hidden_layers: int, norm: bool = False) -> None:
         layers: list[nn.Module] = []
@@ -49,9 +49,9 @@ class ReluMLP(nn.Sequential):
 
 
 class EdgeLinear(nn.Module):
-    """A linear map of (edge, target, source), which multiplies nodes before it gathers them to edges.
+    """Linear map of (edge, target, source) that multiplies nodes before it gathers them to edges.
 
-    With target i and source j it is
+    With target i and source j it computes
 
         W [e, h_i, h_j] + b = W_e e + (W_i h + b)_i + (W_j h)_j
     """
@@ -65,22 +65,21 @@ class EdgeLinear(nn.Module):
         return self.nodes(h, edge_index).add_(self.edges(e))
 
     def edges(self, e: Float[Tensor, "edge state"]) -> Float[Tensor, "edge out"]:
-        """W_e e, which a loop with constant edge states computes once."""
+        """Return W_e e, which a loop with constant edge states computes once."""
         return functional.linear(e, self.linear.weight[:, : self.widths[0]])
 
     def nodes(self, h: Float[Tensor, "node hidden"], edge_index: Int64[Tensor, "2 edge"]) -> Float[Tensor, "edge out"]:
-        """(W_i h + b)_i + (W_j h)_j."""
+        """Return (W_i h + b)_i + (W_j h)_j."""
         _, target, source = self.linear.weight.split(self.widths, dim=1)
         j, i = edge_index
-        at_target = functional.linear(h, target, self.linear.bias).index_select(0, i)  # its gradient sums faster than that of [i]
+        at_target = functional.linear(h, target, self.linear.bias).index_select(0, i)  # its gradient sums faster than the gradient of [i]
         return at_target.add_(functional.linear(h, source).index_select(0, j))
 
 
 class Standardize(nn.Module):
-    """(x − mean) / std with stored statistics.
+    """Standardisation (x − mean) / std with stored statistics.
 
-    With ``centered=False`` the mean stays zero and the scale is the root mean square, which keeps odd channels odd. Channels that do not vary keep
-    scale 1.
+    With ``centered=False`` the mean stays zero and the scale is the root mean square, so that odd channels stay odd. Constant channels keep scale 1.
     """
 
     mean: Tensor
@@ -94,11 +93,11 @@ class Standardize(nn.Module):
 
     @property
     def is_identity(self) -> bool:
-        """Whether no statistics are set; none of features that vary are exactly these."""
+        """Whether no statistics are set; statistics of varying features never equal the identity."""
         return bool((self.mean == 0).all()) and bool((self.std == 1).all())
 
     def fit(self, batches: Iterable[Float[Tensor, "row channel"]]) -> bool:
-        """Set the statistics from data, in float64; rows that are not finite are ignored, no rows leave the identity. Returns whether there was any row."""
+        """Set the statistics from data, in float64, ignoring rows that are not finite; return whether there were any rows, else keep the identity."""
         rows = [b.double() for b in batches if b.shape[0]]
         if not rows:
             return False

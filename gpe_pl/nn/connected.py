@@ -1,4 +1,4 @@
-"""Which nodes edges touch, and in which order: nodes that no edge touches take no part in message passing, and those of one edge should lie near each other."""
+"""Nodes with edges, and the order of nodes. Nodes without an edge take no part in message passing, and nodes of one edge should be near in memory."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from torch import Tensor
 from gpe_pl.schema import EdgeType
 
 Edges = dict[EdgeType, tuple[Tensor, Tensor, Tensor]]
-"""``edge_index``, ``odd`` and ``even`` of the relations that have edges."""
+"""``edge_index``, ``odd`` and ``even`` of each relation that has edges."""
 
 
 def touched(num_nodes: dict[str, int], edges: Edges) -> dict[str, Tensor]:
-    """For every node type, which of its nodes have an edge [node]."""
+    """Return for every node type a mask of the nodes that have an edge [node]."""
     masks: dict[str, Tensor] = {}
     for (source, _, target), (index, _, _) in edges.items():
         for node_type, rows in ((source, index[0]), (target, index[1])):
@@ -23,10 +23,10 @@ def touched(num_nodes: dict[str, int], edges: Edges) -> dict[str, Tensor]:
 
 
 def order_of_edges(num_nodes: dict[str, int], edges: Edges) -> dict[str, Tensor]:
-    """For every node type, its nodes in the order in which the edges come to them, those without an edge last [node].
+    """Return for every node type its nodes in the order in which edges first reach them; nodes without an edge come last [node].
 
-    Neighbour search goes through space place by place, so that nodes in this order are near in memory where they are near in space, and edges keep theirs:
-    all sums are taken in the same order as before.
+    The neighbour search proceeds through space, so in this order nodes that are near in space are near in memory. Edges keep their order, so all sums are
+    taken in the same order as before.
     """
     never = 2 * sum(index.shape[1] for index, _, _ in edges.values())
     first: dict[str, Tensor] = {}
@@ -42,7 +42,7 @@ def order_of_edges(num_nodes: dict[str, int], edges: Edges) -> dict[str, Tensor]
 
 
 def reordered(edges: Edges, order: dict[str, Tensor]) -> Edges:
-    """The edges between nodes that stand in another order."""
+    """Return the edges with the node numbers of a new order."""
     number = {}
     for t, rows in order.items():
         number[t] = torch.empty_like(rows)
@@ -51,7 +51,7 @@ def reordered(edges: Edges, order: dict[str, Tensor]) -> Edges:
 
 
 def renumbered(edges: Edges, masks: dict[str, Tensor]) -> Edges:
-    """The edges between the nodes that ``masks`` keep, by their new numbers."""
+    """Return the edges between the nodes that ``masks`` keep, with their new numbers."""
     return _with_numbers(edges, {t: torch.cumsum(mask, dim=0) - 1 for t, mask in masks.items()})
 
 

@@ -4,8 +4,8 @@ A filter is a grid of K^d matrices, stretched over the ball of the neighbour rad
 
     y_i = b + Σ_j a(u_ij) G(Λ(u_ij)) f_j         u_ij = (x_j − x_i) / R,  j ≠ i,  a(u) = (1 − |u|²)³
 
-Λ maps the ball onto the cube and keeps ratios of volumes, so that every filter cell sees an equal share of the ball [Griepentrog, Höppner, Kaiser and Rehberg
-2008, "A bi-Lipschitz continuous, volume preserving map from the unit ball onto a cube"]. The outermost grid points lie on the cube's surface.
+Λ maps the ball onto the cube and preserves ratios of volumes, so that every filter cell covers the same fraction of the ball [Griepentrog, Höppner, Kaiser and
+Rehberg 2008, "A bi-Lipschitz continuous, volume preserving map from the unit ball onto a cube"]. The outermost grid points lie on the cube's surface.
 """
 
 import itertools
@@ -18,10 +18,10 @@ from torch.nn import functional
 
 
 def ball_to_cube(u: Float[Tensor, "edge dim"]) -> Float[Tensor, "edge dim"]:
-    """Λ: from the unit ball onto [−1, 1]^d, by way of the cylinder in 3D; its Jacobian is 4/π in 2D and 6/π in 3D everywhere.
+    """Map the unit ball onto [−1, 1]^d by Λ, through a cylinder in 3D; the Jacobian is 4/π in 2D and 6/π in 3D everywhere.
 
-    With r the length of (x, y, z) and ρ that of (x, y), the ball maps to the cylinder by (x, y) ← (x, y) √(3 r / (r + |z|)), z ← ± r in the cones where
-    5 z² > 4 ρ², and by (x, y) ← (x, y) r / ρ, z ← 3 z / 2 elsewhere; and the disc to the square by (x, y) ← ± ρ (1, 4/π arctan(y / x)) where |y| ≤ |x|.
+    With r the length of (x, y, z) and ρ that of (x, y), the ball maps to the cylinder by (x, y) ← (x, y) √(3 r / (r + |z|)), z ← ± r in the cones with
+    5 z² > 4 ρ², and by (x, y) ← (x, y) r / ρ, z ← 3 z / 2 elsewhere. The disc maps to the square by (x, y) ← ± ρ (1, 4/π arctan(y / x)) where |y| ≤ |x|.
     """
     if u.shape[1] == 2:
         return _disc_to_square(u)
@@ -47,15 +47,15 @@ def _nonzero(x: Tensor) -> Tensor:
 
 
 def _length(u: Tensor) -> Tensor:
-    """Euclidean length [row, 1], with gradient zero at zero."""
+    """Return the Euclidean length [row, 1], with gradient zero at zero."""
     square = u.square().sum(dim=1, keepdim=True)
     return torch.where(square == 0, 0.0, _nonzero(square).sqrt())
 
 
 def interpolate(u: Float[Tensor, "edge dim"], kernel_size: int) -> tuple[Int64[Tensor, "edge corner"], Float[Tensor, "edge corner"]]:
-    """Filter cells around Λ(u) and their weights, windowed by (1 − |u|²)³; computed once, used by every layer with the same edges.
+    """Return the filter cells around Λ(u) and their weights, windowed by (1 − |u|²)³. Layers with the same edges share the result.
 
-    Cells are numbered with the last axis fastest; there are 2^d corners.
+    Cells are numbered with the last axis fastest; each edge has 2^d corners.
     """
     dim = u.shape[1]
     grid = (ball_to_cube(u).clamp(-1, 1) + 1) * ((kernel_size - 1) / 2)
@@ -77,9 +77,10 @@ def interpolate(u: Float[Tensor, "edge dim"], kernel_size: int) -> tuple[Int64[T
 class ContinuousConv(nn.Module):
     """One layer of the convolution above; neighbours are given as edges with their interpolation.
 
-    Either the inputs are summed into each target's K^d filter cells and one product makes the outputs, or one product makes every cell's output at the
-    source and these are interpolated per edge; the cheaper order has the narrower features at the edges. The product takes 2 N K^d C_in C_out floating-point
-    operations instead of the 2 E 2^d C_in C_out of a matrix per edge: with N nodes and E = 19 N directed edges in 2D and K = 4, 4.75 times fewer.
+    There are two orders of evaluation. Either the inputs are summed into each target's K^d filter cells and one product gives the outputs, or one product
+    gives every cell's output at the source and these are interpolated per edge. The layer chooses the order with narrower features at the edges. The product
+    takes 2 N K^d C_in C_out floating-point operations instead of the 2 E 2^d C_in C_out of a matrix per edge. With N nodes and E = 19 N directed edges in
+    2D and K = 4, this is 4.75 times fewer.
 
     Weights start uniform in ±0.05 and biases at zero, as in the authors' layer.
     """

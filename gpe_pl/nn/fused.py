@@ -1,4 +1,4 @@
-"""What the passes that are made for a CPU share: when they work, whether they are wanted, and how many rows they take at a time."""
+"""Shared parts of the fused passes for CPUs: when they work, whether they are enabled, and the number of rows in a block."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 BLOCK = 512
-"""Rows at a time: at 128 channels in single precision an array of a block takes 256 KiB, and a handful of them fit a core's second-level cache."""
+"""Number of rows in a block. At 128 channels in single precision an array takes 256 KiB, and a few of them fit a core's second-level cache."""
 FASTMATH = {"contract", "nsz", "arcp"}
-"""What compiled loops may do with sums and products; not-a-numbers and infinities stay what they are."""
+"""Optimisations of sums and products that compiled loops may apply; NaN and infinity are preserved."""
 _is_wanted = ContextVar("_is_wanted", default=True)
 
 
 @contextmanager
 def unfused() -> Iterator[None]:
-    """Forward passes inside use PyTorch's operations alone, and so do their backward passes: to compare with."""
+    """Use only PyTorch's operations in forward passes inside this block, and in their backward passes, for comparison."""
     token = _is_wanted.set(False)
     try:
         yield
@@ -27,7 +27,7 @@ def unfused() -> Iterator[None]:
 
 
 def works_on(*tensors: Tensor) -> bool:
-    """Whether these passes can take the tensors, here and now."""
+    """Tell whether these passes can take the tensors in the present context."""
     if torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu") or not _is_wanted.get():
         return False
     first = tensors[0]
@@ -36,12 +36,12 @@ def works_on(*tensors: Tensor) -> bool:
 
 
 def block_size(num_rows: int) -> int:
-    """Rows of the largest block."""
+    """Return the number of rows of the largest block."""
     return min(BLOCK, num_rows)
 
 
 def blocks(num_rows: int) -> Iterator[tuple[int, int]]:
-    """First row and number of rows of every block."""
+    """Yield first row and number of rows of every block."""
     for first in range(0, num_rows, BLOCK):
         yield first, min(BLOCK, num_rows - first)
 
@@ -49,14 +49,14 @@ def blocks(num_rows: int) -> Iterator[tuple[int, int]]:
 def plain_gradients(
     plain: Callable[..., Sequence[Tensor | None]], inputs: Sequence[Tensor | None], grads: Sequence[Tensor | None]
 ) -> list[Tensor | None]:
-    """Gradients of what passes compute, by PyTorch's operations: for a backward pass that is itself to be differentiated (``create_graph=True``).
+    """Return gradients of a fused pass by PyTorch's operations, for a backward pass that is itself differentiated (``create_graph=True``).
 
     Args:
-        plain: the same results of the same inputs.
-        inputs: as they were saved, so that second derivatives find their way back.
-        grads: of the results.
+        plain: function that returns the same results from the same inputs with PyTorch's operations.
+        inputs: inputs as they were saved, so that second derivatives reach them.
+        grads: gradients of the results.
     """
-    own = [t.view_as(t) if t is not None and t.requires_grad else t for t in inputs]  # one input may have come from another
+    own = [t.view_as(t) if t is not None and t.requires_grad else t for t in inputs]  # one input may depend on another
     wanted = [t for t in own if t is not None and t.requires_grad]
     pairs = [(y, g) for y, g in zip(plain(*own), grads, strict=True) if y is not None and g is not None]
     outputs, arriving = zip(*pairs, strict=True)

@@ -1,4 +1,4 @@
-"""Messages and the new latent state of all edges, a block of edges at a time (on a CPU).
+"""Messages and new latent states of all edges, a block of edges at a time (on a CPU).
 
 With rows a of the targets, b of the sources, latent states e and even features s of the edges, for an edge k from j to i::
 
@@ -6,8 +6,8 @@ With rows a of the targets, b of the sources, latent states e and even features 
     x_k = φ(z_k)   or, for odd messages,   x_k = φ(z_k) − φ(z'_k),   φ(z) = max(z, 0) + p min(z, 0)
     m_k = C x_k + c,   T_i = Σ_k m_k over edges into i,   S_j = −Σ_k m_k over edges out of j,   e'_k = e_k + m_k
 
-A block stays in the cache between its two matrix products, where plain PyTorch reads and writes every edge in memory about ten times. The backward pass
-computes the activations again.
+A block stays in the cache between its two matrix products, whereas plain PyTorch reads and writes every edge in memory about ten times. The backward pass
+recomputes the activations.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ def _activate_odd(a, b, w, u, slope, source, target, first, count, x):
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _update(m, bias, e, source, target, first, count, new, at_target, at_source):
-    """Adds m + bias to the sums at the ends of a block's edges, and to their states e: in place, or into ``new``."""
+    """Add m + bias to the sums at the ends of a block's edges, and to their states e, in place or into ``new``."""
     for k in range(count):
         i, j = target[first + k], source[first + k]
         for c in range(m.shape[1]):
             message = m[k, c] + bias[c]
-            if new is None:  # one array under two names would not be vectorised
+            if new is None:  # with one array under two names the loop would not be vectorised
                 e[first + k, c] += message
             else:
                 new[first + k, c] = e[first + k, c] + message
@@ -84,7 +84,7 @@ def _gather_grad(grad_target, grad_source, source, target, first, count, g):
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _gather_message_grad(grad_target, grad_source, grad_new, source, target, first, count, g, total):
-    """Gradients of the messages, which also reach the new states, and their sum in ``total``: of a block, then of blocks, to round no worse than PyTorch's."""
+    """Gather the gradients of the messages, which include those of new states, and add them to ``total`` block by block, for PyTorch's accuracy or better."""
     block_sum = np.zeros_like(g[0])
     for k in range(count):
         i, j = target[first + k], source[first + k]
@@ -98,7 +98,7 @@ def _gather_message_grad(grad_target, grad_source, grad_new, source, target, fir
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _backward(a, b, w, slope, source, target, first, count, g, grad_a, grad_b, below):
-    """Turns g, the gradient of x, into that of z."""
+    """Turn g, the gradient of x, into the gradient of z."""
     block_sum = np.zeros_like(g[0])
     for k in range(count):
         i, j = target[first + k], source[first + k]
@@ -116,7 +116,7 @@ def _backward(a, b, w, slope, source, target, first, count, g, grad_a, grad_b, b
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _backward_odd(a, b, w, u, slope, source, target, first, count, g, even, grad_a, grad_b, below):
-    """Turns g, the gradient of x, into that of W e; ``even`` becomes that of V s."""
+    """Turn g, the gradient of x, into the gradient of W e; ``even`` becomes the gradient of V s."""
     block_sum = np.zeros_like(g[0])
     for k in range(count):
         i, j = target[first + k], source[first + k]
@@ -136,7 +136,7 @@ def _backward_odd(a, b, w, u, slope, source, target, first, count, g, even, grad
 
 
 class _Layer:
-    """What all blocks share: rows a and b, states and features of the edges, the first linear map; and room for W e, V s and x of one block."""
+    """Data that all blocks share: rows a and b, edge states and features, the first linear map, and buffers for W e, V s and x of one block."""
 
     def __init__(
         self, a: Tensor, b: Tensor, e: Tensor, s: Tensor | None, weight: Tensor, even_weight: Tensor, slope: Tensor, edge_index: Tensor
@@ -151,7 +151,7 @@ class _Layer:
         self.arrays = self.w.numpy(), self.u.numpy(), self.x.numpy()
 
     def multiply(self, first: int, count: int) -> tuple[np.ndarray, ...]:
-        """W e of a block, and V s where messages are odd."""
+        """Return W e of a block, and V s if messages are odd."""
         w, u, _ = self.arrays
         torch.mm(self.e[first : first + count], self.weight, out=self.w[:count])
         if self.s is None:
@@ -160,7 +160,7 @@ class _Layer:
         return w, u
 
     def activate(self, first: int, count: int, products: tuple[np.ndarray, ...]) -> Tensor:
-        """X of a block."""
+        """Return x of a block."""
         kernel = _activate if self.s is None else _activate_odd
         kernel(*self.rows, *products, self.slope, self.source, self.target, first, count, self.arrays[-1])
         return self.x[:count]
@@ -284,15 +284,22 @@ def fused_latent(
     is_joint: bool = False,
     overwrites: bool = False,
 ) -> tuple[Float[Tensor, "target hidden"], Float[Tensor, "source hidden"] | None, Float[Tensor, "edge state"] | None]:
-    """T, S and e' of the module's text, on the CPU in single or double precision; differentiable in all but ``edge_index``.
+    """Return T, S and e' of the module's docstring, on the CPU in single or double precision; differentiable in all arguments but ``edge_index``.
 
-    ``edge_index`` must hold rows that exist: nothing is checked.
+    ``edge_index`` must hold existing rows; nothing is checked.
 
     Args:
-        s: for odd messages, which need both ends of an edge to be of one type: a and b then have the same rows; None for the others.
-        out: C, and c if there is one; states then have as many channels as the messages. None: T and S are sums of x, and there is no e'.
+        a: rows of the targets.
+        b: rows of the sources.
+        e: latent edge states.
+        s: even edge features for odd messages, None for others. Odd messages need both ends of an edge of one type, so a and b have the same rows.
+        weight: W.
+        even_weight: V.
+        slope: p.
+        out: C, and c if there is one; states then have as many channels as the messages. With None, T and S are sums of x, and there is no e'.
+        edge_index: source (row 0) and target (row 1) of every edge.
         is_joint: both ends are of one type: return T + S, and None in place of S.
-        overwrites: e' may take the place of e in memory, where no gradient is asked for.
+        overwrites: e' may reuse the memory of e if no gradient is needed.
     """
     c, bias = out if out is not None else (e.new_empty(0, 0), None)
     bias = c.new_zeros(len(c)) if bias is None else bias

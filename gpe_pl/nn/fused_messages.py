@@ -5,8 +5,8 @@ With rows a of the targets, b of the sources and features e of the edges::
     x_k = φ(a_i + b_j + W e_k),  φ(z) = max(z, 0) + p min(z, 0)          edge k from j to i
     T_i = Σ_k x_k over edges into i,   S_j = −Σ_k x_k over edges out of j
 
-No array of the edges' width is ever made: what plain PyTorch writes and reads about ten times per layer stays in the cache. The backward pass computes the
-activations again, which costs less than to keep them.
+No array over all edges is made: values that plain PyTorch writes and reads about ten times per layer stay in the cache. The backward pass recomputes the
+activations, which costs less than storing them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from gpe_pl.nn.fused import BLOCK, FASTMATH, plain_gradients
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _add_up(z, a, b, e, w, i, j, k):
-    """Z of edge k, from j to i."""
+    """Return z of edge k, from j to i."""
     for c in range(len(z)):
         z[c] = a[i, c] + b[j, c]
     for q in range(e.shape[1]):
@@ -76,7 +76,7 @@ def _backward(a, b, e, w, slope, source, target, grad_target, grad_source, grad_
                 for c in range(width):
                     total += w[q, c] * g[c]
                 grad_e[k, q] = total
-        if k % BLOCK == BLOCK - 1 or k == len(source) - 1:  # sums of a block, then of blocks, round no worse than PyTorch's
+        if k % BLOCK == BLOCK - 1 or k == len(source) - 1:  # summing within blocks, then over blocks, is at least as accurate as PyTorch
             below += block_below
             total_w += block_w
             block_below[:] = 0
@@ -136,11 +136,17 @@ def fused_messages(
     edge_index: Int64[Tensor, "2 edge"],
     is_joint: bool = False,
 ) -> tuple[Float[Tensor, "target hidden"], Float[Tensor, "source hidden"] | None]:
-    """T and S of the module's text, on the CPU in single or double precision; differentiable in all but ``edge_index``.
+    """Return T and S of the module's docstring, on the CPU in single or double precision; differentiable in all arguments but ``edge_index``.
 
-    ``edge_index`` must hold rows that exist: nothing is checked.
+    ``edge_index`` must hold existing rows; nothing is checked.
 
     Args:
+        a: rows of the targets.
+        b: rows of the sources.
+        e: edge features.
+        weight: W.
+        slope: p.
+        edge_index: source (row 0) and target (row 1) of every edge.
         is_joint: both ends are of one type: return T + S, and None.
     """
     return _FusedMessages.apply(a, b, e, weight, slope, edge_index, is_joint)  # type: ignore[no-untyped-call,return-value]

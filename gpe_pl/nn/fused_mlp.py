@@ -1,10 +1,10 @@
 """Two linear maps with an activation between them, a block of rows at a time (on a CPU).
 
-For a row x and, if there is one, a row r that the result is added to::
+For a row x and an optional residual row r::
 
     z = A x + b,   y = C φ(z) + c + r,   φ(z) = max(z, 0) + p min(z, 0)
 
-A block stays in the cache between its two products, where plain PyTorch copies biases and writes and reads all rows in memory five times.
+A block stays in the cache between its two products, whereas plain PyTorch copies biases and writes and reads all rows in memory five times.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gpe_pl.nn.fused import FASTMATH, block_size, blocks, plain_gradients
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _activate(z, bias, slope, first, count, h):
-    """Adds the bias to rows of z, in place, and activates them into h."""
+    """Add the bias to rows of z, in place, and write their activations to h."""
     for k in range(count):
         for c in range(z.shape[1]):
             y = z[first + k, c] + bias[c]
@@ -55,7 +55,7 @@ def _finish(y, bias, residual, first, count):
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH)
 @no_type_check
 def _backward(z, slope, first, count, g, grad_bias, below):
-    """Turns g, the gradient of φ(z), into that of z; sums over rows are of a block, then of blocks, so that they round no worse than PyTorch's."""
+    """Turn g, the gradient of φ(z), into that of z; sums run within blocks, then over blocks, which is at least as accurate as PyTorch."""
     bias_sum, below_sum = np.zeros_like(z[0]), np.zeros_like(z[0])
     for k in range(count):
         for c in range(z.shape[1]):
@@ -69,7 +69,7 @@ def _backward(z, slope, first, count, g, grad_bias, below):
 
 
 def _forward(x: Tensor, weights: tuple[Tensor, ...], residual: Tensor | None, keeps: bool) -> tuple[Tensor, Tensor]:
-    """Y, and with ``keeps`` all of z."""
+    """Return y, and with ``keeps`` also z of all rows."""
     weight, bias, slope, out_weight, out_bias = (w.detach() for w in weights)
     weight, out_weight = weight.t().contiguous(), out_weight.t().contiguous()
     num_rows, hidden = len(x), weight.shape[1]
@@ -134,7 +134,7 @@ def fused_mlp(
     out_bias: Float[Tensor, " out"],
     residual: Float[Tensor, "row out"] | None = None,
 ) -> Float[Tensor, "row out"]:
-    """Y of the module's text, on the CPU in single or double precision; differentiable."""
+    """Return y of the module's docstring, on the CPU in single or double precision; differentiable."""
     weights = weight, bias, slope, out_weight, out_bias
     if not torch.is_grad_enabled():
         return _forward(x.detach().contiguous(), weights, residual, keeps=False)[0]

@@ -1,7 +1,7 @@
-"""A typed graph as one graph of one node type, for models whose layers are shared by all particles and which tell types apart by their input.
+"""A typed graph as a graph of one node type, for models whose layers are shared by all particles and which distinguish types by their input.
 
-Nodes stand one type after another in the order of ``FeatureSpec.node_types``. Features of different meaning stand in columns of their own and are zero for
-nodes or edges that do not have them: motion of materials, boundary nodes, virtual nodes, one block per material's parameters; and one block per relation.
+Nodes are ordered by type, in the order of ``FeatureSpec.node_types``. Features of different meaning have separate columns, which are zero for nodes or edges
+without them: motion of materials, boundary nodes, virtual nodes, one block for the parameters of each material, and one block for each relation.
 """
 
 from collections.abc import Iterable
@@ -15,21 +15,21 @@ from torch_geometric.data import HeteroData
 from gpe_pl.schema import EdgeType, FeatureSpec, role
 
 Edges = dict[EdgeType, tuple[Tensor, Tensor, Tensor]]
-"""``edge_index``, ``odd`` and ``even`` of the relations that have edges."""
+"""``edge_index``, ``odd`` and ``even`` of each relation that has edges."""
 
 
 class Homogeneous:
-    """Where types and relations of a ``FeatureSpec`` go in the homogeneous graph.
+    """Layout of types and relations of a ``FeatureSpec`` in the homogeneous graph.
 
     Args:
         spec: channels of the typed graphs.
-        node_types: that take part, all materials among them.
+        node_types: node types that take part, all materials among them.
 
     Attributes:
-        kind: per node type, the number under which a model knows it; virtual nodes of all levels have the same.
-        num_kinds: how many those are.
-        node_channels: columns of ``nodes``.
-        edge_channels: columns of ``edges``.
+        kind: number of each node type in the model; virtual nodes of all levels share one.
+        num_kinds: number of different kinds.
+        node_channels: number of columns of ``nodes``.
+        edge_channels: number of columns of ``edges``.
     """
 
     def __init__(self, spec: FeatureSpec, node_types: tuple[str, ...]) -> None:
@@ -56,7 +56,7 @@ class Homogeneous:
         self.edge_channels = sum(edge_widths.values())
 
     def nodes(self, x: dict[str, Tensor], params: dict[str, Tensor]) -> tuple[Float[Tensor, "node channel"], Int64[Tensor, " node"]]:
-        """Features and kinds of all nodes."""
+        """Return features and kinds of all nodes."""
         rows, kinds = [], []
         for t, features in x.items():
             row = _place(features, self._x[t], self.node_channels)
@@ -69,7 +69,7 @@ class Homogeneous:
     def edges(
         self, x: dict[str, Tensor], edges: Edges, forward: Iterable[EdgeType], backward: Iterable[EdgeType]
     ) -> tuple[Int64[Tensor, "2 edge"], Float[Tensor, "edge channel"]]:
-        """Directed edges (row 0 source, row 1 target) and their features: the relations in ``forward`` as stored, those in ``backward`` turned around."""
+        """Return directed edges (row 0 source, row 1 target) and features: relations in ``forward`` as stored, relations in ``backward`` reversed."""
         start = first_rows(x)
         indices, features = [], []
         for relations, sign in ((forward, 1), (backward, -1)):
@@ -89,14 +89,14 @@ class Homogeneous:
 
 
 def present(data: HeteroData, spec: FeatureSpec) -> tuple[dict[str, Tensor], dict[str, Tensor], Edges]:
-    """What a graph has any of: features of its node types, parameters of its materials, and its relations."""
+    """Return what a graph contains: features of its node types, parameters of its materials, and its relations, each only if not empty."""
     x = {t: data[t].x for t in spec.node_types if data[t].x.shape[0]}
     params = {m: data[m].material_params for m in spec.materials if m in x}
     return x, params, {r: (data[r].edge_index, data[r].odd, data[r].even) for r in spec.relations if data[r].edge_index.shape[1]}
 
 
 def first_rows(x: dict[str, Tensor]) -> dict[str, int]:
-    """The row at which each node type starts."""
+    """Return the row at which each node type starts."""
     start, rows = {}, 0
     for t, features in x.items():
         start[t] = rows
@@ -105,7 +105,7 @@ def first_rows(x: dict[str, Tensor]) -> dict[str, int]:
 
 
 def _first_columns(widths: dict[str, int]) -> dict[str, int]:
-    """The first column of each block."""
+    """Return the first column of each block."""
     first, column = {}, 0
     for name, width in widths.items():
         first[name] = column
@@ -114,5 +114,5 @@ def _first_columns(widths: dict[str, int]) -> dict[str, int]:
 
 
 def _place(values: Tensor, first: int, channels: int) -> Tensor:
-    """Columns ``first``, ``first + 1``, … of ``channels``, the others zero."""
+    """Write values to columns ``first``, ``first + 1``, … of ``channels`` columns; the others are zero."""
     return functional.pad(values, (first, channels - first - values.shape[1]))

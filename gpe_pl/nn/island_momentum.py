@@ -1,12 +1,12 @@
-"""The momentum of what moves together: of islands in free flight, which keep it exactly whatever a network says, and of bodies, which forces move as a whole.
+"""Momentum of islands in free flight, which is conserved exactly for any network, and of bodies, which forces move as a whole.
 
-What no edge ties to anything outside keeps its linear and angular momentum. With a the accelerations without gravity of an island's nodes, m their masses
-and r their positions relative to the island's centre of mass::
+An island without edges to anything outside keeps its linear and angular momentum. With a the accelerations without gravity of its nodes, m their masses and r
+their positions relative to the island's centre of mass::
 
     a ← a − Σ m a / Σ m                                  linear: the centre of mass falls freely
     a ← a − α × r,   J α = Σ m r × a                     angular: J is the inertia tensor
 
-which is the smallest change in the mass-weighted sense that makes Σ m a and Σ m r × a vanish. What it takes away is the ``rigid_part``.
+This is the smallest change in the mass-weighted sense for which Σ m a and Σ m r × a vanish. The part that is removed is the ``rigid_part``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor
 
 IslandMomentum = Literal["ignored", "linear", "angular"]
 SMALLEST_PRINCIPAL_SHARE = 1e-4
-"""Of the largest principal moment of inertia: about axes below it an island cannot be said to turn (a single node, nodes in a row)."""
+"""Fraction of the largest principal moment of inertia below which an island has no defined rotation about an axis (a single node, nodes in a row)."""
 
 
 def conserve(
@@ -30,8 +30,17 @@ def conserve(
     is_free: Bool[Tensor, " island"],
     angular: bool,
 ) -> Float[Tensor, "node dim"]:
-    """Accelerations without gravity that give every free island no momentum, and without angular momentum if ``angular``."""
-    if torch.compiler.is_exporting():  # shapes must not depend on values: all rows, and then only those of free islands
+    """Return accelerations without gravity that change no free island's linear momentum, nor its angular momentum if ``angular``.
+
+    Args:
+        acceleration: accelerations without gravity, in any unit.
+        mass: masses [kg].
+        pos: positions [m].
+        island: island of each node.
+        is_free: whether each island has no edge to anything outside.
+        angular: also conserve angular momentum.
+    """
+    if torch.compiler.is_exporting():  # shapes must not depend on values: compute all rows, then select those of free islands
         rows = torch.arange(island.shape[0], device=island.device)
         return torch.where(is_free[island][:, None], _kept(acceleration, mass, pos, island, rows, is_free.shape[0], angular), acceleration)
     rows = torch.nonzero(is_free[island]).flatten()
@@ -48,13 +57,13 @@ def rigid_part(
     body: Int64[Tensor, " node"],
     count: int,
 ) -> Float[Tensor, "node dim"]:
-    """The part of accelerations in which each of ``count`` bodies moves as if it were rigid: all of its momentum and angular momentum, and no more."""
+    """Return the rigid part of accelerations for each of ``count`` bodies: it carries all of their linear and angular momentum and no deformation."""
     rows = torch.arange(body.shape[0], device=body.device)
     return acceleration - _kept(acceleration, mass, pos, body, rows, count, angular=True)
 
 
 def _kept(acceleration: Tensor, mass: Tensor, pos: Tensor, island: Tensor, rows: Tensor, count: int, angular: bool) -> Tensor:
-    """``conserve`` of these rows, which are whole islands."""
+    """Apply ``conserve`` to these rows, which are whole islands."""
     label, m, a = island[rows], mass[rows, None], acceleration[rows]
     total = _sum(m, label, count).clamp(min=torch.finfo(m.dtype).tiny)
     a = a - (_sum(m * a, label, count) / total)[label]
@@ -69,7 +78,7 @@ def _sum(values: Tensor, label: Tensor, count: int) -> Tensor:
 
 
 def _rotation(a: Tensor, m: Tensor, r: Tensor, label: Tensor, count: int) -> Tensor:
-    """α × r of each node: the part of the accelerations in which its island turns."""
+    """Return α × r of each node: the part of the accelerations in which its island rotates."""
     if a.shape[1] == 2:
         moment = _sum(m * (r[:, :1] * a[:, 1:] - r[:, 1:] * a[:, :1]), label, count)
         inertia = _sum(m * r.square().sum(dim=1, keepdim=True), label, count)

@@ -1,15 +1,15 @@
-"""The message-passing layer of GPE: each undirected edge is computed once, its message is added at one end and subtracted at the other.
+"""The message-passing layer of GPE, which computes each undirected edge once, adds its message at one end and subtracts it at the other.
 
-The message is a two-layer MLP, whose first layer is linear in its parts, so that it factors into products per node and per edge::
+The message is a two-layer MLP. Its first layer is linear in its parts, so it factors into products per node and per edge::
 
     z_ij = A h_i + B h_j + W e_ij + S s_ij + b                       (i target, j source, e odd or latent edge state, s even features)
 
 - ``directed``: m_ij = C φ(z_ij) + c for both directions of every edge
-- ``negated``: m_ij = C φ(z_ij) + c and m_ji = −m_ij, the paper's form (section 2.3); it depends on which end is called i, see ``orient``
-- ``odd``: m_ij = C (φ(z_ij) − φ(z_ji)), antisymmetric whichever end is called i
-- ``odd_even``: as ``odd``, and D (φ(z_ij) + φ(z_ji)) goes to both ends
+- ``negated``: m_ij = C φ(z_ij) + c and m_ji = −m_ij, the paper's form (section 2.3); it depends on which end is i, see ``orient``
+- ``odd``: m_ij = C (φ(z_ij) − φ(z_ji)), antisymmetric for either choice of i
+- ``odd_even``: as ``odd``, and D (φ(z_ij) + φ(z_ji)) is added at both ends
 
-A relation between two node types has a direction already, and is ``negated`` unless the layer is ``directed``.
+A relation between two node types already has a direction. It is ``negated`` unless the layer is ``directed``.
 """
 
 from typing import Any, Literal, Optional, cast
@@ -28,18 +28,18 @@ Interaction = Literal["directed", "negated", "odd", "odd_even"]
 EdgeState = Literal["latent", "geometry"]
 Implementation = Literal["factored", "plain"]
 RAW = 32
-"""Up to so many edge channels are multiplied where they are used; more go through a matrix product."""
+"""Number of edge channels up to which the product is computed where it is used; more channels go through a matrix product."""
 MaybeTensor = Optional[Tensor]  # noqa: UP045 - PyG's code generator reads the signatures below and does not understand unions written with |
 
 Ends = tuple[Tensor, MaybeTensor]
-"""Sums at targets and at sources; or in one array at both, which are nodes of one type, and None."""
+"""Sums at targets and at sources; if both are nodes of one type, one array for both, and None."""
 
 
 def orient(edge_index: Int64[Tensor, "2 edge"], odd: Float[Tensor, "edge odd"]) -> tuple[Tensor, Tensor]:
-    """Turn every edge so that its first non-zero odd channel is positive: a rule of geometry, independent of node labels.
+    """Turn every edge so that its first non-zero odd channel is positive; this geometric rule does not depend on node labels.
 
-    The first odd channels are the displacement x_i − x_j, so the target is the end with the larger x, then y, then z; coincident nodes are told apart
-    by their relative velocity where it is a feature. Pairs without any difference keep their order.
+    The first odd channels are the displacement x_i − x_j, so the target is the end with the larger x, then y, then z. Coincident nodes are distinguished by
+    their relative velocity if it is a feature. Pairs without any difference keep their order.
     """
     first = torch.zeros_like(odd[:, 0])
     for channel in odd.unbind(dim=1):
@@ -55,9 +55,9 @@ class MomentumConv(MessagePassing):
     Args:
         hidden_channels: node and message channels.
         edge_channels: channels of the edge state ``e``.
-        even_channels: channels of ``s``; only used by ``odd`` and ``odd_even``.
-        interaction: see the module's text; relations between two types accept only ``directed`` and ``negated``.
-        implementation: ``factored`` multiplies per node before gathering; ``plain`` multiplies the concatenation per edge. Same parameters, same result.
+        even_channels: channels of ``s``; used only by ``odd`` and ``odd_even``.
+        interaction: see the module's docstring; relations between two types accept only ``directed`` and ``negated``.
+        implementation: ``factored`` multiplies per node before gathering; ``plain`` multiplies the concatenation per edge. Parameters and results are the same.
     """
 
     def __init__(
@@ -89,14 +89,14 @@ class MomentumConv(MessagePassing):
         edges_at_once: int | None = None,
         overwrites: bool = False,
     ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-        """Sums of messages at the target nodes, at the source nodes, and the new edge states e_ij + m_ij, which need as many channels as the messages.
+        """Return the sums of messages at the target nodes and at the source nodes, and the new edge states e_ij + m_ij.
 
-        In a relation of one type with itself pass the same tensor twice: the first result then has what its nodes get as targets and as sources, and the
-        second is None. Without ``update_edges`` the last linear map is applied after the sum (it commutes), once per node instead of once per edge; the
-        new states are then None.
+        New edge states need as many channels as the messages. In a relation of one type with itself, pass the same tensor twice: the first result then
+        contains the sums at both ends, and the second is None. Without ``update_edges`` the new states are None, and the last linear map is applied after the
+        sum, once per node instead of once per edge (the two commute).
 
-        For inference: with ``edges_at_once``, what is computed on the way exists for so many edges only, and with ``overwrites``, new edge states may take
-        the place of the old ones in memory.
+        Two arguments save memory in inference. With ``edges_at_once``, intermediate results exist for this many edges at a time. With ``overwrites``, new
+        edge states may reuse the memory of the old ones.
         """
         size, is_joint = (h_source.shape[0], h_target.shape[0]), h_source is h_target
         if self._is_fused(h_source, h_target, e):
@@ -106,7 +106,7 @@ class MomentumConv(MessagePassing):
             terms = {"a": (h_source, h_target), "b": (None, None), "s": s}
         else:
             a, b, w, _ = self.lin_in.weight.split(self.widths, dim=1)
-            both = self.interaction != "negated"  # also z_ji is needed
+            both = self.interaction != "negated"  # z_ji is needed too
             at = functional.linear(h_target, a, self.lin_in.bias)
             bs = functional.linear(h_source, b)
             as_ = (at if is_joint else functional.linear(h_source, a, self.lin_in.bias)) if both else None
@@ -119,13 +119,13 @@ class MomentumConv(MessagePassing):
         if edges_at_once is not None and edges_at_once < edge_index.shape[1]:
             return self._in_parts(edge_index, e, w, terms, size, is_joint, update_edges, edges_at_once, overwrites)
         we = e if w is None else functional.linear(e, w)
-        at_target, at_source, messages = self.propagate(  # PyG reads these names, once, for all layers
+        at_target, at_source, messages = self.propagate(  # PyG reads these names once for all layers
             edge_index, size=size, a=terms["a"], b=terms["b"], e=we, s=terms["s"], is_joint=is_joint, with_messages=update_edges
         )
         return at_target, at_source, e + messages if update_edges else None
 
     def _is_fused(self, h_source: Tensor, h_target: Tensor, e: Tensor) -> bool:
-        """Whether the passes over the edges that are made for a CPU can do it, here and now."""
+        """Tell whether the fused passes for CPUs can be used in the present context."""
         kind = self.interaction == "negated" or (self.interaction == "odd" and h_source is h_target)
         return self.implementation == "factored" and kind and works_on(h_source, h_target, e)
 
@@ -159,11 +159,11 @@ class MomentumConv(MessagePassing):
         chunk: int,
         overwrites: bool,
     ) -> tuple[Tensor, MaybeTensor, MaybeTensor]:
-        """What follows the products per node, for ``chunk`` edges after the other."""
+        """Compute everything after the products per node, for ``chunk`` edges at a time."""
         count, width = edge_index.shape[1], self.lin_out.in_features
         sums = _zeros(e, width, size[1], size[0], is_joint)
         evens = None if self.lin_even is None else _zeros(e, width, size[1], size[0], is_joint)
-        directions, sign = e.split(count), 1  # of ``directed`` two
+        directions, sign = e.split(count), 1  # two for ``directed``
         new = None if not update_edges else e if overwrites else torch.empty_like(e)
         for first in range(0, count, chunk):
             part = slice(first, first + chunk)
@@ -186,7 +186,7 @@ class MomentumConv(MessagePassing):
     def message(
         self, a_i: MaybeTensor, a_j: MaybeTensor, b_i: MaybeTensor, b_j: MaybeTensor, e: Tensor, s: MaybeTensor
     ) -> tuple[Tensor, MaybeTensor]:
-        """φ(z_ij), and φ(z_ji) where the interaction needs it."""
+        """Return φ(z_ij), and φ(z_ji) if the interaction needs it."""
         if self.implementation == "plain":
             return self._odd_plain(a_i, a_j, e, s) if self.is_odd else self._plain(a_i, a_j, e)
         if self.interaction == "negated":
@@ -203,7 +203,7 @@ class MomentumConv(MessagePassing):
         return self.act(self.lin_in(torch.cat([h_i, h_j, forward], dim=1))), self.act(self.lin_in(torch.cat([h_j, h_i, reverse], dim=1)))
 
     def _odd_plain(self, h_i: Any, h_j: Any, e: Tensor, s: Any) -> tuple[Tensor, Tensor]:
-        """z_ij and z_ji as even part ± odd part, so that even without factoring every edge is multiplied once."""
+        """Return z_ij and z_ji as even part ± odd part, so that every edge is multiplied once even without factoring."""
         a, b, w, v = self.lin_in.weight.split(self.widths, dim=1)
         even = functional.linear(torch.cat([h_i + h_j, s], dim=1), torch.cat([(a + b) / 2, v], dim=1), self.lin_in.bias)
         odd = functional.linear(torch.cat([h_i - h_j, e], dim=1), torch.cat([(a - b) / 2, w], dim=1))
@@ -214,7 +214,7 @@ class MomentumConv(MessagePassing):
         z.add_(e, alpha=sign)  # in place: at these sizes a new buffer costs more than the sum
         if s is not None:
             v = self.lin_in.weight[:, -self.widths[3] :]
-            z.addmm_(s.to(z.dtype), v.t().to(z.dtype))  # which autocast leaves as they are
+            z.addmm_(s.to(z.dtype), v.t().to(z.dtype))  # autocast does not cast in-place products
         return self.act(z)
 
     def aggregate(
@@ -227,7 +227,7 @@ class MomentumConv(MessagePassing):
         is_joint: bool,
         with_messages: bool,
     ) -> tuple[Tensor, MaybeTensor, MaybeTensor]:
-        """Sums at targets and sources: +m and −m, or for ``directed`` each its own."""
+        """Sum at targets and sources: +m and −m, or for ``directed`` the message of each direction."""
         forward, reverse = inputs
         x, y, sign = self._outgoing(forward, reverse, with_messages)
         messages = None if not with_messages else torch.cat([x, y]) if self.interaction == "directed" else x
@@ -240,7 +240,7 @@ class MomentumConv(MessagePassing):
         return *self._finished(sums, evens, i, j, sign, with_messages), messages
 
     def _outgoing(self, forward: Tensor, reverse: Any, with_messages: bool) -> tuple[Tensor, Tensor, int]:
-        """What targets get, and what sources get with a sign: messages, or the activations before the last linear map."""
+        """Return what targets receive, what sources receive, and its sign: messages, or the activations before the last linear map."""
         x = forward - reverse if self.is_odd else forward
         y, sign = (reverse, 1) if self.interaction == "directed" else (x, -1)
         if not with_messages:
@@ -249,7 +249,7 @@ class MomentumConv(MessagePassing):
         return m, self.lin_out(y) if self.interaction == "directed" else m, sign
 
     def _finished(self, sums: Ends, evens: Ends | None, i: Tensor, j: Tensor, sign: int, are_messages: bool) -> Ends:
-        """Sums of messages, from sums of messages or of activations; and of even activations, where there are any."""
+        """Return sums of messages from sums of messages or activations, and from sums of even activations, if any."""
         at_target, at_source = sums if are_messages else self._to_messages(sums, i, j, sign)
         if self.lin_even is None or evens is None:
             return at_target, at_source
@@ -257,14 +257,14 @@ class MomentumConv(MessagePassing):
         return at_target + self.lin_even(even_target), at_source if even_source is None else at_source + self.lin_even(even_source)
 
     def _to_messages(self, sums: Ends, i: Tensor, j: Tensor, sign: int) -> Ends:
-        """Sums of messages from sums of activations, of edges with targets i and, with a sign, sources j."""
+        """Convert sums of activations to sums of messages, for edges with targets i and, with a sign, sources j."""
         at_target, at_source = sums
         if at_source is None:
             return self._last_linear(at_target, (i, 1), (j, sign)), None
         return self._last_linear(at_target, (i, 1)), self._last_linear(at_source, (j, sign))
 
     def _last_linear(self, total: Tensor, *ends: tuple[Tensor, int]) -> Tensor:
-        """The last linear map of a sum, with its bias as often as the ends name a node."""
+        """Apply the last linear map to a sum; its bias counts as often as the ends name a node."""
         y = functional.linear(total, self.lin_out.weight)
         if self.lin_out.bias is None:
             return y
@@ -275,12 +275,12 @@ class MomentumConv(MessagePassing):
 
 
 def _zeros(like: Tensor, width: int, num_target: int, num_source: int, is_joint: bool) -> Ends:
-    """Room for sums at targets and sources, or in one array for both."""
+    """Return zeros for the sums at targets and sources, or one array for both."""
     return like.new_zeros(num_target, width), None if is_joint else like.new_zeros(num_source, width)
 
 
 def _add(sums: Ends, x: Tensor, y: Tensor, i: Tensor, j: Tensor, sign: int) -> Ends:
-    """Adds x at the targets i, and ±y at the sources j, in place."""
+    """Add x at the targets i, and ±y at the sources j, in place."""
     at_target, at_source = sums
     at_target.index_add_(0, i, x)
     (at_target if at_source is None else at_source).index_add_(0, j, y, alpha=sign)

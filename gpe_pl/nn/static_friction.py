@@ -1,8 +1,9 @@
-"""Static friction: what lies on a wall and hardly moves stays where it is.
+"""Static friction: nodes that rest on a wall and hardly move keep their positions.
 
-A network is never exactly right, and what it is wrong by at rest adds up, frame by frame, to a heap that creeps. So nodes are held that are slower, before a
-step and after it, than a share of what gravity gives within a frame: what rests starts to move when more than this share of gravity is left over. What nothing
-supports gets all of it and falls. Only nodes are held that edges tie to a wall, directly or through others, and to none that moves.
+A network is never exact, and its errors at rest add up over frames, so that a heap creeps. A node is therefore kept in place if it is slower, before and after
+a step, than a fraction of the speed that gravity gives in one frame. A resting node starts to move when the unbalanced part of gravity exceeds this fraction.
+Unsupported nodes feel all of gravity and fall. Only nodes with edges to a wall at rest, directly or through other nodes, and with none to a moving wall, are
+kept in place.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from torch import Tensor
 
 
 def supported(is_free: Bool[Tensor, " island"], contacts: Iterable[tuple[Tensor, Tensor]]) -> Bool[Tensor, " island"]:
-    """Islands that touch walls, none of which moves.
+    """Return a mask of the islands that touch walls, none of which moves.
 
     Args:
         is_free: whether an island touches no wall.
-        contacts: for edges to walls, the island [edge] at one end and whether the wall at the other moves [edge].
+        contacts: for edges to walls, the island at one end [edge] and whether the wall at the other end moves [edge].
     """
     pushes = torch.zeros(is_free.shape[0], device=is_free.device)
     for island, is_moving in contacts:
@@ -34,6 +35,14 @@ def is_held(
     is_supported: Bool[Tensor, " island"],
     speed: Float[Tensor, ""],
 ) -> Bool[Tensor, " node"]:
-    """Nodes that stay where they are: in supported islands, and slower than ``speed`` [m/s] before and after a step."""
+    """Return a mask of the nodes that keep their positions.
+
+    Args:
+        before: velocities before the step [m/s].
+        after: velocities after the step [m/s].
+        island: island of each node.
+        is_supported: whether each island rests on walls, see ``supported``.
+        speed: speed below which a node keeps its position, both before and after the step [m/s].
+    """
     slow = (before.square().sum(dim=1) < speed**2) & (after.square().sum(dim=1) < speed**2)
     return slow & is_supported[island]

@@ -117,7 +117,7 @@ def test_stress_is_decoded_at_the_nodes_of_materials_that_have_one(dim: int) -> 
     none = scenes.to_dtype(build(scenes.state(5, ("elastomer",), dim=dim).to_torch()), DOUBLE)
     assert model(none).stress == {}
     assert GPE(build.spec, num_message_passing_steps=1, hidden_channels=8).double()(data).stress == {}
-    with pytest.raises(StressError, match="no stress is stored of sand"):
+    with pytest.raises(StressError, match="the data set stores no stress of sand"):
         GPE(scenes.builder().spec, num_message_passing_steps=1, hidden_channels=8, stress=True)
 
 
