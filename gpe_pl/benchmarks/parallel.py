@@ -1,6 +1,7 @@
-"""How many nodes per second data-parallel training takes in, with one process and with several that share the same batches.
+"""Benchmark of data-parallel training: nodes per second with one process, and with several that share the same batches.
 
-A step is what training does: build the graphs, forward and backward pass, sum the gradients over processes, clip, Adam. Sand on a jittered lattice.
+A step does what training does: build the graphs, forward and backward pass, sum the gradients over processes, clip, Adam. The scene is sand on a jittered
+lattice.
 """
 
 from __future__ import annotations
@@ -33,18 +34,18 @@ NUM_WARM_UPS = 3
 
 
 class ParallelError(GpeError, ValueError):
-    """So many processes cannot share this machine or these batches."""
+    """This number of processes cannot share this machine or these batches."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The problem, and how many processes share it.
+    """Size of the problem, and number of processes.
 
     Attributes:
-        num_processes: numbers to compare; the first one is what the others' speed-up is relative to.
-        num_graphs: of a step, over all processes.
-        num_nodes, num_edges: of a graph.
-        num_steps: timed; the median counts.
+        num_processes: numbers of processes to compare; speed-ups are relative to the first.
+        num_graphs: graphs per step, over all processes.
+        num_nodes, num_edges: nodes and edges per graph.
+        num_steps: number of timed steps; the median counts.
     """
 
     num_processes: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [1, 2])
@@ -59,7 +60,7 @@ class Settings:
 
 
 def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
-    """Records of step times [s], throughput [nodes/s] and speed-ups, and a Markdown table."""
+    """Return records of step times [s], throughput [nodes/s] and speed-ups, and a Markdown table."""
     most = max(settings.num_processes)
     if most > settings.num_graphs:
         raise ParallelError(f"suite.num_graphs={settings.num_graphs}: too few for {most} processes, each of which takes at least one")
@@ -89,7 +90,7 @@ def _ms(*times: float) -> list[str]:
 
 
 def step_times(settings: Settings, num_processes: int) -> list[tuple[float, float]]:
-    """Seconds of each step, and of its exchange of gradients, in a group of processes of their own, as the first one sees it."""
+    """Return seconds of each step, and of its exchange of gradients, as measured by the first process of a new group of processes."""
     with tempfile.TemporaryDirectory() as folder, ProcessPoolExecutor(num_processes, multiprocessing.get_context("spawn")) as pool:
         meeting = (Path(folder) / "rendezvous").as_uri()
         futures = [pool.submit(_times_on_rank, settings, rank, num_processes, meeting) for rank in range(num_processes)]

@@ -1,8 +1,8 @@
-"""Run time against error for solvers and learned models on the same axes: who is more accurate at equal cost, and cheaper at equal accuracy.
+"""Run time against error for solvers and learned models on the same axes: accuracy at equal cost, and cost at equal accuracy.
 
-The reference is the solver at half the spacing between nodes, and thereby at a substep at most half as long, with its observed order of convergence.
-Everything is compared with it, the solver that made the training data too: its error is the floor of what can be learned from them. Protocol after McGreivy
-and Hakim 2024 (arXiv 2407.07218): a solver always has a resolution to turn down, and only equal cost or equal accuracy may be compared.
+The reference is the solver at half the spacing between nodes, and thus with substeps at most half as long; its observed order of convergence is reported.
+Everything is compared with it, including the solver that made the training data, whose error is the floor of what can be learned from them. The protocol
+follows McGreivy and Hakim 2024 (arXiv 2407.07218): a solver can always run at a lower resolution, so only equal cost or equal accuracy may be compared.
 """
 
 from __future__ import annotations
@@ -52,23 +52,23 @@ HELD = ", held predictions"
 
 
 class ComparisonError(GpeError, ValueError):
-    """Nothing can be compared; the message says what is missing."""
+    """The comparison lacks something; the message says what."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is compared.
+    """Settings of the comparison.
 
     Attributes:
         cases: data sets, by name.
-        runs: folders of finished runs; the models among them that were trained on a case's data set take part.
-        factors: how many times coarser than the data the solver is also run.
-        step_factors: how many times longer its steps may also be, at the spacing of the data.
-        holds: frames for which a prediction is held, in further rungs of every model (``Skips.hold``).
-        split, num_trajectories: scenes.
-        horizons: frames over which errors are averaged; the full length is always added.
-        num_threads: of PyTorch; the solvers use one.
-        accelerator: where models run; the solvers run on the CPU.
+        runs: folders of finished runs; their models take part in the case whose data set they were trained on.
+        factors: factors by which the solver is also run at a coarser spacing than the data.
+        step_factors: factors by which the solver's steps may also be longer, at the spacing of the data.
+        holds: numbers of frames for which predictions are repeated, each a further variant of every model (``Skips.hold``).
+        split, num_trajectories: split and number of the scenes.
+        horizons: numbers of frames over which errors are averaged; the full length is always added.
+        num_threads: threads of PyTorch; the solvers use one.
+        accelerator: device of the models; the solvers run on the CPU.
     """
 
     cases: Annotated[dict[str, Case], Field(min_length=1)]
@@ -89,15 +89,15 @@ class Settings:
 
 @dataclass
 class Point:
-    """A simulator on the two axes.
+    """Cost and error of one simulator.
 
     Attributes:
-        name: of the simulator.
-        family: what kind it is.
+        name: name of the simulator.
+        family: kind of simulator.
         seconds: wall time over simulated time, of each scene.
-        mse: [m²] over the frames up to each horizon, of each scene; infinite where it failed.
-        distance: energy distance [m] to the reference in the last frame, of each scene: a difference of distributions, for when the error of single nodes
-            says nothing any more.
+        mse: mean square error [m²] over the frames up to each horizon, of each scene; infinite if it failed.
+        distance: energy distance [m] to the reference in the last frame, of each scene. It compares distributions, for times at which errors of single nodes
+            carry no information.
         overhead: seconds of training and of generating its data.
     """
 
@@ -117,7 +117,7 @@ class Point:
 
 
 def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
-    """Records of every simulator in every case, and a Markdown table per case with a section on where learning loses."""
+    """Return records of every simulator in every case, and a Markdown table per case with a section on where learned models lose."""
     torch.set_num_threads(settings.num_threads)
     records: list[dict[str, Any]] = []
     parts = []
@@ -137,7 +137,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
 
 
 def _models(runs: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[str, tuple[LearnedSimulator, float]]:
-    """Trained simulators, also with predictions held for some frames, and the seconds of their training, by label."""
+    """Return trained simulators, with variants that repeat predictions, and the seconds of their training, by label."""
     found = {}
     for label, (simulator, run) in trained_on(spec, runs).items():
         seconds = training_seconds(run)
@@ -150,7 +150,7 @@ def _models(runs: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[
 
 
 def training_seconds(run: Run) -> float:
-    """Steps of a run times the step time that its sweep measured, for which its budget was enough; NaN where none was measured."""
+    """Return the number of steps of a run times its measured step time; NaN if the sweep measured none."""
     path = next((p for folder in run.folder.parents if (p := folder / "step_times.json").exists()), None)
     model = str(run.config["model._target_"]).rpartition(".")[2]
     about = f"{run.config['data.name']} {run.config['size.name']} {model} "
@@ -160,7 +160,7 @@ def training_seconds(run: Run) -> float:
 
 
 def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]], settings: Settings) -> tuple[list[Point], float]:
-    """All simulators on the same scenes, and the solver's observed order of convergence."""
+    """Run all simulators on the same scenes; return their points and the solver's observed order of convergence."""
     history = max(simulator.builder.config.history for simulator, _ in models.values())
     points: dict[str, Point] = {}
     orders = []
@@ -189,7 +189,7 @@ def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]]
 
 @dataclass(frozen=True)
 class _Restricted:
-    """Where a simulator starts, how the positions of its nodes become those of the scene's, and for how many frames a step of it is."""
+    """Start state of a simulator, the map from its nodes' positions to those of the scene, and the number of frames per step."""
 
     resolved: Resolved
     from_start: bool
@@ -204,7 +204,7 @@ def _simulators(
     history: int,
     settings: Settings,
 ) -> Iterator[tuple[str, Family, Simulator, _Restricted]]:
-    """Solvers start with the scene, the others where learned models have the history they need."""
+    """Yield the simulators: solvers start with the scene, the others at the frame where learned models have the history they need."""
     same = Resolved(start, lambda pos: pos)
     yield DATA, "solver", spec.solver, _Restricted(same, True)
     for factor in settings.factors:
@@ -229,7 +229,7 @@ def _simulators(
 
 
 def _solver(spec: DatasetSpec, factor: float) -> Any | None:
-    """The solver for nodes so many times farther apart: on a grid as much coarser, if it has one; None where that does not fit the domain."""
+    """Return the solver for a node spacing ``factor`` times as large, with a grid as much coarser, if any; None if it does not fit the domain."""
     solver: Any = spec.solver
     spacing = getattr(solver, "grid_spacing", None)
     if spacing is None:
@@ -244,8 +244,9 @@ def _solver(spec: DatasetSpec, factor: float) -> Any | None:
 
 
 def _with_longer_steps(spec: DatasetSpec, factor: int) -> Any | None:
-    """The solver with frames, and by its own criterion substeps, so many times as long, up to one cell; None for one without a grid, whose substeps are as long
-    as is stable.
+    """Return the solver with frames and (by its criterion) substeps ``factor`` times as long, up to one cell.
+
+    Return None for a solver without a grid, whose substeps are already as long as is stable.
     """
     solver: Any = spec.solver
     if getattr(solver, "grid_spacing", None) is None:
@@ -254,7 +255,7 @@ def _with_longer_steps(spec: DatasetSpec, factor: int) -> Any | None:
 
 
 def _reference(spec: DatasetSpec, start: State, data: Trajectory) -> Trajectory:
-    """The solver at half the spacing, seen at the nodes of the scene."""
+    """Run the solver at half the spacing, and restrict it to the nodes of the scene."""
     resolved = finer(start, spec.scene.spacing)
     prediction, _ = _timed(_solver(spec, 0.5), _Restricted(resolved, True), data, 0)
     if prediction.num_frames < data.num_frames:
@@ -263,7 +264,7 @@ def _reference(spec: DatasetSpec, start: State, data: Trajectory) -> Trajectory:
 
 
 def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Trajectory, num_frames: int = 20) -> float:
-    """P = log₂ |u_h − u_{h/2}| / |u_2h − u_h| over the first frames, while solutions still are close to each other; NaN where 2h does not fit."""
+    """Return P = log₂ |u_h − u_{h/2}| / |u_2h − u_h| over the first frames, while solutions are still close; NaN if 2h does not fit."""
     solver = _solver(spec, 2.0)
     try:
         resolved = coarser(start, spec.scene.spacing, 2.0)
@@ -281,9 +282,9 @@ def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Traject
 
 
 def _timed(simulator: Any, at: _Restricted, data: Trajectory, history: int) -> tuple[Trajectory, float]:
-    """A rollout from frame ``history`` to the end of the data, at the nodes of the scene, and its wall time over its simulated time.
+    """Run from frame ``history`` to the end of the data; return the rollout at the nodes of the scene, and its wall time over its simulated time.
 
-    The first step is taken twice and timed once: compilation and first use of memory are not part of it. A rollout that fails ends there. Frames within a step
+    The first step runs twice and is timed once, so that compilation and first use of memory do not count. A failed rollout ends early. Frames within a step
     are interpolated.
     """
     state: Any = at.resolved.state
@@ -322,7 +323,7 @@ def _numpy(state: State) -> Frame:
 
 
 def _squared_error(prediction: Trajectory, truth: Trajectory) -> np.ndarray:
-    """Mean over nodes and axes [m²] of every frame; infinite in those that the prediction lacks. Frame 0 need not be the same: another resolution made it."""
+    """Return the mean over nodes and axes of every frame [m²]; infinite for missing frames. Frame 0 may differ, because another resolution made it."""
     error = np.full(truth.num_frames, np.inf)
     count = prediction.num_frames
     error[:count] = np.square(prediction.pos.astype(np.float64) - truth.pos[:count]).mean(axis=(1, 2))
@@ -339,7 +340,7 @@ def _distance(prediction: Trajectory, truth: Trajectory) -> float:
 
 
 def front(points: Sequence[Point], horizon: str) -> list[Point]:
-    """Those that no other one beats in both cost and error, from the cheapest on."""
+    """Return the points that no other point beats in both cost and error, from the cheapest on."""
     best: list[Point] = []
     for point in sorted(points, key=lambda p: (p.cost, p.error(horizon))):
         if np.isfinite(point.error(horizon)) and (not best or point.error(horizon) < best[-1].error(horizon)):
@@ -348,7 +349,7 @@ def front(points: Sequence[Point], horizon: str) -> list[Point]:
 
 
 def hypervolume(points: Sequence[Point], horizon: str, worst: tuple[float, float]) -> float:
-    """Area in decades² that the points dominate, up to the worst cost and error: larger is better."""
+    """Return the area in decades² that the points dominate, up to the worst cost and error; larger is better."""
     area, limit = 0.0, worst[1]
     for point in front(points, horizon):
         if point.cost < worst[0] and point.error(horizon) < limit:
@@ -358,7 +359,7 @@ def hypervolume(points: Sequence[Point], horizon: str, worst: tuple[float, float
 
 
 def cost_at_error(points: Sequence[Point], error: float, horizon: str) -> float:
-    """Cost of a solver of that error: interpolated along the front on logarithmic axes; that of the cheapest for larger errors, infinite for smaller ones."""
+    """Return the cost of a solver of this error, interpolated along the logarithmic front; the cheapest cost for larger errors, infinite for smaller ones."""
     best = front(points, horizon)
     if not best or error < best[-1].error(horizon):
         return float("inf")
@@ -370,7 +371,7 @@ def cost_at_error(points: Sequence[Point], error: float, horizon: str) -> float:
 
 
 def error_at_cost(points: Sequence[Point], cost: float, horizon: str) -> float:
-    """Error of a solver of that cost, the other way round: that of the most accurate for larger costs, infinite for smaller ones."""
+    """Return the error of a solver of this cost, as ``cost_at_error``; the smallest error for larger costs, infinite for smaller ones."""
     best = front(points, horizon)
     if not best or cost < best[0].cost:
         return float("inf")
@@ -378,7 +379,7 @@ def error_at_cost(points: Sequence[Point], cost: float, horizon: str) -> float:
 
 
 def break_even(point: Point, solvers: Sequence[Point], horizon: str, duration: float) -> float:
-    """Rollouts of a duration [s] after which training has paid off against an error-equivalent solver; infinite if never."""
+    """Return the number of rollouts of a duration [s] after which training has paid off against a solver of the same error; infinite if never."""
     saved = (cost_at_error(solvers, point.error(horizon), horizon) - point.cost) * duration
     if saved <= 0:
         return float("inf")
@@ -413,7 +414,7 @@ def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[
 
 
 def _points(records: Sequence[dict[str, Any]], case: str) -> list[Point]:
-    """The points that ``_records`` wrote."""
+    """Read the points that ``_records`` wrote."""
     points: dict[str, Point] = {}
     for r in records:
         if r["case"] == case and "simulator" in r:
@@ -465,7 +466,7 @@ def _pays_off(seconds: float) -> str:
 
 
 def _against(point: Point, solvers: Sequence[Point], horizon: str) -> str:
-    """A model's cell: below 1 it loses."""
+    """Return a model's table cell; below 1 the model loses."""
     needed = cost_at_error(solvers, point.error(horizon), horizon)
     if needed <= point.cost:
         return f"{needed / point.cost:.2g}"
@@ -477,7 +478,7 @@ def _against(point: Point, solvers: Sequence[Point], horizon: str) -> str:
 
 
 def verdicts(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:
-    """Of every horizon, whether a learned model passes below the solvers' front; if none does, what the nearest one lacks."""
+    """Tell for every horizon whether a learned model lies below the solvers' front; if none does, what the nearest one lacks."""
     solvers = [p for p in points if p.family == "solver"]
     learned = [p for p in points if p.family == "learned"]
     for horizon in horizons:
@@ -507,7 +508,7 @@ def _none_as_accurate(learned: Sequence[Point], cheapest: Point, horizon: str) -
 
 
 def _rounded(factor: float) -> str:
-    """Two digits, without an exponent."""
+    """Format with two digits, without an exponent."""
     return f"{float(f'{factor:.2g}'):g}"
 
 
@@ -519,7 +520,7 @@ def _interval(values: list[float], scale: float) -> str:
 
 
 def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
-    """Cost against error, a figure per case."""
+    """Draw cost against error, a figure per case."""
     from gpe_pl.viz.comparison import CostAndError, cost_error_figure
 
     found = {}

@@ -1,4 +1,4 @@
-"""How the cost of a rollout step grows with the number of nodes, in two and three dimensions: time, memory, and the exponent between."""
+"""Benchmark of scaling: time and memory of a rollout step against the number of nodes, in 2D and 3D, with the fitted exponent."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 EDGES_PER_NODE = {2: 9.6, 3: 15.0}
-"""Undirected edges of a node in the data sets' graphs."""
+"""Number of undirected edges per node in the data sets' graphs, by dimension."""
 NUM_PAIRS = 3
-"""Of forward passes with and without ordered nodes, each of which takes seconds."""
+"""Number of timed pairs of forward passes with and without ordered nodes; each pass takes seconds."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Which scenes and which model.
+    """Settings of scenes and model.
 
     Attributes:
         num_nodes: sizes of the scenes.
-        dimensions: of the scenes.
+        dimensions: dimensions of the scenes.
         fitted: range of sizes over which the exponent is fitted, and whose ends are compared per edge.
-        budget: seconds that repetitions of one size may take; the fastest counts.
+        budget: time [s] that repetitions of one size may take; the fastest counts.
     """
 
     num_nodes: Annotated[list[Annotated[int, Field(ge=10)]], Field(min_length=1)] = field(default_factory=lambda: [1000, 10_000, 100_000])
@@ -69,7 +69,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Step:
-    """A rollout step in two parts, and how many edges it has."""
+    """A rollout step in two parts, and its number of edges."""
 
     graph: Callable[[], Any]
     forward: Callable[[], Any]
@@ -77,7 +77,7 @@ class Step:
 
 
 def prepare(settings: Settings, num_nodes: int, dim: int, skips: Skips | None = None) -> Step:
-    """A step of a lattice: building its graph, and the model's forward pass."""
+    """Prepare a step on a lattice: building its graph, and the model's forward pass."""
     torch.manual_seed(settings.seed)
     builder, state = lattice_scene(num_nodes, int(EDGES_PER_NODE[dim] * num_nodes), GraphConfig(), dim)
     graph = builder(state).to(settings.device)
@@ -95,13 +95,13 @@ def prepare(settings: Settings, num_nodes: int, dim: int, skips: Skips | None = 
 
 
 def whole_step(settings: Settings, num_nodes: int, dim: int) -> Callable[[], Any]:
-    """A step as one function, for the measurement of its memory."""
+    """Return a step as one function, for measuring its memory."""
     step = prepare(settings, num_nodes, dim)
     return lambda: (step.graph(), step.forward())
 
 
 def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
-    """Records of times [s], memory [B] and exponents per dimension, and a Markdown table."""
+    """Return records of times [s], memory [B] and exponents per dimension, and a Markdown table."""
     torch.set_num_threads(settings.num_threads)
     records: list[dict[str, Any]] = []
     lines = []
@@ -147,7 +147,7 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
 
 
 def _sorted_time_ratio(settings: Settings, num_nodes: int, dim: int) -> float:
-    """Time of a forward pass with nodes in the order of edges over that as they come: median over pairs."""
+    """Return the time of a forward pass with nodes in the order of edges over that with nodes in the original order; median over pairs."""
     alternatives = {
         name: prepare(settings, num_nodes, dim, skips).forward
         for name, skips in (("sorted", Skips()), ("as they come", Skips(sorted_from=None)))
@@ -156,7 +156,7 @@ def _sorted_time_ratio(settings: Settings, num_nodes: int, dim: int) -> float:
 
 
 def _fastest(function: Callable[[], Any], budget: float) -> float:
-    """Seconds of the fastest call, one at least after one that does not count."""
+    """Return the seconds of the fastest call; there is at least one timed call, after one that does not count."""
     function()
     times: list[float] = []
     while not times or sum(times) < budget:
@@ -167,7 +167,7 @@ def _fastest(function: Callable[[], Any], budget: float) -> float:
 
 
 def _fit(rows: list[tuple[int, float, float]], fitted: tuple[int, int], dim: int) -> list[dict[str, Any]]:
-    """The exponent p of time ∝ Nᵖ by least squares of the logarithms, and the time per edge and layer at the larger end over that at the smaller."""
+    """Fit the exponent p of time ∝ Nᵖ by least squares of the logarithms; also return the ratio of times per edge and layer at the ends of the range."""
     inside = sorted(row for row in rows if fitted[0] <= row[0] <= fitted[1])
     if len(inside) < 2:
         return []
@@ -214,7 +214,7 @@ def _ordered(records: list[dict[str, Any]]) -> Iterator[str]:
 
 
 def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
-    """Time and memory against the number of nodes."""
+    """Draw time and memory against the number of nodes."""
     from gpe_pl.viz.figures import scaling_figure
 
     def curves(metric: str) -> dict[str, dict[int, float]]:

@@ -1,4 +1,4 @@
-"""What a step costs when a scene grows by what does not matter: distant walls, falling particles, materials that others have, piles that have come to rest."""
+"""Benchmark of skipping: the cost of a step when a scene grows by irrelevant parts: distant walls, falling particles, absent materials, piles at rest."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ from gpe_pl.trajectory.state import State
 
 MATERIALS = ("sand", "snow", "fluid")
 FAR = 5.0
-"""Where things are put that the scene, of unit size, does not reach."""
+"""Position of the added parts, out of reach of the scene, which has unit size."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The scene that matters, and how much of what does not is added.
+    """Settings of the scene and of the irrelevant parts.
 
     Attributes:
-        num_boundary: boundary nodes out of reach.
-        num_falling: particles in free fall without neighbours.
-        num_settled: copies of the scene at rest, far from each other.
-        holds: frames for which one prediction is held.
-        seed: of the weights.
+        num_boundary: number of boundary nodes out of reach.
+        num_falling: number of particles in free fall without neighbours.
+        num_settled: number of copies of the scene at rest, far from each other.
+        holds: numbers of frames for which one prediction is repeated.
+        seed: seed of the weights.
     """
 
     num_nodes: Annotated[int, Field(ge=10)] = 2500
@@ -65,14 +65,14 @@ class Settings:
 
 @dataclass(frozen=True)
 class Growth:
-    """A scene that has grown.
+    """A grown scene.
 
     Attributes:
-        metric: name of the share that a step takes longer.
-        amount: of what was added.
-        state: of the grown scene.
-        builder: of its graphs.
-        on, off: with the level that skips it, and without.
+        metric: name of the metric: the fraction by which a step takes longer.
+        amount: amount that was added, in words.
+        state: state of the grown scene.
+        builder: builder of its graphs.
+        on, off: skips with and without the level that skips the added part.
     """
 
     metric: str
@@ -84,13 +84,13 @@ class Growth:
 
 
 def scene_of(settings: Settings) -> tuple[GraphBuilder, State]:
-    """What matters: a moving lattice without gravity, so that what is put beside it can rest."""
+    """Return the relevant scene: a moving lattice without gravity, so that parts beside it can rest."""
     builder, scene = lattice_scene(settings.num_nodes, settings.num_edges, GraphConfig())
     return builder, replace(scene, gravity=torch.zeros_like(scene.gravity)).to_torch(settings.device)
 
 
 def growths(settings: Settings, builder: GraphBuilder, scene: State) -> list[Growth]:
-    """All that a scene is grown by."""
+    """Return all ways in which a scene grows."""
     found = []
     for n in settings.num_boundary:
         found.append(
@@ -110,7 +110,7 @@ def growths(settings: Settings, builder: GraphBuilder, scene: State) -> list[Gro
 
 
 def simulator(settings: Settings, edge_state: EdgeState, builder: GraphBuilder, skips: Skips) -> LearnedSimulator:
-    """A model with random weights; its accelerations are so small that what rests stays at rest."""
+    """Return a model with random weights, whose accelerations are so small that nodes at rest stay at rest."""
     torch.manual_seed(settings.seed)
     model = GPE(
         builder.spec,
@@ -125,7 +125,7 @@ def simulator(settings: Settings, edge_state: EdgeState, builder: GraphBuilder, 
 
 
 def absent_material_calls(settings: Settings, skips: Skips) -> int:
-    """Calls of what belongs to a material that the scene has none of, in a step of a model that knows it."""
+    """Count the calls of modules for a material of the model that is absent from the scene, in one step."""
     builder, state = _with_absent_materials(*scene_of(settings))
     made = simulator(settings, settings.edge_states[0], builder, skips)
     absent, count = MATERIALS[1:], 0
@@ -142,7 +142,7 @@ def absent_material_calls(settings: Settings, skips: Skips) -> int:
 
 
 def message_passing_calls(settings: Settings, builder: GraphBuilder, scene: State, skips: Skips) -> int:
-    """Calls of message-passing layers, and node updates of more than one row, in a step of nothing but falling nodes."""
+    """Count the calls of message-passing layers, and the node updates of more than one row, in a step with falling nodes only."""
     made = simulator(settings, settings.edge_states[0], builder, skips)
     count = 0
 
@@ -159,7 +159,7 @@ def message_passing_calls(settings: Settings, builder: GraphBuilder, scene: Stat
 
 
 def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
-    """Records of step times [s] and of the share by which each growth makes a step longer, with its level on and off, and a Markdown table."""
+    """Return records of step times [s] and of the fraction by which each growth makes a step longer, with its level on and off, and a Markdown table."""
     torch.set_num_threads(settings.num_threads)
     builder, scene = scene_of(settings)
     records: list[dict[str, Any]] = []
@@ -196,7 +196,7 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
 
 
 def _hold_time_ratio(settings: Settings, edge_state: EdgeState, builder: GraphBuilder, scene: State, hold: int) -> float:
-    """Time of ``hold`` frames with one prediction over that with a prediction for each."""
+    """Return the time of ``hold`` frames with one repeated prediction over that with a prediction for each frame."""
 
     def frames(skips: Skips) -> Callable[[], State]:
         runner = approximate(simulator(settings, edge_state, builder, skips))
@@ -237,7 +237,7 @@ def _table(settings: Settings, num_edges: int, lines: list[str], records: list[d
 
 
 def _step(runner: Simulator, state: State) -> Callable[[], State]:
-    """A step of a state, from which the level has come into effect."""
+    """Return a step from a state in which the level has taken effect."""
     for _ in range(2):
         state = replace(runner.step(state), pos=state.pos, vel=state.vel, velocity_history=state.velocity_history)
     return lambda: runner.step(state)
@@ -247,7 +247,7 @@ NODE_FIELDS = ("pos", "vel", "velocity_history", "node_type", "mass", "material_
 
 
 def _joined(scene: State, pos: torch.Tensor, vel: torch.Tensor) -> State:
-    """The scene and further nodes of sand, which have always moved as they do."""
+    """Add nodes of sand with constant velocities to the scene."""
     assert scene.velocity_history is not None
     rows = torch.zeros(len(pos), dtype=torch.int64, device=pos.device)
     more = {name: getattr(scene, name)[rows] for name in NODE_FIELDS}
@@ -265,7 +265,7 @@ def _with_walls(scene: State, count: int) -> State:
 
 
 def _falling(scene: State, count: int) -> State:
-    """Nothing but nodes in free fall, one spacing of the unit apart."""
+    """Return a scene of nodes in free fall, one unit apart."""
     side = int(np.ceil(count ** (1 / scene.dim)))
     lattice = np.stack(np.unravel_index(np.arange(count), (side,) * scene.dim), axis=-1)
     pos = FAR + torch.from_numpy(lattice.astype(float)).to(scene.pos.device)

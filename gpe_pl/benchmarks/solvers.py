@@ -1,4 +1,4 @@
-"""How fast the ground-truth solvers are: particle-substeps per second and core, time per frame, and trajectories per minute of whole data sets."""
+"""Benchmark of the ground-truth solvers: particle-substeps per second and core, time per frame, and trajectories per minute of whole data sets."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class BenchmarkError(GpeError):
 
 @dataclass(frozen=True)
 class Case:
-    """One data set to time.
+    """A data set to time.
 
     Attributes:
-        overrides: of ``python -m gpe_pl.simulate``.
-        prototype: figures of an earlier implementation to print beside ours.
+        overrides: overrides of ``python -m gpe_pl.simulate``.
+        prototype: figures of an earlier implementation, printed beside the measured ones.
     """
 
     overrides: list[str]
@@ -38,13 +38,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Settings:
-    """What is timed.
+    """Settings of the benchmark.
 
     Attributes:
-        cases: by label.
-        num_trajectories: per case, at evenly spread training indices.
-        num_frames: of each, from the start.
-        num_workers: processes that simulate at the same time, one core each.
+        cases: data sets, by label.
+        num_trajectories: trajectories per case, at evenly spaced training indices.
+        num_frames: number of frames of each, from the start.
+        num_workers: number of processes that simulate at the same time, one core each.
     """
 
     cases: Annotated[dict[str, Case], Field(min_length=1)]
@@ -55,12 +55,12 @@ class Settings:
 
 @dataclass(frozen=True)
 class Timing:
-    """One simulated trajectory.
+    """Time and size of one simulated trajectory.
 
     Attributes:
-        seconds: of simulation, kernels compiled beforehand.
-        num_frames, num_nodes, num_substeps: simulated.
-        num_bytes, num_stored_bytes: of its arrays, in memory and in a shard.
+        seconds: time of the simulation; kernels are compiled beforehand.
+        num_frames, num_nodes, num_substeps: numbers of simulated frames, nodes and substeps.
+        num_bytes, num_stored_bytes: sizes of its arrays in memory and in a shard.
     """
 
     seconds: float
@@ -74,7 +74,7 @@ class Timing:
 def simulate(spec: DatasetSpec, index: int, num_frames: int) -> Timing:
     """Simulate and store the first frames of a training trajectory."""
     state, metadata = initial_state(spec, "train", index), trajectory_metadata(spec, "train", index)
-    rollout(spec.solver, state, 1, metadata)  # loads the kernels
+    rollout(spec.solver, state, 1, metadata)  # loads the kernels before timing
     substeps: list[int] = []
     started = time.perf_counter()
     trajectory = rollout(spec.solver, state, num_frames, metadata, on_frame=lambda _, frame: substeps.append(frame.num_substeps))
@@ -88,7 +88,7 @@ def simulate(spec: DatasetSpec, index: int, num_frames: int) -> Timing:
 
 
 def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
-    """Records per case, and a Markdown table."""
+    """Return records per case, and a Markdown table."""
     records: list[dict[str, Any]] = []
     lines = []
     with ProcessPoolExecutor(settings.num_workers, multiprocessing.get_context("spawn")) as pool:

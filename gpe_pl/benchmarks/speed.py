@@ -1,7 +1,7 @@
-"""How long a forward pass and a training step take: every interaction, plain and fast, and the baselines, on the same nodes, edges, width and depth.
+"""Benchmark of speed: time of a forward pass and a training step for every interaction, plain and fast, and the baselines, on the same graph and size.
 
-The floor of a case is the time of its own matrix products, counted operation by operation, at the rate that the machine reaches in them; beside it stands the
-time of moving every edge state in and out once per layer.
+The floor of a case is the time of its matrix products, counted operation by operation, at the machine's measured rate. The second floor is the time of moving
+every edge state in and out once per layer.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 INTERACTIONS: tuple[Interaction, ...] = ("directed", "negated", "odd", "odd_even")
 REFERENCE = "directed, plain"
-"""Concatenated features, one product per directed edge: how message passing is usually written."""
+"""Reference case: concatenated features and one product per directed edge, the usual form of message passing."""
 SAND = "sand"
 MEDIUM = ", medium"
 
@@ -64,7 +64,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Case:
-    """A model to time: one of GPE's variants, or a baseline."""
+    """A model to time: a variant of GPE, or a baseline."""
 
     model: Literal["GPE", "GNS", "DPINet", "ContinuousConvNet"] = "GPE"
     interaction: Interaction = "negated"
@@ -75,8 +75,8 @@ class Case:
     precision: Literal["highest", "medium"] = "highest"
 
     def runs(self, function: Callable[[], Any]) -> Callable[[], Any]:
-        """The function as this case has it: with its precision of single-precision products (``medium`` allows bfloat16 inside), and without fused passes
-        where it has none.
+        """Wrap the function with the settings of this case: the precision of float32 products (``medium`` allows bfloat16 inside), and no fused passes if
+        it has none.
         """
 
         def call() -> Any:
@@ -92,7 +92,7 @@ class Case:
 
     @property
     def saves_against(self) -> str | None:
-        """The case which computes both directions of an edge in the same way otherwise."""
+        """Name of the case that computes both directions of an edge and is the same otherwise, or None."""
         if self.model != "GPE" or self.edge_state != "latent" or self.compiled or self.precision != "highest":
             return None
         if self.implementation == "plain":
@@ -100,7 +100,7 @@ class Case:
         return None if self.is_fused else "directed, factored"
 
     def build(self, spec: FeatureSpec, num_steps: int, hidden: int, seed: int = 0) -> nn.Module:
-        """The model, with the same weights for the same parameters."""
+        """Build the model; equal parameters get equal weights in all cases."""
         torch.manual_seed(seed)
         if self.model == "GNS":
             return GNS(spec, num_steps, hidden)
@@ -119,7 +119,7 @@ class Case:
 
 
 def cases(compiled: bool, reduced: bool) -> dict[str, Case]:
-    """All that is timed, by name, the reference first; with ``torch.compile``, and with products of reduced precision, where the machine has them."""
+    """Return all timed cases by name, the reference first; ``torch.compile`` and products of reduced precision are included if the machine has them."""
     found = {f"{i}, plain": Case(interaction=i, implementation="plain") for i in INTERACTIONS}
     found |= {f"{i}, factored": Case(interaction=i, is_fused=False) for i in INTERACTIONS}
     found |= {i: Case(interaction=i) for i in ("negated", "odd")}
@@ -133,14 +133,14 @@ def cases(compiled: bool, reduced: bool) -> dict[str, Case]:
 
 
 def flop(model: nn.Module, graph: HeteroData) -> int:
-    """Floating-point operations of the matrix products of a forward pass. On the meta device, where fused passes step aside and every product is seen."""
+    """Count the floating-point operations of a forward pass's matrix products, on the meta device, where no fused passes hide products."""
     with torch.inference_mode(), FlopCounterMode(display=False) as counter:
         model.to("meta")(graph.clone().to("meta"))
     return int(counter.get_total_flops())
 
 
 def edge_bytes(case: Case, spec: FeatureSpec, graph: HeteroData, settings: Settings) -> int:
-    """Bytes of edge states that a forward pass of GPE reads and writes at least: latent ones in and out in all layers but the last, which only reads."""
+    """Return the least bytes of edge states that a forward pass of GPE moves: latent states in and out in all layers but the last, which only reads."""
     edges = sum(graph[r].edge_index.shape[1] * (2 if case.interaction == "directed" else 1) for r in spec.relations)
     if case.edge_state == "geometry":
         channels = next(spec.odd_channels[r] + spec.even_channels[r] for r in spec.relations)
@@ -149,13 +149,13 @@ def edge_bytes(case: Case, spec: FeatureSpec, graph: HeteroData, settings: Setti
 
 
 def forward_pass(case: Case, settings: Settings) -> Callable[[], Any]:
-    """A forward pass in inference, its graph and model built."""
+    """Return a forward pass in inference, with graph and model already built."""
     model, graph = _built(case, settings)
     return synchronized(case.runs(torch.inference_mode()(lambda: model(graph))), settings.device)
 
 
 def training_pass(case: Case, settings: Settings) -> Callable[[], Any]:
-    """A training step, its graph and model built."""
+    """Return a training step, with graph and model already built."""
     return synchronized(case.runs(training_step(*_built(case, settings))), settings.device)
 
 
@@ -167,7 +167,7 @@ def _built(case: Case, settings: Settings) -> tuple[nn.Module, HeteroData]:
 
 
 def training_step(model: nn.Module, graph: HeteroData) -> Callable[[], Any]:
-    """Forward and backward pass, clipping and Adam with learning rate zero."""
+    """Return a step of forward and backward pass, clipping, and Adam with learning rate zero."""
     optimizer = torch.optim.Adam(model.parameters(), lr=0.0, fused=True)
 
     def step() -> Tensor:
@@ -183,13 +183,13 @@ def training_step(model: nn.Module, graph: HeteroData) -> Callable[[], Any]:
 
 def _compiled(model: nn.Module, device: str) -> nn.Module:
     fast: Any = model
-    mode = "reduce-overhead" if device == "cuda" else None  # CUDA graphs
+    mode = "reduce-overhead" if device == "cuda" else None  # uses CUDA graphs
     fast.compute = torch.compile(fast.compute, dynamic=device != "cuda", mode=mode)
     return model
 
 
 def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
-    """Records of times [s], paired ratios, floors and memory, and a Markdown table."""
+    """Return records of times [s], paired ratios, floors and memory, and a Markdown table."""
     torch.set_num_threads(settings.num_threads)
     device = settings.device
     builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
@@ -197,7 +197,7 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
     num_edges = sum(graph[r].edge_index.shape[1] for r in spec.relations)
     compiles = settings.compile and (device != "cpu" or has_cpp_compiler())
     if settings.compile and not compiles:
-        log.warning("suite.compile: no C++ compiler here, so nothing is timed with torch.compile")
+        log.warning("suite.compile: found no C++ compiler, so the cases with torch.compile are left out")
     todo = cases(compiles, reduces_precision(device))
     forward = _beside_the_reference(forward_pass, todo, settings, settings.num_rounds, "forward passes")
     training = _beside_the_reference(training_pass, todo, settings, max(1, settings.num_rounds // 2), "training steps")
@@ -247,7 +247,7 @@ class Timing:
 def _beside_the_reference(
     make: Callable[[Case, Settings], Callable[[], Any]], todo: dict[str, Case], settings: Settings, num_rounds: int, what: str
 ) -> dict[str, Timing]:
-    """Every case in turns with the reference, either in a process of its own. Only these two are there at a time, as a training step may keep gigabytes."""
+    """Time every case in turns with the reference, each in a separate process. Only these two exist at a time, because a training step may keep gigabytes."""
     found = {}
     with apart({REFERENCE: partial(make, todo[REFERENCE], settings)}) as reference:
         for name, case in todo.items():
@@ -259,7 +259,7 @@ def _beside_the_reference(
 
 
 def _graph_records(settings: Settings) -> list[dict[str, Any]]:
-    """Neighbour search, and the whole graph with its features, apart from the model."""
+    """Return records of the neighbour search, and of the whole graph with its features, without the model."""
     builder, state = lattice_scene(settings.num_nodes, settings.num_edges, GraphConfig())
     pos = state.pos.numpy()
     functions: dict[str, Callable[[], Any]] = {
@@ -290,7 +290,7 @@ def _cells(values: dict[str, float]) -> list[str]:
 
 
 def table(settings: Settings, num_edges: int, records: list[dict[str, Any]]) -> str:
-    """Markdown of the records of a run."""
+    """Return the Markdown table of the records of a run."""
     header = [
         *("model", "forward [ms]", "faster", "than GNS", "saved [%]", "product floor [ms]", "byte floor [ms]", "over floor"),
         *("training [ms]", "faster", "memory [MB]", "training [MB]"),

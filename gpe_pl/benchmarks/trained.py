@@ -1,4 +1,4 @@
-"""What suites are given: data sets, and folders of runs whose models were trained on them."""
+"""Inputs of suites: data sets, and folders of runs whose models were trained on them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.reports.finished_runs import Run, axes_of, finished_runs
 
 DEPTHS = ("num_message_passing_steps", "num_propagation_steps", "num_convolutions")
-"""What models call the number of their layers."""
+"""Names that models give to their number of layers."""
 
 
 LENGTHS = ("training.num_steps", "training.val_interval", "training.budget_minutes")
@@ -21,19 +21,20 @@ LENGTHS = ("training.num_steps", "training.val_interval", "training.budget_minut
 
 @dataclass(frozen=True)
 class Case:
-    """A data set: what ``python -m gpe_pl.simulate`` would be given."""
+    """A data set, given by the overrides of ``python -m gpe_pl.simulate``."""
 
     overrides: list[str]
 
 
 def runs_in(folders: Sequence[str]) -> list[Run]:
-    """The finished runs in all these folders."""
+    """Return the finished runs in all these folders."""
     return [run for folder in folders for run in finished_runs(Path(folder))]
 
 
 def trained_on(spec: DatasetSpec, runs: Iterable[Run]) -> dict[str, tuple[LearnedSimulator, Run]]:
-    """Simulators that were trained on a data set, and their runs, by label: the model's, and what else differs between runs of the same model. Of several
-    seeds, and of runs that differ in their length alone, the first.
+    """Return simulators that were trained on a data set, and their runs, by label.
+
+    A label names the model, and the settings in which runs of the same model differ. Among runs that differ only in seed or length, the first is returned.
     """
     same: dict[str, list[tuple[LearnedSimulator, Run]]] = defaultdict(list)
     for run in runs:
@@ -44,7 +45,7 @@ def trained_on(spec: DatasetSpec, runs: Iterable[Run]) -> dict[str, tuple[Learne
     for label, members in same.items():
         these = [run for _, run in members]
         axes = [axis for axis in axes_of(these) if axis.startswith(("training.", "graph.")) and axis not in LENGTHS]
-        axes = [axis for axis in axes if all(run.config.get(axis) is not None for run in these)]  # others follow from another setting
+        axes = [axis for axis in axes if all(run.config.get(axis) is not None for run in these)]  # others follow from these
         for simulator, run in members:
             differences = [f"{axis.rpartition('.')[2]}={run.config.get(axis)}" for axis in axes]
             found.setdefault(", ".join([label, *differences]), (simulator, run))
@@ -52,7 +53,7 @@ def trained_on(spec: DatasetSpec, runs: Iterable[Run]) -> dict[str, tuple[Learne
 
 
 def model_label(simulator: LearnedSimulator) -> str:
-    """Class, depth, width, and what else is not at its default."""
+    """Return class, depth, width, and all other settings that differ from the default."""
     cls, settings = type(simulator.model), dict(simulator.description()["settings"])
     depth = next((settings.pop(k) for k in DEPTHS if k in settings), "")
     plain = cast(Any, cls)(simulator.builder.spec).settings

@@ -26,7 +26,7 @@ class Prediction:
 class Model(Protocol):
     """Network whose constructor takes a ``FeatureSpec`` first and keyword settings after it.
 
-    ``forward`` takes a graph with standardised features. ``settings`` holds the keyword arguments of the constructor as plain values, so a checkpoint can rebuild
+    ``forward`` takes a graph with standardised features. ``settings`` holds the keyword arguments as plain values, so that a checkpoint can rebuild
     the model. ``compute`` does the work of ``forward`` on tensors in dictionaries and tuples; ``torch.compile`` compiles this part. ``skips`` lists what
     ``forward`` may leave out in evaluation mode; a model may ignore it. ``num_hops`` is the number of ``radius`` edges to the farthest node that can influence
     a prediction, apart from paths inside meshes.

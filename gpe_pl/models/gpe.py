@@ -277,9 +277,7 @@ class GPE(nn.Module):
 
     @property
     def num_hops(self) -> int:
-        return self.num_message_passing_steps + (
-            self.decoder == "pair" or bool(self.bodies)
-        )  # a pair force reads the states of both ends
+        return self.num_message_passing_steps + (self.decoder == "pair" or bool(self.bodies))  # a pair force reads the other end
 
     @property
     def is_fused(self) -> bool:

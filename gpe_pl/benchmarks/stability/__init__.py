@@ -1,1 +1,1 @@
-"""Stress tests of trained simulators: what is measured, against which limit, and whether it holds."""
+"""Stress tests of trained simulators, each with a measurement, a limit, and a verdict."""

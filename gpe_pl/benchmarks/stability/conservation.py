@@ -1,4 +1,4 @@
-"""Momentum and energy of scenes on which nothing acts from outside."""
+"""Stress tests of momentum and energy in scenes without external forces."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ NUM_STEPS = 300
 
 
 def momentum_residual(simulator: LearnedSimulator, state: State) -> float:
-    """|Σ m a| / Σ m |a| of the accelerations without gravity."""
+    """Return |Σ m a| / Σ m |a| of the accelerations without gravity."""
     a, m = acceleration(simulator, state), state.mass[:, None]
     return float((m * a).sum(dim=0).norm() / (m * a).norm(dim=1).sum())
 
 
 def angular_residual(simulator: LearnedSimulator, state: State) -> float:
-    """|Σ r × m a| / Σ |r| m |a| about the centre of mass."""
+    """Return |Σ r × m a| / Σ |r| m |a| about the centre of mass."""
     a, m = acceleration(simulator, state), state.mass[:, None]
     r = state.pos - (m * state.pos).sum(dim=0) / m.sum()
     moment = _cross(r, m * a).sum(dim=0)
@@ -36,7 +36,7 @@ def _cross(r: Tensor, f: Tensor) -> Tensor:
 
 
 def _exact(subject: Subject) -> tuple[bool, bool]:
-    """Whether linear and angular momentum are exact by construction."""
+    """Tell whether linear and angular momentum are exact by construction."""
     settings = subject.simulator.description()["settings"]
     island = settings.get("island_momentum", "ignored")
     return settings.get("decoder") == "pair" or island != "ignored", island == "angular"

@@ -1,4 +1,4 @@
-"""Figures of long rollouts: what grows, how long predictions stay valid, how long rollouts stay alive, and how fast neighbours part."""
+"""Figures of long rollouts: growth of energy and momentum, valid frames, surviving scenes, and growth of a perturbation."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Curves = Mapping[str, Mapping[str, np.ndarray]]
 
 
 def long_horizon_figure(models: Curves) -> Figure:
-    """Four panels: median energy over its start and median momentum per mass against the frame; valid frames and share alive.
+    """Draw four panels: median energy over its initial value and median momentum per mass against the frame; valid frames and fraction alive.
 
     Args:
         models: by name: ``energy`` and ``momentum`` at evenly spaced frames up to the last of ``horizons``; ``valid_steps`` and ``steps_to_failure``
-            of each scene, infinite for one that did not fail. Infinite values of curves, of scenes that failed, are not drawn.
+            of each scene, infinite if it did not fail. Infinite values of curves, from scenes that failed, are not drawn.
     """
     figure = new_figure(TEXT_WIDTH, 4.2)
     figure.set_layout_engine("constrained")
@@ -56,7 +56,7 @@ def long_horizon_figure(models: Curves) -> Figure:
 
 
 def perturbation_figure(models: Curves) -> Figure:
-    """Distance of twin rollouts in spacings against the frame: each ``model``, and the ``solver``, which is the same for all."""
+    """Draw the distance of twin rollouts in spacings against the frame, for each ``model`` and for the ``solver``, which is the same for all."""
     figure = new_figure(TEXT_WIDTH / 2, 2.6)
     figure.set_layout_engine("constrained")
     axes = figure.subplots()
@@ -74,5 +74,5 @@ def perturbation_figure(models: Curves) -> Figure:
 
 
 def _columns(names: Iterable[str], width: int) -> int:
-    """Columns of a legend that is as wide as so many letters."""
+    """Return the number of columns of a legend that is ``width`` letters wide."""
     return min(3, max(1, width // (8 + max(map(len, names), default=0))))

@@ -1,4 +1,4 @@
-"""Degenerate arrangements: nodes on top of each other, alone, too many in one place, and at the edge of the neighbour radius."""
+"""Stress tests of degenerate arrangements: coincident, isolated and crowded nodes, and nodes at the edge of the neighbour radius."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NUM_CROWDED = 20_000
 
 
 def has_finite_gradients(subject: Subject, state: State) -> bool:
-    """Whether outputs, and the gradients of their squares by all weights, are finite."""
+    """Tell whether outputs, and the gradients of their squares by all weights, are finite."""
     model = subject.simulator.model
     with torch.enable_grad():
         values = [*subject.simulator(subject.simulator.builder(state)).acceleration.values()]
@@ -85,7 +85,7 @@ def density_spike(subject: Subject) -> Outcome:
 def cutoff(subject: Subject) -> Outcome:
     state, radius = subject.free_state(), subject.simulator.builder.scales.radius
     if state.cells is not None:
-        state = permuted(state, torch.arange(state.num_nodes - 1))  # particles: a node of a mesh cannot come from outside
+        state = permuted(state, torch.arange(state.num_nodes - 1))  # particles only: a node of a mesh cannot come from outside
     first = int(torch.argmax(state.pos[:, 0]))
     visitor = permuted(state, torch.tensor([first]))
     outputs = []

@@ -1,4 +1,4 @@
-"""Long rollouts: whether they stay bounded, stay at rest, how fast they forget where they started, and whether they can be resumed."""
+"""Stress tests of long rollouts: whether they stay bounded and at rest, how fast perturbations grow, and whether they can be resumed."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 
 MAX_CORRECTED = 0.01
-"""Share of particle-steps beyond which containment does the model's work."""
+"""Fraction of corrected particle-steps above which containment replaces the model."""
 VALID_ERROR = 0.5
-"""Of a spacing: root mean square displacement until which a prediction is valid."""
+"""Root mean square displacement in spacings up to which a prediction is valid."""
 PERTURBATION = 1e-6
-"""Of the domain's longest side."""
+"""Initial distance of twin rollouts, as a fraction of the domain's longest side."""
 STATIC_FRICTION = 0.5
-"""Share of gravity, of the rollout that is only reported."""
+"""Static friction, as a fraction of gravity, in the rollout that is reported without a limit."""
 AT_REST = 0.01
-"""Of a spacing per frame: largest speed of a pile at rest."""
+"""Largest speed of a pile at rest, in spacings per frame."""
 
 
 # --- staying bounded ------------------------------------------------------------------------------------------------------------------------
@@ -81,23 +81,23 @@ def long_horizon(subject: Subject) -> Outcome:
 
 
 def energy(trajectory: Trajectory, subject: Subject) -> np.ndarray:
-    """Kinetic energy and that of height above the lowest corner of the domain [J], in every frame."""
+    """Return kinetic energy plus potential energy above the lowest corner of the domain [J], in every frame."""
     mass, gravity = trajectory.mass.astype(np.float64), np.asarray(trajectory.metadata.gravity)
     low = np.array([a for a, _ in trajectory.metadata.bounds])
     high = np.array([b for _, b in trajectory.metadata.bounds])
-    bottom = np.where(gravity > 0, high, low)  # where all potential energy is spent
+    bottom = np.where(gravity > 0, high, low)  # position of zero potential energy
     height = -((trajectory.pos.astype(np.float64) - bottom) @ gravity)
     return (mass * (0.5 * np.square(trajectory.vel.astype(np.float64)).sum(axis=-1) + height)).sum(axis=-1)
 
 
 def momentum(trajectory: Trajectory) -> np.ndarray:
-    """|Σ m v| / Σ m [m/s] in every frame."""
+    """Return |Σ m v| / Σ m [m/s] in every frame."""
     mass = trajectory.mass.astype(np.float64)
     return np.linalg.norm(np.einsum("n,fnd->fd", mass / mass.sum(), trajectory.vel.astype(np.float64)), axis=-1)
 
 
 def valid_steps(prediction: Trajectory, truth: Trajectory, spacing: float) -> int:
-    """Frames before the root mean square displacement from the ground truth exceeds ``VALID_ERROR`` spacings; all of them if it never does."""
+    """Return the number of frames before the root mean square displacement from the ground truth exceeds ``VALID_ERROR`` spacings, or of all frames."""
     count = min(prediction.num_frames, truth.num_frames)
     error = np.square(displacement(prediction.pos[:count], truth.pos[:count], truth.metadata)).sum(axis=-1).mean(axis=-1)
     beyond = np.flatnonzero(~(np.sqrt(error) <= VALID_ERROR * spacing))
@@ -105,7 +105,7 @@ def valid_steps(prediction: Trajectory, truth: Trajectory, spacing: float) -> in
 
 
 def _middle(curves: list[np.ndarray], num_steps: int, count: int = 200) -> list[float]:
-    """Median over scenes at evenly spaced frames; infinite where most have failed."""
+    """Return the median over scenes at evenly spaced frames; infinite where most have failed."""
     padded = [np.concatenate([c, np.full(num_steps + 1 - len(c), np.inf)]) for c in curves]
     frames = np.unique(np.linspace(0, num_steps, count).astype(int))
     return np.quantile(np.stack(padded)[:, frames], 0.5, axis=0, method="inverted_cdf").tolist()
@@ -133,7 +133,7 @@ def rest(subject: Subject) -> Outcome:
 
 
 def stays(subject: Subject, settled: State) -> Outcome:
-    """Whether a state in which the solver has come to rest stays as it is."""
+    """Tell whether a state at rest in the solver stays at rest in the model."""
     metadata, guard = subject.scenes[0].metadata, subject.guard()
     result = rollout(Contained(subject.simulator, subject.dt), settled, subject.num_rest_steps, metadata, guard)
     moved = np.linalg.norm(result.pos - result.pos[0], axis=-1).max(axis=1) / subject.spacing
@@ -149,7 +149,7 @@ def stays(subject: Subject, settled: State) -> Outcome:
 
 
 def settle(subject: Subject) -> State | str:
-    """A state in which the solver has come to rest, with no velocity at all; or why there is none."""
+    """Return a state in which the solver has come to rest, with all velocities zero; or the reason why there is no such state."""
     length = max(subject.horizon_factors) * subject.spec.num_frames
     fastest = math.inf
     for index in range(len(subject.scenes)):
@@ -180,7 +180,7 @@ def perturbation(subject: Subject) -> Outcome:
 
 
 def separation(simulator: Simulator, state: State, num_steps: int, spacing: float, size: float, seed: int = 0) -> np.ndarray:
-    """Root mean square distance [spacings] of two rollouts whose positions differ by ``PERTURBATION`` times ``size`` [m] at the start, per frame."""
+    """Return the root mean square distance [spacings] per frame of two rollouts whose initial positions differ by ``PERTURBATION`` times ``size`` [m]."""
     noise: Any = np.random.default_rng(seed).normal(size=tuple(state.pos.shape))
     noise *= PERTURBATION * size / np.sqrt(np.square(noise).sum(axis=-1).mean())
     is_torch = isinstance(state.pos, torch.Tensor)
@@ -196,7 +196,7 @@ def separation(simulator: Simulator, state: State, num_steps: int, spacing: floa
 
 
 def growth_rate(separations: np.ndarray, spacing: float, saturated: float = 0.1) -> float:
-    """Slope of log separation over frames, by least squares, until it first exceeds ``saturated`` spacings."""
+    """Return the slope of log separation over frames, by least squares, until it first exceeds ``saturated`` spacings."""
     beyond = np.flatnonzero(~(separations < saturated))
     count = int(beyond[0]) if len(beyond) else len(separations)
     logs = np.log(np.maximum(separations[: max(count, 2)], 1e-300))
@@ -233,7 +233,7 @@ def _advanced(simulator: Simulator, state: State, num_steps: int) -> State:
 
 
 def max_speed(spec: Any, generate: Callable[..., Trajectory], num_trajectories: int) -> float:
-    """Largest speed [m/s] in some training trajectories, as differences of positions over a frame."""
+    """Return the largest speed [m/s] in some training trajectories, from differences of positions over a frame."""
     dt = spec.solver.frame_dt
     found = [generate(spec, "train", k).pos.astype(np.float64) for k in range(min(num_trajectories, spec.num_train))]
     return max(float(np.linalg.norm(np.diff(pos, axis=0), axis=-1).max()) / dt for pos in found)

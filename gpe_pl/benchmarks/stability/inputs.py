@@ -1,4 +1,4 @@
-"""Inputs that are not as in training: materials, values that are not finite, wrong types, other time steps."""
+"""Stress tests of inputs unlike training: materials, values that are not finite, wrong types, other time steps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NUM_STEPS = 20
 
 @dataclass(frozen=True)
 class Spoiled:
-    """A simulator whose result of one frame somebody changes."""
+    """Simulator whose result of one frame is replaced."""
 
     simulator: Simulator
     frame: int

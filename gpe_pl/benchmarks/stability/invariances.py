@@ -1,4 +1,4 @@
-"""What must not matter: the order of nodes and edges, where a scene lies, what else is computed beside it."""
+"""Stress tests of invariances: order of nodes and edges, position of a scene, and other scenes computed beside it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NUM_DRAWS = 5
 
 
 def turned(data: HeteroData, spec: FeatureSpec, seed: int = 0, *, turn: bool = True, shuffle: bool = True) -> HeteroData:
-    """The same graph with half of those edges the other way round that can be, and edges in another order."""
+    """Return the graph with half of the reversible edges reversed, and with shuffled edges."""
     out = data.clone()
     random = torch.Generator().manual_seed(seed)
     for relation in spec.relations:
@@ -51,7 +51,7 @@ def turned(data: HeteroData, spec: FeatureSpec, seed: int = 0, *, turn: bool = T
 
 
 def relabelling_error(subject: Subject, dtype: torch.dtype, seed: int) -> float:
-    """‖Pᵀ f(P x) − f(x)‖ / ‖f(x)‖ for a random permutation of the nodes."""
+    """Return ‖Pᵀ f(P x) − f(x)‖ / ‖f(x)‖ for a random permutation of the nodes."""
     simulator = in_double(subject.simulator) if dtype == torch.float64 else subject.simulator
     state = subject.state(seed)
     order = torch.randperm(state.num_nodes, generator=torch.Generator().manual_seed(seed))
@@ -60,7 +60,7 @@ def relabelling_error(subject: Subject, dtype: torch.dtype, seed: int) -> float:
 
 
 def turning_error(subject: Subject, dtype: torch.dtype, seed: int, *, turn: bool, shuffle: bool) -> float:
-    """Relative change of the output when edges are turned around or stored in another order."""
+    """Return the relative change of the output when edges are reversed or shuffled."""
     simulator = in_double(subject.simulator) if dtype == torch.float64 else subject.simulator
     state = subject.state(seed)
     graph = simulator.builder(state)
@@ -94,7 +94,7 @@ def edge_order(subject: Subject) -> Outcome:
 
 
 def wrong_edges(graph: HeteroData, subject: Subject) -> int:
-    """Edges that are stored twice, in either direction, or that begin where they end."""
+    """Count the edges that are stored twice, in either direction, or that connect a node to itself."""
     count = 0
     for relation in subject.simulator.builder.spec.relations:
         index = graph[relation].edge_index

@@ -1,4 +1,4 @@
-"""Rounding, equal implementations, memory, training under attack, and the guard."""
+"""Stress tests of rounding, equal implementations, memory, training under attack, and the guard."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def memory(subject: Subject) -> Outcome:
 
 
 def compilations() -> int:
-    """Graphs that ``torch.compile`` has made in this process."""
+    """Return the number of graphs that ``torch.compile`` has made in this process."""
     return int(torch._dynamo.utils.counters["stats"]["unique_graphs"])
 
 
@@ -121,7 +121,7 @@ def _skipping(subject: Subject, skips: Skips) -> LearnedSimulator:
 
 
 def sleeping(subject: Subject, num_steps: int = 20) -> tuple[float, float, float]:
-    """What sleeping costs: the ratio of mean square errors over rollouts that start all along the scenes; the ratio of times; and the share asleep."""
+    """Measure sleeping: ratio of mean square errors over rollouts that start throughout the scenes, ratio of times, and fraction asleep."""
     runners = {"asleep": approximate(_skipping(subject, ASLEEP)), "awake": subject.simulator}
     errors, seconds, num_asleep, num_steps_of_nodes = dict.fromkeys(runners, 0.0), dict.fromkeys(runners, 0.0), 0, 0
 
@@ -166,7 +166,7 @@ def training(subject: Subject) -> Outcome:
 
 
 def training_graph(subject: Subject) -> HeteroData:
-    """A graph of the first scene with its target."""
+    """Return a graph of the first scene with its target."""
     truth, builder = subject.scenes[0], subject.simulator.builder
     frame = truth.num_frames // 2
     state = subject.simulator.initial_state(truth, frame)
@@ -178,13 +178,13 @@ def training_graph(subject: Subject) -> HeteroData:
 
 
 def target_power(subject: Subject, graph: HeteroData) -> float:
-    """Mean square of a graph's normalised target: the loss of predicting zero."""
+    """Return the mean square of a graph's normalised target, which is the loss of predicting zero."""
     values = torch.cat([graph[m].target for m in subject.simulator.builder.spec.materials]) / subject.acceleration_std
     return float(values.square().mean())
 
 
 def trained(subject: Subject, graphs: list[HeteroData], learning_rate: float) -> list[float]:
-    """Losses of fresh weights over a list of graphs, gradients clipped as in training."""
+    """Train fresh weights on a list of graphs with gradients clipped as in training; return the losses."""
     torch.manual_seed(0)
     simulator = copy.deepcopy(subject.simulator).train()
     settings = simulator.description()["settings"]
@@ -205,7 +205,7 @@ def trained(subject: Subject, graphs: list[HeteroData], learning_rate: float) ->
 
 
 def gradients_are_correct(subject: Subject) -> bool:
-    """Gradients by node features against finite differences in double precision, on 5 nodes."""
+    """Compare gradients by node features with finite differences in double precision, on 5 nodes."""
     simulator = in_double(subject.simulator)
     state = subject.state()
     near = torch.argsort((state.pos - state.pos[0]).norm(dim=1))[:5]
@@ -242,7 +242,7 @@ def guard(subject: Subject) -> Outcome:
         found[reason] = stop is not None and (stop.reason, stop.frame) == (reason, 3) and stop.node >= 0 and result.num_frames == 3
     obstructed = replace(state, boundary=replace(state.boundary, shapes=(obstacle(state, subject.spacing),)))
     before, behind = (replace(obstructed, pos=torch.cat([place[None], state.pos[1:]])) for place in _beside(obstructed, subject.spacing))
-    stop = limits.check(behind, 3, before)  # a model that sees an obstacle need not go through it, so the two states are made
+    stop = limits.check(behind, 3, before)  # a model may avoid an obstacle, so both states are constructed
     found["tunnelling"] = stop is not None and (stop.reason, stop.frame, stop.node) == ("tunnelling", 3, 0)
     inside = replace(obstructed, boundary=replace(state.boundary, shapes=(ball(state, 2 * radius),)))
     stop = limits.check(inside, 3)
@@ -257,7 +257,7 @@ def guard(subject: Subject) -> Outcome:
 
 
 def attacks(subject: Subject, limits: Guard) -> dict[str, Callable[[State, State], State]]:
-    """What is done to a new state, by the reason that the guard must give."""
+    """Return the changes of a new state, by the reason that the guard must give."""
 
     def placed(new: State, rows: slice, to: torch.Tensor) -> State:
         pos = new.pos.clone()
@@ -275,7 +275,7 @@ def attacks(subject: Subject, limits: Guard) -> dict[str, Callable[[State, State
 
 
 def obstacle(state: State, spacing: float) -> Box:
-    """A plate, two spacings thick, right above all nodes."""
+    """Return a plate, two spacings thick, directly above all nodes."""
     middle, top = state.pos.mean(dim=0), state.pos.max(dim=0).values
     low, high = middle - 4 * spacing, middle + 4 * spacing
     low[-1], high[-1] = top[-1] + 2 * spacing, top[-1] + 4 * spacing
@@ -283,12 +283,12 @@ def obstacle(state: State, spacing: float) -> Box:
 
 
 def ball(state: State, radius: float) -> Sphere:
-    """An obstacle around the first node."""
+    """Return an obstacle around the first node."""
     return Sphere(tuple(state.pos[0].tolist()), radius, friction=0.0)
 
 
 def _beside(state: State, spacing: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """A place below the plate, and one above it."""
+    """Return a position below the plate, and one above it."""
     plate = state.boundary.shapes[-1]
     assert isinstance(plate, Box)
     below, above = torch.tensor([plate.low, plate.high], dtype=torch.float64)

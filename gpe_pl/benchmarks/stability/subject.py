@@ -1,4 +1,4 @@
-"""What a stress test is given, what it answers, and the changes of states and graphs that several of them make."""
+"""Subjects and outcomes of stress tests, and the changes of states and graphs that several tests use."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class Subject:
-    """A trained simulator in the domain that it was trained in.
+    """A trained simulator with the data that it is tested on.
 
     Attributes:
-        name: of the model.
-        domain: of the data set.
-        simulator: with its checkpoint's weights.
-        spec: of the data set, whose solver is the reference.
-        scenes: ground truth that was not trained on.
+        name: name of the model.
+        domain: name of the data set.
+        simulator: simulator with the weights of its checkpoint.
+        spec: data set, whose solver is the reference.
+        scenes: ground truth that was not used in training.
         max_speed: largest speed [m/s] in training trajectories.
-        is_gating: whether a failure of this one fails the suite.
-        peers: the simulators of this domain, by name, this one included.
+        is_gating: whether a failure of this model fails the suite.
+        peers: the simulators of this domain by name, this one included.
         horizon_factors: lengths of long rollouts over the trained horizon, which is the number of frames of a scene.
-        num_rest_steps: frames that a pile at rest is watched.
+        num_rest_steps: number of frames over which a pile at rest is observed.
     """
 
     name: str
@@ -69,29 +69,29 @@ class Subject:
         return self.simulator.acceleration_std.item()
 
     def state(self, scene: int = 0, share: float = 0.5) -> State:
-        """The state after a share of a scene's frames, float64."""
+        """Return the state after a fraction of a scene's frames, in float64."""
         truth = self.scenes[scene % len(self.scenes)]
         frame = max(self.history, round(share * (truth.num_frames - 1)))
         return self.simulator.initial_state(truth, frame)
 
     def free_state(self, scene: int = 0, share: float = 0.5) -> State:
-        """The same without gravity and boundary."""
+        """Return the same state without gravity and boundary."""
         state = self.state(scene, share)
         return replace(state, gravity=torch.zeros_like(state.gravity), boundary=no_boundary(state))
 
     def guard(self) -> Guard:
-        """Limits of a stable rollout: no node leaves the domain by more than the radius, none is thrice as fast as any in training."""
+        """Return the limits of a stable rollout: nodes stay within one radius of the domain, below three times the largest speed in training."""
         metadata = self.simulator.builder.metadata
         return Guard(3 * self.max_speed, metadata.bounds, self.simulator.builder.scales.radius, self.spacing)
 
     def truth_acceleration(self, scene: int, frame: int) -> np.ndarray:
-        """Acceleration [node, dim] of the ground truth from a frame to the next, m/s²."""
+        """Return the acceleration [node, dim] of the ground truth from a frame to the next, in m/s²."""
         velocities = integrators.velocities(self.scenes[scene].pos[frame - 1 : frame + 2].astype(np.float64), self.dt)
         return integrators.acceleration(velocities[1], velocities[0], self.dt)
 
     @cached_property
     def one_step_rmse(self) -> float:
-        """Root mean square error [m/s²] of an acceleration over some frames of all scenes."""
+        """Root mean square error [m/s²] of one-step accelerations over some frames of all scenes."""
         errors = []
         for number, truth in enumerate(self.scenes):
             for frame in np.linspace(self.history, truth.num_frames - 2, 4).astype(int).tolist():
@@ -103,12 +103,12 @@ class Subject:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a test found.
+    """Result of a stress test.
 
     Attributes:
-        passed: whether the criterion holds; None where the test does not apply.
-        measured: the numbers, or why it does not apply.
-        curves: over frames, for figures.
+        passed: whether the criterion holds; None if the test does not apply.
+        measured: the measured numbers, or why the test does not apply.
+        curves: values over frames, for figures.
     """
 
     passed: bool | None
@@ -130,12 +130,12 @@ class StressTest:
 
 
 def stress_test(number: int, name: str, criterion: str) -> Callable[[Callable[[Subject], Outcome]], StressTest]:
-    """Make a function a ``StressTest``."""
+    """Return a decorator that turns a function into a ``StressTest``."""
     return lambda function: StressTest(number, name, criterion, function)
 
 
 def inapplicable(reason: str) -> Outcome:
-    """The outcome of a test that does not apply, and why."""
+    """Return the outcome of a test that does not apply, with the reason."""
     return Outcome(None, reason)
 
 
@@ -143,7 +143,7 @@ def inapplicable(reason: str) -> Outcome:
 
 
 def in_order(predicted: Prediction, graph: HeteroData, num_nodes: int, dim: int) -> Tensor:
-    """Predicted accelerations in the order of the state's nodes."""
+    """Return predicted accelerations in the order of the state's nodes."""
     values = [*predicted.acceleration.values()]
     out = torch.full((num_nodes, dim), float("nan"), dtype=values[0].dtype if values else torch.float64)
     for material, value in predicted.acceleration.items():
@@ -153,17 +153,17 @@ def in_order(predicted: Prediction, graph: HeteroData, num_nodes: int, dim: int)
 
 @torch.no_grad()
 def output(simulator: LearnedSimulator, graph: HeteroData, num_nodes: int) -> Tensor:
-    """What the network says about a graph, in units of the acceleration scale, in the order of the state's nodes."""
+    """Return the network's output for a graph, in units of the acceleration scale, in the order of the state's nodes."""
     return in_order(simulator(graph), graph, num_nodes, simulator.builder.spec.dim)
 
 
 def acceleration(simulator: LearnedSimulator, state: State) -> Tensor:
-    """Accelerations without gravity [m/s²] of a state."""
+    """Return accelerations without gravity [m/s²] for a state."""
     return output(simulator, simulator.builder(state), state.num_nodes).double() * simulator.acceleration_std
 
 
 def relative_change(new: Tensor, old: Tensor) -> float:
-    """‖new − old‖ / ‖old‖."""
+    """Return ‖new − old‖ / ‖old‖."""
     return float((new - old).norm() / old.norm().clamp(min=torch.finfo(old.dtype).tiny))
 
 
@@ -171,28 +171,28 @@ def relative_change(new: Tensor, old: Tensor) -> float:
 
 
 class _DoubleBuilder(GraphBuilder):
-    """Features, masses and lever arms in double precision."""
+    """Graph builder with features, masses and lever arms in double precision."""
 
     def _rounded(self, values: Tensor) -> Tensor:
         return values
 
 
 class _DoubleSimulator(LearnedSimulator):
-    """Computes in double precision from the same graphs."""
+    """Simulator that computes in double precision from the same graphs."""
 
     def forward(self, data: HeteroData) -> Prediction:
         return super().forward(to_dtype(data, torch.float64))
 
 
 def in_double(simulator: LearnedSimulator) -> LearnedSimulator:
-    """The same weights in double precision: the oracle of rounding."""
+    """Return the simulator with the same weights in double precision, as a reference for rounding errors."""
     twin = _DoubleSimulator(copy.deepcopy(simulator.model), _DoubleBuilder(simulator.builder.config, simulator.builder.metadata))
     twin.load_state_dict(simulator.state_dict())
     return twin.double().eval()
 
 
 def to_dtype(data: HeteroData, dtype: torch.dtype) -> HeteroData:
-    """The same graph with all floating-point features in another precision."""
+    """Return the graph with all floating-point features in another precision."""
     out = data.clone()
     for store in out.stores:
         for key, value in store.items():
@@ -202,12 +202,12 @@ def to_dtype(data: HeteroData, dtype: torch.dtype) -> HeteroData:
 
 
 def no_boundary(state: State) -> Boundary:
-    """An empty boundary for a state of tensors."""
+    """Return an empty boundary for a state of tensors."""
     return replace(state, boundary=Boundary.empty(state.dim)).to_torch().boundary
 
 
 def permuted(state: State, order: Any) -> State:
-    """The same state with its nodes in another order, or some of them (then without its mesh)."""
+    """Return the state with its nodes in another order, or with some of them (then without its mesh)."""
     history = state.velocity_history
     whole = len(order) == state.num_nodes
     cells = None
@@ -228,19 +228,19 @@ def permuted(state: State, order: Any) -> State:
 
 
 def shifted(state: State, offset: Tensor) -> State:
-    """The scene somewhere else; shapes stay, which graphs do not see."""
+    """Return the scene translated by an offset; shapes are not moved, because graphs do not depend on them."""
     boundary = replace(state.boundary, pos=state.boundary.pos + offset)
     rest = None if state.rest_pos is None else state.rest_pos + offset
     return replace(state, pos=state.pos + offset, rest_pos=rest, boundary=boundary)
 
 
 def with_velocities(state: State, history: Tensor) -> State:
-    """The state with another velocity history [node, history, dim]."""
+    """Return the state with another velocity history [node, history, dim]."""
     return replace(state, vel=history[:, -1], velocity_history=history)
 
 
 def joined(a: State, b: State) -> State:
-    """The nodes of two states in one, with the boundary of the first."""
+    """Return the nodes of two states as one state, with the boundary of the first."""
     names = ["pos", "vel", "node_type", "mass", "material_params", "velocity_history"]
     values: dict[str, Any] = {name: torch.cat([getattr(a, name), getattr(b, name)]) for name in names}
     if a.cells is not None and b.cells is not None and a.rest_pos is not None and b.rest_pos is not None:

@@ -1,4 +1,4 @@
-"""Stress tests of trained models in the domains that they were trained in: thirty criteria, fixed before they were measured, one table."""
+"""The suite of stress tests for trained models, each in the domain of its training: thirty criteria, fixed before measurement, and one table."""
 
 from __future__ import annotations
 
@@ -42,24 +42,24 @@ GROUPS = {
 
 
 class NothingToTestError(GpeError, ValueError):
-    """No model for a data set, or several of one name; the message says where they were looked for."""
+    """There is no model for a data set, or several with one name; the message says where models were searched for."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is tested.
+    """Settings of the suite.
 
     Attributes:
         cases: data sets, by name.
-        runs: folders of finished runs; the models among them that were trained on a case's data set take part, the first seed of each.
-        checkpoints: further ones, as files or as names of shipped models; they take part in the case whose data set they were trained on.
-        gating: settings of the models that must pass: those of the configuration that is shipped.
-        num_scenes: of ``test``, per data set.
+        runs: folders of finished runs; their models take part in the case whose data set they were trained on, with the first seed of each.
+        checkpoints: further models, as files or names of shipped models; they take part in the case whose data set they were trained on.
+        gating: settings of the models that must pass, which are those of the shipped configuration.
+        num_scenes: number of scenes of the split ``test``, per data set.
         horizon_factors: lengths of long rollouts over the trained horizon.
-        num_rest_steps: frames that a pile at rest is watched.
-        tests: numbers of the tests to run; none runs all.
-        num_workers: processes, each with data sets of its own.
-        num_threads: of PyTorch in each; the solvers use one.
+        num_rest_steps: number of frames over which a pile at rest is observed.
+        tests: numbers of the tests to run; an empty list runs all.
+        num_workers: number of processes; each takes whole data sets.
+        num_threads: threads of PyTorch in each process; the solvers use one.
     """
 
     cases: dict[str, Case]
@@ -75,7 +75,7 @@ class Settings:
 
 
 def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
-    """A record per test and model, and a Markdown table per domain."""
+    """Return a record per test and model, and a Markdown table per domain."""
     records: list[dict[str, Any]] = []
     untested = [name for name, spec in specs.items() if not any(_models(spec, settings))]
     tested = {name: spec for name, spec in specs.items() if name not in untested}
@@ -96,12 +96,12 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
 
 
 def _show_progress() -> None:
-    """What a process logs goes to the terminal; it knows nothing of the settings of the one that made it."""
+    """Configure logging to the terminal, because a worker process does not inherit it."""
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s][%(name)s][%(levelname)s] - %(message)s")
 
 
 def _test_domain(name: str, spec: DatasetSpec, settings: Settings) -> list[dict[str, Any]]:
-    """Records of all models of a data set."""
+    """Return the records of all models of a data set."""
     torch.set_num_threads(settings.num_threads)
     models: dict[str, LearnedSimulator] = {}
     for label, simulator in _models(spec, settings):
@@ -112,7 +112,7 @@ def _test_domain(name: str, spec: DatasetSpec, settings: Settings) -> list[dict[
 
 
 def test(subject: Subject, numbers: Sequence[int] = ()) -> Iterator[dict[str, Any]]:
-    """Records of all tests, or of those with these numbers, of one model; a test that crashes has failed."""
+    """Yield the records of all tests of one model, or of those with these numbers; a test that crashes has failed."""
     for group, tests in GROUPS.items():
         for stress_test in tests:
             if not numbers or stress_test.number in numbers:
@@ -148,11 +148,11 @@ def _outcome(stress_test: StressTest, subject: Subject) -> Outcome:
 
 
 def subjects(domain: str, spec: DatasetSpec, models: dict[str, LearnedSimulator], settings: Settings) -> list[Subject]:
-    """The models of a data set with what they are tested on, the gating ones first."""
+    """Return the models of a data set with their test data, the gating ones first."""
     scenes = [generate_trajectory(spec, "test", k) for k in range(settings.num_scenes)]
     speed = horizon.max_speed(spec, generate_trajectory, settings.num_scenes)
     for simulator in models.values():
-        simulator.static_friction = 0.0  # what a network does by itself
+        simulator.static_friction = 0.0  # tests measure the network alone
     found = [
         Subject(
             name,
@@ -172,13 +172,13 @@ def subjects(domain: str, spec: DatasetSpec, models: dict[str, LearnedSimulator]
 
 
 def is_gating(simulator: LearnedSimulator, gating: dict[str, str]) -> bool:
-    """Whether a model has all of these settings."""
+    """Tell whether a model has all of these settings."""
     own = simulator.description()["settings"]
     return bool(gating) and all(own.get(key) == value for key, value in gating.items())
 
 
 def _models(spec: DatasetSpec, settings: Settings) -> Iterator[tuple[str, LearnedSimulator]]:
-    """Simulators with their names."""
+    """Yield the names and simulators of all models of a data set."""
     yield from ((name, simulator) for name, (simulator, _) in trained_on(spec, runs_in(settings.runs)).items())
     for checkpoint in settings.checkpoints:
         simulator = LearnedSimulator.from_checkpoint(checkpoint)
@@ -189,7 +189,7 @@ def _models(spec: DatasetSpec, settings: Settings) -> Iterator[tuple[str, Learne
 
 
 def failures(records: Sequence[dict[str, Any]]) -> list[str]:
-    """What gating models failed, which is what the suite fails by."""
+    """Return the failures of gating models, by which the suite fails."""
     return [f"{r['domain']}, {r['model']}: {r['test']}" for r in records if r["gating"] and r["status"] == "failed"]
 
 
@@ -200,7 +200,7 @@ MARKS = {"passed": "passed", "failed": "**failed**", "not_applicable": "–"}
 
 
 def _report(records: Sequence[dict[str, Any]], untested: Sequence[str] = ()) -> str:
-    """Counts, of every model too, and a table per domain: a row per test, a column per model."""
+    """Return counts, also for each model, and a table per domain with a row per test and a column per model."""
     gating = [r for r in records if r["gating"]]
     lines = [
         f"Gating configurations: {sum(r['status'] == 'passed' for r in gating)} passed, {len(failures(records))} failed, "
@@ -230,7 +230,7 @@ def _cell(text: str) -> str:
 
 
 def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
-    """Per domain: energy and momentum over a long rollout, how long predictions are valid and rollouts alive, and growth of a perturbation."""
+    """Draw figures per domain: energy and momentum over a long rollout, valid and surviving frames, and growth of a perturbation."""
     from gpe_pl.benchmarks.stability.figures import long_horizon_figure, perturbation_figure
 
     found = {}
