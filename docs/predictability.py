@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec, initial_state, parameter_values, trajectory_metadata
 from gpe_pl.files.atomic import replacing
 from gpe_pl.rollout.loop import rollout
-from gpe_pl.simulate import dataset
 from gpe_pl.trajectory.state import State
 
 HORIZONS = (20, 50, 100)

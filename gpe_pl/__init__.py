@@ -21,6 +21,7 @@ from gpe_pl.system import early_interrupts
 from gpe_pl.system.caches import prepare
 
 if TYPE_CHECKING:
+    from gpe_pl.config.datasets import dataset as dataset
     from gpe_pl.data.ground_truth import generate_trajectory as generate_trajectory
     from gpe_pl.data.importers.assemble import save_dataset as save_dataset
     from gpe_pl.errors import GpeError as GpeError
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from gpe_pl.metrics import rollout_metrics as rollout_metrics
     from gpe_pl.rollout.containment import Contained as Contained
     from gpe_pl.rollout.loop import rollout as roll_out  # noqa: F401
-    from gpe_pl.simulate import dataset as dataset
     from gpe_pl.trajectory.boundary import Boundary as Boundary
     from gpe_pl.trajectory.state import State as State
     from gpe_pl.trajectory.store import iter_trajectories as iter_trajectories
@@ -54,7 +54,7 @@ _MODULES = {
     "Metadata": "trajectory.trajectory",
     "State": "trajectory.state",
     "Trajectory": "trajectory.trajectory",
-    "dataset": "simulate",
+    "dataset": "config.datasets",
     "domain_walls": "geometry.shapes",
     "export_model": "export.program",
     "generate_trajectory": "data.ground_truth",

@@ -42,7 +42,7 @@ def benchmark(cfg: DictConfig) -> None:
     import torch
     from omegaconf import OmegaConf
 
-    from gpe_pl.simulate import dataset
+    from gpe_pl.config.datasets import dataset
     from gpe_pl.system.locks import held
     from gpe_pl.system.machine import environment, keep_freed_memory
     from gpe_pl.system.provenance import recorded

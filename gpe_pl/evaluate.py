@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 def evaluate_checkpoint(cfg: DictConfig) -> None:
     """Roll a trained model out on one split of a data set, and in the scene's showcase if it has one; numbers and pictures go to ``{paths.runs}/{name}``."""
+    from gpe_pl.config.datasets import ensure_split, evaluated_config, scene_metadata
     from gpe_pl.evaluation.rollouts import EvaluationSettings, evaluate
     from gpe_pl.files.names import run_name
     from gpe_pl.files.run_folder import claim, release
@@ -29,7 +30,6 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     from gpe_pl.learned.simulator import LearnedSimulator
     from gpe_pl.reports.sweep_table import conclusion
     from gpe_pl.rollout.skips import Skips
-    from gpe_pl.simulate import ensure_split, evaluated_config, scene_metadata
     from gpe_pl.system.locks import held
     from gpe_pl.system.provenance import recorded
     from gpe_pl.training.run import TrainerSettings, set_up
@@ -84,8 +84,8 @@ def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
 
 def _own_data(simulator: LearnedSimulator) -> str:
     """Overrides that choose data like those of the training; empty where none do."""
+    from gpe_pl.config.datasets import IMPORTED, dataset
     from gpe_pl.data.ground_truth import trajectory_metadata
-    from gpe_pl.simulate import IMPORTED, dataset
 
     own = simulator.builder.metadata
     if own.solver.startswith("import/"):

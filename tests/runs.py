@@ -10,9 +10,9 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, OmegaConf
 
+from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.config.folder import CONF
 from gpe_pl.data.generation import generate
-from gpe_pl.simulate import dataset_spec
 
 DATA = [
     "size=tiny",

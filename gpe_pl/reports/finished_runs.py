@@ -47,9 +47,6 @@ class Run:
     curve: Curve | None = None
 
 
-UNSAID: dict[str, Any] = {"training.sampling": "uniform", "training.push_share": 0.0, "training.push_correction": 1.0}
-"""What the ``config.json`` of a run leaves out where it is not used, as runs did before there was a choice."""
-
 WITHOUT_CONSEQUENCE = {"evaluation.num_pictures", "evaluation.export"}
 """What runs may differ in without having been done otherwise."""
 
@@ -102,19 +99,18 @@ def finished_runs(folder: Path) -> list[Run]:
         if config.exists():
             said = {key: value for key, value in _flatten(config_in(config)) if key not in WITHOUT_CONSEQUENCE}
             data = {key: str(said.pop(key)) for key in list(said) if DATA_CHECKSUMS in key.split(".")}
-            values = UNSAID | said
-            if values.keys() >= TRAINED.keys():
+            if said.keys() >= TRAINED.keys():
                 for key, kind in TRAINED.items():
-                    if type(values[key]) is not kind:
+                    if type(said[key]) is not kind:
                         raise RunError(
-                            f"{config}: {key} is {values[key]!r}; delete the folder {path.parent}, which this package has not written"
+                            f"{config}: {key} is {said[key]!r}; delete the folder {path.parent}, which this package has not written"
                         )
-                runs.append(Run(path.parent, values, table_of(read_rows(path)), data))
+                runs.append(Run(path.parent, said, table_of(read_rows(path)), data))
             else:
                 log.warning(
                     "%s is not of a training run (%s) and is left out of the report",
                     path.parent,
-                    ", ".join(sorted(TRAINED.keys() - values.keys())),
+                    ", ".join(sorted(TRAINED.keys() - said.keys())),
                 )
     _warn_of_replaced_data(runs)
     return runs

@@ -53,13 +53,14 @@ def step_time_key(config: dict[str, Any], training: TrainingSettings, trainer: T
         training, trainer: the same settings as objects.
         data: checksum of imported data, of which the configuration says only the name; None: it says how the data are made.
     """
-    parts = {k: config[k] for k in ("graph", "model", "data")} | {"batch_size": training.batch_size, "device": trainer.device}
-    # only what is not as in the first files of step times, so that those stay known
-    parts |= {} if data is None else {"data_sha256": data}
-    parts |= {} if config["batching"]["max_nodes"] is None else {"batching": config["batching"]}
-    parts |= {} if training.compile == "off" else {"compile": training.compile}
-    parts |= {} if trainer.matmul_precision == "highest" else {"matmul_precision": trainer.matmul_precision}
-    parts |= {"push_forward": [training.push_share, training.push_steps]} if training.push_share else {}
+    parts = {key: config[key] for key in ("graph", "model", "data", "batching")} | {
+        "batch_size": training.batch_size,
+        "compile": training.compile,
+        "push_forward": [training.push_share, training.push_steps] if training.push_share else None,
+        "device": trainer.device,
+        "matmul_precision": trainer.matmul_precision,
+        "data_sha256": data,
+    }
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:8]
     return f"{config['data']['name']} {config['size']['name']} {config['model']['_target_'].rpartition('.')[2]} {digest}"
 

@@ -8,11 +8,13 @@ means instead, which is what ``DistributedDataParallel`` does, weighs a node by 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
 
 import torch
 import torch.distributed as dist
 from lightning.pytorch.strategies import DDPStrategy
+from lightning.pytorch.utilities import rank_zero_only
 from torch import Tensor, nn
 
 
@@ -30,6 +32,14 @@ def sum_gradients(parameters: Iterable[nn.Parameter]) -> None:
     is_there, *parts = message.split([len(parameters), *(p.numel() for p in parameters)])
     for parameter, part, number in zip(parameters, parts, is_there.tolist(), strict=True):
         parameter.grad = part.view_as(parameter) if number else None
+
+
+def end_later_processes() -> None:
+    """End all processes of a run but the first, which alone does what follows the training."""
+    if rank_zero_only.rank > 0:  # type: ignore[attr-defined]
+        sys.exit()
+    if dist.is_available() and dist.is_initialized():
+        dist.destroy_process_group()
 
 
 class SummedGradients(DDPStrategy):

@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-import sys
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -75,17 +74,6 @@ class TrainingSettings:
                 f"val_interval={self.val_interval} must divide num_steps={self.num_steps}: the last steps would be neither validated nor saved"
             )
 
-    def as_dict(self) -> dict[str, Any]:
-        """For a run's ``config.json``: without what runs did not have once, where it is not used, so that those are known again."""
-        values = asdict(self)
-        for key in ("sampling", "push_share", "push_correction"):
-            if values[key] == type(self).__dataclass_fields__[key].default:
-                del values[key]
-        if not self.push_share:
-            del values["push_steps"]
-            values.pop("push_correction", None)
-        return values
-
     @property
     def noise(self) -> Noise:
         """On the inputs."""
@@ -129,19 +117,18 @@ class TrainerSettings:
 def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
     """Copy the checkpoint of a finished run below ``folder`` that was trained with the configuration ``config``; None if there is no such run.
 
-    Of several processes that ``torchrun`` or Slurm started only the first returns, the others end.
+    Of several processes the first copies.
     """
     for path in sorted(folder.rglob(CONFIG)):
         trained = path.parent / "checkpoints" / "best.ckpt"
         if (path.parent / "metrics.csv").exists() and trained.exists():
             there = config_in(path)
             if not differences({key: value for key, value in there.items() if key != "evaluation"}, config):
-                if rank_zero_only.rank > 0:  # type: ignore[attr-defined]
-                    sys.exit()
-                log.info("taking the model that was trained in %s", path.parent)
                 own = run_dir / "checkpoints" / "best.ckpt"
-                with replacing(own) as part:
-                    shutil.copy(trained, part)
+                if rank_zero_only.rank == 0:  # type: ignore[attr-defined]
+                    log.info("taking the model that was trained in %s", path.parent)
+                    with replacing(own) as part:
+                        shutil.copy(trained, part)
                 return own
     return None
 
@@ -157,8 +144,7 @@ def train(
 ) -> Path:
     """Train to ``num_steps``, resuming from ``checkpoints/last.ckpt`` if there is one; returns the checkpoint with the best validation rollout.
 
-    Of several processes only the first returns, the others end. Unless something else starts them (``torchrun``, Slurm), each runs the command that is
-    running.
+    Several processes return; ``end_later_processes`` leaves the first. Unless ``torchrun`` or Slurm starts them, each runs the same command.
     """
     datamodule.push_forward = training.push_forward  # known only now, as a budget of time has become a number of steps
     interruption = Interruption()
@@ -223,11 +209,12 @@ def train(
         raise TrainingError(
             f"{error}; {'no checkpoint was saved yet' if saved is None else f'the last good checkpoint is kept: {saved}'}"
         ) from None
-    if is_parallel:
-        if trainer.global_rank > 0:
-            sys.exit()  # what comes after training is for one process
-        torch.distributed.destroy_process_group()
     return checkpoints.best
+
+
+def seed(number: int) -> None:
+    """Seed the random numbers of Python, NumPy and PyTorch."""
+    L.seed_everything(number, verbose=False)
 
 
 def set_up(settings: TrainerSettings) -> str:

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from omegaconf import DictConfig
 
+from gpe_pl.config.datasets import scene_metadata
 from gpe_pl.config.entry_point import construct
 from gpe_pl.config.folder import CONF
-from gpe_pl.simulate import scene_metadata
 from gpe_pl.training.run import TrainingSettings
 from tests.runs import compose
 

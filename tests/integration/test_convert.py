@@ -15,6 +15,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
+from gpe_pl.config.datasets import ensure_data
 from gpe_pl.config.entry_point import ConfigError, explain
 from gpe_pl.config.folder import CONF
 from gpe_pl.convert import convert
@@ -23,7 +24,6 @@ from gpe_pl.evaluate import evaluate_checkpoint
 from gpe_pl.evaluation.rollouts import read_rows
 from gpe_pl.fit import fit
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.simulate import ensure_data
 from gpe_pl.trajectory.store import StoreError
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests import sources

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.config.entry_point import ConfigError
 from gpe_pl.data.ground_truth import trajectory_metadata
 from gpe_pl.evaluate import evaluate_checkpoint
@@ -24,7 +25,6 @@ from gpe_pl.learned.simulator import LearnedSimulator, SceneError
 from gpe_pl.models.gpe import GPE
 from gpe_pl.reports.finished_runs import table_of
 from gpe_pl.reports.sweep_table import summary
-from gpe_pl.simulate import dataset_spec
 from gpe_pl.trajectory.store import StoreError
 from tests.runs import DATA, compose, tiny
 
@@ -108,7 +108,7 @@ def test_an_evaluation_that_fails_leaves_no_folder(tiny_data: Path, tmp_path: Pa
     def fails(*_: object) -> None:
         raise StoreError("damaged")
 
-    monkeypatch.setattr("gpe_pl.simulate.ensure_split", fails)
+    monkeypatch.setattr("gpe_pl.config.datasets.ensure_split", fails)
     with pytest.raises(StoreError, match="damaged"):
         evaluate(tiny_data, tmp_path, tmp_path / "fit")
     assert not (tmp_path / "evaluation_test_unseen").exists()

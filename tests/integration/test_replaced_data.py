@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from omegaconf import DictConfig
 
+from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import data_statistics
 from gpe_pl.data.generation import generate
@@ -21,7 +22,6 @@ from gpe_pl.files import sealed
 from gpe_pl.files.run_folder import RunError
 from gpe_pl.fit import fit
 from gpe_pl.reports.finished_runs import finished_runs
-from gpe_pl.simulate import dataset_spec
 from gpe_pl.trajectory.store import StoreError, iter_trajectories, read_trajectory, trajectory_names, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests.runs import DATA, RUN, compose, generate_tiny

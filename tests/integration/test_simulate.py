@@ -61,7 +61,7 @@ def test_every_variant(tmp_path: Path, arguments: list[str], name: str) -> None:
 @pytest.mark.parametrize("size", ["tiny", "small", "paper"])
 @pytest.mark.parametrize("data", ["sand", "snow", "elastomer", "mixed", "snow_on_liquid", "fluid", "fem"])
 def test_every_size_composes(data: str, size: str) -> None:
-    from gpe_pl.simulate import dataset_spec
+    from gpe_pl.config.datasets import dataset_spec
 
     spec = dataset_spec(compose("simulate", f"data={data}", f"size={size}"))
     assert (spec.name, spec.size) == (data, size)

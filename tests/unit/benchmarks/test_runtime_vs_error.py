@@ -31,6 +31,7 @@ from gpe_pl.benchmarks.runtime_vs_error import (
     verdicts,
 )
 from gpe_pl.benchmarks.trained import Case
+from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.data.ground_truth import generate_trajectory, initial_state, trajectory_metadata
 from gpe_pl.files import sealed
 from gpe_pl.graphs.builder import GraphBuilder
@@ -40,7 +41,6 @@ from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.reports.finished_runs import Run, table_of
 from gpe_pl.rollout.baselines import ConstantVelocity
-from gpe_pl.simulate import dataset_spec
 from gpe_pl.solvers.resolution import Resolved
 from tests.runs import compose
 

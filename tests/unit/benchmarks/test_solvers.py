@@ -6,8 +6,8 @@ import pytest
 from omegaconf import OmegaConf
 
 from gpe_pl.benchmarks.solvers import BenchmarkError, Case, Settings, run, simulate
+from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.config.folder import CONF
-from gpe_pl.simulate import dataset_spec
 from tests.runs import compose
 
 TINY = ["size=tiny", "data.sizes.tiny.num_train=3", "data.sizes.tiny.num_frames=5"]

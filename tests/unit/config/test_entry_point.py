@@ -20,12 +20,12 @@ from pydantic import Field
 
 from gpe_pl.benchmark import benchmark, without_folder
 from gpe_pl.config import entry_point as configuration
+from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.config.entry_point import ConfigError, Report, bind, construct, entry_point, explain, output_dir, quoted
 from gpe_pl.config.folder import CONF
 from gpe_pl.errors import GpeError
 from gpe_pl.fit import fit
 from gpe_pl.learned.simulator import UnknownModelError
-from gpe_pl.simulate import dataset_spec
 from tests.runs import compose
 
 ROOT = Path(__file__).parents[3]

@@ -20,6 +20,7 @@ import h5py
 import numpy as np
 import pytest
 
+from gpe_pl.config.datasets import dataset, dataset_spec
 from gpe_pl.config.entry_point import ConfigError
 from gpe_pl.data import generation
 from gpe_pl.data.generation import discard_damaged, generate, plan, seconds_per_trajectory
@@ -35,7 +36,6 @@ from gpe_pl.data.ground_truth import (
 from gpe_pl.data.validate import validate
 from gpe_pl.files.run_folder import RunError
 from gpe_pl.schema import SPLITS
-from gpe_pl.simulate import dataset, dataset_spec
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.scenes import BodyScene
 from gpe_pl.system.progress import progress_bar

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gpe_pl.config.datasets import imported_data
 from gpe_pl.config.entry_point import ConfigError, compose
 from gpe_pl.evaluate import evaluate_checkpoint
 from gpe_pl.files.names import NameRefused, data_name, portable, run_name, sweep_name
 from gpe_pl.fit import fit
-from gpe_pl.simulate import imported_data
 
 LEAD_OUT = ["..", "../x", "a/../../x", "/etc/x", "a//b", "a/", "", " ", ".", "./a", ".hidden", "a/.lock"]
 UNPORTABLE = ["C:\\x", "a:b", "a?b", 'a"b', "con", "NUL.txt", "a/LPT1", "end.", "end ", " start"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.data.ground_truth import DatasetSpec, initial_state
-from gpe_pl.simulate import dataset_spec
 from gpe_pl.solvers.resolution import Resolved, coarser, finer, outline
 from gpe_pl.trajectory.state import State
 from tests.runs import compose

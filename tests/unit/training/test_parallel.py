@@ -32,7 +32,7 @@ from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import node_code, param_names
 from gpe_pl.system import ranks
 from gpe_pl.training.module import MAX_IN_ROW, TrainingError, TrainingModule
-from gpe_pl.training.parallel import sum_gradients
+from gpe_pl.training.parallel import end_later_processes, sum_gradients
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, train
 from gpe_pl.trajectory.store import StoreError, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -168,6 +168,7 @@ def trained(root: Path, run: Path, rank: int, num_ranks: int, size: BatchSize, n
     seen: dict[str, Any] = {"steps": module.steps, "losses": module.losses}
     try:
         train(module, data, settings, TrainerSettings(devices=num_ranks, progress=False), [CSVLogger(run, name="log")], run)
+        end_later_processes()
     finally:
         seen["weights"] = {k: v.numpy() for k, v in module.simulator.state_dict().items()}
         (run / f"seen_{rank}.pickle").write_bytes(pickle.dumps(seen))

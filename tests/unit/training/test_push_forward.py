@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,6 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
-from gpe_pl.reports.finished_runs import UNSAID
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.push_forward import walked
@@ -155,20 +154,11 @@ def test_a_start_can_be_moved(data: WindowDataset) -> None:
     assert moved.own_steps == 2 and torch.equal(moved.truth, start.truth)
 
 
-def test_settings_of_older_runs_are_known_again() -> None:
-    old = TrainingSettings(num_steps=10, val_interval=5)
-    assert not {"sampling", "push_share", "push_steps", "push_correction"} & old.as_dict().keys()
-    assert old.push_forward is None
-    assert {f"training.{key}": value for key, value in asdict(old).items() if key not in {*old.as_dict(), "push_steps"}} == UNSAID
-    new = TrainingSettings(num_steps=10, val_interval=5, sampling="activity", push_share=0.3, push_steps=4)
-    assert {k: new.as_dict()[k] for k in ("sampling", "push_share", "push_steps")} == {
-        "sampling": "activity",
-        "push_share": 0.3,
-        "push_steps": 4,
-    }
-    assert "push_correction" not in new.as_dict() and new.push_forward == PushForward(7, 4)
-    newer = replace(new, push_correction=0.2)
-    assert newer.as_dict()["push_correction"] == 0.2 and newer.push_forward == PushForward(7, 4, 0.2)
+def test_the_last_steps_are_unrolled() -> None:
+    settings = TrainingSettings(num_steps=10, val_interval=5, push_steps=4)
+    assert settings.push_forward is None
+    assert replace(settings, push_share=0.3).push_forward == PushForward(7, 4)
+    assert replace(settings, push_share=0.3, push_correction=0.2).push_forward == PushForward(7, 4, 0.2)
 
 
 def test_walls_that_move_go_on_moving_on_the_way(

@@ -22,9 +22,9 @@ from gpe_pl.benchmarks.faults import checkpoints, configs, field_values, isolati
 from gpe_pl.benchmarks.faults.isolation import CANARY, Ended, verdicts
 from gpe_pl.benchmarks.faults.suite import report
 from gpe_pl.benchmarks.faults.verdict import GOOD, Fault, Verdict, judge
+from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.errors import GpeError
-from gpe_pl.simulate import dataset
 from gpe_pl.system import early_interrupts
 
 

@@ -19,6 +19,7 @@ from gpe_pl.benchmarks.stability.subject import Outcome, StressTest, Subject
 from gpe_pl.benchmarks.stability.suite import GROUPS, NothingToTestError, Settings, figures, is_gating, run
 from gpe_pl.benchmarks.stability.suite import test as run_tests
 from gpe_pl.benchmarks.trained import Case, model_label, trained_on
+from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec, generate_trajectory
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
@@ -26,9 +27,8 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.reports.finished_runs import Run
-from gpe_pl.simulate import dataset
 from gpe_pl.trajectory.state import State
-from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import State, Trajectory
 from tests.runs import compose
 
 NUM_FRAMES = 16

@@ -1,0 +1,182 @@
+"""A training run as the configuration of ``fit`` describes it, in stages that each do one thing."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from gpe_pl.config.datasets import IMPORTED, ensure_data, evaluated_config, scene_metadata
+from gpe_pl.config.entry_point import ConfigError, bind, construct
+from gpe_pl.data.checksum import split_checksum
+from gpe_pl.data.datamodule import TrajectoryDataModule
+from gpe_pl.data.dataset import open_split, window_counts
+from gpe_pl.data.sampling import BatchSize
+from gpe_pl.evaluation.rollouts import LEARNED, EvaluationSettings, evaluate, means, read_rows
+from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError, claim, without_tables
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned.pretrained import fingerprint
+from gpe_pl.learned.simulator import LearnedSimulator, model_class
+from gpe_pl.reports.finished_runs import Run, rollout_errors, table_of
+from gpe_pl.training.budget import PauseForMeasurements, mean_step_time, step_time_key, within_budget
+from gpe_pl.training.module import TrainingModule
+from gpe_pl.training.parallel import end_later_processes
+from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, seed, set_up, train
+from gpe_pl.training.tracking import LoggerSettings, publish
+
+OPTIMISATION = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "stress_weight", "compile")
+"""Fields of ``TrainingSettings`` that ``TrainingModule`` takes."""
+
+
+class FitRun:
+    """One run of ``fit``. The constructor checks every setting and does nothing else; the methods are called in the order in which they are written.
+
+    Args:
+        cfg: the composed configuration.
+        folder: of the results.
+
+    Raises:
+        ConfigError: a setting has the wrong type or value, or does not fit the others.
+    """
+
+    def __init__(self, cfg: DictConfig, folder: Path) -> None:
+        if type(cfg.seed) is not int or cfg.seed < 0:
+            raise ConfigError(f"seed={cfg.seed!r}: must be an integer of at least 0")
+        if not (cfg.start_from is None or isinstance(cfg.start_from, str)):
+            raise ConfigError(f"start_from={cfg.start_from!r}: must be null, the folder of a run, a checkpoint or a shipped model")
+        self.cfg, self.folder, self.runs = cfg, folder, Path(cfg.paths.runs)
+        self.training = construct(TrainingSettings, cfg.training, "training")
+        self.trainer = construct(TrainerSettings, cfg.trainer, "trainer")
+        self.evaluation = construct(EvaluationSettings, {k: v for k, v in cfg.evaluation.items() if k != "data"}, "evaluation")
+        self.graph = construct(GraphConfig, cfg.graph, "graph")
+        self.first_frame = self.evaluation.first_frame(self.graph.history)
+        self.logger = construct(LoggerSettings, cfg.logger, "logger")
+        settings = {key: value for key, value in cfg.model.items() if key != "_target_"}
+        self.new_model = bind(model_class(cfg.model._target_), settings, "model", "spec")
+        self.batch_size = construct(BatchSize, cfg.batching, "batching", num_graphs=self.training.batch_size)
+        if self.evaluation.static_friction and not self.graph.islands:
+            raise ConfigError(
+                f"evaluation.static_friction={self.evaluation.static_friction:g}: needs graph.islands=true, which model=gpe_tuned has"
+            )
+        self.start = None if cfg.start_from is None else LearnedSimulator.from_checkpoint(cfg.start_from)
+        self.callbacks: list[PauseForMeasurements] = []
+
+    def prepare_data(self) -> None:
+        """Generate missing data. A model to start from and noise that do not fit the scenes are refused before."""
+        if self.start is not None or self.training.position_noise_of_domain:
+            scenes = scene_metadata(self.cfg, "train")
+            self.training.noise.check(scenes)
+            if self.start is not None:
+                self.start.check_scene(scenes)
+        self.root = ensure_data(self.cfg)
+        self.evaluated_root = ensure_data(evaluated_config(self.cfg)) if self.cfg.evaluation.data else self.root
+        self.device = set_up(self.trainer)
+
+    def choose_num_steps(self) -> None:
+        """Replace a budget of minutes by the number of steps that it allows."""
+        if self.training.budget_minutes is None:
+            return
+        checksum = self._checksums["train"] if self._settings["data"]["size"] == IMPORTED else None
+        key = step_time_key(self._settings, self.training, self.trainer, checksum)
+        times = self.runs / (self.cfg.reuse or self.cfg.name) / "step_times.json"
+        self.callbacks.append(PauseForMeasurements(times))
+        self.training = within_budget(self.training, times, key, self._step_time, self.device)
+
+    def claim_folder(self) -> None:
+        """Take the folder for this run; raises ``RunError`` where it belongs to a run with another configuration."""
+        claim(self.folder, self._config)
+
+    @property
+    def is_evaluated(self) -> bool:
+        """Whether an earlier start has finished the run."""
+        return self._metrics.exists()
+
+    def check_evaluation(self) -> None:
+        """Refuse splits whose trajectories are too short, before the training rather than after it."""
+        for split in self.evaluation.splits:
+            window_counts(open_split(self.evaluated_root, split, cache_bytes=0), self.first_frame)
+
+    def finished_model(self) -> Path | None:
+        """The best checkpoint of a finished run of the sweep ``reuse`` with the same training."""
+        best = None if self.cfg.reuse is None else adopt(self.runs / self.cfg.reuse, self._trained, self.folder)
+        if best is not None:
+            end_later_processes()
+        return best
+
+    def train(self) -> Path:
+        """Train to the last step, from the last checkpoint where there is one; returns the best checkpoint."""
+        best = train(self._new_module(self.training), self._data, self.training, self.trainer, self._loggers, self.folder, self.callbacks)
+        end_later_processes()
+        return best
+
+    def evaluate(self, checkpoint: Path) -> None:
+        """Roll the model out on the evaluated splits, and publish the means."""
+        rows = evaluate(LearnedSimulator.from_checkpoint(checkpoint, self.device), self.evaluated_root, self.evaluation, self.folder)
+        publish(self._loggers, self.folder, means(rows))
+
+    def error(self) -> float:
+        """Mean full-length rollout MSE [m²] on the first evaluated split."""
+        split = self.evaluation.splits[0]
+        run = Run(self.folder, {}, table_of(read_rows(self._metrics)))
+        values = [value for errors in rollout_errors([run], split, "full") for value in errors.values()]
+        if not values:
+            raise RunError(f"{self._metrics}: has no rollout_mse of {LEARNED} on {split}; delete the file to evaluate again")
+        return sum(values) / len(values)
+
+    @property
+    def _metrics(self) -> Path:
+        return self.folder / "metrics.csv"
+
+    @cached_property
+    def _settings(self) -> dict[str, Any]:
+        resolved: Any = OmegaConf.to_container(self.cfg, resolve=True)
+        return without_tables(resolved)
+
+    @cached_property
+    def _checksums(self) -> dict[str, str]:
+        return {split: split_checksum(self.root, split) for split in ("train", "val")}
+
+    @property
+    def _trained(self) -> dict[str, Any]:
+        """Everything that the trained model depends on."""
+        own = {key: self._settings[key] for key in ("seed", "size", "data", "graph", "batching", "model")}
+        start = {} if self.cfg.start_from is None else {"start_from": fingerprint(self.cfg.start_from)}
+        return own | start | {"training": asdict(self.training), DATA_CHECKSUMS: self._checksums}
+
+    @cached_property
+    def _config(self) -> dict[str, Any]:
+        """Everything that the results depend on."""
+        checksums = {split: split_checksum(self.evaluated_root, split) for split in self.evaluation.splits}
+        return self._trained | {"evaluation": self._settings["evaluation"] | {DATA_CHECKSUMS: checksums}}
+
+    @cached_property
+    def _loggers(self) -> list[Any]:
+        return self.logger.loggers(self.folder, self.cfg.name, self._config)
+
+    @cached_property
+    def _data(self) -> TrajectoryDataModule:
+        return TrajectoryDataModule(
+            self.root,
+            self.graph,
+            self.training.noise,
+            self.batch_size,
+            self.cfg.seed,
+            self.trainer.num_workers,
+            stress=bool(self.cfg.model.get("stress", False)),
+            sampling=self.training.sampling,
+        )
+
+    def _new_module(self, training: TrainingSettings) -> TrainingModule:
+        seed(self.cfg.seed)
+        data = self._data
+        simulator = LearnedSimulator(self.new_model(spec=data.builder.spec), data.builder)
+        simulator.fit_statistics(data.statistics_sample(), data.parameter_ranges(), data.trained_scene())
+        if self.start is not None:
+            simulator.start_from(self.start)
+        return TrainingModule(simulator, **{name: getattr(training, name) for name in OPTIMISATION})
+
+    def _step_time(self, training: TrainingSettings) -> float:
+        return mean_step_time(self._new_module(training).to(self.device), self._data.train_set, self.batch_size, training)
