@@ -7,7 +7,6 @@ follows McGreivy and Hakim 2024 (arXiv 2407.07218): a solver can always run at a
 
 from __future__ import annotations
 
-import copy
 import logging
 import math
 import time
@@ -143,8 +142,7 @@ def _models(runs: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[
         seconds = training_seconds(run)
         found[label] = simulator.to(settings.device), seconds
         for hold in settings.holds:
-            holding = copy.copy(simulator)
-            holding.skips = replace(simulator.skips, hold=hold)
+            holding = simulator.configured(skips=replace(simulator.skips, hold=hold))
             found[f"{label}{HELD} × {hold}"] = holding, seconds
     return found
 

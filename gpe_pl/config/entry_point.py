@@ -401,9 +401,13 @@ class Report(Callback):
         """Ends the process on failure: Hydra turns an exception of a callback into a warning, and the command would seem to have succeeded."""
         try:
             if is_sweep:
+                from gpe_pl.benchmarks.forward_times import measure_forward_times
+                from gpe_pl.reports.finished_runs import finished_runs
                 from gpe_pl.reports.tables import write_tables
 
-                table = write_tables(folder)
+                runs = finished_runs(folder)
+                measure_forward_times(folder, runs)
+                table = write_tables(folder, runs)
                 if table.exists():  # not where no run has finished
                     print(table.read_text(encoding="utf-8"))
             else:

@@ -115,10 +115,9 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     """Roll out every trajectory of the splits; writes ``metrics.csv``, ``error_curve_*.png``, ``rollout_*.png``, ``rollout_*.gif``
     and ``rollout_*.html`` (a viewer) of some, and their ``stress_*.png`` where the model decodes a stress.
 
-    All rollouts start at ``settings.start_frame`` and run to the end of the ground truth; ``simulator`` is left with ``settings.hold_parameters`` and
-    ``settings.static_friction``. Share outside with containment off is reported as
-    ``share_outside_uncontained``, where it was asked for, the share of corrected particle-steps as ``share_corrected``; neither where a boundary is known by
-    its nodes only.
+    All rollouts start at ``settings.start_frame`` and run to the end of the ground truth. ``share_outside_uncontained`` is the fraction of particle-frames
+    outside when containment is off, for as many rollouts as ``settings.num_uncontained``. ``share_corrected`` is the fraction of particle-steps that
+    containment corrects. Neither is reported where a boundary is known by its nodes only.
 
     Where ``simulator.skips`` has approximate levels, the rollout without them is evaluated beside, and what they cost is reported: ``skipping_mse`` [m²] is
     the distance between the two rollouts, as far as the exact one came, ``share_asleep`` that of particle-steps that were not computed, ``lost_impulse``
@@ -133,9 +132,7 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
         raise ExportError(
             "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
         )
-    simulator.holds_parameters = settings.hold_parameters
-    if settings.static_friction is not None:
-        simulator.static_friction = settings.static_friction
+    simulator = simulator.configured(holds_parameters=settings.hold_parameters, static_friction=settings.static_friction)
     run_dir.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     for split in settings.splits:

@@ -116,6 +116,20 @@ class LearnedSimulator(nn.Module):
         self.builder = replace(self.builder, skips=skips)
         cast(Any, self.model).skips = skips
 
+    def configured(
+        self, *, skips: Skips | None = None, holds_parameters: bool | None = None, static_friction: float | None = None
+    ) -> LearnedSimulator:
+        """A copy with other settings; None keeps a setting. The copy shares the weights and leaves this simulator unchanged."""
+        other = copy.copy(self)
+        other._modules = {**self._modules, "model": copy.copy(self.model)}
+        if skips is not None:
+            other.skips = skips
+        if holds_parameters is not None:
+            other.holds_parameters = holds_parameters
+        if static_friction is not None:
+            other.static_friction = static_friction
+        return other
+
     @property
     def static_friction(self) -> float:
         return self._static_friction

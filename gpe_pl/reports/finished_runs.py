@@ -66,8 +66,8 @@ def archive(runs: list[Run], root: Path, folder: Path) -> None:
         settings = {f"{CONFIG}{key}": value for key, value in run.config.items()} | {
             f"{DATA}{key}": value for key, value in run.data.items()
         }
-        about[_name(run, root)] = settings | dict(zip(CURVE, (array.tolist() for array in validation_curve(run)), strict=True))
-    run_archive.write_archive(folder, about, {_name(run, root): run.rows for run in runs})
+        about[run_name(run, root)] = settings | dict(zip(CURVE, (array.tolist() for array in validation_curve(run)), strict=True))
+    run_archive.write_archive(folder, about, {run_name(run, root): run.rows for run in runs})
 
 
 CONFIG, DATA = "config:", "data:"
@@ -75,7 +75,8 @@ CONFIG, DATA = "config:", "data:"
 CURVE = ("validation_steps", "validation_losses")
 
 
-def _name(run: Run, root: Path) -> str:
+def run_name(run: Run, root: Path) -> str:
+    """Path of a run relative to the folder of its sweep."""
     return run.folder.relative_to(root).as_posix()
 
 

@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 
 from gpe_pl.evaluation.rollouts import LEARNED, read_rows
+from gpe_pl.files import sealed
 from gpe_pl.files.atomic import replace_text, replacing
 from gpe_pl.files.markdown import table_row
-from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import bootstrap_interval
-from gpe_pl.nn.fused import unfused
 from gpe_pl.printable import printable
 from gpe_pl.reports.finished_runs import (
     UNSEEN_GROUPS,
@@ -27,6 +25,7 @@ from gpe_pl.reports.finished_runs import (
     distinct_runs,
     finished_runs,
     rollout_errors,
+    run_name,
     shared_table,
     splits_of,
     table_of,
@@ -36,13 +35,15 @@ from gpe_pl.reports.finished_runs import (
 )
 from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
 from gpe_pl.rollout.baselines import BASELINES
-from gpe_pl.system.timing import paired_ratio, paired_times
 from gpe_pl.viz.saving import save_figure
 
 log = logging.getLogger(__name__)
 
 STRESS_METRICS = ("von_mises_error", "stress_error")
 SWEEP_MD = "table.md"
+FORWARD_TIMES = "forward_times.json"
+Variant = tuple[str, ...]
+"""Values of the keys in which runs of a sweep differ."""
 
 TABLE_HORIZONS = 4
 """The longest horizons, shown in the Markdown table; ``table.csv`` has all."""
@@ -58,16 +59,22 @@ def report(folder: Path) -> None:
     _report(folder, [run for run in finished_runs(folder) if run.folder == folder])
 
 
+def variants_of(runs: list[Run]) -> tuple[list[str], dict[Variant, list[Run]]]:
+    """Keys in which runs differ besides their seeds, and the runs by their values of these keys."""
+    axes = [axis for axis in axes_of(runs) if axis != "seed"]
+    variants: dict[Variant, list[Run]] = defaultdict(list)
+    for run in runs:
+        variants[tuple(str(run.config.get(axis)) for axis in axes)].append(run)
+    return axes, variants
+
+
 def _report(folder: Path, runs: list[Run]) -> None:
     """Write ``table.csv``, ``table.md``, ``validation_loss.png`` and, of unseen material parameters, ``error_by_parameter.png``."""
     if not runs:
         return
-    axes = [a for a in axes_of(runs) if a != "seed"]
-    variants: dict[tuple[str, ...], list[Run]] = defaultdict(list)
-    for run in runs:
-        variants[tuple(str(run.config.get(a)) for a in axes)].append(run)
+    axes, variants = variants_of(runs)
     _write_csv(folder / "table.csv", axes, runs)
-    ratios = forward_time_ratios(variants)
+    ratios = forward_time_ratios(folder, variants)
     replace_text(folder / SWEEP_MD, _markdown(axes, variants, ratios))
     curves = {", ".join(v) or LEARNED: [validation_curve(r) for r in members] for v, members in variants.items()}
     curves = {k: [c for c in v if len(c[0])] for k, v in curves.items()}
@@ -136,31 +143,17 @@ def _interval(values: Values, scale: float = 1.0) -> str:
     return f"{i.estimate:.3g} [{i.low:.3g}, {i.high:.3g}]"
 
 
-def forward_time_ratios(variants: dict[tuple[str, ...], list[Run]], num_rounds: int = 30) -> dict[tuple[str, ...], float]:
-    """Forward time of each variant's trained model over that of the first, by PyTorch's operations alone, which all variants have in common: the median of
-    paired ratios on one graph; empty for a single variant.
-    """
-    from gpe_pl.graphs.lattice import lattice_graph
-
-    if len(variants) < 2:
+def forward_time_ratios(folder: Path, variants: dict[Variant, list[Run]]) -> dict[Variant, float]:
+    """Forward time of each variant's model over that of the first, as ``benchmarks.forward_times`` measured them; empty where it did not."""
+    path = folder / FORWARD_TIMES
+    if not path.exists():
         return {}
-    names = {v: "/".join(v) for v in variants}
-    alternatives = {}
-    for v, members in variants.items():
-        simulator = LearnedSimulator.from_checkpoint(members[0].folder / "checkpoints" / "best.ckpt")
-        if simulator.builder.spec.materials != ("sand",) or simulator.builder.spec.dim != 2:
-            return {}  # the graph below is one layer of sand
-        _, graph = lattice_graph(600, 6000, simulator.builder.config)
-        alternatives[names[v]] = unfused()(torch.inference_mode()(lambda s=simulator, g=graph: s(g)))
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    times = paired_times(alternatives, num_rounds)
-    torch.set_num_threads(threads)
-    first = names[next(iter(variants))]
-    return {v: paired_ratio(times, names[v], first) for v in variants}
+    ratios = sealed.read(path, "delete it; the command of the sweep measures again")
+    names = {variant: run_name(members[0], folder) for variant, members in variants.items()}
+    return {variant: ratios[name] for variant, name in names.items()} if {*names.values()} == ratios.keys() else {}
 
 
-def _markdown(axes: list[str], variants: dict[tuple[str, ...], list[Run]], ratios: dict[tuple[str, ...], float]) -> str:
+def _markdown(axes: list[str], variants: dict[Variant, list[Run]], ratios: dict[Variant, float]) -> str:
     names = [_column(a) for a in axes] or ["model"]
     first = next(iter(variants.values()))[0]
     return "\n".join(
@@ -168,7 +161,7 @@ def _markdown(axes: list[str], variants: dict[tuple[str, ...], list[Run]], ratio
     )
 
 
-def _training_table(names: list[str], variants: dict[tuple[str, ...], list[Run]], ratios: dict[tuple[str, ...], float]) -> list[str]:
+def _training_table(names: list[str], variants: dict[Variant, list[Run]], ratios: dict[Variant, float]) -> list[str]:
     header = [
         *names,
         "seeds",
@@ -203,7 +196,7 @@ def _training_table(names: list[str], variants: dict[tuple[str, ...], list[Run]]
     return [*lines, *rows, "", note]
 
 
-def _rollout_table(names: list[str], variants: dict[tuple[str, ...], list[Run]], first: Run) -> list[str]:
+def _rollout_table(names: list[str], variants: dict[Variant, list[Run]], first: Run) -> list[str]:
     splits = splits_of(first)
     horizons = _horizons(first)
     baselines = sorted({*first.rows["model"]} - {LEARNED})
@@ -239,7 +232,7 @@ def _horizons(run: Run) -> list[str]:
     return sorted(found, key=lambda h: (h == "full", h.zfill(6)))[-TABLE_HORIZONS:]
 
 
-def _stress_table(names: list[str], variants: dict[tuple[str, ...], list[Run]]) -> list[str]:
+def _stress_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[str]:
     """Errors of displacement, velocity and stress beside each other, of models that decode a stress."""
     stressed = {key: runs for key, runs in variants.items() if runs[0].rows["metric"].isin(STRESS_METRICS).any()}
     if not stressed:

@@ -10,19 +10,18 @@ from gpe_pl.errors import GpeError
 from gpe_pl.files.run_folder import RunError
 from gpe_pl.printable import one_line, speak_utf8
 from gpe_pl.reports.domain_table import TABLE_MD, compares_models, report_domains
-from gpe_pl.reports.finished_runs import finished_runs
+from gpe_pl.reports.finished_runs import Run, finished_runs
 from gpe_pl.reports.sweep_table import SWEEP_MD, report_sweep
 from gpe_pl.reports.trial_table import TRIALS_MD, compares_settings, report_trials
 from gpe_pl.system.locks import held
 
 
-def write_tables(folder: Path) -> Path:
-    """Write the tables that suit what the runs below a folder differ in, or those that are archived in it.
+def write_tables(folder: Path, runs: list[Run]) -> Path:
+    """Write the tables that suit what runs differ in into the folder of their sweep.
 
     Returns:
         The one to read, which is not there where no run has finished.
     """
-    runs = finished_runs(folder)
     if compares_settings(runs):
         report_trials(folder, runs)
         return folder / TRIALS_MD
@@ -40,10 +39,11 @@ def main(arguments: list[str] | None = None) -> int:
     folder = parser.parse_args(arguments).folder
     speak_utf8()
     try:
-        if not finished_runs(folder):
+        runs = finished_runs(folder)
+        if not runs:
             raise RunError(f"{folder}: has no finished run, which would have a config.json and a metrics.csv")
         with held(folder):
-            print(write_tables(folder).read_text(encoding="utf-8"))
+            print(write_tables(folder, runs).read_text(encoding="utf-8"))
     except GpeError as error:
         print(f"error: {one_line(str(error))}", file=sys.stderr)
         return 2

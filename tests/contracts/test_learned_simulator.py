@@ -8,7 +8,7 @@ import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -48,6 +48,20 @@ def silenced(simulator: LearnedSimulator) -> LearnedSimulator:
         for p in simulator.model.parameters():
             p.zero_()
     return simulator
+
+
+def test_a_copy_with_other_settings_leaves_the_original_unchanged(new_trajectory: Callable[..., Trajectory]) -> None:
+    simulator = learned(builder_of(new_trajectory(), islands=True))
+    other = simulator.configured(skips=replace(simulator.skips, stress=True), holds_parameters=False, static_friction=0.5)
+    own, others = (cast(Any, s.model).skips.stress for s in (simulator, other))
+    assert (other.skips.stress, others, other.holds_parameters, other.static_friction) == (True, True, False, 0.5)
+    assert (simulator.skips.stress, own, simulator.holds_parameters, simulator.static_friction) == (
+        False,
+        False,
+        True,
+        0.0,
+    )
+    assert all(a is b for a, b in zip(simulator.parameters(), other.parameters(), strict=True))
 
 
 @pytest.mark.parametrize("history", HISTORIES)

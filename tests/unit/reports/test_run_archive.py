@@ -29,8 +29,8 @@ def archived(tmp_path: Path) -> Path:
 
 def test_tables_from_an_archive_are_those_of_the_runs(archived: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(domain_table, "_figures", lambda *_: None)
-    write_tables(tmp_path / "runs")
-    write_tables(archived)
+    write_tables(tmp_path / "runs", finished_runs(tmp_path / "runs"))
+    write_tables(archived, finished_runs(archived))
     for name in ("table1.md", "table1_ratios.md", "table1.csv"):
         assert (archived / name).read_text() == (tmp_path / "runs" / name).read_text()
 

@@ -38,8 +38,7 @@ def write_run(folder: Path, interaction: str, seed: int) -> None:
 
 
 @pytest.fixture
-def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr(sweep_table, "forward_time_ratios", lambda variants: {})  # there are no checkpoints
+def runs(tmp_path: Path) -> Path:
     for interaction, seed in ERRORS:
         write_run(tmp_path / interaction / str(seed), interaction, seed)
     return tmp_path
@@ -64,6 +63,16 @@ def test_errors_are_means_and_factors_over_the_best_trivial_baseline(runs: Path)
     assert cells(runs, "odd")[1][2] == "8 0.5×"
     assert cells(runs, "odd_even")[1][2] == "4e+09 < 0.01×"
     assert cells(runs, "ballistic")[0][2] == "4"
+
+
+def test_forward_times_are_shown_where_all_variants_have_them(runs: Path) -> None:
+    ratios = {f"{name}/0": 1.0 + k / 4 for k, name in enumerate(("directed", "negated", "odd", "odd_even"))}
+    sealed.write(runs / "forward_times.json", ratios)
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    assert [cells(runs, name)[0][3] for name in ("directed", "negated", "odd", "odd_even")] == ["1.00", "1.25", "1.50", "1.75"]
+    sealed.write(runs / "forward_times.json", {key: value for key, value in ratios.items() if key != "odd/0"})
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    assert cells(runs, "negated")[0][3] == "–"
 
 
 def test_failed_rollouts_are_counted(runs: Path) -> None:

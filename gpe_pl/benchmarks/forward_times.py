@@ -1,0 +1,50 @@
+"""Forward times of the models of a sweep, for the column of its table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from gpe_pl.files import sealed
+from gpe_pl.graphs.lattice import lattice_graph
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.nn.fused import unfused
+from gpe_pl.reports.domain_table import compares_models
+from gpe_pl.reports.finished_runs import Run, distinct_runs, run_name
+from gpe_pl.reports.sweep_table import FORWARD_TIMES, variants_of
+from gpe_pl.system.timing import paired_ratio, paired_times
+
+NUM_NODES, NUM_EDGES = 600, 6000
+"""Of the graph: one layer of sand."""
+
+
+def measure_forward_times(folder: Path, runs: list[Run], num_rounds: int = 30) -> None:
+    """Write the forward time of one model per variant over that of the first variant: the median of paired ratios on one graph.
+
+    All models compute by PyTorch's operations alone, which all variants have in common. Nothing is measured where runs are of several models or domains, where
+    there is one variant, where models know other materials than sand, or where the variants were measured before.
+
+    Args:
+        folder: of the sweep; ``forward_times.json`` is written there.
+        runs: of the sweep, all finished.
+        num_rounds: of the measurement.
+    """
+    runs = distinct_runs(runs)
+    path = folder / FORWARD_TIMES
+    first_runs = [members[0] for members in variants_of(runs)[1].values()] if runs else []
+    names = [run_name(run, folder) for run in first_runs]
+    if len(names) < 2 or compares_models(runs) or (path.exists() and sealed.read(path, "delete it to measure again").keys() == {*names}):
+        return
+    alternatives = {}
+    for name, run in zip(names, first_runs, strict=True):
+        simulator = LearnedSimulator.from_checkpoint(run.folder / "checkpoints" / "best.ckpt")
+        if simulator.builder.spec.materials != ("sand",) or simulator.builder.spec.dim != 2:
+            return
+        _, graph = lattice_graph(NUM_NODES, NUM_EDGES, simulator.builder.config)
+        alternatives[name] = unfused()(torch.inference_mode()(lambda s=simulator, g=graph: s(g)))
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    times = paired_times(alternatives, num_rounds)
+    torch.set_num_threads(threads)
+    sealed.write(path, {name: paired_ratio(times, name, names[0]) for name in names})
