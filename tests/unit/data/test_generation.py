@@ -38,6 +38,7 @@ from gpe_pl.files.run_folder import RunError
 from gpe_pl.schema import SPLITS
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.scenes import BodyScene
+from gpe_pl.system.locks import FolderError
 from gpe_pl.system.progress import progress_bar
 from gpe_pl.trajectory.store import iter_trajectories, read_trajectory
 from tests.runs import compose
@@ -205,6 +206,19 @@ def test_killed_at_random_moments(tmp_path, data):
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=Path(generation.__file__).parents[2])
     assert contents(killed) == contents(whole)
     assert not validate([killed]).violations
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_a_data_set_that_is_deleted_meanwhile_can_be_made_again(tmp_path, num_workers):
+    def delete_once(done, total):
+        if done == 2:
+            shutil.rmtree(tmp_path / "sand", ignore_errors=True)
+
+    with pytest.raises(FolderError, match="deleted or replaced"):
+        generate(tmp_path, SPEC, num_workers, delete_once)
+    assert not list(tmp_path.rglob("shard-*.h5"))
+    folder = generate(tmp_path, SPEC, num_workers)
+    assert not validate([folder]).violations
 
 
 def test_accelerations_that_would_be_rounding_are_refused_before_they_are_stored(tmp_path, caplog):
