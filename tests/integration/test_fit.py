@@ -248,7 +248,7 @@ def _claimed(cfg: DictConfig) -> dict[str, Any]:
     from omegaconf import OmegaConf
 
     values: Any = OmegaConf.to_container(cfg, resolve=True)
-    return {k: values[k] for k in ("seed", "size", "data", "graph", "model", "training", "evaluation")}
+    return {k: values[k] for k in ("seed", "size", "data", "graph", "batching", "model", "training", "evaluation")}
 
 
 @pytest.mark.slow

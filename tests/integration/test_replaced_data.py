@@ -92,7 +92,7 @@ def test_a_run_knows_its_data_by_what_they_hold(tmp_path: Path, monkeypatch: pyt
         fit(run)
     other = config("fit", tmp_path, "evaluation.splits=[test]", "name=other", "reuse=run", f"paths.data={tmp_path / 'moved'}")
     (tmp_path / "runs" / "run" / "metrics.csv").touch()
-    monkeypatch.setattr("gpe_pl.training.run.train", lambda *_: pytest.fail("trains its own", pytrace=False))
+    monkeypatch.setattr("gpe_pl.config.fit_run.train", lambda *_: pytest.fail("trains its own", pytrace=False))
     with pytest.raises(pytest.fail.Exception, match="trains its own"):  # rather than take the model of the run on other data
         fit(other)
 
