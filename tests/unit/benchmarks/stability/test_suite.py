@@ -28,6 +28,7 @@ from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.reports.finished_runs import Run
 from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests.runs import compose
 
 NUM_FRAMES = 16
