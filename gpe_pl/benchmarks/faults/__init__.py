@@ -1,1 +1,1 @@
-"""Damage, hostility and interruption, done on purpose, and what comes of it."""
+"""Fault injection: deliberate damage, hostile input and interruption, and what follows from it."""

@@ -1,4 +1,4 @@
-"""Checkpoints that are damaged, belong to another model, or carry code."""
+"""Faults of checkpoints: damaged files, files of another model, and files that carry code."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from gpe_pl.benchmarks.faults.verdict import Fault, Verdict, judge
 from gpe_pl.learned.simulator import LearnedSimulator
 
 MAX_WEIGHTS = 16
-"""That are left out or not finite, about; the others are stored alike."""
+"""Approximate number of weights that are removed or made not finite; the others are stored in the same way."""
 TRACE = "executed"
-"""File that a payload leaves behind."""
+"""Name of the file that an executed payload creates."""
 
 
 def load_damaged(sound: Path, damage: Callable[[bytes], bytes], folder: Path) -> Verdict:
@@ -72,7 +72,7 @@ OTHER_MODELS: tuple[tuple[str, Any], ...] = (
 
 
 def load_changed(sound: Path, key: str, value: Any, folder: Path) -> Verdict:
-    """Load a checkpoint whose description says something else."""
+    """Load a checkpoint with a changed entry of its description."""
     stored = torch.load(sound, weights_only=True)
     description = stored["simulator"]
     changed = {**description[key], **value} if isinstance(value, dict) and isinstance(description[key], dict) else value
@@ -80,7 +80,7 @@ def load_changed(sound: Path, key: str, value: Any, folder: Path) -> Verdict:
 
 
 def load_without(sound: Path, key: str, folder: Path) -> Verdict:
-    """Load a checkpoint in which a weight is missing, or the description."""
+    """Load a checkpoint without a weight, or without the description."""
     stored = torch.load(sound, weights_only=True)
     if key in stored:
         del stored[key]
@@ -90,12 +90,12 @@ def load_without(sound: Path, key: str, folder: Path) -> Verdict:
 
 
 def load_content(content: Any, folder: Path) -> Verdict:
-    """Load a file of PyTorch that is no checkpoint."""
+    """Load a PyTorch file that is not a checkpoint."""
     return _load_saved(content, folder)
 
 
 def load_not_finite(sound: Path, key: str, value: float, folder: Path) -> Verdict:
-    """Load a checkpoint in which a weight is not finite."""
+    """Load a checkpoint with a weight that is not finite."""
     stored = torch.load(sound, weights_only=True)
     stored["state_dict"][key].view(-1)[0] = value
     return _load_saved(stored, folder)
@@ -111,7 +111,7 @@ def _load_saved(content: Any, folder: Path) -> Verdict:
 
 
 class Payload:
-    """When it is unpickled it calls a function."""
+    """Object that calls a function when it is unpickled."""
 
     def __init__(self, function: Callable[..., Any], *arguments: Any) -> None:
         self.call = (function, arguments)
@@ -121,7 +121,7 @@ class Payload:
 
 
 def payload(kind: str, folder: Path) -> Payload:
-    """Code that leaves a file behind, in one of several ways."""
+    """Return an object whose code creates a file, in one of several ways."""
     trace = str(folder / TRACE)
     found: dict[str, Payload] = {
         "system": Payload(os.system, f"touch {trace}"),
@@ -139,7 +139,7 @@ PLACES = ("whole", "description", "settings", "weights", "optimizer", "key", "pi
 
 
 def load_hostile(sound: Path, kind: str, place: str, folder: Path) -> Verdict:
-    """Load a checkpoint with code in it."""
+    """Load a checkpoint that contains code."""
     code, path = payload(kind, folder), folder / "hostile.ckpt"
     stored = torch.load(sound, weights_only=True)
     if place == "whole":
@@ -187,6 +187,6 @@ def _others(sound: Path) -> Iterator[tuple[str, str, Callable[[Path], Verdict]]]
 
 
 def faults(sound: Path, num_damages: int, seed: int = 0) -> list[Fault]:
-    """Damages to the bytes of a sound checkpoint, and everything else that a file of its name may hold."""
+    """Return damages to the bytes of a sound checkpoint, and other contents of a file with its name."""
     found = [Fault(f"checkpoint, {kind}", name, partial(load_damaged, sound, damage)) for kind, name, damage in damages(num_damages, seed)]
     return found + [Fault(*other) for other in _others(sound)]

@@ -1,4 +1,4 @@
-"""Configurations with wrong types, missing and misspelt keys, and absurd values, as overrides of a command."""
+"""Faults of configurations: wrong types, missing and misspelt keys, and absurd values, as overrides of a command."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ PLACES = (
     "data.larger",
     "logger.project",
 )
-"""Keys that are not drawn: where things lie, and tables that other keys are taken from, of which most entries do not matter."""
+"""Keys that are not drawn: paths, and tables from which other keys are taken and whose entries are mostly unused."""
 UNBOUNDED = ("training.num_steps", "training.val_interval", "seed", "data.seed", "num_workers")
-"""Integers that may be as large as anybody likes."""
+"""Integers without an upper limit."""
 
 
 class NoConfigError(GpeError):
-    """A command does not show its configuration; the message says what it printed."""
+    """A command does not print its configuration; the message contains its output."""
 
 
 def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Keys of a configuration with what is neither a mapping nor a list of mappings."""
+    """Yield the keys of a configuration and their values, except mappings and lists of mappings."""
     if isinstance(values, dict) and values:
         for key, value in values.items():
             yield from leaves(value, f"{path}.{key}" if path else str(key))
@@ -45,10 +45,10 @@ def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def mutations(key: str, value: Any) -> Iterator[tuple[str, str, bool]]:
-    """Kind and override of what may be typed instead of a value, and whether nothing but a refusal will do."""
+    """Yield kind and override of each wrong value, and whether the command must refuse it."""
     parent, _, leaf = key.rpartition(".")
     yield "unknown key", f"+{parent + '.' if parent else ''}{leaf}_typo=1", True
-    yield "missing key", f"~{key}", False  # defaults of signatures count
+    yield "missing key", f"~{key}", False  # the default of the signature may apply
     if isinstance(value, bool):
         wrong, absurd = ["banana", "7", "[true]", "{a:1}", "0.5"], []
     elif isinstance(value, int):
@@ -68,7 +68,7 @@ def mutations(key: str, value: Any) -> Iterator[tuple[str, str, bool]]:
 
 
 def started(command: str, arguments: Sequence[str], override: str, must_fail: bool, limit: float, folder: Path) -> Verdict:
-    """Start a command with one override more."""
+    """Start a command with one additional override."""
     ended = run(command, [*arguments, f"paths.runs={folder}", override], limit)
     verdict = ended.verdict("accepted" if must_fail else "harmless")
     if verdict.status in ("refused", "harmless") and list(folder.rglob("*.part*")):
@@ -77,18 +77,18 @@ def started(command: str, arguments: Sequence[str], override: str, must_fail: bo
 
 
 def faults(command: str, arguments: Sequence[str], count: int, seed: int = 0, limit: float = 120.0, seconds: float = 0.0) -> list[Fault]:
-    """Mutations of the configuration that a command gets with some arguments.
+    """Return mutations of the configuration of a command.
 
     Args:
-        command: ``fit`` and so on.
-        arguments: of the command where nothing is wrong.
-        count: of the mutations, equally many of each kind.
-        seed: of their choice.
-        limit: seconds after which a command is stopped.
-        seconds: that the command takes where nothing is wrong. Some mutations change nothing, and the command runs to its end.
+        command: name of the command, such as ``fit``.
+        arguments: arguments of the undisturbed command.
+        count: number of mutations, divided equally among the kinds.
+        seed: seed of their choice.
+        limit: time [s] after which a command is stopped.
+        seconds: duration of the undisturbed command [s]; some mutations change nothing, and the command then runs to its end.
 
     Raises:
-        NoConfigError: the arguments themselves do not fit.
+        NoConfigError: the undisturbed arguments are refused.
     """
     shown = run(command, [*arguments, "--cfg", "job", "--resolve"])
     if shown.code != 0:

@@ -1,4 +1,4 @@
-"""Values in stored arrays that break the rules of their fields, brought in by every way that data come in."""
+"""Faults of stored values: values in arrays that break the rules of their fields, through every way in which data enter."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ OFFENDERS: dict[Values, tuple[float, ...]] = {
     "nodes of cells": (-1, 2**31 - 1),
     "dimension of cells": (0, 1, 7),
 }
-"""Values that break each rule, in whichever element they stand."""
+"""Values that break each rule, in any element."""
 Value = int | float | str
 LONGER = "a row more"
 FIRST = "00000"
 
 
 def spoilt(arrays: dict[str, np.ndarray], key: str, value: Value, seed: int) -> dict[str, np.ndarray]:
-    """The arrays with a wrong value in one of them, at a random place, or with a row more than the others."""
+    """Return the arrays with a wrong value at a random position in one of them, or with one row more than the others."""
     array = arrays[key].copy()
     if value == LONGER:
-        axis = int(FIELDS[key].dims[0] in ("frame", MOTION))  # of nodes, or cells
+        axis = int(FIELDS[key].dims[0] in ("frame", MOTION))  # the axis of nodes or cells
         array = np.concatenate([array, array.take([0], axis)], axis)
     else:
         array[np.unravel_index(int(np.random.default_rng(seed).integers(array.size)), array.shape)] = value
@@ -63,32 +63,32 @@ def spoilt(arrays: dict[str, np.ndarray], key: str, value: Value, seed: int) -> 
 
 
 def train(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
-    """As training reads it: what it says of a trajectory that it leaves out, or of the whole split."""
+    """Read as training does; return the message about a trajectory that it leaves out, or about the whole split."""
     _store(shard, key, value, seed, folder)
     return _left_out(lambda: [stored.name for stored in usable(open_split(folder, "train"))])
 
 
 def evaluate(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
-    """As evaluation reads it: the same."""
+    """Read as evaluation does; return its message."""
     _store(shard, key, value, seed, folder)
     return _left_out(lambda: [trajectory.metadata.dataset for trajectory in long_enough(folder, "train", 2)])
 
 
 def check(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
-    """What the validator says of it."""
+    """Return the message of the validator."""
     found = validate([_store(shard, key, value, seed, folder)]).violations
     return "; ".join(str(v) for v in found if v.trajectory == FIRST)
 
 
 def convert(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
-    """What a data set made of it and of a sound one says of the one that it refuses."""
+    """Convert a data set of this trajectory and a sound one; return the message about the refused trajectory."""
     sound, arrays = _sound(shard)
     report = save_dataset(folder, "own", train=[_trajectory(sound, spoilt(arrays, key, value, seed)), sound, sound, sound])
     return "; ".join(event.what for event in report.refusals if event.trajectory == "train[0]")
 
 
 def roll_out(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
-    """Why a learned simulator does not start from it."""
+    """Return the reason why a learned simulator does not start from this trajectory."""
     sound, arrays = _sound(shard)
     trajectory = _trajectory(sound, spoilt(arrays, key, value, seed))
     simulator = small_model(sound.metadata)
@@ -104,11 +104,11 @@ WAYS: dict[str, Callable[[Path, str, float | str, int, Path], str]] = {
     "rollout": roll_out,
 }
 OF_STATES = ("node_type", "mass", "material_params", "boundary_", "rest_pos", "cells")
-"""Beginnings of the fields that a rollout starts from, besides positions, which it takes of several frames."""
+"""Prefixes of the fields from which a rollout starts, besides positions, which it takes from several frames."""
 
 
 def brought_in(way: str, shard: Path, key: str, value: Value, seed: int, folder: Path) -> Verdict:
-    """Bring a wrong value in; whatever is said must name the field."""
+    """Enter a wrong value; the message must name the field."""
     try:
         text = WAYS[way](shard, key, value, seed, folder)
     except GpeError as error:
@@ -122,7 +122,7 @@ def brought_in(way: str, shard: Path, key: str, value: Value, seed: int, folder:
 
 
 def _names(shard: Path, key: str, value: Value) -> tuple[str, ...]:
-    """What messages may call the culprit: parameters by their column, positions by the velocity that they give, two sizes by either."""
+    """Return the names of the wrong field in messages: the column for parameters, the velocity for positions, either of two sizes."""
     if value == LONGER:
         return ("has size",)
     return {"material_params": read_trajectory(shard, FIRST).metadata.param_names, "pos": ("pos", "vel")}.get(key, (key,))
@@ -137,7 +137,7 @@ def _sound(shard: Path) -> tuple[Trajectory, dict[str, np.ndarray]]:
 
 
 def _store(shard: Path, key: str, value: Value, seed: int, folder: Path) -> Path:
-    """A data set whose first trajectory is spoilt, with checksums that fit."""
+    """Make a data set whose first trajectory is spoilt, with matching checksums."""
     path = shard_path(folder, "train", 0)
     path.parent.mkdir()
     shutil.copy(shard, path)
@@ -152,7 +152,7 @@ def _store(shard: Path, key: str, value: Value, seed: int, folder: Path) -> Path
 
 
 def _left_out(read: Callable[[], list[str]]) -> str:
-    """What reading says in warnings and in its error."""
+    """Return the text of warnings and of the error while reading."""
     with _warnings() as said:
         try:
             read()
@@ -163,7 +163,7 @@ def _left_out(read: Callable[[], list[str]]) -> str:
 
 @contextmanager
 def _warnings() -> Iterator[list[str]]:
-    """What is logged inside as a warning."""
+    """Collect the warnings that are logged inside the block."""
     said: list[str] = []
 
     class Listener(logging.Handler):
@@ -179,7 +179,7 @@ def _warnings() -> Iterator[list[str]]:
 
 
 def _trajectory(sound: Trajectory, arrays: dict[str, np.ndarray]) -> Trajectory:
-    """A trajectory of arrays that nobody has looked at."""
+    """Return a trajectory of unchecked arrays."""
     wall: dict[str, Any] = {name: arrays[f"boundary_{name}"] for name in ("pos", "vel", "normal")}
     moves = sound.boundary.motion is not None
     fixed: dict[str, Any] = {name: arrays[f"boundary_{name}"] for name in ("friction", "restitution")}
@@ -191,19 +191,19 @@ def _trajectory(sound: Trajectory, arrays: dict[str, np.ndarray]) -> Trajectory:
 
 
 def _last_state(trajectory: Trajectory) -> State:
-    """The last frame, with a history."""
+    """Return the last frame as a state with velocity history."""
     return trajectory.state(trajectory.num_frames - 1, history=2)
 
 
 def _applies(way: str, key: str) -> bool:
-    """Whether a field comes in by a way: a rollout takes no velocities of frames, and neither it nor an import of trajectories the stress."""
+    """Tell whether a field enters in a way: a rollout takes no velocities of frames, and neither a rollout nor an import takes the stress."""
     if way == "rollout":
         return key.startswith(OF_STATES) or key == "pos"
     return way != "conversion" or not ("stress" in key or "mises" in key or key == "cell_dim")
 
 
 def shards(specs: dict[str, DatasetSpec], folder: Path) -> dict[str, Path]:
-    """A shard of a few short trajectories of each data set."""
+    """Make a shard of a few short trajectories of each data set."""
     folder.mkdir(parents=True, exist_ok=True)
     found = {}
     for name, spec in specs.items():
@@ -213,7 +213,7 @@ def shards(specs: dict[str, DatasetSpec], folder: Path) -> dict[str, Path]:
 
 
 def faults(sound: dict[str, Path], seed: int = 0) -> list[Fault]:
-    """Every wrong value in every field of one shard of each data set, by every way."""
+    """Return every wrong value in every field of one shard of each data set, in every way."""
     found = []
     for domain, shard in sound.items():
         fields = sorted(_sound(shard)[1])

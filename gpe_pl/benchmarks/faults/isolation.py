@@ -1,4 +1,4 @@
-"""Faults and commands in processes of their own, forked from one that has imported everything: what hangs or dies costs only itself, and no start-up."""
+"""Isolated processes for faults and commands, forked from one that has imported everything, so that a hang or crash affects no other and starts are fast."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ PRELOADED = [
 
 
 HANG = 10.0
-"""Seconds beyond what something takes where nothing is wrong, after which it hangs."""
+"""Time [s] beyond the undisturbed duration after which a fault counts as hung."""
 CANARY = "canary"
-"""Folder beside those that are attacked, which none of them may change."""
+"""Folder beside the attacked ones, which no fault may change."""
 
 
 class IsolationError(GpeError):
@@ -50,10 +50,10 @@ class IsolationError(GpeError):
 
 
 def forks() -> Any:
-    """A multiprocessing context whose processes start with everything imported.
+    """Return a multiprocessing context whose processes start with everything imported.
 
     Raises:
-        IsolationError: the system has no such processes (Windows).
+        IsolationError: the system cannot fork processes (Windows).
     """
     if "forkserver" not in multiprocessing.get_all_start_methods():
         raise IsolationError("suite=faults needs processes that are forked, which this system does not have; run it on Linux")
@@ -66,11 +66,11 @@ def forks() -> Any:
 
 
 def verdicts(faults: Sequence[Fault], limit: float = 60.0) -> Iterator[Verdict]:
-    """What comes of each fault, in order.
+    """Yield the verdict of each fault, in order.
 
     Args:
-        faults: each attacks in a folder of its own, which is removed afterwards.
-        limit: seconds after which a fault counts as hung.
+        faults: faults; each attacks in a separate folder, which is removed afterwards.
+        limit: time [s] after which a fault counts as hung.
     """
     context = forks()
     first = 0
@@ -108,19 +108,19 @@ def _received(connection: Connection, limit: float, count: int) -> Iterator[Verd
 
 
 def _attack(faults: Sequence[Fault], answers: Connection, folder: str) -> None:
-    with open(os.devnull, "wb") as null:  # what a fault prints is of no interest
+    with open(os.devnull, "wb") as null:  # the output of a fault is not needed
         os.dup2(null.fileno(), 1)
         os.dup2(null.fileno(), 2)
     canary = Path(folder) / CANARY
     for number, fault in enumerate(faults):
         verdict = _watched(fault, Path(folder) / str(number), canary)
-        if verdict.status == "hung":  # or the machine was busy: what hangs does so again
+        if verdict.status == "hung":  # the machine may have been busy, so try again
             verdict = _watched(fault, Path(folder) / str(number), canary)
         answers.send(verdict)
 
 
 def _watched(fault: Fault, own: Path, canary: Path) -> Verdict:
-    """Attack in a new folder with another one beside it; takes too long, or changes the other one: that is what came of it."""
+    """Attack in a new folder beside another; a fault that takes too long or changes the other folder gets a verdict for that."""
     own.mkdir()
     shutil.rmtree(canary, ignore_errors=True)
     (canary / "checkpoints").mkdir(parents=True)
@@ -149,13 +149,13 @@ def _contents(folder: Path) -> set[tuple[Path, bytes]]:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended: its exit code, negative for a signal, None if it was stopped at its time limit, and what it printed."""
+    """End of a command: its exit code (negative for a signal, None if stopped at its time limit) and its output."""
 
     code: int | None
     output: str
 
     def verdict(self, on_success: str = "harmless") -> Verdict:
-        """Refused with one line of error, or as good as the caller says that success is."""
+        """Return refused if the output is one line of error, and ``on_success`` if the command succeeded."""
         lines = [line for line in self.output.splitlines() if line.strip()]
         last = lines[-1][:MAX_DETAIL] if lines else ""
         if self.code is None:
@@ -169,15 +169,15 @@ class Ended:
 
 
 def start(command: str, arguments: Sequence[str], output: Path, prepare: Callable[[], Any] | None = None) -> Any:
-    """``python -m gpe_pl.{command} {arguments}`` as a process that prints into a file; ``prepare`` is called in it first."""
-    output.touch()  # also where it is killed before it prints
+    """Start ``python -m gpe_pl.{command} {arguments}`` as a process that prints to a file; it first calls ``prepare``."""
+    output.touch()  # the file exists even if the process is killed before it prints
     process = forks().Process(target=_run_command, args=(command, list(arguments), str(output), prepare))
     process.start()
     return process
 
 
 def run(command: str, arguments: Sequence[str], limit: float = 600.0, prepare: Callable[[], Any] | None = None) -> Ended:
-    """The same to its end, or to a time limit [s]."""
+    """Run a command as ``start`` does, until its end or a time limit [s]."""
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
         output = Path(folder) / "output"
         process = start(command, arguments, output, prepare)
@@ -188,7 +188,7 @@ def run(command: str, arguments: Sequence[str], limit: float = 600.0, prepare: C
 
 
 def end(process: Any) -> None:
-    """Kill a process, and wait until it is gone."""
+    """Kill a process and wait for its end."""
     with contextlib.suppress(ProcessLookupError):
         process.kill()
     process.join()
@@ -199,7 +199,7 @@ def _run_command(command: str, arguments: list[str], output: str, prepare: Calla
     with open(output, "wb", buffering=0) as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    os.environ.pop("HYDRA_FULL_ERROR", None)  # of the command that attacks: it would show tracebacks
+    os.environ.pop("HYDRA_FULL_ERROR", None)  # inherited from the attacking command; it would show tracebacks
     if prepare is not None:
         prepare()
     sys.argv = [command, *arguments]
@@ -207,6 +207,6 @@ def _run_command(command: str, arguments: list[str], output: str, prepare: Calla
 
 
 def waited(process: Any, seconds: float) -> bool:
-    """Wait; whether the process has ended meanwhile."""
+    """Wait for a process; tell whether it has ended."""
     process.join(seconds)
     return process.exitcode is not None

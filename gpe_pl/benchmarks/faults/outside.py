@@ -1,4 +1,4 @@
-"""Names, links and checkpoints that lead out of the folders that a command is given."""
+"""Faults that lead outside: names, links and checkpoints that point out of the folders of a command."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from gpe_pl.benchmarks.faults.runs import Command
 from gpe_pl.benchmarks.faults.verdict import Fault, Verdict
 
 LEADING_OUT = ("../../canary", "a/../../../canary", "{canary}", "file://{canary}", "../../canary/../canary/x", "..", ".", "/")
-"""Names; ``{canary}`` stands for the path of a folder beside that of the command."""
+"""Names that lead outside; ``{canary}`` stands for the path of a folder beside that of the command."""
 
 
 def named(command: Command, key: str, name: str, limit: float, folder: Path) -> Verdict:
-    """Give a command a name that leads out; it must be refused."""
+    """Give a command a name that leads outside; it must refuse the name."""
     override = f"{key}='{name.replace('{canary}', str(folder.parent / CANARY))}'"
     return isolation.run(command.module, [*command.given(folder / "own"), override], limit).verdict("accepted")
 
 
 def linked(command: Command, sound: Path, part: str, target: str, limit: float, folder: Path) -> Verdict:
-    """Put a link that leads out in place of a part of what a command has left, and give the command again."""
+    """Replace a part of a command's results by a link that leads outside, and repeat the command."""
     own = folder / "own"
     shutil.copytree(sound, own)
     path = own / part
     shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     path.symlink_to(folder.parent / CANARY / target)
-    for finished in own.rglob("metrics.csv*"):  # so that it writes again
+    for finished in own.rglob("metrics.csv*"):  # so that the command writes again
         if not finished.is_symlink():
             finished.unlink()
     return isolation.run(command.module, command.given(own), limit).verdict()
 
 
 def interrupted(command: Command, limit: float, folder: Path) -> Path | None:
-    """Kill a training once it has saved ``last.ckpt``, whose path is returned; None: it was too quick."""
+    """Kill a training once it has saved ``last.ckpt``, and return its path; return None if the training ended first."""
     process = isolation.start(command.module, command.given(folder), folder.parent / "output")
     deadline = time.monotonic() + limit
     try:
@@ -64,11 +64,11 @@ STATES: dict[str, Callable[[str], dict[str, Any]]] = {
     },
     "own": lambda path: {"best": path, "last": path, "best_score": 1e9, "best_step": 0},
 }
-"""What a callback may have left in a checkpoint that names a path."""
+"""States of callbacks in a checkpoint that name a path."""
 
 
 def resumed(command: Command, state: str, path: str, limit: float, folder: Path) -> Verdict:
-    """Interrupt a training, let the states of all callbacks in its checkpoint name a path outside, and give the command again."""
+    """Interrupt a training, let the states of all callbacks in its checkpoint name a path outside, and repeat the command."""
     own = folder / "own"
     own.mkdir()
     last = interrupted(command, limit, own)
@@ -83,7 +83,7 @@ def resumed(command: Command, state: str, path: str, limit: float, folder: Path)
 
 
 def faults(command: Command, sound: Path, keys: Sequence[str], also_files: bool, limit: float) -> list[Fault]:
-    """Names for each of the keys; on request links in place of everything in the folders of a run or data set, and for trainings paths in checkpoints."""
+    """Return names for each key, optional links in place of all files of a run or data set, and, for trainings, paths in checkpoints."""
     found = []
     for key in keys:
         for name in LEADING_OUT:

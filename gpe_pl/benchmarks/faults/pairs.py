@@ -1,4 +1,4 @@
-"""Two commands at once in one folder, and folders that are deleted under a command."""
+"""Faults of concurrency: two commands at once in one folder, and folders that are deleted under a running command."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from gpe_pl.benchmarks.faults.verdict import GOOD, MAX_DETAIL, Fault, Verdict
 
 HELD = re.compile(r"another command writes to it \((process \d+ on .+|which has just begun)\)")
 Results = dict[str, str]
-"""Digests of what a command leaves, see ``runs.digests``."""
+"""Digests of a command's results, see ``runs.digests``."""
 
 
 def together(commands: Sequence[Command], expected: Sequence[Results], delay: float, limit: float, folder: Path) -> Verdict:
-    """Start two commands in one folder, the second so many seconds after the first.
+    """Start two commands in one folder, the second ``delay`` seconds after the first.
 
-    Sound is that everything is there that those leave which succeeded, and nothing else; the others were refused, by one that they name where it still ran.
+    The outcome is sound if the folder contains exactly the results of the commands that succeeded, and each refused command names the one that ran.
     """
     own, outputs = folder / "own", [folder / f"output-{k}" for k in range(len(commands))]
     processes = []
@@ -47,7 +47,7 @@ def together(commands: Sequence[Command], expected: Sequence[Results], delay: fl
     refused = "; ".join(verdict.detail for verdict in verdicts if verdict.status == "refused")
     if not done:
         return Verdict("different", f"none succeeded: {refused}"[:MAX_DETAIL])
-    if refused and order[0] not in done and not HELD.search(printed[order[0]]):  # a verdict has only its beginning
+    if refused and order[0] not in done and not HELD.search(printed[order[0]]):  # a verdict contains only the beginning of the output
         return Verdict("accepted", f"does not say who holds the folder: {refused}"[:MAX_DETAIL])
     found = runs.digests(own)
     wrong = {name for k in done for name, digest in expected[k].items() if found.get(name) != digest}
@@ -60,9 +60,9 @@ def together(commands: Sequence[Command], expected: Sequence[Results], delay: fl
 
 
 def deleted(command: Command, part: str, delay: float, expected: Results, limit: float, folder: Path) -> Verdict:
-    """Delete what lies in the folder of the data or of the results while a command runs; it says so or succeeds, and the same command then succeeds.
+    """Delete the folder of the data or of the results while a command runs; it must fail with an error or succeed, and its repetition must succeed.
 
-    A command whose data are deleted gets its own copy of them, which it makes again where they are gone.
+    A command whose data are deleted gets a separate copy of them, and makes it again if it is missing.
     """
     own = folder / "own"
     if command.data is not None and part == "data":
@@ -90,14 +90,14 @@ def deleted(command: Command, part: str, delay: float, expected: Results, limit:
 
 @dataclass(frozen=True)
 class Leaving:
-    """A command, and what it leaves in an empty folder."""
+    """A command, and the results that it leaves in an empty folder."""
 
     command: Command
     results: Results
 
 
 def pair_faults(couples: Iterable[tuple[Leaving, Leaving]], count: int, seed: int, limit: float) -> list[Fault]:
-    """Every couple at once, so often, the second a random time after the first."""
+    """Return ``count`` faults for every couple of commands, the second started a random time after the first."""
     rng, found = np.random.default_rng(seed), []
     for first, second in couples:
         for _ in range(count):
@@ -109,7 +109,7 @@ def pair_faults(couples: Iterable[tuple[Leaving, Leaving]], count: int, seed: in
 
 
 def deletion_faults(command: Command, part: str, expected: Results, count: int, seed: int, limit: float) -> list[Fault]:
-    """So many deletions of a part of a command's folder at random moments; ``expected`` is what the same command leaves at last."""
+    """Return deletions of a part of a command's folder at random moments; ``expected`` are the command's final results."""
     rng, found = np.random.default_rng(seed), []
     for _ in range(count):
         delay = float(rng.uniform(0, 0.9) * command.seconds)

@@ -1,4 +1,4 @@
-"""Commands that are killed, run out of disk, or meet what a disk has done to their files; and the same command again."""
+"""Faults of runs: commands that are killed, run out of disk, or find damaged files; and the same command again."""
 
 from __future__ import annotations
 
@@ -38,31 +38,31 @@ SAVED = (
     "excursions",
     "skipped",
 )
-"""What of a training checkpoint does not depend on where it lies."""
+"""Entries of a training checkpoint that do not depend on its location."""
 
 
 MEASURED = "results.json"
-"""Of benchmarks: times are never the same, so their number and the settings are compared."""
+"""File of measured results of benchmarks; times vary, so only their number and the settings are compared."""
 ONCE = ("convert",)
-"""Commands that refuse to do again what is done."""
+"""Commands that refuse to repeat finished work."""
 TRACEBACK = re.compile(r".*\n?Traceback \(most recent call last\)[^\n]*(\n .*)*(\n.*)?")
-"""With the line before, which says whether it was ignored, and the one after, which names the error."""
+"""A traceback with the line before, which tells whether it was ignored, and the line after, which names the error."""
 LOCKS = (".*.lock", ".*.holder")
-"""Files of locks."""
+"""Patterns of lock files."""
 MESSAGE_BYTES = 1000
-"""What a command prints goes to a file, too: with less room in it the error would be cut off."""
+"""Smallest file size that leaves room for a command's output, which goes to a file too; with less room its error would be cut off."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """A command, and how it is told where its data and results go.
+    """A command, and the folders of its data and results.
 
     Attributes:
         name: row of the matrix.
-        module: ``python -m gpe_pl.{module}``.
-        arguments: all but the folders.
-        data: folder of the data, or None if the command makes them in its own.
-        seconds: that it takes undisturbed.
+        module: module in ``python -m gpe_pl.{module}``.
+        arguments: all arguments but the folders.
+        data: folder of the data, or None if the command makes its own data.
+        seconds: duration of the undisturbed command [s].
     """
 
     name: str
@@ -72,7 +72,7 @@ class Command:
     seconds: float = math.inf
 
     def given(self, folder: Path) -> list[str]:
-        """The arguments with the folders."""
+        """Return the arguments with the folders."""
         return [*self.arguments, f"paths.data={self.data or folder / 'data'}", f"paths.runs={folder / 'runs'}"]
 
 
@@ -80,9 +80,9 @@ class Command:
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """SHA-256 of what must not depend on how a command was interrupted: data, metrics, tables, weights and the state of the optimiser, bit for bit.
+    """Return the SHA-256 of results that must not depend on interruptions: data, metrics, tables, weights and the optimiser's state, bit for bit.
 
-    Logs and provenance do: each start of a run has its own.
+    Logs and provenance differ between the starts of a run, so they are left out.
     """
     found = {}
     for path in _final_files(folder):
@@ -129,7 +129,7 @@ def _digest(value: Any) -> str:
 
 
 def incomplete(folder: Path) -> list[str]:
-    """Files in their final place that cannot be read."""
+    """Return final files that cannot be read."""
     found = []
     for path in _final_files(folder):
         try:
@@ -145,12 +145,12 @@ def incomplete(folder: Path) -> list[str]:
 
 
 def leftovers(folder: Path) -> list[str]:
-    """Temporary files, and the files of locks, which a command removes unless it is killed."""
+    """Return temporary files and lock files, which a command removes unless it is killed."""
     return sorted(path.name for pattern in ("*.part*", *LOCKS) for path in folder.rglob(pattern))
 
 
 def released(folder: Path) -> frozenset[str]:
-    """Files of locks that killed commands have left: the operating system has released them, and the next command that needs one removes it."""
+    """Return lock files that killed commands have left; the system has released them, and the next command that needs one removes it."""
     return frozenset(path.name for pattern in LOCKS for path in folder.rglob(pattern))
 
 
@@ -159,7 +159,7 @@ def _final_files(folder: Path) -> list[Path]:
 
 
 def finished(command: Command, folder: Path, expected: dict[str, str], limit: float, stays: frozenset[str] = frozenset()) -> Verdict:
-    """Run a command to its end, and compare what it leaves; names in ``stays`` may be left over."""
+    """Run a command to its end, and compare its results; names in ``stays`` may be left over."""
     ended = isolation.run(command.module, command.given(folder), limit)
     verdict = ended.verdict()
     may_be_done = command.module in ONCE and verdict.status == "refused"
@@ -176,7 +176,7 @@ def finished(command: Command, folder: Path, expected: dict[str, str], limit: fl
 
 
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-"""What ends a command before its time."""
+"""Signals that end a command early."""
 
 
 # --- kills --------------------------------------------------------------------------------------------------------------------------------
@@ -185,7 +185,7 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: int = 0, limit: float = 600.0) -> Iterator[Verdict]:
     """Kill a command at random moments, with SIGKILL, SIGTERM and SIGINT in turn, start it again, and after some kills let it finish.
 
-    What it then leaves is compared with an undisturbed run. Yields a verdict per kill, which names the moment.
+    The final results are compared with those of an undisturbed run. Yield a verdict per kill, which names the moment.
     """
     rng = np.random.default_rng(seed)
     whole = folder / "whole"
@@ -205,7 +205,7 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
             moment = float(rng.uniform(0.0, duration))
             process = isolation.start(command.module, command.given(own), folder / "output")
             try:
-                if isolation.waited(process, moment):  # it was faster; from the start again
+                if isolation.waited(process, moment):  # the command ended first, so start over
                     if process.exitcode != 0:
                         problem = (
                             problem
@@ -240,7 +240,7 @@ def kills(command: Command, folder: Path, count: int, in_a_row: int = 5, seed: i
 
 
 def damaged_file(command: Command, sound: Path, name: str, damage: Callable[[bytes], bytes], limit: float, folder: Path) -> Verdict:
-    """Damage a file that a command has left, and give the command again: it refuses, or what it leaves is sound."""
+    """Damage a file that a command has left, and repeat the command: it must refuse, or give sound results."""
     return changed_file(command, sound, name, partial(_damaged_bytes, damage), limit, folder)
 
 
@@ -249,7 +249,7 @@ def _damaged_bytes(damage: Callable[[bytes], bytes], path: Path) -> None:
 
 
 def changed_file(command: Command, sound: Path, name: str, change: Callable[[Path], None], limit: float, folder: Path) -> Verdict:
-    """Change a file that a command has left, or what lies in its place, and give the command again: the same."""
+    """Change or replace a file that a command has left, and repeat the command, as in ``damaged_file``."""
     for part in sound.iterdir():
         (shutil.copytree if part.is_dir() else shutil.copy)(part, folder / part.name)
     change(folder / name)
@@ -259,18 +259,18 @@ def changed_file(command: Command, sound: Path, name: str, change: Callable[[Pat
     try:
         expected, found = digests(sound), digests(folder)
         wrong = sorted(k for k in expected if found.get(k) != expected[k] and not _hold_the_same(sound / k, folder / k))
-    except GpeError as error:  # the command had no need of the file; whoever has is refused
+    except GpeError as error:  # the command did not need the file; commands that need it are refused
         return Verdict("refused", str(error)[:MAX_DETAIL])
     return Verdict("accepted", f"no error, but {', '.join(wrong)} differ") if wrong else Verdict("harmless")
 
 
 def _hold_the_same(sound: Path, damaged: Path) -> bool:
-    """Whether two files are shards with the same content in different bytes: some bytes have no meaning."""
+    """Tell whether two files are shards with equal content in different bytes, because some bytes have no meaning."""
     return sound.suffix == ".h5" and damaged.exists() and stores.contents(sound) == stores.contents(damaged)
 
 
 def damage_faults(command: Command, sound: Path, count: int, seed: int, limit: float) -> list[Fault]:
-    """So many damages to files that a command has left in a folder, other than pictures and logs."""
+    """Return damages to files that a command has left in a folder, other than pictures and logs."""
     rng = np.random.default_rng(seed)
     names = sorted(digests(sound))
     kinds = list(stores.damages(4 * count, seed))
@@ -286,7 +286,7 @@ def damage_faults(command: Command, sound: Path, count: int, seed: int, limit: f
 
 
 def limit_file_size(size: int) -> None:
-    """From now on no file of this process grows beyond a size: what a full disk does to a write, with another number of error."""
+    """Limit the size of all files that this process writes from now on; writes then fail as on a full disk, with another error number."""
     import resource  # Windows has none
 
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
@@ -295,7 +295,7 @@ def limit_file_size(size: int) -> None:
 
 @contextlib.contextmanager
 def small_disk(folder: Path, size: int) -> Iterator[bool]:
-    """A file system of so many bytes in a folder; yields whether there is one, which needs the right to mount."""
+    """Mount a file system of ``size`` bytes on a folder; yield whether this worked, which needs the right to mount."""
     folder.mkdir(parents=True)
     done = (
         subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)], capture_output=True, check=False).returncode
@@ -309,7 +309,7 @@ def small_disk(folder: Path, size: int) -> Iterator[bool]:
 
 
 def full_disk(command: Command, size: int, expected: dict[str, str], limit: float, folder: Path) -> Verdict:
-    """Run a command on a disk that fills up; then there is room again, and the same command finishes."""
+    """Run a command on a disk that fills up; then make room, and run the same command to its end."""
     with small_disk(folder / "disk", size) as is_mounted:
         own = folder / "disk"
         prepare = None if is_mounted else partial(limit_file_size, size)
@@ -327,7 +327,7 @@ def full_disk(command: Command, size: int, expected: dict[str, str], limit: floa
 
 
 def file_limit(command: Command, size: int, expected: dict[str, str], limit: float, folder: Path) -> Verdict:
-    """The same where no file may grow beyond a size."""
+    """Run a command with a limited file size, as in ``full_disk``."""
     verdict = isolation.run(command.module, command.given(folder), limit, partial(limit_file_size, size)).verdict()
     if verdict.status != "refused":
         return verdict
@@ -338,12 +338,12 @@ def file_limit(command: Command, size: int, expected: dict[str, str], limit: flo
 
 
 def read_only(command: Command, limit: float, folder: Path) -> Verdict:
-    """Run a command in a folder that cannot be written."""
+    """Run a command in a folder that is not writable."""
     with small_disk(folder / "disk", 2**20) as is_mounted:
         own = folder / "disk"
         if is_mounted:
             subprocess.run(["mount", "-o", "remount,ro", str(own)], check=True, capture_output=True)
-        elif os.geteuid() == 0:  # permissions do not bind
+        elif os.geteuid() == 0:  # permissions do not restrict root
             return Verdict("harmless", "not done, for want of the right to mount")
         else:
             own.chmod(0o555)
@@ -354,13 +354,13 @@ def read_only(command: Command, limit: float, folder: Path) -> Verdict:
 
 
 def file_in_the_way(command: Command, limit: float, folder: Path) -> Verdict:
-    """Run a command where a file lies in place of the folder that it writes to."""
+    """Run a command with a file in place of its output folder."""
     (folder / ("data" if command.data is None else "runs")).write_text("a file", encoding="utf-8")
     return isolation.run(command.module, command.given(folder), limit).verdict("accepted")
 
 
 def disk_faults(command: Command, sizes: Sequence[int], expected: dict[str, str], limit: float) -> list[Fault]:
-    """Full disks and files of so many bytes, and folders that cannot be written."""
+    """Return faults of full disks, of limited file sizes [bytes], and of folders that are not writable."""
     found = []
     for size in sizes:
         found.append(

@@ -1,4 +1,4 @@
-"""Scenes that no scene generator would draw: nothing in them, bodies in one place, particles in obstacles, values out of this world."""
+"""Faults of scenes that no generator draws: empty scenes, coincident bodies, particles in obstacles, absurd values."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ NODE_FIELDS = ("pos", "vel", "node_type", "mass", "material_params")
 
 
 class Stopped(GpeError):
-    """A rollout that its guard stopped; the message has reason, frame and node."""
+    """A rollout was stopped by its guard; the message has reason, frame and node."""
 
 
 def rows(state: State, chosen: np.ndarray) -> State:
-    """Some of the nodes, with the cells between them."""
+    """Return some of the nodes, with the cells between them."""
     values: dict[str, Any] = {name: getattr(state, name)[chosen] for name in NODE_FIELDS}
     if state.cells is not None and state.rest_pos is not None:
         number = np.full(state.num_nodes, -1)
@@ -43,7 +43,7 @@ def rows(state: State, chosen: np.ndarray) -> State:
 
 
 def twice(state: State, offset: np.ndarray) -> State:
-    """Every body once more, a little beside itself."""
+    """Return the state with a copy of every body at an offset."""
     values: dict[str, Any] = {name: np.concatenate([getattr(state, name)] * 2) for name in NODE_FIELDS}
     values["pos"] = np.concatenate([state.pos, state.pos + offset])
     if state.cells is not None and state.rest_pos is not None:
@@ -59,7 +59,7 @@ def _changed(state: State, name: str, chosen: np.ndarray, value: Any) -> State:
 
 
 def _inside(state: State, rng: np.random.Generator) -> State:
-    """A third of the particles behind the surface of walls and obstacles."""
+    """Move a third of the particles behind the surface of walls and obstacles."""
     chosen = rng.permutation(state.num_nodes)[: max(1, state.num_nodes // 3)]
     wall = rng.integers(len(state.boundary.pos), size=len(chosen))
     depth = rng.uniform(0.0, 0.2, (len(chosen), 1))
@@ -93,11 +93,11 @@ WRONG = {
     "a material parameter not finite",
     "an impossible material parameter",
 }
-"""What has no sound result."""
+"""Changes that have no sound result."""
 
 
 def simulated(spec: DatasetSpec, name: str, learned: bool, seed: int, folder: Path) -> Verdict:
-    """Some steps of a changed scene by the data set's solver, or by a model with random weights."""
+    """Run some steps of a changed scene with the data set's solver, or with a model with random weights."""
     state = CHANGES[name](initial_state(spec, "test", seed % spec.counts["test"]), np.random.default_rng(seed))
     metadata = trajectory_metadata(spec, "test", 0)
     return judge(lambda: _rolled_out(spec, state, metadata, learned), lambda result: name not in WRONG and _is_finite(result))
@@ -116,7 +116,7 @@ def _rolled_out(spec: DatasetSpec, state: State, metadata: Metadata, learned: bo
 
 
 def small_model(metadata: Metadata) -> LearnedSimulator:
-    """A learned simulator with random weights and two velocities of history."""
+    """Return a learned simulator with random weights and a history of two velocities."""
     torch.manual_seed(0)
     build = GraphBuilder(GraphConfig(history=2, islands=True), metadata)
     return LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=8), build).eval()
@@ -127,7 +127,7 @@ def _is_finite(result: Trajectory) -> bool:
 
 
 def faults(specs: dict[str, DatasetSpec], num_seeds: int) -> list[Fault]:
-    """Every change of so many scenes of each data set, for its solver and for a learned simulator."""
+    """Return every change of ``num_seeds`` scenes of each data set, for its solver and for a learned simulator."""
     return [
         Fault(f"scene, {name}", f"{domain}, {'model' if learned else 'solver'}, seed {seed}", partial(simulated, spec, name, learned, seed))
         for domain, spec in specs.items()

@@ -1,4 +1,4 @@
-"""What may stand in the small files beside runs and data instead of what was written there, and archives of arrays that nobody would write."""
+"""Faults of the small files beside runs and data, and of archives of arrays."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ _TEXTS: dict[str, bytes] = {
     "zeros": bytes(1000),
     "escapes": b'{"\\u001b]0;x\\u0007\\u001b[2J": "\\u001b[31m"}',
 }
-"""Whole contents."""
+"""Contents that replace a whole file."""
 _NUMBERS = {"NaN": b"NaN", "infinity": b"Infinity", "0": b"0", "negative": b"-1", "text": b'"soon"', "a huge integer": _HUGE.encode()}
-"""What may stand in place of a number."""
+"""Texts that replace a number."""
 _VALUES: dict[str, Any] = {
     "null": None,
     "a list": [[1]],
@@ -58,7 +58,7 @@ _VALUES: dict[str, Any] = {
     "a long text": _LONG_NAME,
     "deep": json.loads("[" * 500 + "]" * 500),
 }
-"""What may stand in place of a value in a table whose checksum fits."""
+"""Values that replace a value in a table with a matching checksum."""
 
 
 def _text(name: str, path: Path) -> None:
@@ -71,7 +71,7 @@ def _truncated(path: Path) -> None:
 
 
 def _number(seed: int, text: bytes | None, path: Path) -> None:
-    """Another number in place of one; without a text, another first digit."""
+    """Replace a number by another text; without a text, change its first digit."""
     content = path.read_bytes()
     found = list(NUMBER.finditer(content))
     if not found:
@@ -84,7 +84,7 @@ def _number(seed: int, text: bytes | None, path: Path) -> None:
 
 
 def _value(seed: int, name: str, path: Path) -> None:
-    """A value of another type in a table, with a checksum that fits."""
+    """Replace a value in a table by one of another type, with a matching checksum."""
     values = json.loads(path.read_bytes())
     keys = sorted(set(values) - {sealed.SEAL})
     key = keys[int(np.random.default_rng(seed).integers(len(keys)))]
@@ -107,7 +107,7 @@ def _fifo(path: Path) -> None:
 
 
 def changes(is_table: bool, seed: int = 0) -> Iterator[tuple[str, Change]]:
-    """Name and function of everything that may come of a small file; of a table in JSON, also values of other types."""
+    """Yield name and function of every change of a small file; for JSON tables, also values of other types."""
     for name in _TEXTS:
         yield name, partial(_text, name)
     yield "truncated", _truncated
@@ -127,7 +127,7 @@ SMALL = (".json", ".csv", ".sha256")
 
 
 def command_faults(command: Command, sound: Path, count: int, seed: int, limit: float) -> list[Fault]:
-    """So many changes of small files that a command has left, each followed by the same command."""
+    """Return changes of small files that a command has left, each followed by the same command."""
     names = sorted(str(path.relative_to(sound)) for path in sound.rglob("*") if path.suffix in SMALL and "log" not in path.parts)
     every = [(name, what, change) for name in names for what, change in changes(name.endswith(".json"), seed)]
     chosen = np.random.default_rng(seed).permutation(len(every))[:count]
@@ -152,7 +152,7 @@ def _steps(path: Path) -> int:
 
 
 def read_changed_times(change: Change, folder: Path) -> Verdict:
-    """Turn a budget of time into steps with a changed file of step times."""
+    """Convert a time budget to steps with a changed file of step times."""
     sealed.write(folder / "sound.json", {KEY: SECONDS, "other": 0.125})
     path = folder / "step_times.json"
     shutil.copy(folder / "sound.json", path)
@@ -164,7 +164,7 @@ def read_changed_times(change: Change, folder: Path) -> Verdict:
 
 
 def raw_arrays(folder: Path, num_frames: int = 8, num_nodes: int = 20) -> None:
-    """A small source of ``format=arrays``: fluid that falls, in three splits."""
+    """Make a small source of ``format=arrays``: falling fluid, in three splits."""
     rng = np.random.default_rng(0)
     for split, count in {"train": 3, "val": 1, "test": 1}.items():
         (folder / split).mkdir(parents=True)
@@ -186,7 +186,7 @@ def raw_arrays(folder: Path, num_frames: int = 8, num_nodes: int = 20) -> None:
 
 
 def _member(name: str, header: str, path: Path) -> None:
-    """Other bytes in place of one array of an archive, or beside them."""
+    """Replace the bytes of one array of an archive, or add a member."""
     with zipfile.ZipFile(path) as archive:
         parts = {each: archive.read(each) for each in archive.namelist()}
     with zipfile.ZipFile(path, "w") as archive:
@@ -228,11 +228,11 @@ _HEADERS: dict[str, bytes] = {
 
 
 SOUND = {("params_fluid", "no axes"), ("frame_dt", "no axes")}
-"""Archives that are as they may be."""
+"""Changed archives that are valid."""
 
 
 def archive_changes() -> Iterator[tuple[str, Change]]:
-    """Everything that may come of an archive of arrays."""
+    """Yield name and function of every change of an archive of arrays."""
     for key in ("pos", "frame_dt", "materials", "bounds", "params_fluid"):
         for name in _HEADERS:
             if (key, name) not in SOUND:
@@ -249,7 +249,7 @@ def archive_changes() -> Iterator[tuple[str, Change]]:
 
 
 def converted(raw: Path, change: Change, folder: Path) -> Verdict:
-    """Import a source of which one archive was changed: it is refused or left out by its name."""
+    """Import a source with one changed archive; it must be refused, or left out by name."""
     source = folder / "raw"
     shutil.copytree(raw, source)
     change(source / "train" / "00.npz")
@@ -265,6 +265,6 @@ def converted(raw: Path, change: Change, folder: Path) -> Verdict:
 
 
 def faults(raw: Path) -> list[Fault]:
-    """Changed files of step times, and changed archives of arrays in a source."""
+    """Return changed files of step times, and changed archives of arrays in a source."""
     found = [Fault("file of step times", name, partial(read_changed_times, change)) for name, change in changes(is_table=True)]
     return found + [Fault("archive of arrays", name, partial(converted, raw, change)) for name, change in archive_changes()]

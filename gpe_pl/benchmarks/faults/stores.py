@@ -1,4 +1,4 @@
-"""Shards that are truncated, have bits flipped, or hold something else than the schema says."""
+"""Faults of shards: truncation, flipped bits, and content that contradicts the schema."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 
 def content(trajectory: Trajectory) -> str:
-    """Digest of all that a trajectory holds."""
+    """Return a digest of the whole content of a trajectory."""
     return digest(stored_arrays(trajectory), stored_attributes(trajectory))
 
 
 def read_damaged(sound: Path, damage: Callable[[bytes], bytes], folder: Path) -> Verdict:
-    """Read every trajectory of a shard whose bytes were damaged, as ``fit`` does: by HDF5's own checksums, without the digest."""
+    """Read every trajectory of a shard with damaged bytes, as ``fit`` does: with HDF5's checksums, without the digest."""
     path = folder / sound.name
     path.write_bytes(damage(sound.read_bytes()))
     return judge(lambda: contents(path), lambda found: found == contents(sound))
 
 
 def read_rewritten(sound: Path, rewrite: Callable[[Path], None], folder: Path) -> Verdict:
-    """Read a shard in which something else stands, with checksums that fit."""
+    """Read a shard with other content and matching checksums."""
     path = folder / sound.name
     path.write_bytes(sound.read_bytes())
     rewrite(path)
@@ -39,7 +39,7 @@ def read_rewritten(sound: Path, rewrite: Callable[[Path], None], folder: Path) -
 
 
 def contents(path: Path) -> dict[str, str]:
-    """Digests of a shard's trajectories, by name."""
+    """Return digests of a shard's trajectories, by name."""
     return {name: content(read_trajectory(path, name)) for name in trajectory_names(path)}
 
 
@@ -51,13 +51,13 @@ def truncated(share: float, data: bytes) -> bytes:
 
 
 def flipped(seed: int, data: bytes) -> bytes:
-    """One bit, anywhere."""
+    """Flip one bit at a random position."""
     bit = int(np.random.default_rng(seed).integers(8 * len(data)))
     return data[: bit // 8] + bytes([data[bit // 8] ^ 1 << bit % 8]) + data[bit // 8 + 1 :]
 
 
 def overwritten(seed: int, data: bytes) -> bytes:
-    """A block of random bytes, as a bad sector leaves."""
+    """Overwrite a block with random bytes, as a bad sector does."""
     rng = np.random.default_rng(seed)
     length = min(len(data), int(rng.integers(1, 4096)))
     start = int(rng.integers(len(data) - length + 1))
@@ -65,7 +65,7 @@ def overwritten(seed: int, data: bytes) -> bytes:
 
 
 def damages(count: int, seed: int) -> Iterator[tuple[str, str, Callable[[bytes], bytes]]]:
-    """Kind, name and function of so many damages: a quarter truncated, a quarter overwritten, half with a bit flipped."""
+    """Yield kind, name and function of ``count`` damages: a quarter truncated, a quarter overwritten, half with a flipped bit."""
     rng = np.random.default_rng(seed)
     for k in range(count):
         number = int(rng.integers(2**31))
@@ -158,7 +158,7 @@ def _folder(path: Path) -> None:
 
 
 def rewrites(sound: Path) -> Iterator[tuple[str, Callable[[Path], None]]]:
-    """Name and function of everything that may stand in a shard instead of what should."""
+    """Yield name and function of every other content of a shard."""
     trajectory = read_trajectory(sound, "00000")
     for key in stored_arrays(trajectory):
         if FIELDS[key].required:
@@ -181,6 +181,6 @@ def rewrites(sound: Path) -> Iterator[tuple[str, Callable[[Path], None]]]:
 
 
 def faults(sound: Path, num_damages: int, seed: int = 0) -> list[Fault]:
-    """Damages to the bytes of a sound shard, and everything else that may stand in it."""
+    """Return damages to the bytes of a sound shard, and every other content of it."""
     found = [Fault(f"shard, {kind}", name, partial(read_damaged, sound, damage)) for kind, name, damage in damages(num_damages, seed)]
     return found + [Fault("shard, other content", name, partial(read_rewritten, sound, rewrite)) for name, rewrite in rewrites(sound)]

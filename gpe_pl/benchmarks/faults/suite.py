@@ -1,4 +1,4 @@
-"""What comes of damaged files, hostile checkpoints, wrong values, full disks, and commands that are killed or meet each other: a matrix with counts."""
+"""The suite of faults: damaged files, hostile checkpoints, wrong values, full disks, killed and concurrent commands, and a matrix of the outcomes."""
 
 from __future__ import annotations
 
@@ -28,38 +28,38 @@ log = logging.getLogger(__name__)
 Count = Annotated[int, Field(ge=0)]
 KILLED = "killed"
 TEMPORARY = re.compile(r"\S*/faults-\w+/")
-"""Folders in which faults were done."""
+"""Pattern of the folders in which faults are injected."""
 
 
 RAW = "raw"
-"""Folder of arrays that ``convert`` reads."""
+"""Folder of the arrays that ``convert`` reads."""
 OF_DATA, READS_DATA = ("simulate", "fit", "evaluate"), ("fit", "evaluate")
-"""Commands that have a data set, and those that read one."""
+"""Commands that have a data set, and commands that read one."""
 DELETED = {"simulate": ("data",), "convert": ("data",), "fit": ("data", "runs"), "evaluate": ("runs",), "benchmark": ("runs",)}
 """Folders that are deleted while a command runs."""
 
 
 class PreparationError(GpeError):
-    """A command that nothing was done to has failed; the message says how."""
+    """An undisturbed command failed; the message says how."""
 
 
 @dataclass(frozen=True)
 class Attacked:
-    """A command that is attacked.
+    """A command that is attacked, and numbers of attacks.
 
     Attributes:
-        module: ``python -m gpe_pl.{module}``.
-        arguments: further overrides, that make it last a second or two; ``{root}`` is the folder in which every command has one of its own by its name.
-        others: further overrides, by a name, of commands that run at once with it in its folder; it does so with itself too.
-        num_pairs: of each of these.
-        num_deletions: of its folders while it runs.
-        num_kills: at random moments.
-        num_configs: wrong configurations.
-        num_damages: of files that it has left, each followed by the same command.
-        num_contents: other contents of small files that it has left, each followed by the same command.
-        names: keys of names that become folders.
-        leads_out: also links, and paths in checkpoints, that lead out of its folder.
-        disk_sizes: of disks that fill up, in bytes.
+        module: module in ``python -m gpe_pl.{module}``.
+        arguments: further overrides, which make the command last a second or two; ``{root}`` is the folder with a subfolder for each command.
+        others: further overrides, by name, of commands that run at once in the same folder; the command also runs beside itself.
+        num_pairs: number of runs of each such pair.
+        num_deletions: number of deletions of its folders while it runs.
+        num_kills: number of kills at random moments.
+        num_configs: number of wrong configurations.
+        num_damages: number of damages to its files, each followed by the same command.
+        num_contents: number of other contents of its small files, each followed by the same command.
+        names: keys whose values become names of folders.
+        leads_out: also try links, and paths in checkpoints, that lead out of its folder.
+        disk_sizes: sizes of disks that fill up [bytes].
     """
 
     module: Annotated[str, Field(pattern="^(simulate|fit|evaluate|convert|benchmark)$")]
@@ -78,17 +78,17 @@ class Attacked:
 
 @dataclass(frozen=True)
 class Settings:
-    """How much of each.
+    """Settings of the suite.
 
     Attributes:
         cases: data sets whose scenes are changed.
-        data: overrides of every command that has a data set: the data set, in miniature.
+        data: overrides of every command that has a data set; they select a miniature data set.
         values: data sets, among the cases, whose stored arrays get wrong values.
-        commands: the first generates the data that the others use; the first checkpoint that one leaves is damaged.
-        num_file_damages: of a shard's bytes, and of a checkpoint's.
-        num_scenes: of each data set, for each change.
-        limit: seconds after which something hangs.
-        seed: of everything random.
+        commands: attacked commands; the first generates the data of the others, and the first checkpoint among their results is damaged.
+        num_file_damages: number of damages to the bytes of a shard, and of a checkpoint.
+        num_scenes: number of scenes of each data set, for each change.
+        limit: time [s] after which a fault counts as hung.
+        seed: seed of all random choices.
     """
 
     cases: dict[str, Case]
@@ -102,7 +102,7 @@ class Settings:
 
 
 def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
-    """A record per fault, and a Markdown table of their counts."""
+    """Return a record per fault, and a Markdown table of their counts."""
     records: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
         root = Path(folder)
@@ -125,7 +125,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
 
 
 def failures(records: list[dict[str, Any]]) -> list[str]:
-    """What was not survived, or accepted, executed or kept silent about."""
+    """Return the faults with a bad status, as lines of text."""
     return [f"{r['kind']}, {r['fault']}: {r['status']}" for r in records if r["status"] in BAD]
 
 
@@ -137,7 +137,7 @@ def _note(records: list[dict[str, Any]], kind: str, name: str, verdict: Verdict)
 
 
 def _prepared(settings: Settings, root: Path) -> dict[str, Command]:
-    """The commands, each of which has been run undisturbed in a folder of its own, the first one's data serving the others."""
+    """Return the commands, each after an undisturbed run in a separate folder; the others use the data of the first."""
     commands: dict[str, Command] = {}
     data: str | None = None
     side_files.raw_arrays(root / RAW)
@@ -146,7 +146,7 @@ def _prepared(settings: Settings, root: Path) -> dict[str, Command]:
         if attacked.module in OF_DATA:
             arguments = [*settings.data, *arguments]
         command = Command(name, attacked.module, tuple(arguments), data if attacked.module in READS_DATA else None)
-        _timed(replace(command, name=f"{name} for the first time"), settings, root)  # it compiles then
+        _timed(replace(command, name=f"{name} for the first time"), settings, root)  # the first run compiles
         command = _timed(command, settings, root)
         for other, overrides in attacked.others.items():
             _timed(replace(command, name=f"{name} {other}", arguments=(*command.arguments, *overrides)), settings, root)
@@ -156,7 +156,7 @@ def _prepared(settings: Settings, root: Path) -> dict[str, Command]:
 
 
 def _timed(command: Command, settings: Settings, root: Path) -> Command:
-    """Run a command undisturbed in a folder of its own, and note how long it takes."""
+    """Run a command undisturbed in a separate folder, and return it with its duration."""
     given, started = command.given(root / command.name), time.monotonic()
     ended = isolation.run(command.module, given, settings.limit)
     if ended.code != 0:
@@ -167,7 +167,7 @@ def _timed(command: Command, settings: Settings, root: Path) -> Command:
 
 
 def _faults(settings: Settings, specs: dict[str, DatasetSpec], commands: dict[str, Command], root: Path) -> list[Fault]:
-    """Everything that is wrong but no kill."""
+    """Return all faults but kills."""
     found = scenes.faults(specs, settings.num_scenes)
     found += field_values.faults(field_values.shards({name: specs[name] for name in settings.values}, root / "values"), settings.seed)
     found += side_files.faults(root / RAW)
@@ -197,7 +197,7 @@ def _faults(settings: Settings, specs: dict[str, DatasetSpec], commands: dict[st
 
 
 def _pairs(settings: Settings, name: str, commands: dict[str, Command], root: Path) -> Iterator[tuple[pairs.Leaving, pairs.Leaving]]:
-    """A command beside itself, each of its others, and where it is a training beside the command that makes its data."""
+    """Yield pairs: a command and itself, a command and each of its others, and a training and the command that makes its data."""
     command = commands[name]
     own = pairs.Leaving(command, runs.digests(root / name))
     yield own, own
@@ -214,7 +214,7 @@ def _pairs(settings: Settings, name: str, commands: dict[str, Command], root: Pa
 
 
 def report(records: Sequence[dict[str, Any]]) -> str:
-    """Counts, a row per kind of fault, and every fault of which nothing good came."""
+    """Return counts, a row per kind of fault, and every fault with a bad outcome."""
     killed = [r for r in records if r["kind"].endswith(KILLED)]
     bad = [r for r in records if r["status"] in BAD]
     inputs = [r for r in records if not r["kind"].endswith(KILLED)]
@@ -242,7 +242,7 @@ def _table(records: Sequence[dict[str, Any]]) -> Iterator[str]:
 
 
 def _failures(bad: Sequence[dict[str, Any]], most: int = 5) -> Iterator[str]:
-    """Some of each kind."""
+    """Yield some failures of each kind."""
     seen: Counter[str] = Counter()
     for r in bad:
         seen[r["kind"]] += 1

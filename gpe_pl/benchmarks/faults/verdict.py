@@ -1,4 +1,4 @@
-"""What a fault is, what may come of it, and what must not."""
+"""Faults and their verdicts."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from typing import Literal, TypeVar
 from gpe_pl.errors import GpeError
 
 Status = Literal[
-    "refused",  # with a typed, readable error
-    "harmless",  # the result is what it would have been, or as sound as any
-    "accepted",  # silently: a result that cannot be trusted
-    "traceback",  # an error of no type that a user could act on
+    "refused",  # a typed, readable error
+    "harmless",  # the result is the undisturbed one, or sound
+    "accepted",  # no error, and a result that cannot be trusted
+    "traceback",  # an error without a type that a user could act on
     "executed",  # a payload ran
-    "outside",  # a file changed in a folder that is none of the command's
-    "half-written",  # something incomplete lies where something complete belongs
-    "different",  # what was resumed is not what an undisturbed run gives
+    "outside",  # a file changed in a folder that does not belong to the command
+    "half-written",  # an incomplete file has a final name
+    "different",  # the resumed result differs from that of an undisturbed run
     "hung",
     "died",
 ]
@@ -30,7 +30,7 @@ MAX_DETAIL = 300
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came of a fault: a status, and the message or reason."""
+    """Outcome of a fault: a status, and the message or reason."""
 
     status: Status
     detail: str = ""
@@ -38,13 +38,13 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Fault:
-    """Something wrong, done on purpose.
+    """A deliberate fault.
 
     Attributes:
         kind: row of the matrix.
-        name: what exactly, so that it can be done again.
-        attack: does it in an empty folder and says what came of it; can be pickled.
-        seconds: that the same takes where nothing is wrong.
+        name: exact description, with which the fault can be repeated.
+        attack: function that injects the fault in an empty folder and returns the verdict; can be pickled.
+        seconds: duration of the same action without the fault [s].
     """
 
     kind: str
@@ -54,7 +54,7 @@ class Fault:
 
 
 def judge(action: Callable[[], T], is_sound: Callable[[T], bool]) -> Verdict:
-    """Do what must either be refused with a ``GpeError`` or have a sound result."""
+    """Run an action that must either be refused with a ``GpeError`` or have a sound result."""
     try:
         result = action()
     except GpeError as error:
