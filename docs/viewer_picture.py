@@ -1,34 +1,27 @@
-"""``python docs/viewer_picture.py``: the picture of the viewer in the guide, ``docs/images/viewer.png``, of a model that comes with the package.
+"""``python docs/viewer_picture.py``: the picture of the embedded viewer in the guide, ``docs/images/viewer.png``.
 
-Needs playwright and a Chromium.
+Needs ``docs/_static/viewer.html`` (``python docs/viewer_page.py``), playwright and a Chromium.
 """
 
 from __future__ import annotations
 
 import shutil
-import tempfile
 from pathlib import Path
 
 from playwright.sync_api import sync_playwright
 
-from gpe_pl import LearnedSimulator, dataset, generate_trajectory, roll_out, write_viewer
-
-PICTURE = Path(__file__).resolve().parent / "images" / "viewer.png"
-FRAME = "70"
+DOCS = Path(__file__).resolve().parent
+PAGE = DOCS / "_static" / "viewer.html"
+PICTURE = DOCS / "images" / "viewer.png"
+FRAME = "35"
 
 
 def main() -> None:
-    """Roll out, write the viewer, look at one frame of it."""
-    simulator = LearnedSimulator.from_checkpoint("sand")
-    truth = generate_trajectory(dataset("data=sand", "size=small"), split="test", index=0, values={"sand": 27.5})
-    start = simulator.builder.config.history
-    prediction = roll_out(simulator, simulator.initial_state(truth, start), truth.num_frames - 1 - start, truth.metadata)
-    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
-        page_file = Path(folder) / "viewer.html"
-        write_viewer(page_file, truth.frames(start), {"GPE": prediction})
+    """Open the viewer in a browser and photograph one frame."""
+    with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--use-angle=swiftshader"])
         page = browser.new_page(viewport={"width": 1100, "height": 480}, device_scale_factor=1.5)
-        page.goto(page_file.as_uri())
+        page.goto(PAGE.as_uri())
         page.wait_for_selector("#message", state="hidden")
         page.locator("#frame").fill(FRAME)
         PICTURE.write_bytes(page.screenshot())
