@@ -18,7 +18,8 @@ from gpe_pl.data.importers import Format
 
 ROOT = Path(__file__).resolve().parents[2]
 GUIDE = ROOT / "docs" / "guide"
-PAGES = (ROOT / "README.md", ROOT / "docs" / "faq.md", *sorted(GUIDE.glob("*.md")))
+PAGES = (ROOT / "README.md", ROOT / "docs" / "index.md", ROOT / "docs" / "faq.md", *sorted(GUIDE.glob("*.md")))
+MOST_WORDS = 2500  # ten minutes of reading
 NO_COMPOSITION = {"--help", "--cfg", "job", "--resolve", "-m"}
 
 
@@ -27,7 +28,7 @@ def commands() -> dict[str, tuple[str, list[str]]]:
     found: dict[str, tuple[str, list[str]]] = {}
     for page in PAGES:
         blocks = re.findall(r"```sh\n(.*?)```", page.read_text(), re.DOTALL)
-        lines = [*"\n".join(blocks).splitlines(), *re.findall(r"`(python -m gpe_pl\.[^`]+)`", page.read_text())]
+        lines = [*"\n".join(blocks).replace("\\\n", " ").splitlines(), *re.findall(r"`(python -m gpe_pl\.[^`]+)`", page.read_text())]
         for command in (part.strip() for line in lines for part in line.split("&&")):
             if match := re.match(r"python -m gpe_pl\.(fit|simulate|evaluate|benchmark|convert)\b(.*)", command):
                 words = [word for word in shlex.split(match[2], comments=True) if word not in NO_COMPOSITION]
@@ -97,3 +98,12 @@ def test_every_format_is_in_the_table() -> None:
 def test_every_notebook_is_in_the_table() -> None:
     listed = set(re.findall(r"\| `(\w+)\.ipynb`", (GUIDE / "notebooks.md").read_text()))
     assert listed == {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")}
+
+
+def test_no_page_takes_more_than_ten_minutes() -> None:
+    lengths = {page.name: len(page.read_text().split()) for page in PAGES}
+    assert not {name: length for name, length in lengths.items() if length > MOST_WORDS}
+
+
+def test_the_embedded_viewer_is_small() -> None:
+    assert (ROOT / "docs" / "_static" / "viewer.html").stat().st_size < 600_000
