@@ -1,4 +1,4 @@
-"""Whether two checkpoints of a training hold the same."""
+"""Comparison of two training checkpoints."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from gpe_pl.benchmarks.faults.runs import SAVED
 
 
 def assert_same_checkpoint(a: dict[str, Any], b: dict[str, Any]) -> None:
-    """All that does not depend on where a checkpoint lies, bit for bit."""
+    """Compare everything that does not depend on the location of a checkpoint, bit for bit."""
     assert_equal({key: a[key] for key in SAVED}, {key: b[key] for key in SAVED})
 
 
 def assert_equal(a: Any, b: Any, path: str = "") -> None:
-    """Nested values with tensors, bit for bit."""
+    """Compare nested values with tensors, bit for bit."""
     if isinstance(a, dict):
         assert a.keys() == b.keys(), path
         for key in a:

@@ -1,4 +1,4 @@
-"""Small states and reference computations that several tests share."""
+"""Small states and reference computations for several tests."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def make_trajectory(seed: int = 0, num_frames: int = 6, num_nodes: int = 12, **metadata: object) -> Trajectory:
-    """A sound trajectory of sand in a unit box with walls and an obstacle; the motion is random, not physical."""
+    """Return a valid trajectory of sand in a unit box with walls and an obstacle; the motion is random, not physical."""
     rng = np.random.default_rng(seed)
     bounds = ((0.0, 1.0), (0.0, 1.0))
     values = {
@@ -73,13 +73,13 @@ def trajectory() -> Trajectory:
 
 @pytest.fixture
 def new_trajectory() -> Callable[..., Trajectory]:
-    """Makes more of them: ``new_trajectory(seed, num_frames=…, split=…)``."""
+    """Function that makes further trajectories: ``new_trajectory(seed, num_frames=…, split=…)``."""
     return make_trajectory
 
 
 @pytest.fixture
 def store(tmp_path: Path) -> Path:
-    """A data set's folder with two trajectories for training and one of each other split."""
+    """Folder of a data set with two trajectories for training and one of each other split."""
     root = tmp_path / "grains"
     write_shard(root / "train" / "shard-00000.h5", [make_trajectory(seed) for seed in (0, 1)])
     for seed, split in enumerate(("val", "test", "test_unseen"), start=2):
@@ -90,7 +90,7 @@ def store(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def brute_force_radius() -> Callable[[np.ndarray, np.ndarray, float], set[tuple[int, int]]]:
-    """Reference neighbour search: all pairs (source, target) no further apart than the radius, by float64 distances."""
+    """Find by float64 distances all pairs (source, target) within the radius, as a reference for neighbour search."""
 
     def pairs(source: np.ndarray, target: np.ndarray, radius: float) -> set[tuple[int, int]]:
         offset = np.asarray(source, np.float64)[:, None] - np.asarray(target, np.float64)[None]
@@ -101,7 +101,7 @@ def brute_force_radius() -> Callable[[np.ndarray, np.ndarray, float], set[tuple[
 
 @pytest.fixture(autouse=True, scope="session")
 def _one_thread() -> None:
-    """Small tensors run faster on one thread, and results do not depend on the machine's cores."""
+    """Use one thread: small tensors run faster, and results do not depend on the number of cores."""
     import torch
 
     torch.set_num_threads(1)
@@ -109,7 +109,7 @@ def _one_thread() -> None:
 
 @pytest.fixture(scope="session")
 def step_times_of_few_steps() -> Iterator[None]:
-    """What a test trains within a budget of time shows that the steps are measured and kept; it has no use for their precise time."""
+    """Shorten the measurement of step times: tests of time budgets check that steps are measured and stored, not their precise time."""
     from gpe_pl.training import budget
 
     with pytest.MonkeyPatch.context() as monkeypatch:
@@ -120,7 +120,7 @@ def step_times_of_few_steps() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def tiny_data(tmp_path_factory: pytest.TempPathFactory, step_times_of_few_steps: None) -> Path:
-    """A generated data set for training runs of seconds (``tests.runs``), within budgets too; shared, so never written to."""
+    """Generated data set for training runs of seconds (``tests.runs``), also within time budgets. It is shared, so never write to it."""
     from tests.runs import generate_tiny
 
     return generate_tiny(tmp_path_factory.mktemp("data"))
@@ -136,7 +136,7 @@ def shard(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small GPE, as it is shipped."""
+    """Checkpoint of a small GPE, in the shipped form."""
     import torch
 
     from gpe_pl.learned.simulator import LearnedSimulator

@@ -1,4 +1,4 @@
-"""A small mesh with virtual nodes and random features, made by hand: a chain whose neighbours are merged two by two, level by level."""
+"""A small mesh with virtual nodes and random features, made by hand: a chain whose neighbours are merged in pairs, level by level."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ NUM_NODES, NUM_BOUNDARY = 8, 2
 
 
 def spec(num_levels: int) -> FeatureSpec:
-    """Channels of ``graph``; every relation and type has widths of its own."""
+    """Channels of ``graph``; every relation and type has its own widths."""
     materials = ("solid",)
     relations = (*radius_relations(materials), *mesh_relations(materials, num_levels))
     widths = {RADIUS: (4, 2), CELL: (6, 3), SAME: (6, 4), DOWN: (6, 4)}
@@ -28,7 +28,7 @@ def spec(num_levels: int) -> FeatureSpec:
 
 
 def graph(num_levels: int, seed: int = 0) -> HeteroData:
-    """Nodes 0 … 7 in a chain of cells, 2 boundary nodes near its ends, contact of its ends, and 4, 2, 1 virtual nodes."""
+    """Return nodes 0 … 7 in a chain of cells, 2 boundary nodes near its ends, contact of its ends, and 4, 2, 1 virtual nodes."""
     channels, random = spec(num_levels), torch.Generator().manual_seed(seed)
     size = {"solid": NUM_NODES, BOUNDARY: NUM_BOUNDARY, **{grid(level): NUM_NODES >> level for level in range(1, num_levels + 1)}}
     pairs: dict[EdgeType, list[tuple[int, int]]] = {

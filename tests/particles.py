@@ -1,4 +1,4 @@
-"""Blocks of particles that tests of particle solvers start from."""
+"""Blocks of particles as initial states for tests of particle solvers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def block(
     jitter: float = 0.25,
     seed: int = 0,
 ) -> State:
-    """A box of particles at the nodes of a lattice, moved by up to ``jitter`` spacings; as many axes as ``low`` has."""
+    """Return a box of particles at the nodes of a lattice, moved by up to ``jitter`` spacings; it has as many axes as ``low``."""
     dim = len(low)
     counts = [round(s / spacing) for s in size]
     lattice = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1).reshape(-1, dim)
@@ -49,7 +49,7 @@ def block(
 
 
 def together(materials: tuple[str, ...], *states: State) -> State:
-    """Blocks in one scene with the boundary and gravity of the first; ``materials`` are those of the solver."""
+    """Join blocks to one scene with the boundary and gravity of the first; ``materials`` are those of the solver."""
     names = param_names(materials)
     params = []
     for state in states:
@@ -61,7 +61,7 @@ def together(materials: tuple[str, ...], *states: State) -> State:
 
 
 def run(solver: Simulator, state: State, num_steps: int) -> State:
-    """The state after some frames."""
+    """Return the state after some frames."""
     for _ in range(num_steps):
         state = solver.step(state)
     return state

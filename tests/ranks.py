@@ -17,7 +17,7 @@ TIMEOUT = 300.0
 
 
 def on_ranks(folder: Path, function: Callable[[int], Any], num_ranks: int = 2) -> list[Any]:
-    """What ``function(rank)`` returns in each process of a group; fails if one of them raises or hangs."""
+    """Return the results of ``function(rank)`` in each process of a group; fail if one of them raises or hangs."""
 
     def work(rank: int) -> Any:
         dist.init_process_group("gloo", init_method=f"file://{folder / 'rendezvous'}", rank=rank, world_size=num_ranks)
@@ -27,7 +27,7 @@ def on_ranks(folder: Path, function: Callable[[int], Any], num_ranks: int = 2) -
 
 
 def as_launched(folder: Path, function: Callable[[int], Any], num_ranks: int = 2) -> list[Any]:
-    """The same where Lightning finds the group by the environment, as processes that ``torchrun`` or Slurm has started do."""
+    """Run as ``on_ranks`` with the group in the environment, where Lightning finds it for processes that ``torchrun`` or Slurm has started."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -41,7 +41,7 @@ def as_launched(folder: Path, function: Callable[[int], Any], num_ranks: int = 2
 
 
 def _forked(folder: Path, work: Callable[[int], Any], num_ranks: int) -> list[Any]:
-    """Forks rather than starting afresh: the imports of a new interpreter take longer than most tests."""
+    """Fork processes, because the imports of a new interpreter take longer than most tests."""
     folder.mkdir(parents=True, exist_ok=True)
 
     def run(rank: int) -> None:

@@ -1,4 +1,4 @@
-"""Sources that are converted, and what was refused of them."""
+"""Conversions of sources, and checks of their refusals."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def convert(tmp_path: Path, format: Any, **settings: Any) -> Report:
 
 
 def refused(tmp_path: Path, format: Any, message: str, **settings: Any) -> None:
-    """The conversion as a whole fails with this message, and leaves nothing."""
+    """Check that the conversion as a whole fails with this message, and leaves nothing."""
     with pytest.raises(ImportFailure, match=message) as caught:
         convert(tmp_path, format, **settings)
     assert len(str(caught.value)) < 1000
@@ -37,7 +37,7 @@ def only_refusal(report: Report) -> str:
 
 
 def unreadable(tmp_path: Path, format: Any) -> str:
-    """The refusal of the only trajectory that cannot be read, without writing the others."""
+    """Return the refusal of the only unreadable trajectory, without writing the others."""
     settings = ImportSettings(format, str(tmp_path / "raw"))
     source = importlib.import_module(f"gpe_pl.data.importers.{format}").open_source(tmp_path / "raw", settings)
     found = []

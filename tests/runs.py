@@ -1,4 +1,4 @@
-"""Training runs of seconds: composed configs and the smallest data set that has everything."""
+"""Training runs of seconds: composed configs, and the smallest data set with all features."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RUN = [
 
 
 def compose(name: str, *overrides: str, hydra_config: bool = False) -> DictConfig:
-    """A config as an entry point sees it."""
+    """Return a config as an entry point receives it."""
     GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = hydra.compose(name, list(overrides), return_hydra_config=hydra_config)
@@ -39,18 +39,18 @@ def compose(name: str, *overrides: str, hydra_config: bool = False) -> DictConfi
 
 
 def tiny(data: Path, runs: Path, *overrides: str) -> DictConfig:
-    """The config of a run of two steps on the tiny data set."""
+    """Return the config of a run of two steps on the tiny data set."""
     return compose("fit", *DATA, *RUN, "size.comparison.budget_minutes=1e-5", f"paths.data={data}", f"paths.runs={runs}", *overrides)
 
 
 def generate_tiny(folder: Path) -> Path:
-    """The tiny data set, generated in this process; returns ``folder``."""
+    """Generate the tiny data set in this process; return ``folder``."""
     generate(folder, dataset_spec(compose("simulate", *DATA)), 1)
     return folder
 
 
 def first_choices(experiment: str) -> list[str]:
-    """The first value of every axis that an experiment sweeps over."""
+    """Return the first value of every axis that an experiment sweeps over."""
     params: Any = compose("fit", f"experiment={experiment}", hydra_config=True).hydra.sweeper.params
     return [f"{key}={_first_choice(str(values))}" for key, values in (params or {}).items()]
 

@@ -1,4 +1,4 @@
-"""Small states and graphs that tests build on."""
+"""Small states and graphs for tests."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SPACING = 0.05
 
 
 def metadata(materials: tuple[str, ...] = ("sand",), dim: int = 2, radius: float = 0.12) -> Metadata:
-    """Metadata of a unit box with these materials."""
+    """Return metadata of a unit box with these materials."""
     return Metadata(
         dataset="test",
         materials=materials,
@@ -46,7 +46,7 @@ def state(
     low: float = 0.02,
     high: float = 0.45,
 ) -> State:
-    """A random cloud of the given materials near a corner of the box; node order is random."""
+    """Return a random cloud of the given materials near a corner of the box, in random order."""
     rng = np.random.default_rng(seed)
     pos = rng.uniform(low, high, (num_nodes, dim))
     past = rng.normal(scale=1.0, size=(num_nodes, history, dim))
@@ -70,7 +70,7 @@ def state(
 
 
 def mesh(kind: str, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Points in rest spacings and cells of one body: a ``lattice`` of quadrilaterals, unstructured ``triangles`` or ``tetrahedra``."""
+    """Return points in rest spacings and cells of one body: a ``lattice`` of quadrilaterals, unstructured ``triangles`` or ``tetrahedra``."""
     rng = np.random.default_rng(seed)
     if kind == "lattice":
         number = np.arange(np.prod(shape := tuple(rng.integers(3, 8, 2)))).reshape(shape)
@@ -90,7 +90,7 @@ def mesh_state(
     seed: int = 0,
     walls: bool = True,
 ) -> State:
-    """Bodies of ``mesh`` side by side, ``gap`` spacings apart, strained and moving; the other materials of the scene are clouds; node order is random."""
+    """Return strained, moving bodies of ``mesh`` side by side, ``gap`` spacings apart, and clouds of the scene's other materials, in random order."""
     dim, rng = 3 if kind == "tetrahedra" else 2, np.random.default_rng(seed)
     meshes = [m for m in materials if m in MESH_MATERIALS]
     points, cells, edge = [np.empty((0, dim))], [], 1.0
@@ -127,17 +127,17 @@ def mesh_state(
 
 
 def builder(materials: tuple[str, ...] = ("sand",), dim: int = 2, **config: object) -> GraphBuilder:
-    """A graph builder for such states."""
+    """Return a graph builder for such states."""
     return GraphBuilder(GraphConfig(**{"history": 1, "islands": True, **config}), metadata(materials, dim))  # type: ignore[arg-type]
 
 
 def graph(materials: tuple[str, ...] = ("sand",), dtype: torch.dtype = torch.float64, **settings: object) -> HeteroData:
-    """A graph of a random state with features of the given precision."""
+    """Return a graph of a random state with features of the given precision."""
     return to_dtype(builder(materials)(state(materials=materials, **settings).to_torch()), dtype)  # type: ignore[arg-type]
 
 
 def assert_equal_graphs(a: HeteroData, b: HeteroData, rtol: float = 0.0, atol: float = 0.0) -> None:
-    """Equal stores with equal values, bit for bit unless tolerances are given."""
+    """Check that stores and values are equal, bit for bit unless tolerances are given."""
     assert (a.node_types, a.edge_types) == (b.node_types, b.edge_types)
     for store, other in zip(a.stores, b.stores, strict=True):
         assert set(store.keys()) == set(other.keys())

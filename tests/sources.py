@@ -1,4 +1,4 @@
-"""Writers of the formats that ``gpe_pl.data.importers`` reads, made from their descriptions alone: no code is shared with the readers."""
+"""Writers of the formats that ``gpe_pl.data.importers`` reads. They follow the descriptions of the formats and share no code with the readers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DT, SPACING = 0.01, 0.05
 
 
 def motion(num_frames: int = 10, num_nodes: int = 20, dim: int = 2, seed: int = 0, low: float = 0.2, high: float = 0.8) -> np.ndarray:
-    """Positions [frame, node, dim] of particles that swing about places of their own."""
+    """Return positions [frame, node, dim] of particles that swing about their centres."""
     rng = np.random.default_rng(seed)
     rest = rng.uniform(low, high, (num_nodes, dim))
     phase, rate = rng.uniform(0, 2 * np.pi, (2, num_nodes, dim))
@@ -31,7 +31,7 @@ def frames_of(pos: np.ndarray) -> list[bytes]:
 
 
 def crc32c(data: bytes) -> int:
-    """CRC-32C, bit by bit."""
+    """Return the CRC-32C, computed bit by bit."""
     crc = 0xFFFFFFFF
     for byte in data:
         crc ^= byte
@@ -64,7 +64,7 @@ def message(number: int, content: bytes) -> bytes:
 
 
 def feature(values: Any, packed: bool = True) -> bytes:
-    """Bytes, floats or integers as a ``Feature``."""
+    """Encode bytes, floats or integers as a ``Feature``."""
     if isinstance(values, bytes):
         return message(1, message(1, values))
     array = np.asarray(values)
@@ -77,7 +77,7 @@ def feature(values: Any, packed: bool = True) -> bytes:
 
 
 def named(entries: Mapping[str, bytes]) -> bytes:
-    """A map from names to messages."""
+    """Encode a map from names to messages."""
     return b"".join(message(1, message(1, name.encode()) + message(2, value)) for name, value in entries.items())
 
 
@@ -155,7 +155,7 @@ def lagrangebench_h5(path: Path, trajectories: Sequence[tuple[np.ndarray, np.nda
 
 
 def sheet(num_frames: int = 10, rows: int = 5, columns: int = 6, seed: int = 0) -> dict[str, np.ndarray]:
-    """A cloth that hangs from two corners, as the fields of a cloth data set of MeshGraphNets."""
+    """Return a cloth that hangs from two corners, as the fields of a cloth data set of MeshGraphNets."""
     rng = np.random.default_rng(seed)
     u, v = np.meshgrid(np.arange(columns), np.arange(rows))
     mesh_pos = SPACING * np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float32)
@@ -198,7 +198,7 @@ def mgn_h5(path: Path, trajectories: Sequence[Mapping[str, np.ndarray]]) -> None
 
 
 def dpinet(folder: Path, pos: np.ndarray, vel: np.ndarray, **extra: np.ndarray) -> None:
-    """One rollout: a file per frame."""
+    """Write one rollout, a file per frame."""
     folder.mkdir(parents=True)
     for k, (x, v) in enumerate(zip(pos, vel, strict=True)):
         with h5py.File(folder / f"{k}.h5", "w") as file:
@@ -207,13 +207,13 @@ def dpinet(folder: Path, pos: np.ndarray, vel: np.ndarray, **extra: np.ndarray) 
 
 
 def msgpack_array(array: np.ndarray) -> dict[bytes, Any]:
-    """As msgpack-numpy has it."""
+    """Encode an array as msgpack-numpy does."""
     kind = b"O" if array.dtype.hasobject else b""
     return {b"nd": True, b"type": array.dtype.str, b"kind": kind, b"shape": list(array.shape), b"data": array.tobytes()}
 
 
 def dmcf_frames(pos: np.ndarray, vel: np.ndarray, first: int = 0, **static: np.ndarray) -> list[dict[str, Any]]:
-    """Frames of one part; ``static`` goes into the first."""
+    """Return the frames of one part; the first contains ``static``."""
     count = pos.shape[1]
     frames: list[dict[str, Any]] = []
     for k, (x, v) in enumerate(zip(pos, vel, strict=True)):

@@ -1,4 +1,4 @@
-"""Hypothesis strategies for states, scenes, graphs and files: what any of them may be, the awkward ones included."""
+"""Hypothesis strategies for states, scenes, graphs and files, including degenerate ones."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 @st.composite
 def clouds(draw: Callable[..., Any], num_nodes: int, dim: int) -> np.ndarray:
-    """Positions [node, dim] in the unit box: anywhere, on a lattice with ties and coincident nodes, crowded, or at the walls."""
+    """Draw positions [node, dim] in the unit box: random, on a lattice with ties and coincident nodes, crowded, or at the walls."""
     rng = np.random.default_rng(draw(seeds))
     pos = rng.uniform(0.0, 1.0, (num_nodes, dim))
     kind = draw(st.sampled_from(["anywhere", "lattice", "crowded", "walls", "one place"]))
@@ -50,7 +50,7 @@ def clouds(draw: Callable[..., Any], num_nodes: int, dim: int) -> np.ndarray:
 def states(
     draw: Callable[..., Any], max_nodes: int = 24, materials: tuple[str, ...] = PARTICLES, history: int = 2, dim: int | None = None
 ) -> State:
-    """A state of particles that a graph can be built of: any number of them from none, of any materials, still or fast, with walls or without."""
+    """Draw a state of particles for which a graph exists: any number from 0, any materials, at rest or fast, with or without walls."""
     dim = draw(st.sampled_from([2, 3])) if dim is None else dim
     count = draw(st.integers(0, max_nodes))
     rng = np.random.default_rng(draw(seeds))
@@ -77,7 +77,7 @@ def states(
 
 @st.composite
 def trajectories(draw: Callable[..., Any], max_nodes: int = 8, max_frames: int = 6) -> Trajectory:
-    """What a store may hold: any number of frames and nodes, values of any size that fit, text of any kind in the metadata."""
+    """Draw a trajectory that can be stored: any number of frames and nodes, values of any size that fit, any text in the metadata."""
     state = draw(states(max_nodes))
     rng, frames = np.random.default_rng(draw(seeds)), draw(st.integers(1, max_frames))
     scale = 10.0 ** draw(st.integers(-30, 18))  # larger numbers are not read
@@ -102,7 +102,7 @@ def trajectories(draw: Callable[..., Any], max_nodes: int = 8, max_frames: int =
 
 @st.composite
 def body_scenes(draw: Callable[..., Any]) -> BodyScene:
-    """Settings of scenes of thrown bodies, small ones."""
+    """Draw settings of small scenes of thrown bodies."""
     dim, materials = (
         draw(st.sampled_from([2, 3])),
         tuple(draw(st.lists(st.sampled_from(["sand", "snow", "elastomer"]), min_size=1, unique=True))),
@@ -129,7 +129,7 @@ def body_scenes(draw: Callable[..., Any]) -> BodyScene:
 
 @st.composite
 def graphs(draw: Callable[..., Any], materials: tuple[str, ...] = PARTICLES, dim: int = 2) -> tuple[GraphBuilder, HeteroData]:
-    """A graph of any state, and what built it."""
+    """Draw a graph of any state, and its builder."""
     build = builder(materials, dim, history=2)
     return build, build(draw(states(materials=materials, dim=dim)).to_torch())
 
@@ -138,7 +138,7 @@ def graphs(draw: Callable[..., Any], materials: tuple[str, ...] = PARTICLES, dim
 
 
 def damages() -> st.SearchStrategy[Callable[[bytes], bytes]]:
-    """What may happen to the bytes of a file: the end is lost, a bit flips, a block is overwritten."""
+    """Draw damage to the bytes of a file: a truncated end, a flipped bit or an overwritten block."""
     return st.one_of(
         st.floats(0.0, 1.0, exclude_max=True).map(lambda share: partial(truncated, share)),
         seeds.map(lambda seed: partial(flipped, seed)),

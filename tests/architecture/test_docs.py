@@ -1,4 +1,4 @@
-"""What the guide names exists, what exists is named, and every command in it composes."""
+"""The guide names only things that exist, everything that exists is named, and every command in the guide composes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NO_COMPOSITION = {"--help", "--cfg", "job", "--resolve", "-m"}
 
 
 def commands() -> dict[str, tuple[str, list[str]]]:
-    """Name and overrides of every command of the package that a page shows, the first value of what it sweeps over."""
+    """Return name and overrides of every command of the package on a page, with the first value of each sweep."""
     found: dict[str, tuple[str, list[str]]] = {}
     for page in PAGES:
         blocks = re.findall(r"```sh\n(.*?)```", page.read_text(), re.DOTALL)
@@ -45,7 +45,7 @@ def test_commands_compose(name: str, overrides: list[str]) -> None:
 
 
 def named(page: str, key: str) -> set[str]:
-    """First columns of the table whose head is ``key=``."""
+    """Return the first columns of the table whose head is ``key=``."""
     rows = re.search(rf"\| `(?:benchmark )?{key}=` \|.*?\n\n", (GUIDE / page).read_text() + "\n\n", re.DOTALL)
     assert rows, f"{page} has no table of {key}="
     cells = [row.split("|")[1] for row in rows[0].strip().splitlines()[2:]]

@@ -1,4 +1,4 @@
-"""Text is UTF-8, whatever the locale of the machine."""
+"""Text is UTF-8 with any locale of the machine."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.architecture.test_imports import MODULES, ROOT, dotted
 
 
 def without_encoding(tree: ast.Module) -> Iterator[int]:
-    """Lines that read or write text in whatever encoding the locale has."""
+    """Return lines that read or write text in the encoding of the locale."""
     for node in ast.walk(tree):
         if not isinstance(node, ast.Call) or any(keyword.arg == "encoding" for keyword in node.keywords):
             continue

@@ -1,4 +1,4 @@
-"""What may be imported where: the contracts in pyproject.toml, and what a reader of data must not have to load."""
+"""Import rules: the contracts in pyproject.toml, and modules that a reader of data must not load."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def dotted(path: Path) -> str:
 
 
 def loaded_by(*modules: str) -> set[str]:
-    """Top-level names in ``sys.modules`` of a fresh interpreter that imports these modules."""
+    """Return the top-level names in ``sys.modules`` of a fresh interpreter that imports these modules."""
     script = f"import json, sys, {', '.join(modules)}; print(json.dumps(sorted({{m.partition('.')[0] for m in sys.modules}})))"
     child = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT, check=False)
     assert child.returncode == 0, child.stderr
@@ -112,7 +112,7 @@ def test_schema_imports_only_the_standard_library() -> None:
 
 
 def top_level_imports(tree: ast.Module) -> set[str]:
-    """First parts of what a module imports when it is imported, without what only type checkers see."""
+    """Return the top-level packages that a module imports at import time, without imports for type checkers."""
     names: set[str] = set()
     pending: list[ast.AST] = [tree]
     while pending:

@@ -1,4 +1,4 @@
-"""Tables in the README are those of the runs in ``docs/results``, and every local link leads somewhere."""
+"""Tables in the README show the runs in ``docs/results``, and every local link leads to a file."""
 
 from __future__ import annotations
 

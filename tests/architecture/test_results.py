@@ -1,4 +1,4 @@
-"""The folder of results: small, and every table in it says where it comes from."""
+"""The folder of results is small, and every table in it states its provenance."""
 
 from __future__ import annotations
 

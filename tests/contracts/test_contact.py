@@ -1,4 +1,4 @@
-"""The ``contact`` decoder: what touches a body of a mesh moves it as a whole, and nothing else does."""
+"""The ``contact`` decoder: contacts move a mesh body as a whole, and nothing else does."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_contacts_alone_move_and_turn_a_body(kind: str) -> None:
 
 
 def with_loose_nodes(materials: tuple[str, ...] = ("elastomer",), gap: float = 0.5) -> State:
-    """Two bodies that touch, each without the cells of one of its corners, of masses that differ a hundredfold, far from walls."""
+    """Return two touching bodies far from walls, each with a corner without cells, of masses that differ a hundredfold."""
     s = scenes.mesh_state("lattice", materials, num_bodies=2, gap=gap, walls=False)
     assert s.cells is not None and s.rest_pos is not None
     first, second = connected(s, s.cells)
@@ -74,14 +74,14 @@ def with_loose_nodes(materials: tuple[str, ...] = ("elastomer",), gap: float = 0
 
 
 def connected(s: State, cells: np.ndarray) -> list[np.ndarray]:
-    """Nodes of each body, the one that begins first along x first."""
+    """Return the nodes of each body, in the order of the bodies along x."""
     label = multiscale_graph(np.asarray(s.rest_pos), cells, scenes.SPACING, 1).body
     bodies = [np.flatnonzero(label[: s.num_nodes] == b) for b in np.unique(label[np.unique(cells)])]
     return sorted(bodies, key=lambda nodes: float(np.asarray(s.rest_pos)[nodes, 0].min()))
 
 
 def momentum_error(before: State, after: State, frame_dt: float) -> tuple[float, float]:
-    """|Σ m Δv| / Σ m |Δv|, and the same of angular momentum about the centre of mass, of velocity changes that gravity does not explain."""
+    """Return |Σ m Δv| / Σ m |Δv|, and the same for angular momentum about the centre of mass, of velocity changes beyond gravity."""
     change = after.vel - before.vel - before.gravity * frame_dt
     mass = before.mass[:, None]
     arm, push = before.pos - (mass * before.pos).sum(dim=0) / mass.sum(), mass * change
@@ -151,7 +151,7 @@ def test_a_loose_node_moves_with_the_body_that_it_lies_beside_at_rest() -> None:
 
 
 def prediction_and_parts(model: GPE, data: HeteroData) -> tuple[dict[str, torch.Tensor], Any]:
-    """The accelerations that a model predicts, and what it made them of."""
+    """Return the accelerations that a model predicts, and the parts from which it makes them."""
     parts: list[Any] = []
     compute = model.compute
 
@@ -167,7 +167,7 @@ def prediction_and_parts(model: GPE, data: HeteroData) -> tuple[dict[str, torch.
 
 
 def turning(arm: torch.Tensor, force: torch.Tensor) -> torch.Tensor:
-    """Torque, of as many components as axes to turn about."""
+    """Return the torque, with one component per rotation axis."""
     arm, force = (torch.nn.functional.pad(x, (0, 3 - x.shape[1])) for x in (arm, force))
     return torch.linalg.cross(arm, force).sum(dim=0)
 

@@ -1,4 +1,4 @@
-"""The contract of the graph builder: exact edges, each once, every store there, features with the symmetries that models rely on."""
+"""The contract of the graph builder: exact edges, each once, all stores, and features with the symmetries that models need."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def builder(materials: tuple[str, ...] = SAND, dim: int = 2, **config: Any) -> G
 
 
 def only(material: str, count: int, materials: tuple[str, ...] = TWO, **settings: Any) -> State:
-    """A state with one of the data set's materials, or without any node."""
+    """Return a state with one of the data set's materials, or without any node."""
     s = scenes.state(max(count, len(materials)) * len(materials), materials, **settings)
     rows = np.flatnonzero(s.node_type == node_code(material))[:count]
     return scenes.permuted(s, rows)
@@ -44,7 +44,7 @@ def edges_of(data: HeteroData, relation: tuple[str, str, str]) -> list[tuple[int
 
 
 def assert_edges_are_exact(build: GraphBuilder, s: State, brute_force: Pairs) -> int:
-    """Compares every relation with all pairs; returns the number of edges."""
+    """Compare every relation with all pairs; return the number of edges."""
     data, pos, count = build(s.to_torch()), node_positions(build, s), 0
     assert set(data.edge_types) == set(build.spec.relations)
     for relation in build.spec.relations:

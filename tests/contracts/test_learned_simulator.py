@@ -1,4 +1,4 @@
-"""A learned model as a simulator: the oracle through its integrator, the same graph as in training, checkpoints that are safe to open."""
+"""A learned model as a simulator: the oracle test of its integrator, the same graph as in training, and safe checkpoints."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def learned(build: GraphBuilder, seed: int = 0, **settings: Any) -> LearnedSimul
 
 
 def silenced(simulator: LearnedSimulator) -> LearnedSimulator:
-    """The same simulator with a network that always answers zero."""
+    """Return the simulator with a network that always predicts zero."""
     with torch.no_grad():
         for p in simulator.model.parameters():
             p.zero_()
@@ -303,7 +303,7 @@ def test_a_description_is_plain_values(simulator: LearnedSimulator) -> None:
 
 
 class Payload:
-    """Creates a file when it is unpickled."""
+    """Object that creates a file when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -555,7 +555,7 @@ def test_material_parameters_outside_the_training_data_are_taken_for_the_nearest
 
 
 def alone(build: GraphBuilder, materials: tuple[str, ...], seed: int = 0) -> tuple[State, HeteroData]:
-    """A state of some of the materials that a builder knows, and its graph with targets."""
+    """Return a state with some of the builder's materials, and its graph with targets."""
     state = scenes.state(40, materials, seed=seed).to_torch()
     columns = [param_names(build.metadata.materials).index(name) for name in param_names(materials)]
     params = state.material_params.new_full((state.num_nodes, len(param_names(build.metadata.materials))), torch.nan)
@@ -590,7 +590,7 @@ def test_what_the_statistics_lack_is_named_once_and_never_silently_unscaled(capl
 
 
 def fitted(seed: int, history: int = 2, **settings: Any) -> LearnedSimulator:
-    """A simulator with statistics and parameter ranges of its own."""
+    """Return a simulator with fitted statistics and parameter ranges."""
     build = scenes.builder(("sand", "snow"), history=history)
     simulator = learned(build, seed, **settings)
     graph = build(scenes.state(40, ("sand", "snow"), history=history, seed=seed).to_torch())
@@ -671,7 +671,7 @@ def test_levels_that_share_weights_start_on_meshes_of_any_size() -> None:
 
 
 def _nested(levels: int, width: int = 1) -> Any:
-    """Lists in lists; with ``width`` 2 each is referred to twice, which is small in a file and 2^levels values to whoever goes through it."""
+    """Return nested lists; with ``width`` 2 each list is referred to twice, which is small in a file but has 2^levels values when traversed."""
     value: Any = "x"
     for _ in range(levels):
         value = [value] * width

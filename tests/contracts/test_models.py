@@ -1,4 +1,4 @@
-"""The contract of every model: symmetries, independence, degenerate input, gradients. A new model joins by one line in ``MODELS``."""
+"""The contract of every model: symmetries, independence, degenerate input, gradients. A new model joins with one line in ``MODELS``."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ TWO = ("sand", "snow")
 USUAL = {
     "gpe-directed-node-latent", "gpe-negated-node-latent", "gpe-odd-pair-geometry", "gpe-odd_even-node-geometry", "gpe-angular", "gns", "dpinet", "cconv",
 }  # fmt: skip
-"""Every setting and every model once; all combinations are among the slow tests."""
+"""Combinations that cover every setting and every model once; the slow tests run all combinations."""
 
 
 @pytest.fixture(params=[pytest.param(name, marks=() if name in USUAL else pytest.mark.slow, id=name) for name in MODELS])
@@ -68,7 +68,7 @@ def make(request: pytest.FixtureRequest) -> Factory:
 
 
 def predict(model: Any, data: HeteroData, num_nodes: int) -> torch.Tensor:
-    """Predictions in the order of the state's nodes."""
+    """Return predictions in the order of the state's nodes."""
     return in_order(model(data), data, num_nodes, model.spec.dim)
 
 

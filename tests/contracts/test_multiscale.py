@@ -1,4 +1,4 @@
-"""The multi-scale graph of meshes against plain loops, and GPE on it."""
+"""The multi-scale graph of meshes compared with plain loops, and GPE on it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def double(build: GraphBuilder, s: State) -> HeteroData:
 
 
 def model_of(build: GraphBuilder, **settings: Any) -> GPE:
-    """A random model in double precision without gradients; equal arguments give the same one, because PyG takes long to make layers."""
+    """Return a random model in double precision without gradients. Equal arguments give the same object, because PyG makes layers slowly."""
     values = {"num_message_passing_steps": 2, "hidden_channels": 16, **settings}
     key = repr((build.spec, sorted(values.items())))
     if key not in MODELS:
@@ -63,7 +63,7 @@ def accelerations(model: GPE, data: HeteroData, num_nodes: int) -> torch.Tensor:
 
 
 def by_loops(rest_pos: np.ndarray, cells: np.ndarray, num_levels: int) -> tuple[set[Any], set[Any], set[Any], dict[int, int]]:
-    """Cell edges, (parent, child) pairs, same edges, and the body of every node; a virtual node is (level, the mesh nodes below it)."""
+    """Return cell edges, (parent, child) pairs, same edges, and the body of every node; a virtual node is (level, the mesh nodes below it)."""
     edges = {frozenset(pair) for cell in cells.tolist() for pair in itertools.combinations(cell, 2)}
     neighbours = defaultdict(set)
     for a, b in map(tuple, edges):
@@ -105,7 +105,7 @@ def by_loops(rest_pos: np.ndarray, cells: np.ndarray, num_levels: int) -> tuple[
 
 
 def names_of(graph: MultiscaleGraph) -> dict[int, Any]:
-    """The virtual nodes of a graph as ``by_loops`` names them."""
+    """Return the virtual nodes of a graph by their names in ``by_loops``."""
     below = defaultdict(set)
     for parent, node in graph.descent.T.tolist():
         below[parent].add(node)
@@ -268,7 +268,7 @@ def test_stores_have_the_channels_of_the_spec(kind: str, features: str) -> None:
 
 
 def masses(build: GraphBuilder, data: HeteroData) -> dict[str, torch.Tensor]:
-    """Mass of every node, that of virtual nodes from their children."""
+    """Return the mass of every node; a virtual node has the mass of its children."""
     mass = {m: data[m].mass.double() for m in build.spec.materials}
     for level in range(1, build.spec.num_levels + 1):
         mass[grid(level)] = torch.zeros(data[grid(level)].num_nodes, dtype=DOUBLE)
@@ -302,7 +302,7 @@ def test_virtual_nodes_are_the_mass_weighted_mean_of_their_children(kind: str) -
 
 
 def children(build: GraphBuilder, data: HeteroData, level: int) -> torch.Tensor:
-    """Which virtual nodes of a level are nobody's children."""
+    """Tell which virtual nodes of a level have no parent."""
     is_top = torch.ones(data[grid(level)].num_nodes, dtype=torch.bool)
     if level < build.spec.num_levels:
         is_top[data[grid(level + 1), "down", grid(level)].edge_index[1]] = False
@@ -429,7 +429,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 USUAL = {"negated", "pair", "contact", "geometry", "sweep-separate-odd"}
-"""The others are among the slow tests."""
+"""Variants of the fast tests; the others run with the slow tests."""
 
 
 @pytest.fixture(params=[pytest.param(name, marks=() if name in USUAL else pytest.mark.slow) for name in VARIANTS])

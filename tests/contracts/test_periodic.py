@@ -1,4 +1,4 @@
-"""Periodic domains: neighbours, features, steps, rollouts and samples do not depend on where the seam lies."""
+"""Periodic domains: neighbours, features, steps, rollouts and samples do not depend on the position of the seam."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def builder(space: Periodicity, materials: tuple[str, ...] = ("sand",), **config
 
 
 def cloud(space: Periodicity, materials: tuple[str, ...] = ("sand",), num_nodes: int = 60, seed: int = 0, history: int = 1) -> State:
-    """Particles all over the domain, and boundary nodes among them."""
+    """Return particles spread over the domain, with boundary nodes among them."""
     rng = np.random.default_rng(seed)
     low, high = np.array(space.bounds).T
     pos, wall = (rng.uniform(low, high, (n, len(low))) for n in (num_nodes, 25))
@@ -61,26 +61,26 @@ def cloud(space: Periodicity, materials: tuple[str, ...] = ("sand",), num_nodes:
 
 
 def shifted(s: State, shift: np.ndarray) -> State:
-    """The whole scene elsewhere, folded back into the domain."""
+    """Return the scene translated, and folded back into the domain."""
     return replace(
         s, pos=s.periodicity.wrapped(s.pos + shift), boundary=replace(s.boundary, pos=s.periodicity.wrapped(s.boundary.pos + shift))
     )
 
 
 def shifts(space: Periodicity, count: int = 4) -> list[np.ndarray]:
-    """Vectors along the periodic axes, some of them longer than the domain."""
+    """Return vectors along the periodic axes, some of them longer than the domain."""
     rng = np.random.default_rng(1)
     return list(rng.uniform(-2, 2, (count, len(space.bounds))) * (space.period > 0))
 
 
 def images(space: Periodicity) -> np.ndarray:
-    """Where the nearest copies of the domain lie."""
+    """Return the offsets of the nearest copies of the domain."""
     steps = [(-1, 0, 1) if repeats else (0,) for repeats in space.periodic]
     return np.array(list(itertools.product(*steps))) * space.period
 
 
 def shortest_by_force(space: Periodicity, source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Differences [source, target, dim], the shortest of those to all copies."""
+    """Return the shortest difference to any copy [source, target, dim]."""
     every = target[None, None] - source[None, :, None] + images(space)[:, None, None]
     nearest = (every**2).sum(-1).argmin(0)
     return np.take_along_axis(every, nearest[None, ..., None], axis=0)[0]
@@ -242,7 +242,7 @@ def test_a_mesh_around_the_domain_is_refused() -> None:
 
 
 def assert_close_graphs(a: Any, b: Any, atol: float = 1e-5) -> None:
-    """Equal stores up to rounding, and to the order of edges and their direction, which the search is free to choose."""
+    """Compare stores up to rounding, and up to the order and direction of edges, which the search may choose."""
     assert (a.node_types, a.edge_types) == (b.node_types, b.edge_types)
     for t in a.node_types:
         torch.testing.assert_close(a[t].x, b[t].x, atol=atol, rtol=1e-5)
@@ -306,7 +306,7 @@ def test_a_shift_changes_neither_step_nor_rollout(periodic: tuple[bool, ...], is
 
 @pytest.fixture
 def drifting(new_trajectory: New) -> Trajectory:
-    """Particles that cross the seam of x within a few frames."""
+    """Return particles that cross the seam of x within a few frames."""
     trajectory = new_trajectory(num_frames=12, periodic=(True, False))
     rng = np.random.default_rng(0)
     start = rng.uniform([0.0, 0.2], [1.0, 0.8], (trajectory.num_nodes, 2))

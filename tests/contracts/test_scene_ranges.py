@@ -1,4 +1,4 @@
-"""What training had of gravity and boundary nodes is known by a checkpoint, and a scene that has anything else is warned of, once per kind."""
+"""A checkpoint stores the ranges of gravity and boundary nodes of its training, and a scene outside them gives one warning per kind."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def boundary(friction: float = 0.3, restitution: float = 0.0, spacing: float = s
 
 
 def sliding(speed: float, frames: int = 4) -> Boundary:
-    """Walls that stand still at first and then slide along themselves."""
+    """Return walls that are at rest at first and then slide along themselves."""
     b = boundary()
     vel = np.zeros((frames, *b.pos.shape))
     vel[2, :, 0] = speed
@@ -64,7 +64,7 @@ def trained(*scenes_: tuple[tuple[float, float], Boundary]) -> LearnedSimulator:
 
 
 def scene(gravity: tuple[float, float] = GRAVITY, b: Boundary | None = None, mass: float = 1.0) -> State:
-    """Masses are ``mass`` times those of training."""
+    """Return a scene whose masses are ``mass`` times those of training."""
     plain = scenes.state(20)
     return replace(plain, mass=mass * plain.mass, gravity=np.array(gravity), boundary=boundary() if b is None else b).to_torch()
 

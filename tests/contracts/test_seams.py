@@ -1,4 +1,4 @@
-"""At the seams of periodic domains: what lies on a bound or a rounding beside it, walls that end there, and obstacles that reach across."""
+"""Seams of periodic domains: positions on a bound or within rounding of it, walls that end there, and obstacles that reach across."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ CHANNEL = Periodicity(((0.1, 0.9), (0.0, 0.4)), (True, False))
 
 @st.composite
 def places(draw: Any, dtype: type) -> tuple[Periodicity, np.ndarray]:
-    """Bounds, and places on them, up to three floating-point numbers beside them, whole periods away, and anywhere; in this precision."""
+    """Return the bounds, positions up to three floating-point numbers beside them, whole periods away, and random positions, in this precision."""
     low = draw(st.sampled_from([0.0, 0.1, -0.5, 1 / 3]) | st.floats(-1e3, 1e3))
     length = draw(st.sampled_from([1.0, 0.8, 0.7, 1.1]) | st.floats(0.01, 100)) * max(1.0, 0.01 * abs(low))
     space = Periodicity(((low, low + length), (0.0, 1.0)), (True, False))
@@ -140,7 +140,7 @@ def test_a_lid_with_both_its_ends_is_closed_at_the_seam() -> None:
 
 
 def grid(origin: np.ndarray) -> DistanceGrid:
-    """A ball of radius 0.1 in a grid."""
+    """Return a ball of radius 0.1 as a distance grid."""
     axes = 0.02 * np.arange(16)
     points = np.stack(np.meshgrid(*[axes] * len(origin), indexing="ij"), axis=-1)
     return DistanceGrid.from_values(tuple(origin.tolist()), 0.02, np.linalg.norm(points - 0.15, axis=-1) - 0.1, 0.3)

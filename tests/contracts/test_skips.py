@@ -1,4 +1,4 @@
-"""Every exact level of skipping, on against off: the same graph bit for bit, the same motion up to rounding, and less work."""
+"""Exact levels of skipping, on and off: the same graph bit for bit, the same motion up to rounding, and less work."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def one_level(level: str) -> Skips:
 
 
 def scattered(materials: tuple[str, ...], present: tuple[str, ...], history: int = 2, seed: int = 0) -> State:
-    """Nodes of some of the data set's materials in a box; a quarter of them far apart from everything."""
+    """Return nodes of some of the data set's materials in a box; a quarter of them is far from everything."""
     s = scenes.state(90, materials, history=history, seed=seed)
     s = scenes.permuted(s, np.flatnonzero(np.isin(s.node_type, [node_code(m) for m in present])))
     pos = s.pos.copy()
@@ -56,7 +56,7 @@ def roll(simulated: LearnedSimulator, state: State, skips: Skips, steps: int = 3
 
 @contextmanager
 def calls(module: nn.Module) -> Iterator[dict[str, list[int]]]:
-    """Rows of the first argument of every call of every submodule, by name."""
+    """Count the rows of the first argument of every call of every submodule, by name."""
     seen: dict[str, list[int]] = {}
     hooks = [
         m.register_forward_pre_hook(lambda _, inputs, name=name: seen.setdefault(name, []).append(len(inputs[0])))

@@ -1,6 +1,6 @@
-"""What every ground-truth solver promises.
+"""The contract of every ground-truth solver.
 
-A new solver joins by an entry in ``SOLVERS``: a solver and an initial state in the unit box whose bodies are about to hit something.
+A new solver joins with an entry in ``SOLVERS``: a solver and an initial state in the unit box whose bodies are about to hit something.
 """
 
 import math
@@ -31,7 +31,7 @@ CELL = 1 / 24
 
 
 def mpm(dim: int, *materials: str) -> tuple[MPM, State]:
-    """A block of each material side by side, falling on a floor with a ball."""
+    """Return a block of each material side by side, falling on a floor with a ball."""
     bounds = ((0.0, 1.0),) * dim
     shapes: tuple[Shape, ...] = (*domain_walls(bounds, 0.3), Sphere((0.4,) * (dim - 1) + (0.1,), 0.08, 0.5))
     boundary = Boundary.sample(shapes, CELL / 2, dim)
@@ -53,7 +53,7 @@ def mpm(dim: int, *materials: str) -> tuple[MPM, State]:
 
 
 def flip(dim: int) -> tuple[FLIP, State]:
-    """A block of liquid that falls on a floor with a ball."""
+    """Return a block of liquid that falls on a floor with a ball."""
     bounds = ((0.0, 1.0),) * dim
     boundary = Boundary.sample((*domain_walls(bounds, 0.0), Sphere((0.4,) * (dim - 1) + (0.2,), 0.15, 0.0)), CELL, dim)
     gravity = (0.0,) * (dim - 1) + (-9.81,)
@@ -65,7 +65,7 @@ def flip(dim: int) -> tuple[FLIP, State]:
 
 
 def fem(dim: int) -> tuple[FEM, State]:
-    """A solid that falls on a floor with a ball."""
+    """Return a solid that falls on a floor with a ball."""
     bounds = ((0.0, 1.0),) * dim
     gravity = (0.0,) * (dim - 1) + (-9.81,)
     scene = SolidScene(bounds=bounds, cell="triangle" if dim == 2 else "tetrahedron", num_cells=150, gravity=gravity, num_obstacles=(0, 0))
@@ -95,7 +95,7 @@ def case(request):
 
 
 def arrays(state):
-    """Every array of a state, the solver's internal ones included."""
+    """Return every array of a state, including the solver's internal ones."""
     named = {name: getattr(state, name) for name in ("pos", "vel", "node_type", "mass", "material_params", "gravity")}
     named |= {f"boundary.{name}": getattr(state.boundary, name) for name in ("pos", "vel", "normal", "friction", "restitution")}
     if state.internal is not None:
@@ -111,7 +111,7 @@ def assert_same_bytes(a, b):
 
 
 def isolated(state, gravity=None):
-    """The same particles without walls, at rest at mid-air."""
+    """Return the same particles without walls, at rest in mid-air."""
     gravity = np.zeros(state.dim) if gravity is None else np.asarray(gravity)
     return replace(state, boundary=Boundary.empty(state.dim), gravity=gravity, vel=np.zeros_like(state.vel), internal=None)
 
@@ -174,7 +174,7 @@ def test_what_another_simulator_moved_is_not_as_deformed_as_before(case):
 
 
 def moving_later(boundary):
-    """Still in the first frame, then lifted."""
+    """Return a boundary that is at rest in the first frame and then rises."""
     lift = np.eye(boundary.pos.shape[1])[-1] * np.array([0.0, 0.0, 0.01])[:, None, None]
     return Boundary.moving(boundary.pos + lift, boundary.normal, 5e-3, friction=boundary.friction)
 
@@ -308,7 +308,7 @@ def test_order_of_particles_does_not_matter(case):
 
 
 def chosen(state, rows):
-    """Some of the particles, with the mesh cells that have all their corners among them."""
+    """Return some of the particles, with the mesh cells whose corners are all among them."""
     per_node = ("pos", "vel", "node_type", "mass", "material_params", *(("rest_pos",) if state.rest_pos is not None else ()))
     part = replace(state, **{name: getattr(state, name)[rows] for name in per_node})
     if state.cells is None:

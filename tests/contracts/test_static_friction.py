@@ -1,4 +1,4 @@
-"""What lies on a wall and hardly moves stays; what flies, is fast, or is pushed by a wall goes as if there were no static friction."""
+"""Static friction: nodes that rest on a wall and hardly move keep their positions; flying, fast or pushed nodes move as without it."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from gpe_pl.trajectory.state import State
 from tests import scenes
 
 NET = 0.4
-"""Share of gravity that is left over by the model of these tests."""
+"""Fraction of gravity that the model of these tests leaves unbalanced."""
 ENOUGH = 0.5
 
 
 class Supporting(GPE):
-    """Answers most of gravity, upwards, for every node."""
+    """Model that predicts an upward acceleration of most of gravity for every node."""
 
     def forward(self, data: HeteroData) -> Prediction:
         up = torch.tensor([0.0, (1 - NET) * 9.81])
@@ -38,7 +38,7 @@ def simulator(islands: bool = True, materials: tuple[str, ...] = ("sand",)) -> L
 
 
 def silent() -> LearnedSimulator:
-    """One whose network answers zero."""
+    """Return a simulator whose network predicts zero."""
     build = scenes.builder(("sand",), islands=True)
     made = LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=8), build).eval()
     with torch.no_grad():
@@ -48,7 +48,7 @@ def silent() -> LearnedSimulator:
 
 
 def lying_and_flying(materials: tuple[str, ...] = ("sand",)) -> tuple[State, np.ndarray]:
-    """A layer on the floor and a cloud above it, both without velocity, and which nodes lie [node]."""
+    """Return a layer on the floor and a cloud above it, both at rest, and a mask of the lying nodes [node]."""
     state = scenes.state(24, materials, seed=3)
     lies = np.arange(24) % 4 < 2
     pos = np.stack([np.linspace(0.3, 0.7, 24), np.where(lies, 0.04, 0.5)], axis=1)

@@ -1,4 +1,4 @@
-"""Every experiment composes, has a name of its own, and trains and evaluates on data of seconds."""
+"""Every experiment composes, has a unique name, and trains and evaluates on miniature data."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.runs import compose, first_choices, tiny
 
 EXPERIMENTS = sorted(p.stem for p in (CONF / "experiment").glob("*.yaml"))
 QUICK = {"smoke"}
-"""This runs with the fast tests."""
+"""Experiments that run with the fast tests."""
 SLOW = {
     "ablation_momentum",
     "ablation_multiscale",
@@ -29,7 +29,7 @@ SLOW = {
     "table1_equal_steps",
     "unseen_materials",
 }
-"""These with the slow ones, all others with the long ones; the canyon is also trained and evaluated for its notebook."""
+"""Experiments that run with the slow tests; all others run with the long tests. The canyon is also trained and evaluated for its notebook."""
 TAKING_OVER = [e for e in EXPERIMENTS if "\nreuse: table1\n" in (CONF / "experiment" / f"{e}.yaml").read_text()]
 
 

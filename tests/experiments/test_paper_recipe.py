@@ -1,4 +1,4 @@
-"""``recipe=paper`` is what the paper states, whatever an experiment sets or a comparison is made with."""
+"""``recipe=paper`` gives the settings of the paper, in any experiment or comparison."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DOMAINS = ("sand", "snow", "elastomer", "fluid", "fem", "mixed", "snow_on_liquid
 
 
 def swept(experiment: str) -> list[tuple[str, ...]]:
-    """Overrides for every model and every data set that an experiment sweeps over."""
+    """Return overrides for every model and every data set that an experiment sweeps over."""
     params: Any = compose("fit", f"experiment={experiment}", hydra_config=True).hydra.sweeper.params or {}
     return list(product(*([f"{key}={value}" for value in str(params[key]).split(",")] for key in ("data", "model") if key in params)))
 

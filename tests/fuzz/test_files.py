@@ -1,4 +1,4 @@
-"""Whatever is stored comes back as it was; whatever happens to a file, it is refused or means the same."""
+"""Stored data read back unchanged, and a damaged file is refused or has the same content."""
 
 from __future__ import annotations
 

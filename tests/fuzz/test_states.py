@@ -1,4 +1,4 @@
-"""Whatever a state, scene or graph holds: graphs are sound, predictions finite, scenes keep their promises."""
+"""For any state, scene or graph: graphs are valid, predictions finite, and scenes meet their contract."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.strategies import PARTICLES, body_scenes, graphs, seeds, states
 
 @cache
 def simulator(dim: int) -> LearnedSimulator:
-    """An untrained model with exact momentum."""
+    """Return an untrained model with exact momentum."""
     torch.manual_seed(0)
     build = builder(PARTICLES, dim, history=2)
     settings: dict[str, Any] = {"edge_state": "geometry", "island_momentum": "angular"}

@@ -1,4 +1,4 @@
-"""``python -m gpe_pl.convert`` as one types it, and ``fit`` on what comes out, with no other step."""
+"""``python -m gpe_pl.convert`` as a user runs it, and ``fit`` on its result, without any other step."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ ROOT = Path(__file__).parents[2]
 
 
 def crowd(seed: int) -> np.ndarray:
-    """Particles that fill the unit box."""
+    """Return particles that fill the unit box."""
     return motion(num_frames=14, num_nodes=60, seed=seed, low=0.0, high=1.0)
 
 
 @pytest.fixture(scope="module")
 def lagrangebench(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder in LagrangeBench's layout: a fluid that drifts through a periodic box."""
+    """Write a folder in LagrangeBench's layout: a fluid that drifts through a periodic box."""
     raw = tmp_path_factory.mktemp("raw") / "2D_TGV"
     sources.lagrangebench_metadata(raw)
     for k, name in enumerate(("train", "valid", "test")):

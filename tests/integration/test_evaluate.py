@@ -1,4 +1,4 @@
-"""``python -m gpe_pl.evaluate``: any model's checkpoint, wherever its run lies now, or a shipped model by its name."""
+"""``python -m gpe_pl.evaluate`` with the checkpoint of any model, after its run has moved, or with a shipped model by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Commands that are killed, run out of disk, may not write, or meet their own files damaged: they say so in one line, and go on where they were."""
+"""Commands that are killed, run out of disk, may not write, or find their files damaged report it in one line and can be continued."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SUITE = yaml.safe_load((CONF / "suite" / "faults.yaml").read_text())
 
 
 def command(name: str, data: Path | None = None) -> Command:
-    """One of the miniatures of the suite."""
+    """Return one of the miniature commands of the suite."""
     attacked = SUITE["commands"][name]
     return Command(name, attacked["module"], (*SUITE["data"], *attacked["arguments"]), None if data is None else str(data))
 
@@ -115,7 +115,7 @@ def test_runs_end_with_their_sweep(data: Path, tmp_path: Path) -> None:
 
 
 def _running(text: str) -> list[int]:
-    """Processes with a text in their command line."""
+    """Return the processes with a text in their command line."""
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):

@@ -1,4 +1,4 @@
-"""``fit`` from start to end: resuming is exact, finished runs stay, folders are not mixed, bad numbers stop early, sweeps are reported."""
+"""``fit`` from start to end: exact resuming, finished runs, separate folders, early stops at bad numbers, and reports of sweeps."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ LATE = ("training.sampling=activity", "training.push_share=0.5", "training.push_
 
 
 class Killed(BaseException):
-    """Stands for the end of the process."""
+    """Exception that stands for the end of the process."""
 
 
 @pytest.fixture
 def losses(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[float]]:
-    """Training losses by step, one per time that the step was taken."""
+    """Return training losses by step, one for each time that the step was taken."""
     seen: dict[int, list[float]] = {}
     plain = TrainingModule.training_step
 
@@ -62,7 +62,7 @@ def losses(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[float]]:
 
 
 def interrupt(patch: pytest.MonkeyPatch, step: int, error: type[BaseException]) -> None:
-    """Training steps raise when they reach this step."""
+    """Let training raise when it reaches this step."""
     plain = TrainingModule.loss
 
     def loss(self: TrainingModule, batch: Any) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Sweeps run side by side, each run as the command that would run it alone; what fails is named, and the rest is run."""
+"""Runs of a sweep side by side equal the same commands alone; a failed run is named, and the others run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def sweep(data: Path, runs: Path, *overrides: str) -> subprocess.CompletedProces
 
 
 def finished(folder: Path) -> dict[Path, int]:
-    """When each run wrote its results."""
+    """Return the times at which runs wrote their results."""
     return {p: p.stat().st_mtime_ns for p in folder.rglob("metrics.csv") if (p.parent / "config.json").exists()}
 
 

@@ -1,4 +1,4 @@
-"""What must not grow, change or be compiled again, however long something runs."""
+"""Long runs: memory does not grow, results do not change, and nothing is compiled again."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MEBIBYTE = 2**20
 
 
 def simulator(**settings: Any) -> LearnedSimulator:
-    """A small untrained model whose accelerations are gentle enough for a long rollout."""
+    """Return a small untrained model whose accelerations are small enough for a long rollout."""
     torch.manual_seed(0)
     build = scenes.builder()
     made = LearnedSimulator(GPE(build.spec, num_message_passing_steps=2, hidden_channels=8, **settings), build).eval()
@@ -91,7 +91,7 @@ def test_memory_of_20_epochs_is_flat(tiny_data: Path, tmp_path: Path, monkeypatc
 
 
 def compilations() -> dict[str, int]:
-    """Graphs that were compiled in a rollout, and in a training with different numbers of edges; and how many numbers these were."""
+    """Count the compiled graphs in a rollout, and in a training with different numbers of edges; also count these numbers."""
     from torch._dynamo.utils import counters
 
     learned = simulator()

@@ -53,7 +53,7 @@ SETTINGS = {"GPE_NAME": "ablation_momentum", "GPE_STEPS": "4"}
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
-    """A folder with ``data`` and ``runs`` of what the notebooks read, made once for all workers: the other ones wait."""
+    """Make a folder with ``data`` and ``runs`` for the notebooks, once for all workers; the others wait."""
     own = tmp_path_factory.getbasetemp()
     folder = (own if worker_id == "master" else own.parent) / "notebooks"
     with FileLock(folder.with_suffix(".lock")):
@@ -64,7 +64,7 @@ def results(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Path:
 
 
 def _make_results(folder: Path) -> None:
-    """Miniatures of two experiments and of a benchmark."""
+    """Run miniatures of two experiments and of a benchmark."""
     in_one_process = "hydra/launcher=basic"  # eight processes would import PyTorch for seconds to train for one
     _command(folder, "fit", "experiment=ablation_momentum", in_one_process, *DATA, *RUN)
     case = "suite.cases.sand.overrides=" + json.dumps(["data=sand", "size=tiny", *DATA])
@@ -84,7 +84,7 @@ def _environment() -> dict[str, str]:
 
 
 def _execute(path: Path, folder: Path, runs: Path, data: Path) -> Any:
-    """Execute a copy of a notebook with the running interpreter; returns the copy, which also stays in ``folder``, with its outputs."""
+    """Execute a copy of a notebook with the running interpreter; return the copy with its outputs, which also stays in ``folder``."""
     from ipykernel.kernelspec import write_kernel_spec
     from nbclient import NotebookClient
 
@@ -111,7 +111,7 @@ def _execute(path: Path, folder: Path, runs: Path, data: Path) -> Any:
 
 @pytest.fixture(scope="module")
 def executed(results: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Any]:
-    """Gives a notebook with its outputs on the miniature; executes each only once."""
+    """Function that returns a notebook with its outputs on the miniature; it executes each notebook once."""
     return functools.cache(lambda path: _execute(path, tmp_path_factory.mktemp(path.stem), results / "runs", results / "data"))
 
 

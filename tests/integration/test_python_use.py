@@ -1,4 +1,4 @@
-"""The lines in the package's docstring, as they stand there."""
+"""The Python example in the package's docstring runs as written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Data that are imported again under the same name are other data: runs, evaluations and step times know the difference."""
+"""Data imported again under the same name count as other data in runs, evaluations and step times."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.runs import DATA, RUN, compose, generate_tiny
 
 
 def falling(gravity: float, seed: int = 0) -> list[Trajectory]:
-    """Blocks of sand that fall, a bit askew."""
+    """Return falling blocks of sand, slightly rotated."""
     rng, dt = np.random.default_rng(seed), 0.01
     made = []
     for _ in range(3):

@@ -1,4 +1,4 @@
-"""``python -m gpe_pl.simulate`` as one types it: every data set, parts, sweeps and launchers."""
+"""``python -m gpe_pl.simulate`` as a user runs it: every data set, parts, sweeps and launchers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The viewer in a browser: it plays, it reacts, it asks the network for nothing. Skipped where there is no browser."""
+"""The viewer in a browser: it plays, reacts to input, and makes no network request. Skipped without a browser."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def browser() -> Iterator[Any]:
 
 
 class Viewer:
-    """An open page, and what went wrong in it."""
+    """An open page, and its errors."""
 
     def __init__(self, browser: Any, path: Path) -> None:
         self.page = browser.new_page(viewport={"width": 900, "height": 420})
@@ -50,12 +50,12 @@ class Viewer:
         self.page.wait_for_selector("#message", state="hidden", timeout=30_000)
 
     def picture(self) -> np.ndarray:
-        """The panels as RGB [height, width, 3]."""
+        """Return the panels as RGB [height, width, 3]."""
         with Image.open(BytesIO(self.page.locator("#stage").screenshot())) as image:
             return np.asarray(image.convert("RGB")).astype(int)
 
     def colored(self, panel: int) -> np.ndarray:
-        """Rows and columns of the coloured pixels of one of three panels, its colour bar aside."""
+        """Return rows and columns of the coloured pixels of one of three panels, without its colour bar."""
         picture = self.picture()[:-40]
         width = picture.shape[1] // 3
         return np.argwhere(np.ptp(picture[:, panel * width : (panel + 1) * width], axis=-1) > 25)

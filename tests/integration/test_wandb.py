@@ -1,4 +1,4 @@
-"""W&B without a network: metrics, config, figures and animations are kept beside the run, under an identifier that a resumed run finds again."""
+"""W&B without a network: metrics, config, figures and animations are stored beside the run, under an identifier that a resumed run finds again."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""``physics``: a check of a measured quantity that also becomes a row of the page of measured values (``--physics-page FILE``).
+"""The fixture ``physics``: it checks a measured quantity and adds it to the page of measured values (``--physics-page FILE``).
 
-What files ``test_convergence_*`` measure becomes a page of its own beside it.
+Quantities that the files ``test_convergence_*`` measure go to a second page beside it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Kind = Literal["relative", "absolute", "at_most", "at_least"]
 
 
 class Row(NamedTuple):
-    """One measured quantity beside its reference."""
+    """A measured quantity and its reference."""
 
     engine: str
     test: str
@@ -55,11 +55,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def physics(request: pytest.FixtureRequest) -> Callable[..., None]:
-    """Records a measured quantity and asserts that it meets its criterion.
+    """Function that records a measured quantity and asserts that it meets its criterion.
 
-    Arguments of the returned function: quantity, measured, expected, tolerance; by name: formula, source (paper and section, or "exact"), unit,
-    and kind: the deviation may be at most ``tolerance`` times the expected value (``relative``) or in the unit (``absolute``), or the measured
-    value at most or at least the expected one.
+    Its arguments are quantity, measured, expected and tolerance; by name: formula, source (paper and section, or "exact"), unit, and kind. With kind
+    ``relative`` or ``absolute`` the deviation may be at most ``tolerance`` times the expected value, or at most ``tolerance`` in the unit. Other kinds require
+    the measured value to be at most or at least the expected one.
     """
     rows = request.config.stash[ROWS]
     engine = request.path.stem.removeprefix("test_")
@@ -109,7 +109,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 def write(path: Path, title: str, about: list[str], rows: list[Row]) -> None:
-    """A page, and its rows beside it as CSV; nothing where there are no rows."""
+    """Write a page, and its rows beside it as CSV; write nothing if there are no rows."""
     if not rows:
         return
     with path.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
@@ -120,7 +120,7 @@ def write(path: Path, title: str, about: list[str], rows: list[Row]) -> None:
 
 
 def page(title: str, about: list[str], rows: list[Row]) -> str:
-    """Markdown: a table per engine."""
+    """Return the page in Markdown, with a table per engine."""
     lines = [title, "", *about]
     for engine in dict.fromkeys(row.engine for row in rows):
         lines += [

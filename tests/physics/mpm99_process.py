@@ -1,7 +1,7 @@
 """Run the substeps of taichi's example ``mpm99`` on given particles: ``python mpm99_process.py FILE.npz``.
 
-The file holds pos, vel [particle, 2], material and num_steps; positions after the steps are written next to it with the suffix .npy. A process of its own,
-because taichi brings another LLVM than numba's and both in one process crash. Importing the example opens no window; only its ``main`` would.
+The file holds pos, vel [particle, 2], material and num_steps. Positions after the steps are written next to it with the suffix .npy. A separate process runs
+it, because taichi and numba bring different LLVM versions, and both in one process crash. Importing the example opens no window; only its ``main`` does.
 """
 
 import sys

@@ -1,4 +1,4 @@
-"""How much too stiff a beam of ``FEM`` is, by the number of cells across."""
+"""Excess stiffness of a beam in ``FEM`` against the number of cells across."""
 
 import math
 
@@ -14,7 +14,7 @@ RATIO, THICKNESS, MODULUS, POISSON = 8, 0.02, 1e6, 0.35
 
 
 def bending_frequency(kind, across):
-    """First bending frequency [Hz] of a free beam with so many cells across, from the solver's own forces."""
+    """Return the first bending frequency [Hz] of a free beam with this number of cells across, from the solver's forces."""
     dim = 3 if kind == "tetrahedron" else 2
     points, cells = lattice(kind, (RATIO * across, *(across,) * (dim - 1)), (RATIO * THICKNESS, *(THICKNESS,) * (dim - 1)))
     state = body(points, cells, MODULUS)
@@ -25,7 +25,7 @@ def bending_frequency(kind, across):
 
 
 def frequency_of_thick_beam(plane_strain):
-    """In plane strain, or of a bar that is as wide as thick [Hz]."""
+    """Return the frequency [Hz] of a thick beam in plane strain, or of a bar with a square cross-section."""
     modulus, poisson = (MODULUS / (1 - POISSON**2), POISSON / (1 - POISSON)) if plane_strain else (MODULUS, POISSON)
     r = 1 / RATIO
     correction = 1 + 6.585 * (1 + 0.0752 * poisson + 0.8109 * poisson**2) * r**2 - 0.868 * r**4

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 
 def effective_viscosity(solver, viscosity, decay):
-    """From how fast a weak shear wave of 16 cells decays inside a free body, by a factor ``exp(-decay)`` or more [m²/s]."""
+    """Return the viscosity [m²/s] from the decay of a weak shear wave of 16 cells inside a free body, by a factor ``exp(-decay)`` or more."""
     dx, dim, wave = solver.grid_spacing, len(solver.bounds), 2 * math.pi / (16 * solver.grid_spacing)
     solver = replace(solver, bounds=(*((0.0, 32 * dx),) * 2, *((0.0, 6 * dx),) * (dim - 2)))
 

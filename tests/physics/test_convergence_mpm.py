@@ -1,4 +1,4 @@
-"""How much the material point solver depends on its time step and its grid."""
+"""Dependence of the material point solver on its time step and grid."""
 
 from dataclasses import replace
 from typing import Any
@@ -19,7 +19,7 @@ HEIGHT, SIDE, GRAVITY = 0.3, 0.25, 9.81
 
 
 def bounce(solver, modulus, spacing):
-    """Height that the centre of a block of elastomer rises to again from a smooth floor, over the height that it fell from rest."""
+    """Return the rebound height of the centre of an elastomer block on a smooth floor, over the height of its fall from rest."""
     dim = len(solver.bounds)
     down, side = -np.eye(dim)[-1], round(SIDE / spacing) * spacing
     low = (*(0.375,) * (dim - 1), HEIGHT)
@@ -36,7 +36,7 @@ def bounce(solver, modulus, spacing):
 
 
 FEW_PARTICLES = ("mixed", "tiny", 3)
-"""Five across a body: the step decides how gradually the floor stops the lowest fifth of it."""
+"""Data with five particles across a body, whose time step determines how gradually the floor stops the lowest particles."""
 
 CASES = [(data, size, dim) for data in ("elastomer", "mixed") for size, dim in (("tiny", 2), ("small", 2), ("tiny", 3), ("small", 3))]
 
@@ -55,7 +55,7 @@ def test_bounce(data, size, dim, physics):
 
 
 def settled_height(solver, hardening, spacing):
-    """Of the centre of a block of snow that was thrown at a rough floor [m]."""
+    """Return the height [m] of the centre of a snow block after it was thrown at a rough floor."""
     dim = len(solver.bounds)
     down, low = -np.eye(dim)[-1], (*(0.375,) * (dim - 1), 0.25)
     boundary = Boundary.sample(domain_walls(solver.bounds, 0.3), spacing, dim)

@@ -1,4 +1,4 @@
-"""The finite element solver against analytic results and scikit-fem; each check states its formula."""
+"""The finite element solver compared with analytic results and scikit-fem; each check states its formula."""
 
 import itertools
 import math
@@ -25,7 +25,7 @@ UNIT = ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
 
 
 def lattice(kind, counts, size, jitter=0.0):
-    """Nodes and cells of a block [0, size] of so many lattice cells per axis; nodes inside it are displaced at random."""
+    """Return nodes and cells of a block [0, size] with this number of lattice cells per axis; inner nodes are displaced at random."""
     dim = len(counts)
     axes = [np.linspace(0.0, s, n + 1) for s, n in zip(size, counts, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, dim)
@@ -94,7 +94,7 @@ def run(fem, state, num_steps):
 
 
 def forces(state, poisson_ratio=0.35):
-    """Internal forces [node, dim] in N: one tiny substep from rest."""
+    """Return internal forces [node, dim] in N from one tiny substep from rest."""
     h = 1e-9
     fem = solver(state.dim, frame_dt=h, poisson_ratio=poisson_ratio)
     still = replace(state, vel=np.zeros_like(state.pos), gravity=np.zeros(state.dim), boundary=Boundary.empty(state.dim))
@@ -102,7 +102,7 @@ def forces(state, poisson_ratio=0.35):
 
 
 def cauchy(deformation, modulus=1e6, poisson_ratio=0.35):
-    """σ = μ/J (F Fᵀ - 1) + λ log J / J of a neo-Hookean solid, in 3D."""
+    """Return σ = μ/J (F Fᵀ - 1) + λ log J / J of a neo-Hookean solid, in 3D."""
     lam, mu = lame_parameters(modulus, poisson_ratio)
     full = np.eye(3)
     full[: len(deformation), : len(deformation)] = deformation
@@ -197,7 +197,7 @@ def test_free_fall_is_exact(kind, physics):
 
 
 def tumbling(kind, **options):
-    """A body that spins, stretches and flies."""
+    """Return a body that spins, stretches and flies."""
     state = block(kind, 6, **options)
     arm = state.pos - state.pos.mean(axis=0)
     spin = np.zeros((state.dim, state.dim))
@@ -240,7 +240,7 @@ def test_energy_of_a_free_body(kind, physics):
 
 
 def bar_frequency(kind, cells, fem_options=None, damping=0.0):
-    """First longitudinal frequency and decay rate of a free-free bar of unit length and E = 1 MPa, ν = 0, from a fit to the motion of its mode."""
+    """Return first longitudinal frequency and decay rate of a free-free bar of unit length and E = 1 MPa, ν = 0, from a fit to the motion of its mode."""
     dim = 3 if kind == "tetrahedron" else 2
     width = 1.0 / cells * 3
     points, mesh = lattice(kind, (cells, *(3,) * (dim - 1)), (1.0, *(width,) * (dim - 1)))
@@ -289,7 +289,7 @@ def test_order_in_time(physics):
 
 
 def stiffness(state, poisson_ratio):
-    """∂(-f)/∂x by central differences of the solver's own forces."""
+    """Return ∂(-f)/∂x by central differences of the solver's forces."""
     count, dim, step = state.num_nodes, state.dim, 1e-6
     matrix = np.empty((count * dim, count * dim))
     for k in range(count * dim):
@@ -324,7 +324,7 @@ def test_substep_is_stable(kind, deformed, physics):
 
 
 def cantilever(kind, nx, ny):
-    """Tip deflection in m under its own weight of a bar of 1 m × 0.1 m clamped at the left, linear, ν = 0.35, E = 10 MPa."""
+    """Return the tip deflection in m under its weight of a bar of 1 m × 0.1 m clamped at the left, linear, ν = 0.35, E = 10 MPa."""
     points, cells = lattice(kind, (nx, ny), (1.0, 0.1))
     state = body(points, cells, 1e7)
     free = np.repeat(points[:, 0] > 1e-9, 2)
@@ -411,7 +411,7 @@ def test_bounce(kind, physics):
 
 
 def slide(kind, slope, friction, surface="wall"):
-    """Acceleration along and displacement down a slope of a block in 0.3 s, in m/s² and m."""
+    """Return acceleration along and displacement down a slope of a block in 0.3 s, in m/s² and m."""
     dim = 3 if kind == "tetrahedron" else 2
     points, cells = lattice(kind, (8, *(4,) * (dim - 1)), (0.2, *(0.08,) * (dim - 1)), 0.2)
     angle = math.radians(slope)

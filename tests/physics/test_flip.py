@@ -1,4 +1,4 @@
-"""The liquid solver against analytic results and published experiments; each test states its formula."""
+"""The liquid solver compared with analytic results and published experiments; each test states its formula."""
 
 import csv
 import math
@@ -24,7 +24,7 @@ DAM_BREAK = Path(__file__).parents[3] / "shared" / "data" / "dam_break_front.csv
 
 
 def fill(low, high, spacing, inside=None, *, shapes=(), viscosity=0.1, velocity=None, gravity=GRAVITY, jitter=0.25, seed=0):
-    """Liquid in a box, or in the part of it where ``inside(points)``; gravity acts downwards along the second axis, or as given."""
+    """Fill a box, or the part of it where ``inside(points)`` is true, with liquid; gravity acts down the second axis unless given."""
     dim = len(low)
     counts = [round((b - a) / spacing) for a, b in zip(low, high, strict=True)]
     lattice = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), axis=-1).reshape(-1, dim)
@@ -49,7 +49,7 @@ def run(solver, state, num_steps):
 
 
 class OnGrid:
-    """A state as the solver sees it during a substep."""
+    """A state in the solver's arrays during a substep."""
 
     def __init__(self, solver, state):
         self.state = state
@@ -86,7 +86,7 @@ class OnGrid:
         return self.liquid.cells[np.all((self.fields.liquid[near] > 0) | ~self.solids.is_open[near], axis=1)]
 
     def relative_density(self):
-        """Mass of the particles in the bulk over the room there, relative to the liquid at rest; also cells whose centre is solid count."""
+        """Mass of the particles in the bulk over the space there, relative to the liquid at rest; cells with a solid centre count too."""
         sums, grid = Fields.empty(self.grid), self.grid
         volume = self.state.mass / (DENSITY * grid.spacing**grid.dim)
         scatter(
@@ -105,7 +105,7 @@ def centered(dim, radius):
 
 
 def turning(x):
-    """Rigid rotation about the middle with 1 rad/s, in 3D about a skew axis."""
+    """Return the velocity of a rigid rotation about the middle with 1 rad/s, in 3D about a skew axis."""
     if x.shape[1] == 2:
         return np.stack([0.5 - x[:, 1], x[:, 0] - 0.5], axis=1)
     return np.cross(np.array([1.0, 2.0, 3.0]) / math.sqrt(14.0), x - 0.5)
@@ -221,7 +221,7 @@ def test_liquid_rests_on_curved_and_tilted_solids(physics, name, dim, shapes):
 
 
 def mean_height(shapes, dim, volume):
-    """Height of the centre of mass of liquid at rest in the unit box, from points that fill it upwards."""
+    """Return the height of the centre of mass of liquid at rest in the unit box, from points that fill it upwards."""
     number = 1000 if dim == 2 else 120
     line = (np.arange(number) + 0.5) / number
     points = np.stack(np.meshgrid(*[line] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
@@ -311,7 +311,7 @@ STOKES = 52.3447
 
 
 def stokes_rate(cells, offset=0.0, dt=2e-3, viscosity=0.1):
-    """Decay rate of the slowest flow in a square with walls ``offset`` cells inside the grid, over the exact rate."""
+    """Return the decay rate of the slowest flow in a square with walls ``offset`` cells inside the grid, over the exact rate."""
     low = offset / cells
     size = 1.0 - 2.0 * low
 
@@ -343,7 +343,7 @@ def stokes_rate(cells, offset=0.0, dt=2e-3, viscosity=0.1):
 
 
 def implicit(dt, viscosity=0.1):
-    """By how much implicit Euler steps slow the decay."""
+    """Return the factor by which implicit Euler steps slow the decay."""
     return math.log1p(STOKES * viscosity * dt) / (STOKES * viscosity * dt)
 
 
@@ -419,7 +419,7 @@ def test_film_flow(physics):
 
 
 def steady_profile(body, force, exact):
-    """Largest deviation from the exact steady profile in the middle of a long body, over the largest exact velocity."""
+    """Return the largest deviation from the exact steady profile in the middle of a long body, over the largest exact velocity."""
     duration = 100.0  # hundreds of times longer than diffusion takes
     body.push([force * duration, 0.0])
     body.diffuse(duration)
@@ -478,7 +478,7 @@ def measured_front():
 
 
 RELEASE = 0.175
-"""Time, in √(a/2g), that an ideal release is ahead of the experiment: the value that the finite elements of Lethe need for the same records."""
+"""Time, in √(a/2g), by which an ideal release leads the experiment: the value that the finite elements of Lethe use for the same records."""
 
 
 @pytest.mark.skipif(not DAM_BREAK.exists(), reason="needs the measured dam-break front")
@@ -565,7 +565,7 @@ def test_volume_over_a_fall_into_a_bowl(physics):
 
 
 def volume_at_rest(height, radius):
-    """Volume [m³] of a liquid at rest in a sphere whose centre of mass is so high above the lowest point [m]."""
+    """Return the volume [m³] of a liquid at rest in a sphere, from the height of its centre of mass above the lowest point [m]."""
     low, high = 0.0, 2.0 * radius
     for _ in range(60):  # for its depth
         depth = 0.5 * (low + high)
@@ -575,14 +575,14 @@ def volume_at_rest(height, radius):
 
 
 def occupied(pos, radius, reach):
-    """Volume [m³] of the points of a sphere around (½, ½, ½) with a particle within ``reach`` [m], by Monte Carlo."""
+    """Return the volume [m³] of the points of a sphere around (½, ½, ½) with a particle within ``reach`` [m], by Monte Carlo."""
     points = np.random.default_rng(0).uniform(-radius, radius, (200_000, 3))
     points = points[np.linalg.norm(points, axis=1) < radius] + 0.5
     return np.mean(np.isfinite(cKDTree(pos).query(points, distance_upper_bound=reach)[0])) * 4 / 3 * math.pi * radius**3
 
 
 def caps(radius, spacing, count):
-    """Jittered lattices, turned anyhow, whose lowest ``count`` points in the sphere fill it up to a plane."""
+    """Return randomly turned jittered lattices whose lowest ``count`` points in the sphere fill it up to a plane."""
     rng = np.random.default_rng(0)
     most = math.ceil(2 * radius / spacing)
     lattice = np.stack(np.meshgrid(*[np.arange(-most, most)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""The material point solver against analytic results and published experiments, in 2D and 3D."""
+"""The material point solver compared with analytic results and published experiments, in 2D and 3D."""
 
 import itertools
 import math
@@ -26,12 +26,12 @@ def unit(dim):
 
 
 def down(dim):
-    """Unit vector."""
+    """Return the unit vector downward."""
     return np.array([0.0] * (dim - 1) + [-1.0])
 
 
 def collision(dim, materials):
-    """Two blocks in an off-centre collision without gravity and walls; of the first and the last material."""
+    """Return two blocks, of the first and the last material, in an off-centre collision without gravity and walls."""
     cell, spacing = (1 / 32, 1 / 64) if dim == 2 else (1 / 16, 1 / 32)
     left = block((0.25, 0.4, 0.4)[:dim], (0.2, 0.2, 0.2)[:dim], spacing, materials[0], velocity=(2.0, 0.3, 0.1)[:dim])
     right = block((0.55, 0.48, 0.37)[:dim], (0.15, 0.25, 0.2)[:dim], spacing, materials[-1], velocity=(-2.0, -0.2, 0.2)[:dim], seed=1)
@@ -70,7 +70,7 @@ def test_linear_momentum(dim, materials, physics):
 
 
 def angular_momentum(state, spacing):
-    """Σ m (x × v + Δ²/4 curl) about the centre of the domain [3 components]: APIC particles carry spin ``ε_ijk C_kj``."""
+    """Return Σ m (x × v + Δ²/4 curl) about the centre of the domain [3 components]; APIC particles carry spin ``ε_ijk C_kj``."""
     x, v, c = np.zeros((3, state.num_nodes)), np.zeros((3, state.num_nodes)), np.zeros((3, 3, state.num_nodes))
     x[: state.dim], v[: state.dim] = state.pos.T - 0.5, state.vel.T
     if state.internal is not None:
@@ -98,7 +98,7 @@ def test_angular_momentum(dim, materials, physics):
 
 
 def elastic_energy(material, value, state):
-    """Elastic energy [J]; snow's hardening included."""
+    """Return the elastic energy [J], including the hardening of snow."""
     stretch = np.linalg.svd(state.internal.deformation, compute_uv=False)
     volume = state.mass / material.density
     if isinstance(material, Fluid):
@@ -117,7 +117,7 @@ def elastic_energy(material, value, state):
 
 
 def energies(solver, state, num_steps):
-    """Kinetic, gravitational and elastic energy after each frame, the initial state first [J]."""
+    """Return kinetic, gravitational and elastic energy [J] in each frame, the initial state first."""
     material, value = solver.constants_of(solver.materials[0]), float(state.material_params[0, 0])
     values = []
     for _ in range(num_steps + 1):
@@ -221,8 +221,9 @@ def test_hydrostatic_column(material, physics):
 
 
 def vortex_decay(viscosity, cells, dim=2):
-    """Decay rate [1/s] of a Taylor-Green vortex between slip walls, extruded in 3D, after sound has crossed the box a few times: it first has to tell all
-    of the liquid what the walls, a cell thick, do to it.
+    """Return the decay rate [1/s] of a Taylor-Green vortex between slip walls, extruded in 3D.
+
+    The measurement starts after sound has crossed the box a few times, when the effect of the walls has reached all of the liquid.
     """
     dx, k = 1 / cells, math.pi
     bounds = ((0.0, 1.0), (0.0, 1.0), (0.0, 4 * dx))[:dim]
@@ -261,7 +262,7 @@ def test_the_grids_own_viscosity_falls_with_its_spacing(physics):
 
 
 def bar_frequency(cells, dim=2, cfl=0.5, modulus=1e5):
-    """Frequency [Hz] of the first longitudinal mode of a free bar without lateral contraction, over five periods, and the share of the amplitude left."""
+    """Return frequency [Hz] of the first longitudinal mode of a free bar without lateral contraction, and the fraction of amplitude left after five periods."""
     length, elastomer = 0.5, Elastomer(poisson_ratio=0.0)
     dx, speed = length / cells, math.sqrt(modulus / elastomer.density)
     bounds = ((0.0, (cells + 8) * dx), *((0.0, 12 * dx),) * (dim - 1))
@@ -324,7 +325,7 @@ def test_bar_frequency_converges(physics):
 
 
 def deposit(xi):
-    """Height [m] that 95 % of the particles of a snow block stay below, 0.8 s after it was thrown at a rough floor at 4 m/s."""
+    """Return the height [m] below which 95 % of the particles of a snow block stay, 0.8 s after it was thrown at a rough floor at 4 m/s."""
     cell = 1 / 64
     boundary = Boundary.sample(domain_walls(unit(2), STICKY), cell / 2, 2)
     fall = {"velocity": 4.0 * down(2), "gravity": GRAVITY * down(2)}
@@ -346,7 +347,7 @@ L0 = 0.2
 
 
 def collapse(aspect, angle, cells_per_width=10, duration=1.6, cfl=0.5):
-    """A column of width L0 and height a L0 against a slip wall, on a sticky floor; returns the final state."""
+    """Return the final state of a column of width L0 and height a L0 that collapses beside a slip wall, on a sticky floor."""
     dx = L0 / cells_per_width
     height = math.ceil((aspect * L0 + 0.1) / dx) * dx
     length = math.ceil(L0 * (1 + 2.5 * max(aspect, 1.0) + 1) / dx) * dx
@@ -359,7 +360,7 @@ def collapse(aspect, angle, cells_per_width=10, duration=1.6, cfl=0.5):
 
 
 def run_out(state):
-    """(L - L0)/L0 of the front."""
+    """Return (L - L0)/L0 of the front."""
     return float(state.pos[:, 0].max() / L0 - 1)
 
 
@@ -410,7 +411,7 @@ def test_pile_comes_to_rest(physics):
 
 
 def slip(angle, tilt):
-    """Displacement in cells of the middle of a layer of 8 cells on a sticky floor after 0.4 s, with gravity tilted by ``tilt`` degrees."""
+    """Return the displacement in cells of the middle of a layer of 8 cells on a sticky floor after 0.4 s, with gravity tilted by ``tilt`` degrees."""
     dx, cells = 1 / 64, (96, 16)
     bounds = ((0.0, cells[0] * dx), (0.0, cells[1] * dx))
     boundary = Boundary.sample(domain_walls(bounds, {"x_low": 0.0, "x_high": 0.0, "y_low": STICKY, "y_high": 0.0}), dx / 2, 2)

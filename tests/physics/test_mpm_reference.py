@@ -1,4 +1,4 @@
-"""The material point solver against the kernels of an engine that others wrote: the example ``mpm99`` that the package taichi ships."""
+"""The material point solver compared with an independent engine: the example ``mpm99`` of the package taichi."""
 
 import os
 import subprocess
@@ -18,14 +18,14 @@ from gpe_pl.trajectory.state import State
 pytestmark = pytest.mark.slow
 
 NODES, DT, GRAVITY, DENSITY, MODULUS, XI = 128, 1e-4, 50.0, 1e3, 1e6, 10.0
-"""Constants that the example fixes, density and modulus in units 1000 times smaller, which changes no motion."""
+"""Constants that the example fixes. Density and modulus have units 1000 times smaller, which does not change the motion."""
 DX, JELLY, SNOW = 1 / NODES, 1, 2
 SOURCE = "taichi 1.7, examples/simulation/mpm99"
 
 
 @pytest.fixture
 def reference(tmp_path):
-    """Positions after the example's own substeps, in double precision [m]."""
+    """Return positions after the example's substeps, in double precision [m]."""
     pytest.importorskip("taichi")
 
     def run(pos, vel, material, num_steps):
@@ -41,7 +41,7 @@ def reference(tmp_path):
 
 
 def two_blocks(seed=0):
-    """9000 jittered particles, as many as the example has, at its spacing, in two blocks one cell apart [particle, 2]."""
+    """Return 9000 jittered particles, the number and spacing of the example, in two blocks one cell apart [particle, 2]."""
     lattice = np.stack(np.meshgrid(np.arange(60), np.arange(75), indexing="ij"), axis=-1).reshape(-1, 2) + 0.5
     jitter = np.random.default_rng(seed).uniform(-0.25, 0.25, (2, *lattice.shape))
     left = np.array([0.5 - 31 * DX, 0.5]) + (lattice + jitter[0]) * DX / 2
@@ -50,7 +50,7 @@ def two_blocks(seed=0):
 
 
 def ours(pos, vel, material, value, num_steps, **constants):
-    """Positions after as many frames of the example's time step [m]; the example's walls begin at the third node from each side."""
+    """Return positions after as many frames of the example's time step [m]; the example's walls begin at the third node from each side."""
     count, bounds = len(pos), ((2 * DX, 1 - 2 * DX),) * 2
     solver = MPM(bounds=bounds, grid_spacing=DX, frame_dt=DT, materials=(material,), cfl=1.0, **constants)
     state = State(
@@ -68,7 +68,7 @@ def ours(pos, vel, material, value, num_steps, **constants):
 
 
 def compare(physics, got, expected, start, tolerances):
-    """Centre of mass, spread (standard deviation per axis) and the median distance of a particle from its twin, in grid cells."""
+    """Compare centre of mass, spread (standard deviation per axis) and the median distance between twin particles, in grid cells."""
     values = {
         "centre of mass": np.abs(got.mean(axis=0) - expected.mean(axis=0)).max(),
         "spread": np.abs(got.std(axis=0) - expected.std(axis=0)).max(),

@@ -47,7 +47,7 @@ def ground_truth() -> Trajectory:
 
 
 def shifted(t: Trajectory, per_frame: np.ndarray) -> Trajectory:
-    """Every node displaced by per_frame[frame] along x."""
+    """Return the trajectory with every node displaced by per_frame[frame] along x."""
     pos = t.pos.copy()
     pos[..., 0] += per_frame[:, None]
     return replace(t, pos=pos)

@@ -1,4 +1,4 @@
-"""What others have written is shown, and does nothing."""
+"""Foreign text is shown without effects."""
 
 from __future__ import annotations
 

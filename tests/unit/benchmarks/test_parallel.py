@@ -1,4 +1,4 @@
-"""The benchmark of data-parallel training says what it measured."""
+"""The benchmark of data-parallel training reports its measurements."""
 
 from __future__ import annotations
 

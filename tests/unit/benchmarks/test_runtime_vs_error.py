@@ -1,4 +1,4 @@
-"""Cost against error: what follows from points on the two axes, and that all simulators get there."""
+"""Cost against error: conclusions from points on the two axes, and points of all simulators."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmark of scaling fits what it measured."""
+"""The benchmark of scaling fits its measurements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The benchmark of skipping grows scenes by what does not matter, and only by that."""
+"""The benchmark of skipping adds irrelevant parts to a scene, and nothing else."""
 
 from __future__ import annotations
 

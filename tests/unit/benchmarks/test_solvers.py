@@ -1,4 +1,4 @@
-"""The benchmark of the solvers runs, counts what it simulates, and names data sets that exist."""
+"""The benchmark of the solvers runs, counts the simulated steps, and names existing data sets."""
 
 from typing import Any
 

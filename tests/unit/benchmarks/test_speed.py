@@ -1,4 +1,4 @@
-"""The benchmark of speed runs, counts the products it claims to count, and times what it says."""
+"""The benchmark of speed runs, counts the matrix products, and times the stated operations."""
 
 from __future__ import annotations
 

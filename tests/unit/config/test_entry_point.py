@@ -1,4 +1,4 @@
-"""Whatever is wrong in a config: one line that names it and says what is allowed, exit code 2, no traceback."""
+"""Errors of configuration: one line that names the error and the allowed values, exit code 2, no traceback."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wherever a launcher runs jobs, it runs their commands: values come back, failures are named with their logs."""
+"""Launchers run the commands of their jobs: values come back, and failures are named with their logs."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ Path(os.environ["GPE_PL_RESULT"]).write_text(json.dumps(float(x) ** 2))
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with a command ``python -m square x=…``."""
+    """Make a folder with a command ``python -m square x=…``."""
     (tmp_path / "square.py").write_text(COMMAND)
     return tmp_path
 
 
 def outcomes(launcher: CommandLauncher, folder: Path, *values: str) -> dict[str, Any]:
-    """The status and value of each job."""
+    """Return status and value of each job."""
     launcher.config = OmegaConf.create({})
     jobs = [Job([f"x={v}"], Path("sweep"), f"x={v}", folder) for v in values]
     found = {}
@@ -68,7 +68,7 @@ def test_a_job_is_its_command_wherever_it_runs(folder: Path, name: str) -> None:
 
 
 class Fixed(CommandLauncher):
-    """Ends jobs as it is told to."""
+    """Launcher that ends jobs with given results."""
 
     def __init__(self, **ends: Any) -> None:
         self.ends = ends

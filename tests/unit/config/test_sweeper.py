@@ -1,4 +1,4 @@
-"""Optuna's sweep: trials within the space, kept in a journal, resumed where they stopped."""
+"""Optuna's sweep: trials within the space, stored in a journal, and resumed after an interruption."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SPACE = {"rate": "tag(log, interval(1e-4, 1e-2))", "model": "gpe,gns", "depth": 
 
 
 class Launcher:
-    """Jobs that return a formula of their overrides; the n-th may be killed, and some models fail or return another value."""
+    """Launcher whose jobs return a formula of their overrides; the n-th may be killed, and some models fail or return another value."""
 
     def __init__(self, killed_at: int | None = None, failing: str = "", other: dict[str, float | None] | None = None) -> None:
         self.killed_at, self.failing, self.other = killed_at, failing, other or {}

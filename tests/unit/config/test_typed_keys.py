@@ -1,4 +1,4 @@
-"""What someone types and nothing reads is refused, whichever experiment, comparison and recipe it stands beside."""
+"""Unknown keys on the command line are refused beside any experiment, comparison and recipe."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The data module: endless, resumable training batches, a fixed validation sample, statistics of the noisy inputs."""
+"""The data module: endless, resumable training batches, a fixed validation sample, and statistics of the noisy inputs."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def root(store: Path) -> Path:
 
 
 def described(root: Path) -> Path:
-    """The data set, with statistics of its training trajectories as they are now."""
+    """Return the data set, with present statistics of its training trajectories."""
     sealed.write(root / "statistics.json", {"acceleration_std": 50.0, "data_sha256": split_checksum(root, "train")})
     return root
 
@@ -152,7 +152,7 @@ FRAMES, BLOCK = 4, 0.05 * np.stack(np.meshgrid(np.arange(3), np.arange(3)), -1).
 
 
 def scene(seed: int, *materials: tuple[str, float], gap: float = 0.5) -> Trajectory:
-    """Nine nodes of each material, with its parameter, that move at random; the materials are far from each other, or as far apart as is said."""
+    """Return nine nodes of each material, with its parameter, in random motion; the materials are far apart unless a distance is given."""
     rng = np.random.default_rng(seed)
     first = np.concatenate([BLOCK + np.array([gap * k, 0.0]) for k in range(len(materials))])
     pos = first + np.cumsum(rng.normal(scale=2e-3, size=(FRAMES, *first.shape)), axis=0)
@@ -161,7 +161,7 @@ def scene(seed: int, *materials: tuple[str, float], gap: float = 0.5) -> Traject
 
 
 def imported(folder: Path, train: list[Trajectory]) -> TrajectoryDataModule:
-    """A data set with these training trajectories of one window each, of which the sample for statistics takes eight."""
+    """Return a data set with these training trajectories of one window each; the sample for statistics takes eight."""
     save_dataset(folder, "made", train=train, val=[scene(1001, ("fluid", 1e-3))], test=[scene(1002, ("fluid", 1e-3))])
     return TrajectoryDataModule(folder / "made" / "imported", GraphConfig(history=2), Noise(), BatchSize(2), num_statistics_windows=8)
 
@@ -240,7 +240,7 @@ def test_a_missing_split_is_named(root: Path) -> None:
 
 
 def with_another(root: Path, change: Callable[[Trajectory], Trajectory], num_sound: int = 6, num_changed: int = 1) -> Path:
-    """The data set with other training trajectories, which swing to and fro; the last of them are changed."""
+    """Return the data set with other training trajectories, which swing to and fro; the last of them are changed."""
     shard = root / "train" / "shard-00000.h5"
     jumping = read_trajectory(shard, trajectory_names(shard)[0])
     swing = 1e-3 * np.sin(np.arange(jumping.num_frames))[:, None, None]

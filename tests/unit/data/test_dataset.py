@@ -1,4 +1,4 @@
-"""Samples are pure functions of their number, never change what is stored, and have the target that the integrator needs."""
+"""Samples are pure functions of their number, never change stored data, and have the target that the integrator needs."""
 
 from __future__ import annotations
 
@@ -299,7 +299,7 @@ def test_late_batches_ask_for_own_steps(store: Path) -> None:
 
 
 def edited(store: Path, key: str) -> None:
-    """The first training trajectory changed in place, with its old digest."""
+    """Return the data set after its first training trajectory was changed in place, with the old digest."""
     with h5py.File(next((store / "train").iterdir()), "r+") as file:
         group = file["00000"]
         if key == "metadata":

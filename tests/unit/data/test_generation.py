@@ -1,4 +1,4 @@
-"""Generation is resumable, reproducible, and refuses to mix data sets."""
+"""Generation is resumable and reproducible, and refuses to mix data sets."""
 
 import contextlib
 import dataclasses
@@ -64,7 +64,7 @@ SPEC = DatasetSpec(
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The data set, generated without interruption."""
+    """Generate the data set without interruption."""
     return generate(tmp_path_factory.mktemp("data"), SPEC)
 
 
@@ -304,7 +304,7 @@ def test_the_folder_itself_may_be_a_link(folder, tmp_path):
 
 @dataclasses.dataclass(frozen=True)
 class SceneOfAFile:
-    """The scene above, which claims to depend on a file."""
+    """The scene above, declaring a dependence on a file."""
 
     path: str
 
@@ -460,7 +460,7 @@ def test_plan_counts_what_is_missing(folder, tmp_path):
 
 
 def share_settled(trajectory, time):
-    """Fraction of particles that have left free flight (velocity off the initial ballistic one by more than 0.1 m/s) by ``time`` [s]."""
+    """Return the fraction of particles whose velocity differs from initial free flight by more than 0.1 m/s at ``time`` [s]."""
     frame = math.ceil(time / trajectory.metadata.frame_dt)
     elapsed = np.arange(frame + 1)[:, None, None] * trajectory.metadata.frame_dt
     ballistic = trajectory.vel[0] + elapsed * np.array(trajectory.metadata.gravity)

@@ -1,4 +1,4 @@
-"""Noise moves inputs as its definition says, in the stated unit, and leaves the stored window alone."""
+"""Noise moves inputs according to its definition and unit, and does not change the stored window."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every kind of violation is named with file, trajectory, field and place; nothing in a file makes the validator fail."""
+"""Every kind of violation is named with file, trajectory, field and position, and no file makes the validator fail."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def metadata(**values: Any) -> Edit:
 
 
 def changed(key: str, index: Any, value: float) -> Edit:
-    """Set one element; ``boundary_*`` fields lie in the boundary."""
+    """Set one element; ``boundary_*`` fields are in the boundary."""
 
     def edit(t: Trajectory) -> Trajectory:
         name = key.removeprefix("boundary_")
@@ -42,7 +42,7 @@ def changed(key: str, index: Any, value: float) -> Edit:
 
 
 def messages(tmp_path: Path, trajectory: Trajectory) -> list[str]:
-    """What the validator says about a shard with this trajectory, without the path, which it must name."""
+    """Return the validator's messages about a shard with this trajectory, after checking and removing the path."""
     path = tmp_path / "shards" / "shard-00000.h5"
     write_shard(path, [trajectory])
     prefix = f"{path}: 00000: "
@@ -339,8 +339,10 @@ def test_usage_error() -> None:
 
 
 def falling(new_trajectory: Callable[..., Trajectory], extra: float, gap: float = 0.05, mesh: bool = False) -> Trajectory:
-    """A pair of nodes in mid-air that falls freely while its second node, ``gap`` [m] away, accelerates by ``extra`` [m/s²] more, and a node at rest on
-    the floor."""
+    """Return a falling pair of nodes in mid-air and a node at rest on the floor.
+
+    The second node of the pair is ``gap`` [m] away and accelerates by ``extra`` [m/s²] more than gravity.
+    """
     t = new_trajectory(num_nodes=3, num_frames=6)
     time = 0.01 * np.arange(6)[:, None]
     acceleration = np.array([[0.0, -9.81], [extra, -9.81], [0.0, 0.0]])

@@ -1,4 +1,4 @@
-"""Numbers of ``metrics.csv`` that no failure may improve, and how they are written."""
+"""Numbers of ``metrics.csv``: no failure improves them, and their format."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gpe_pl.trajectory.trajectory import Termination, Trajectory
 
 @pytest.fixture
 def inside(new_trajectory: Callable[..., Trajectory]) -> Trajectory:
-    """Eleven frames with all particles in free space."""
+    """Return eleven frames with all particles in free space."""
     return new_trajectory(num_frames=11)
 
 

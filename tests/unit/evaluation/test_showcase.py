@@ -1,4 +1,4 @@
-"""A showcase counts what happens in it, keeps few frames, and says why it stopped."""
+"""A showcase counts events, keeps few frames, and says why it stopped."""
 
 from __future__ import annotations
 

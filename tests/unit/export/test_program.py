@@ -1,4 +1,4 @@
-"""A step on plain tensors is the simulator's step, and its program runs where this package is not."""
+"""A step on plain tensors equals the simulator's step, and its program runs without this package."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def simulator(
     periodic: tuple[bool, ...] = (),
     **settings: Any,
 ) -> LearnedSimulator:
-    """A simulator with random weights whose accelerations are of the order of gravity."""
+    """Return a simulator with random weights whose accelerations are of the order of gravity."""
     build = scenes.builder(materials, dim, **{"islands": False, **(config or {})})
     build = GraphBuilder(build.config, replace(build.metadata, periodic=periodic))
     torch.manual_seed(0)
@@ -69,7 +69,7 @@ def assert_same_step(step: Any, learned: LearnedSimulator, state: State, atol: f
 
 
 def at_the_seam(state: State, learned: LearnedSimulator) -> State:
-    """The same in a domain that repeats, moved so that what lies near its lower corner lies on both sides of the seam."""
+    """Return the scene in a periodic domain, moved so that the part near its lower corner lies on both sides of the seam."""
     space = learned.builder.metadata.periodicity
     moved = [0.8 if repeats else 0.0 for repeats in space.periodic]
     return replace(state, pos=space.wrapped(state.pos + moved), periodicity=space)
@@ -142,7 +142,7 @@ def test_what_a_file_cannot_be_is_refused(tmp_path: Path) -> None:
 
 
 def exported(learned: LearnedSimulator, path: Path) -> Path:
-    """Lengths are symbols while a program is made, which the tests' checks of types do not take for numbers."""
+    """Export a program. Lengths are symbols during export, which the tests' type checks do not accept as numbers."""
     jaxtyping.config.update("jaxtyping_disable", True)
     try:
         export_model(learned, path)

@@ -23,13 +23,13 @@ meshio = pytest.importorskip("meshio", reason="meshio, another reader of VTK fil
 
 
 def series(path: Path) -> list[tuple[float, Any]]:
-    """Times and grids of a series, as another program reads them."""
+    """Return times and grids of a series, as another program reads them."""
     entries = ElementTree.parse(path).getroot().iter("DataSet")
     return [(float(e.attrib["timestep"]), meshio.read(path.parent / e.attrib["file"])) for e in entries]
 
 
 def rowed(trajectory: Trajectory) -> Trajectory:
-    """The same with velocities and stresses in which no two numbers are equal."""
+    """Return the trajectory with velocities and stresses in which no two numbers are equal."""
     rng = np.random.default_rng(0)
     stress = (
         None
@@ -83,7 +83,7 @@ def test_meshes_come_back_with_their_stress(tmp_path: Path, dim: int) -> None:
 GRID = np.arange(9).reshape(3, 3)
 QUADS = np.stack([GRID[:-1, :-1], GRID[1:, :-1], GRID[1:, 1:], GRID[:-1, 1:]], -1).reshape(-1, 4)
 CUBE = [0, 1, 3, 2, 4, 5, 7, 6]
-"""A hexahedron of the corners of a cube in the order of their binary numbers."""
+"""A hexahedron of the corners of a cube, numbered in binary."""
 MESHES: dict[str, tuple[int, int, dict[str, Any]]] = {
     "quadrilaterals": (2, 9, {"quadrilateral": QUADS}),
     "a shell of quadrilaterals": (3, 9, {"quadrilateral": QUADS}),
@@ -96,7 +96,7 @@ NAMES = {"triangle": "triangle", "quadrilateral": "quad", "tetrahedron": "tetra"
 
 
 def meshed(name: str) -> Trajectory:
-    """A mesh that swings; where its nodes lie does not matter to the kinds of its cells."""
+    """Return a mesh that swings; the positions of its nodes do not affect the kinds of its cells."""
     dim, count, cells = MESHES[name]
     rest = np.random.default_rng(0).uniform(0.3, 0.7, (count, dim))
     swing = 0.01 * np.sin(np.arange(8)[:, None, None] + rest)

@@ -1,4 +1,4 @@
-"""A file is there whole or not at all, and nothing stays beside it."""
+"""A file appears complete or not at all, and no temporary file stays."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from gpe_pl.files.atomic import replace_text, replacing
 
 NOBODY = 2**30
-"""Larger than any process number."""
+"""A number larger than any process number."""
 
 
 def test_a_file_appears_when_the_block_ends(tmp_path: Path) -> None:

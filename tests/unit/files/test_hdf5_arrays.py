@@ -1,4 +1,4 @@
-"""Arrays in HDF5 files whose reading would take far more than they hold, or lead elsewhere, are refused before they are read."""
+"""Arrays in HDF5 files that expand far beyond their size, or lead elsewhere, are refused before they are read."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ Make = Callable[[h5py.Group, str, np.ndarray], Any]
 
 
 def huge_chunk(group: h5py.Group, name: str, values: np.ndarray) -> None:
-    """A chunk of 32 MiB, of which all but the values is constant; of a terabyte it would be as small a file."""
+    """Write a chunk of 32 MiB, all of it constant; with a terabyte the file would be as small."""
     chunks = (2**23 // max(1, values[0].size), *values.shape[1:])
     group.create_dataset(name, data=values, maxshape=(None, *values.shape[1:]), chunks=chunks, compression="gzip", compression_opts=1)
 
 
 def bomb(group: h5py.Group, name: str, values: np.ndarray) -> None:
-    """A chunk that unpacks to 64 MiB."""
+    """Write a chunk that unpacks to 64 MiB."""
     dataset = group.create_dataset(name, values.shape, values.dtype, chunks=values.shape, compression="gzip")
     pack = zlib.compressobj(1)
     dataset.id.write_direct_chunk((0,) * values.ndim, b"".join(pack.compress(bytes(2**24)) for _ in range(4)) + pack.flush())
 
 
 def constant(group: h5py.Group, name: str, values: np.ndarray) -> None:
-    """Zeros, 600 MiB in 600 kiB."""
+    """Write zeros: 600 MiB in 600 kiB."""
     row = values[0].size
     shape, chunk = (600 * 2**20 // values.itemsize // row, *values.shape[1:]), (2**20 // values.itemsize // row, *values.shape[1:])
     dataset = group.create_dataset(name, shape, values.dtype, chunks=chunk, compression="gzip")
@@ -45,14 +45,14 @@ def constant(group: h5py.Group, name: str, values: np.ndarray) -> None:
 
 
 def many_chunks(group: h5py.Group, name: str, values: np.ndarray) -> None:
-    """Chunks of one number each, of which few are stored."""
+    """Write chunks of one number each, few of them stored."""
     row = values[0].size
     dataset = group.create_dataset(name, (2**18 // row + 1, *values.shape[1:]), values.dtype, chunks=(1,) * values.ndim)
     dataset[: 400 // row] = 1
 
 
 def growing(group: h5py.Group, name: str, values: np.ndarray) -> None:
-    """As a simulation that does not know its end writes: fine."""
+    """Write an array that grows, as a simulation of unknown length does; it is valid."""
     group.create_dataset(name, data=values, maxshape=(None, *values.shape[1:]), chunks=(100, *values.shape[1:]), compression="gzip")
 
 
@@ -100,7 +100,7 @@ def shard(tmp_path: Path, trajectory: Trajectory) -> Path:
 
 @pytest.fixture
 def pipe(tmp_path: Path) -> None:
-    """Whoever opens it waits for ever."""
+    """Make a pipe, which blocks whoever opens it."""
     if not hasattr(os, "mkfifo"):
         pytest.skip("no named pipes here")
     os.mkfifo(tmp_path / "pipe")

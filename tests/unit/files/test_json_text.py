@@ -1,4 +1,4 @@
-"""JSON from files: what would take long, or fill a message, is refused."""
+"""JSON from files: texts that would take long to read, or fill a message, are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What becomes a folder stays where it belongs, on every system."""
+"""Names become folders within their parent folder, on every system."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pipes and devices are refused before they are read: reading them never ends."""
+"""Pipes and devices are refused before they are read, because reading them never ends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that the project writes for itself come back as they were written, or not at all."""
+"""The project's internal files read back unchanged, or not at all."""
 
 from __future__ import annotations
 

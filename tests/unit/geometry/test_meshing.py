@@ -22,7 +22,7 @@ SQUARE = [np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])]
 
 
 def signed_volumes(points, cells):
-    """Of triangles and tetrahedra; of the worst corner of quadrilaterals."""
+    """Return signed volumes of triangles and tetrahedra, and of the worst corner of quadrilaterals."""
     if cells.shape[1] == 4 and points.shape[1] == 2:
         cells = np.stack([cells[:, [k, (k + 1) % 4, k - 1]] for k in range(4)], axis=1).reshape(-1, 3)
     corners = points[cells]
@@ -36,7 +36,7 @@ def area(points, cells):
 
 
 def faces(cells, dim):
-    """How many cells share each face: a set of corners -> count."""
+    """Count the cells of each face: a set of corners -> count."""
     count: dict[frozenset[int], int] = {}
     for cell in cells.tolist():
         sides = [cell[:k] + cell[k + 1 :] for k in range(4)] if dim == 3 else zip(cell, cell[1:] + cell[:1], strict=True)

@@ -52,7 +52,7 @@ def random_points(dim: int, count: int = 400) -> np.ndarray:
 
 
 def inside(solid: Any, points: np.ndarray) -> np.ndarray:
-    """Membership, computed in another way than the signed distance does."""
+    """Tell whether points are inside, without the signed distance."""
     if isinstance(solid, Bowl):
         return np.asarray(((points - np.array(solid.center)) ** 2).sum(-1) > solid.radius**2)
     if isinstance(solid, Sphere):

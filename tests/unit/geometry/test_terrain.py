@@ -1,4 +1,4 @@
-"""Terrain from files and the random canyon, against analytic distances and brute force."""
+"""Terrain from files and the random canyon, compared with analytic distances and brute force."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def hills(x: Any, y: Any) -> np.ndarray:
 
 
 def hill_mesh(cells: int = 40, low: float = 0.0, high: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of an open surface."""
+    """Return vertices and faces of an open surface."""
     x, y = np.meshgrid(*[np.linspace(low, high, cells + 1)] * 2, indexing="ij")
     index = np.arange((cells + 1) ** 2).reshape(cells + 1, cells + 1)
     a, b, c, d = index[:-1, :-1].ravel(), index[1:, :-1].ravel(), index[1:, 1:].ravel(), index[:-1, 1:].ravel()
@@ -39,7 +39,7 @@ def hill_mesh(cells: int = 40, low: float = 0.0, high: float = 1.0) -> tuple[np.
 
 
 def to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Distances [point] to triangles by minimising over a dense barycentric lattice, then refined: another way than the kernel's."""
+    """Return distances [point] to triangles by minimising over a dense barycentric lattice, then refining; the kernel uses another method."""
     steps = np.linspace(0, 1, 41)
     u, v = (w.ravel() for w in np.meshgrid(steps, steps, indexing="ij"))
     u, v = u[u + v <= 1 + 1e-9], v[u + v <= 1 + 1e-9]
@@ -48,7 +48,7 @@ def to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def assert_distances(values: np.ndarray, exact: np.ndarray) -> None:
-    """Exact near the surface but for its facets; far away sweeping may miss the nearest triangle by a little."""
+    """Check distances: exact near the surface up to facets; far away, sweeping may miss the nearest triangle by a little."""
     np.testing.assert_allclose(values, exact, atol=4e-3)
     np.testing.assert_allclose(values[np.abs(exact) < 0.1], exact[np.abs(exact) < 0.1], atol=1.2e-3)
 
@@ -399,7 +399,7 @@ CANYON = ((0.0, 2.0), (0.0, 1.0), (0.0, 1.0))
 
 
 def ground(grid: DistanceGrid) -> np.ndarray:
-    """Height [m] of the lowest free node of each column."""
+    """Return the height [m] of the lowest free node of each column."""
     return np.asarray(grid.origin[2] + grid.spacing * np.argmax(grid.values > 0, axis=-1))
 
 

@@ -1,4 +1,4 @@
-"""Our union of graphs is that of torch-geometric."""
+"""The union of graphs equals that of torch-geometric."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests import scenes
 
 
 def particles() -> list[HeteroData]:
-    """Of other sizes, one without snow, one without a neighbour."""
+    """Return graphs of different sizes, one without snow and one without neighbours."""
     build = scenes.builder(("sand", "snow"), history=2, islands=True)
     states = [scenes.state(n, ("sand", "snow"), history=2, seed=n).to_torch() for n in (30, 7, 2)]
     states[1].node_type[:] = states[1].node_type[0]

@@ -1,4 +1,4 @@
-"""Graphs that know their islands, and a model that keeps their momentum."""
+"""Graphs that contain islands, and a model that conserves their momentum."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TWO = ("sand", "snow")
 
 
 def two_clouds(gap: float) -> State:
-    """One near the floor and one ``gap`` above it, of two materials."""
+    """Return a cloud near the floor and one ``gap`` above it, of two materials."""
     low, high = scenes.state(20, TWO, history=2, seed=1, high=0.25), scenes.state(15, TWO, history=2, seed=2, high=0.25)
     high = replace(high, pos=high.pos + np.array([0.3, gap]))
     assert low.velocity_history is not None and high.velocity_history is not None

@@ -1,4 +1,4 @@
-"""Approximate levels: what rests is left alone and woken, what moves is predicted as before, and a prediction can serve several frames."""
+"""Approximate levels: resting nodes sleep and wake, moving nodes are predicted as before, and a prediction can serve several frames."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def simulator(build: GraphBuilder, model: str = "gpe", sleep_after: int | None =
 
 
 def two_heaps(gap: float = 0.13, speed: float = 1.0) -> State:
-    """Twenty nodes at rest beside twenty that move, both on the floor; no gravity, so that a silent network keeps them so."""
+    """Return twenty nodes at rest beside twenty that move, on the floor; without gravity, a network that predicts zero keeps them so."""
     s = scenes.state(40, low=0.02, high=0.3)
     right = np.arange(40) >= 20
     pos, vel = s.pos.copy(), s.vel.copy()
@@ -60,7 +60,7 @@ def silenced(simulated: LearnedSimulator) -> LearnedSimulator:
 
 
 def after_rest(sleeping: Any, state: State, count: int = 2) -> State:
-    """The state as if its resting nodes had been at rest for so many predictions."""
+    """Return the state as if its resting nodes had been at rest for ``count`` predictions."""
     still = silenced(simulator(sleeping.simulator.builder))
     for _ in range(count):
         moved = Sleeping(still).step(replace(state, pos=state.pos))

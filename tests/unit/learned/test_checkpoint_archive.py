@@ -1,4 +1,4 @@
-"""Archives of PyTorch that would take far more memory or time than they hold are refused before they are read."""
+"""PyTorch archives that would take far more memory or time than their size are refused before they are read."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def archive(tmp_path: Path) -> Path:
 
 
 def rewritten(path: Path, members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> None:
-    """The same archive with other members, or more of them."""
+    """Rewrite an archive with other or additional members."""
     with zipfile.ZipFile(path) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
     top = next(iter(parts)).partition("/")[0]
@@ -47,7 +47,7 @@ def rewritten(path: Path, members: dict[str, bytes], compression: int = zipfile.
 
 
 def compressed(path: Path) -> None:
-    """A thousandth of what it unpacks to."""
+    """Write an archive of a thousandth of its unpacked size."""
     rewritten(path, {"more": bytes(2**24)}, zipfile.ZIP_DEFLATED)
 
 
@@ -58,7 +58,7 @@ def crowded(path: Path) -> None:
 
 
 def overlapping(path: Path) -> None:
-    """Two members that are the same bytes."""
+    """Write an archive in which two members share their bytes."""
     rewritten(path, {"twin": bytes(2**16)})
     with zipfile.ZipFile(path, "a") as archive:
         twin = next(member for member in archive.infolist() if member.filename.endswith("/twin"))
@@ -67,7 +67,7 @@ def overlapping(path: Path) -> None:
 
 
 class Called:
-    """Pickled as a call."""
+    """Object that is pickled as a call."""
 
     def __init__(self, function: Callable[..., Any], *arguments: Any) -> None:
         self.call = function, arguments
@@ -81,7 +81,7 @@ def calling(function: Callable[..., Any], *arguments: Any) -> Callable[[Path], N
 
 
 def tuples(path: Path) -> None:
-    """A key whose hash takes 2^60 steps: a tuple that holds another one twice, and so on."""
+    """Return a key whose hash takes 2^60 steps: nested tuples, each containing the next twice."""
     key: Any = (1,)
     parts = io.BytesIO()
     for _ in range(60):

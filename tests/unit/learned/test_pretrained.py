@@ -1,4 +1,4 @@
-"""Shipped models: small, described, and found by name."""
+"""Shipped models are small, described, and found by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The network of continuous convolutions against its layers, written out edge by edge, and against the published sizes."""
+"""The network of continuous convolutions compared with its layers, written out edge by edge, and with the published sizes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Edge = tuple[int, int, Tensor]
 
 
 def convolve(conv: Any, features: Tensor, edges: list[Edge], num_targets: int, kernel_size: int) -> Tensor:
-    """One filter matrix per edge (source, target, (x_source − x_target) / R)."""
+    """Convolve with one filter matrix per edge (source, target, (x_source − x_target) / R)."""
     out = [conv.bias for _ in range(num_targets)]
     for j, i, u in edges:
         cells, weights = interpolate(u[None], kernel_size)
@@ -29,7 +29,7 @@ def convolve(conv: Any, features: Tensor, edges: list[Edge], num_targets: int, k
 
 
 def published(model: Any, data: HeteroData) -> Tensor:
-    """The paper's network for particles of one or two materials, first those of the first."""
+    """Compute the paper's network for particles of one or two materials, first those of the first."""
     spec: FeatureSpec = model.spec
     rows = {m: len(data[m].x) for m in spec.materials}
     first = dict(zip(spec.materials, [0, *rows.values()], strict=False))

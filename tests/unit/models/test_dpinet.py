@@ -1,4 +1,4 @@
-"""DPI-Net against its propagation, written out with concatenation and loops over nodes and edges, and against the published sizes."""
+"""DPI-Net compared with its propagation, written out with concatenation and loops over nodes and edges, and with the published sizes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Node = tuple[str, int]
 
 
 def published(model: Any, data: HeteroData) -> Tensor:
-    """Accelerations of the nodes of one material, by stages: leaves, then up and same per level, then down per level from the top."""
+    """Compute accelerations of one material's nodes by stages: leaves, then up and same per level, then down per level from the top."""
     spec: FeatureSpec = model.spec
     (material,) = spec.materials
     levels = range(1, spec.num_levels + 1)
@@ -26,7 +26,7 @@ def published(model: Any, data: HeteroData) -> Tensor:
     h = {node: torch.zeros(model.hidden_channels, dtype=DOUBLE) for node in x}
 
     def directed(names: tuple[str, ...], towards: str) -> list[tuple[Node, Node, Tensor]]:
-        """(sender, receiver, relation) of the edges with these names whose receiver is of this type."""
+        """Return (sender, receiver, relation) of the edges with these names whose receiver has this type."""
         found = []
         for relation in spec.relations:
             source, name, target = relation
@@ -61,7 +61,7 @@ def published(model: Any, data: HeteroData) -> Tensor:
 
 
 def inputs(spec: FeatureSpec, data: HeteroData, t: str, k: int) -> Tensor:
-    """Columns: material | boundary | virtual | parameter | one-hot type."""
+    """Return input columns: material | boundary | virtual | parameter | one-hot type."""
     kind = "grid" if t.startswith("grid") else t
     (material,) = spec.materials
     widths = {material: spec.node_channels[material], BOUNDARY: spec.node_channels[BOUNDARY]}
@@ -118,7 +118,7 @@ def test_number_of_parameters_is_that_of_the_published_network() -> None:
 
 
 def influence(model: Any, num_levels: int) -> list[bool]:
-    """Which mesh nodes feel a change at node 0."""
+    """Tell which mesh nodes a change at node 0 affects."""
     data = meshes.graph(num_levels)
     data["solid", RADIUS, "solid"].edge_index = torch.empty(2, 0, dtype=torch.int64)
     before = model(data).acceleration["solid"]

@@ -1,4 +1,4 @@
-"""GNS against its equations, written out with concatenation and a loop over directed edges, and against the sizes of published models."""
+"""GNS compared with its equations, written out with concatenation and a loop over directed edges, and with the sizes of published models."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DOUBLE = torch.float64
 
 
 def published(model: Any, data: HeteroData) -> dict[str, Tensor]:
-    """The model, edge by edge. Columns of a node: material | boundary | virtual | parameters; of an edge: one block per relation, then the length."""
+    """Compute the model edge by edge. Columns of a node: material | boundary | virtual | parameters; of an edge: one block per relation, then the length."""
     spec: FeatureSpec = model.spec
     kinds = [*spec.materials, BOUNDARY, *(["grid"] if spec.num_levels else [])]
     h: dict[tuple[str, int], Tensor] = {}
@@ -82,7 +82,7 @@ def test_takes_meshes_as_one_graph() -> None:
 
 
 def sizes_of(dim: int, motion: int, edge: int) -> FeatureSpec:
-    """A graph whose node and edge inputs are as wide as those of a published model: all columns but one are the material's."""
+    """Return a graph whose inputs are as wide as those of a published model; all columns but one are the material's."""
     relations = (("fluid", "radius", "fluid"),)
     return FeatureSpec(
         dim, ("fluid",), {"fluid": motion - 1, BOUNDARY: 1}, {"fluid": 0}, relations, {relations[0]: edge}, {relations[0]: 0}

@@ -1,4 +1,4 @@
-"""GPE against Algorithm 1 of the paper, written out with concatenated MLPs and loops over edges; and the properties that each option promises."""
+"""GPE compared with Algorithm 1 of the paper, written out with concatenated MLPs and loops over edges; and the properties of each option."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DOUBLE = torch.float64
 
 
 def algorithm_1(model: Any, data: HeteroData) -> dict[str, Tensor]:
-    """The paper's pseudo-code, edge by edge, in its own order: encoder, processor with m_ji = −m_ij, decoder. Latent edge states."""
+    """Compute the paper's pseudo-code edge by edge, in its order: encoder, processor with m_ji = −m_ij, decoder; with latent edge states."""
     directed = model.interaction == "directed"
     h: dict[tuple[str, int], Tensor] = {}
     for t in model.spec.node_types:

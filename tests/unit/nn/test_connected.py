@@ -1,4 +1,4 @@
-"""Which nodes edges touch, and the order in which edges come to them."""
+"""Nodes with edges, and the order in which edges reach them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The continuous convolution against its formula, with interpolation by ``grid_sample`` and the map from ball to cube written out point by point."""
+"""The continuous convolution compared with its formula, with interpolation by ``grid_sample`` and the map from ball to cube written point by point."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DOUBLE = torch.float64
 
 
 def ball(num_points: int, dim: int, seed: int = 0) -> Tensor:
-    """Uniform points of the unit ball."""
+    """Draw uniform points of the unit ball."""
     rng = np.random.default_rng(seed)
     directions = rng.normal(size=(num_points, dim))
     radii = rng.uniform(size=(num_points, 1)) ** (1 / dim)
@@ -24,7 +24,7 @@ def ball(num_points: int, dim: int, seed: int = 0) -> Tensor:
 
 
 def cube_point(u: list[float]) -> list[float]:
-    """The map of one point, in scalars."""
+    """Map one point, in scalars."""
     x, y, *z = u
     if z:
         rho, r = math.hypot(x, y), math.sqrt(x * x + y * y + z[0] ** 2)

@@ -1,4 +1,4 @@
-"""Edges a block at a time equal gather, multiply, activate and scatter, and so do their gradients."""
+"""Blocks of edges give the results and gradients of gather, multiply, activate and scatter."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def inputs(num_edges: int, dtype: torch.dtype, is_odd: bool) -> tuple[list[Tensor], Tensor]:
-    """a, b, e, s, W, V, p, C, c; and the edges."""
+    """Return a, b, e, s, W, V, p, C, c; and the edges."""
     generator = torch.Generator().manual_seed(num_edges)
     targets, sources = 7, 7 if is_odd else 5
     shapes = [(targets, WIDTH), (sources, WIDTH), (num_edges, WIDTH), (num_edges, EVEN), (WIDTH, WIDTH), (WIDTH, EVEN)]

@@ -1,4 +1,4 @@
-"""One pass over the edges equals gather, add, activate and scatter, and so do its gradients."""
+"""One pass over the edges gives the results and gradients of gather, add, activate and scatter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two linear maps a block of rows at a time equal PyTorch's, and so do their gradients."""
+"""Two linear maps on blocks of rows give PyTorch's results and gradients."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def inputs(num_rows: int, dtype: torch.dtype) -> list[Tensor]:
-    """x, A, b, p, C, c, r."""
+    """Return x, A, b, p, C, c, r."""
     generator = torch.Generator().manual_seed(num_rows)
     shapes = [(num_rows, IN), (HIDDEN, IN), (HIDDEN,), (1,), (OUT, HIDDEN), (OUT,), (num_rows, OUT)]
     return [torch.randn(*shape, generator=generator, dtype=dtype) for shape in shapes]

@@ -1,4 +1,4 @@
-"""Free islands keep their momentum exactly, everything else is left as it is."""
+"""Free islands keep their momentum exactly, and everything else is unchanged."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_the_rigid_part_of_each_body_is_the_nearest_rigid_motion(dim: int) -> No
 
 
 def rigid_motions(pos: Tensor) -> Tensor:
-    """Shifts along and turns about every axis [node · dim, motion]."""
+    """Return translations along and rotations about every axis [node · dim, motion]."""
     n, dim = pos.shape
     r = pos - pos.mean(dim=0)
     shifts = torch.eye(dim, dtype=r.dtype).repeat(n, 1)

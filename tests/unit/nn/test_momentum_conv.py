@@ -1,4 +1,4 @@
-"""The layer by itself: both sides of a bipartite relation, summation before or after the last linear map, the orientation rule."""
+"""The message-passing layer: both sides of a bipartite relation, summation before or after the last linear map, and the orientation rule."""
 
 from __future__ import annotations
 

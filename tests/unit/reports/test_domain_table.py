@@ -1,4 +1,4 @@
-"""Table 1 from run folders whose numbers are known."""
+"""Table 1 from run folders with known numbers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ BALLISTIC = {"sand": 30e-3, "fem": 8e-3, "fluid": 1.0, "fluid_2d": 1.0, "fem_3d"
 def write_run(
     folder: Path, domain: str, model: str, seed: int, errors: list[float], checksum: str | None = None, **trivial: list[float]
 ) -> None:
-    """Scenes are in turn between trained values and outside; trivial models are given as lists, or ballistic flight is the same in all scenes."""
+    """Write a run; scenes alternate between trained values and others. Trivial models are given as lists, or ballistic flight is the same in all scenes."""
     folder.mkdir(parents=True)
     config = {
         "seed": seed,
@@ -51,7 +51,7 @@ def write_run(
 
 @pytest.fixture(autouse=True)
 def _without_figures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They take a second, and one test looks at them."""
+    """Leave out the figures, which take a second; one test looks at them."""
     if "figures" not in request.node.name:
         monkeypatch.setattr(domain_table, "_figures", lambda *_: None)
 
@@ -237,7 +237,7 @@ def test_seeds_trained_for_other_numbers_of_steps_are_refused_and_the_table_stay
 
 
 def report_sweep_of(folder: Path) -> None:
-    """What a command does when its sweep has ended."""
+    """Report as a command does at the end of its sweep."""
     Report().on_multirun_end(OmegaConf.create({"hydra": {"sweep": {"dir": str(folder)}}}))
 
 

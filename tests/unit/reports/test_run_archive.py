@@ -1,4 +1,4 @@
-"""Runs in two small files: tables made from them are those of the runs."""
+"""Archives of runs in two small files: their tables equal those of the runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables of runs whose numbers are known."""
+"""Tables of runs with known numbers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def runs(tmp_path: Path) -> Path:
 
 
 def cells(folder: Path, interaction: str) -> list[list[str]]:
-    """The row of one variant in each table of ``table.md``, without its intervals."""
+    """Return the row of one variant in each table of ``table.md``, without its intervals."""
     lines = (folder / "table.md").read_text().splitlines()
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith(f"| {interaction} ")]
     return [[" ".join(word for word in cell.split() if word[0] != "[" and word[-1] != "]") for cell in row] for row in rows]

@@ -1,4 +1,4 @@
-"""Tables of trials from run folders whose numbers are known."""
+"""Tables of trials from run folders with known numbers."""
 
 from __future__ import annotations
 

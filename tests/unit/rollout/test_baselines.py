@@ -1,4 +1,4 @@
-"""The trivial simulators: free fall that sticks, and straight motion."""
+"""The trivial baselines: free fall that sticks, and straight motion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""After containment no node is inside a wall or obstacle, velocities still are differences of positions, and every correction is counted."""
+"""After containment no node is inside a wall or obstacle, velocities are still differences of positions, and every correction is counted."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ OBSTACLES = (
     Polygon(((0.5, 0.6), (0.8, 0.65), (0.6, 0.85)), 0.3),
 )
 HOUSES = (Box((0.4, -0.1), (0.6, 0.1), 0.3), Sphere((0.0, 0.5), 0.1, 0.3), Polygon(((0.9, 0.0), (1.1, 0.0), (1.0, 0.3)), 0.3))
-"""Obstacles that stand in a wall."""
+"""Obstacles that intersect a wall."""
 WEDGES = (Sphere((0.2, 0.1), 0.1, 0.3), Sphere((0.41, 0.1), 0.11, 0.3), Box((0.6, 0.0), (0.8, 0.1), 0.3), Box((0.7, 0.1), (0.9, 0.2), 0.3))
 """Obstacles that touch a wall or each other."""
 
 
 def moved(shapes: tuple[Shape, ...], before: np.ndarray, after: np.ndarray, history: int = 0, dim: int = 2, spacing: float = 0.1) -> State:
-    """The state after a step from one set of positions to another."""
+    """Return the state after a step from one set of positions to another."""
     s = scenes.state(len(before), history=history or 1, walls=False, dim=dim)
     vel = (after - before) / DT
     past = None
@@ -129,14 +129,14 @@ def test_the_state_before_is_left_as_it_is() -> None:
 
 @dataclass(frozen=True)
 class Moves:
-    """Every node moves by its velocity."""
+    """Simulator that moves every node by its velocity."""
 
     def step(self, state: State) -> Any:
         return replace(state, pos=state.pos + DT * state.vel)
 
 
 def cave(length: float) -> tuple[Shape, ...]:
-    """Walls, a disc, a box and a polygon in lengths of which the domain's is one."""
+    """Return walls, a disc, a box and a polygon, in units of the domain's size."""
     corners = ((0.5, 0.6), (0.8, 0.65), (0.6, 0.85))
     return (
         *domain_walls(((0.0, length), (0.0, length)), 0.3),

@@ -1,4 +1,4 @@
-"""The loop: the oracle reproduces a trajectory, and a guard keeps the good frames."""
+"""The time loop: the oracle reproduces a trajectory, and a guard keeps the good frames."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ New = Callable[..., Trajectory]
 
 @dataclass(frozen=True)
 class FreeFall:
-    """Constant acceleration; spoils one node of the frame ``spoil_frame``."""
+    """Simulator with constant acceleration; it spoils one node of the frame ``spoil_frame``."""
 
     dt: float
     spoil_frame: int = -1

@@ -1,4 +1,4 @@
-"""What solvers do not resolve."""
+"""Warnings of scenes and parameters that solvers do not resolve."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ BOX = ((0.0, 1.0), (0.0, 1.0))
 
 
 def strip(length, width):
-    """Quadrilaterals [cell, 4] of a strip and the number of its nodes."""
+    """Return quadrilaterals [cell, 4] of a strip and the number of its nodes."""
     number = np.arange((length + 1) * (width + 1)).reshape(length + 1, width + 1)
     return np.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], axis=-1).reshape(-1, 4), number.size
 

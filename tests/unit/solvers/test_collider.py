@@ -14,7 +14,7 @@ BOUNDS = ((0.0, 1.0), (0.0, 1.0))
 
 
 def grid_of(shape: Shape, dim: int) -> DistanceGrid:
-    """The shape in samples."""
+    """Return the shape as a sampled grid."""
     axis = np.linspace(-0.25, 1.25, 49)
     nodes = np.stack(np.meshgrid(*[axis] * dim, indexing="ij"), axis=-1)
     return DistanceGrid.from_values((-0.25,) * dim, axis[1] - axis[0], shape.signed_distance(nodes), shape.friction)
@@ -41,7 +41,7 @@ def axes(name):
 
 
 def prepared(shapes, dim):
-    """The collider on a grid that reaches 3 cells beyond the unit box, and the arguments that place the grid."""
+    """Return the collider on a grid that reaches 3 cells beyond the unit box, and the arguments that place the grid."""
     origin, counts = np.full(dim, -3 / CELLS), (CELLS + 7,) * dim
     return collider(shapes, tuple(origin), 1 / CELLS, counts), counts, origin, float(CELLS)
 

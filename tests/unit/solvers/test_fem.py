@@ -1,4 +1,4 @@
-"""The finite element solver as a ``Simulator``: purity, restart, hostile input, and contact that the physics tests do not reach."""
+"""The finite element solver as a ``Simulator``: purity, restart, hostile input, and contact beyond the physics tests."""
 
 import math
 from dataclasses import fields, replace
@@ -195,7 +195,7 @@ def test_empty_state():
 
 
 def falling_square(shapes, *, velocity=(0.0, -1.0), damping=0.2, low=(0.4, 0.5)):
-    """A square of 0.2 m of two by two quads, with few nodes on its sides."""
+    """Return a square of 0.2 m with two by two quads, which has few nodes on its sides."""
     axis = np.linspace(0.0, 0.2, 3)
     pos = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2) + low
     cells = np.array([[k, k + 3, k + 4, k + 1] for k in (0, 1, 3, 4)])

@@ -1,4 +1,4 @@
-"""The parts of the liquid solver: linear algebra, open fractions, kernels, and what is refused."""
+"""The parts of the liquid solver: linear algebra, open fractions, kernels, and refusals."""
 
 import math
 import subprocess
@@ -22,7 +22,7 @@ from gpe_pl.trajectory.state import State
 
 
 def liquid(dim=2, count=200, boundary=None, seed=0):
-    """Particles anywhere in the middle of the unit box, moving anyhow."""
+    """Return particles at random positions in the middle of the unit box, with random velocities."""
     rng = np.random.default_rng(seed)
     return State(
         rng.uniform(0.3, 0.7, (count, dim)),
@@ -40,7 +40,7 @@ def solver(dim=2, **settings):
 
 
 def sparse(matrix):
-    """Diagonal and strict lower triangle by rows."""
+    """Return diagonal and strict lower triangle by rows."""
     start: list[int] = [0]
     column: list[int] = []
     value: list[float] = []
@@ -53,7 +53,7 @@ def sparse(matrix):
 
 
 def laplacian(side):
-    """Five-point stencil on a square with a fixed edge."""
+    """Return the five-point stencil on a square with a fixed edge."""
     line = 2 * np.eye(side) - np.eye(side, k=1) - np.eye(side, k=-1)
     return np.kron(line, np.eye(side)) + np.kron(np.eye(side), line)
 

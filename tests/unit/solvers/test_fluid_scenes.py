@@ -1,4 +1,4 @@
-"""Scenes of liquid: exact counts, room around every particle, reproducible, and no scene without an error that says why."""
+"""Scenes of liquid: exact counts, free space around every particle, reproducibility, and errors with a reason."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def test_bowl_of_the_paper() -> None:
 
 
 def bodies_of(state: State) -> list[np.ndarray]:
-    """Indices of the particles that share a velocity."""
+    """Return the indices of particles that share a velocity."""
     _, label = np.unique(state.vel, axis=0, return_inverse=True)
     return [np.flatnonzero(label.ravel() == k) for k in range(label.max() + 1)]
 

@@ -1,4 +1,4 @@
-"""The constitutive laws against independent implementations with a singular value decomposition, in 2D and 3D."""
+"""The constitutive laws compared with independent implementations with a singular value decomposition, in 2D and 3D."""
 
 import math
 from typing import Any
@@ -16,7 +16,7 @@ LAM, MU = materials.lame_parameters(3e5, 0.2)
 
 
 def respond(material, value, deformation, plastic=0.0):
-    """Return-mapped F, plastic state, Kirchhoff stress and stiffness of a material with this parameter."""
+    """Return return-mapped F, plastic state, Kirchhoff stress and stiffness of a material with this parameter."""
     dim = len(deformation)
     constants = material.constants(np.array([value]), dim)
     return by_code(material.law, deformation, plastic, constants)
@@ -31,7 +31,7 @@ def by_code(law, deformation, plastic, constants):
 
 
 def reference_sand(deformation, plastic, alpha):
-    """Drucker-Prager return mapping of Klar et al. 2016, written with an SVD."""
+    """Apply the Drucker-Prager return mapping of Klar et al. 2016, written with an SVD."""
     dim = len(deformation)
     u, sigma, vt = np.linalg.svd(deformation)
     strain = np.log(sigma) + plastic / dim
@@ -46,7 +46,7 @@ def reference_sand(deformation, plastic, alpha):
 
 
 def reference_snow(deformation, compaction, snow, xi):
-    """Fixed-corotated snow of Stomakhin et al. 2013, written with an SVD."""
+    """Apply fixed-corotated snow of Stomakhin et al. 2013, written with an SVD."""
     u, sigma, vt = np.linalg.svd(deformation)
     kept = np.clip(sigma, 1 - snow.critical_compression, 1 + snow.critical_stretch)
     lam, mu = materials.lame_parameters(snow.youngs_modulus, snow.poisson_ratio)
@@ -64,7 +64,7 @@ def random_deformation(rng, dim, amplitude=0.4):
 
 
 def special_deformations(dim):
-    """Repeated and nearly repeated principal stretches, with a rotation."""
+    """Return deformations with repeated and nearly repeated principal stretches, and a rotation."""
     turn, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(dim, dim)))
     for stretches in (
         [0.9, 0.9, 0.9],

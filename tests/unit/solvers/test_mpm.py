@@ -23,12 +23,12 @@ def bounds(dim):
 
 
 def closed(dim, *obstacles, friction=0.3):
-    """Walls on all sides and obstacles."""
+    """Return walls on all sides, and obstacles."""
     return Boundary.sample((*domain_walls(bounds(dim), friction), *obstacles), CELL / 2, dim)
 
 
 def scene(dim, material, value=None, speed=0.0):
-    """A small block that flies down at ``speed`` [m/s]."""
+    """Return a small block that moves down at ``speed`` [m/s]."""
     down, size = np.array([0.0] * (dim - 1) + [-1.0]), (0.25, 0.2) if dim == 2 else (0.125, 0.125, 0.125)
     low = (0.4,) * (dim - 1) + (0.1,)
     return block(low, size, CELL / 2, material, value=value, boundary=closed(dim), velocity=speed * down, gravity=9.81 * down)
@@ -161,7 +161,7 @@ def test_extra_arrays_of_the_state_are_carried():
 
 
 def meshed(dim):
-    """A block of elastomer at rest with one cell, and its solver."""
+    """Return a block of elastomer at rest with one cell, and its solver."""
     state = scene(dim, "elastomer")
     cells = np.array([[0, 1, 20, 21]] if dim == 2 else [[0, 1, 20]])
     return MPM(bounds=bounds(dim), grid_spacing=CELL, materials=("elastomer",)), replace(state, rest_pos=state.pos.copy(), cells=cells)
@@ -186,7 +186,7 @@ def test_deformed_mesh_without_internal_state_is_refused(dim):
 
 
 def bounce(dim, modulus, cfl):
-    """Height that the centre of a block rises to again after a fall, over the height of the fall."""
+    """Return the rebound height of a block's centre, over the height of its fall."""
     height, spacing, bottom = 0.1, CELL / 2, np.eye(dim)[-1]
     low = (0.4,) * (dim - 1) + (height,)
     state = block(
@@ -208,7 +208,7 @@ def test_bounce_does_not_depend_on_the_time_step(modulus):
 
 
 def settled_height(hardening, cfl):
-    """Of the centre of a block of snow [m], with one particle per cell, after a fall."""
+    """Return the height [m] of the centre of a snow block with one particle per cell, after a fall."""
     state = block((0.3, 0.25), (0.25, 0.25), CELL, "snow", value=hardening, velocity=(0.0, -1.0), boundary=closed(2), gravity=(0.0, -9.81))
     after = run(MPM(bounds=bounds(2), grid_spacing=CELL, materials=("snow",), cfl=cfl), state, 120)
     return after.mass @ after.pos[:, 1] / after.mass.sum()
@@ -238,7 +238,7 @@ def test_viscosity_does_not_depend_on_the_time_step():
 
 
 def thin(name, thickness):
-    """An obstacle of one kind with a smallest thickness, around the middle of a grid cell."""
+    """Return an obstacle of one kind with a smallest thickness, around the middle of a grid cell."""
     x, y, half = 0.5 + CELL / 2, 0.5 + CELL / 2, thickness / 2
     return {
         "flat box": lambda: Box((-0.5, y - half), (1.5, y + half), 0.3),

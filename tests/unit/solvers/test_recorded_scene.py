@@ -28,7 +28,7 @@ def packed(array: Any) -> dict[bytes, Any]:
 
 
 def frame(**changes: Any) -> dict[str, Any]:
-    """A slope y = −SLOPE x with 8 particles of spacing 0.1 m above it."""
+    """Return a slope y = −SLOPE x with 8 particles of spacing 0.1 m above it."""
     x, z = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 81), np.linspace(-0.5, 0.5, 41)))
     normal = np.array([SLOPE, 1.0, 0.0]) / math.hypot(SLOPE, 1)
     pos = np.stack(np.unravel_index(np.arange(8), (2, 2, 2)), axis=-1) * 0.1 + [-0.8, 0.4, 0.0]

@@ -1,4 +1,4 @@
-"""A scene at another resolution has the same mass and momentum in the same place, and remembers its nodes."""
+"""A scene at another resolution has the same mass and momentum at the same place, and maps back to its original nodes."""
 
 from __future__ import annotations
 

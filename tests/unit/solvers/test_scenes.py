@@ -1,4 +1,4 @@
-"""Random scenes: pure, exact in number, free of overlap, and without order in the labels."""
+"""Random scenes: reproducible, with an exact number of particles, free of overlap, and with random node order."""
 
 import itertools
 import math

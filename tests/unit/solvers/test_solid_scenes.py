@@ -1,4 +1,4 @@
-"""Scenes of one meshed solid: pure functions of the seed, in free space, with what the finite element solver needs."""
+"""Scenes of one meshed solid: pure functions of the seed, in free space, and valid for the finite element solver."""
 
 import functools
 import math

@@ -1,4 +1,4 @@
-"""Compiled code has a place on systems on which nearly nothing can be written."""
+"""Compiled code finds a cache folder also on systems where nearly nothing is writable."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def unwritable(monkeypatch: pytest.MonkeyPatch, *places: Path) -> None:
-    """As permissions make them, which do not bind root."""
+    """Make a folder unwritable, also for root, whom permissions do not restrict."""
     access = os.access
     monkeypatch.setattr(
         os, "access", lambda path, mode: not any(Path(path).is_relative_to(place) for place in places) and access(path, mode)
@@ -41,7 +41,7 @@ def unwritable(monkeypatch: pytest.MonkeyPatch, *places: Path) -> None:
 
 
 def compiled() -> Path:
-    """Where a process that starts now keeps compiled functions."""
+    """Return the folder of compiled functions of a newly started process."""
     caches.prepare()
     return Path(os.environ["NUMBA_CACHE_DIR"])
 

@@ -1,4 +1,4 @@
-"""Ctrl-C before a command has begun."""
+"""Ctrl-C before a command has started."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Full disks: what is written ends in one typed error, nothing half-written stays, and no library crashes."""
+"""Full disks: a write ends in one typed error, nothing partial stays, and no library crashes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 
 def limited(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
-    """As if the disk had so many bytes left, of which a last write takes as many as fit."""
+    """Simulate a disk with this number of free bytes; the last write fills it."""
     write, left = os.write, [room]
 
     def limited_write(file: int, data: memoryview) -> int:

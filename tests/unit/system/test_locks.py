@@ -1,4 +1,4 @@
-"""One command at a time writes to a folder."""
+"""Only one command at a time writes to a folder."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ with held(Path(sys.argv[1])):
 
 @contextmanager
 def held_elsewhere(folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """By another process, until its standard input closes."""
+    """Let another process lock a folder until its standard input closes."""
     command = [sys.executable, "-c", OTHER, str(folder)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment) as process:

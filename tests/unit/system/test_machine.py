@@ -1,4 +1,4 @@
-"""Rates are rates, and the memory of a function is its own."""
+"""Rates of the machine are plausible, and the measured memory of a function is its own."""
 
 from __future__ import annotations
 

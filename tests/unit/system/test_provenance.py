@@ -1,4 +1,4 @@
-"""What commands note about how results were made."""
+"""Provenance that commands store about their results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Alternatives are timed in turns, and apart: each in a process of its own."""
+"""Alternatives are timed in turns, each in a separate process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gpe_pl.system.timing import apart, paired_times
 
 
 def noting(file: Path) -> Callable[[], None]:
-    """A function that notes the process in which it runs."""
+    """Return a function that records the process in which it runs."""
     with file.open("a") as handle:
         handle.write(f"made {os.getpid()}\n")
 

@@ -1,4 +1,4 @@
-"""Processes that share work: Ctrl-C reaches them all, and is answered once."""
+"""Processes that share work: Ctrl-C reaches all of them, and is handled once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A budget of minutes becomes a number of steps once, and the same number ever after."""
+"""A budget of minutes becomes a number of steps once, and keeps that number."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def test_a_step_is_measured_again_where_its_time_is_another(overrides: list[str]
 
 @pytest.fixture
 def measurable(tiny_data: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[TrainingModule, WindowDataset]:
-    """A module and its windows, of which few steps are measured."""
+    """Return a module and its windows, of which few steps are measured."""
     monkeypatch.setattr(budget, "WARM_UP_STEPS", 1)
     monkeypatch.setattr(budget, "MEASURED_STEPS", 2)
     stored = open_split(tiny_data / "sand" / "tiny", "train")

@@ -1,4 +1,4 @@
-"""What a run keeps: the best checkpoint wherever its folder lies, one when it is interrupted and every few minutes. No file says where files go."""
+"""Checkpoints of a run: the best one, found after the folder moves, and one at interruptions and every few minutes. No file stores output paths."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ STEPS, INTERVAL = 9, 3
 
 
 class Killed(BaseException):
-    """Stands for the end of the process."""
+    """Exception that stands for the end of the process."""
 
 
 @pytest.fixture
 def data(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> Path:
-    """Trajectories that can be learned from."""
+    """Make trajectories for training."""
     root = tmp_path / "grains"
     for split, seeds in (("train", (0, 1)), ("val", (2,))):
         made = [new_trajectory(seed, num_frames=8, num_nodes=12, split=split) for seed in seeds]
@@ -59,7 +59,7 @@ def data(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> Path:
 
 @pytest.fixture
 def scores(monkeypatch: pytest.MonkeyPatch) -> dict[int, float]:
-    """What the validation after each step finds; later ones are worse."""
+    """Set the result of the validation after each step; later ones are worse."""
     found = {3: 1.0, 6: 2.0, 9: 3.0}
     steps: list[int] = []
     monkeypatch.setattr(RolloutValidation, "_mse", lambda *_: found[steps[-1]])
@@ -87,7 +87,7 @@ def _signals() -> Iterator[None]:
 def trained(
     root: Path, run: Path, push_share: float = 0.0, minutes: float = math.inf, at: dict[int, Callable[[], None]] | None = None
 ) -> Path:
-    """Train in a folder, or go on; ``at`` does something before steps."""
+    """Train in a folder, or resume; ``at`` acts before steps."""
 
     class Disturbed(TrainingModule):
         def training_step(self, batch: Any, batch_idx: int) -> torch.Tensor | None:
@@ -123,7 +123,7 @@ def stored(run: Path, name: str = "last") -> dict[str, Any]:
 
 
 def assert_like(run: Path, whole: Path) -> None:
-    """Both checkpoints hold the same, and know the same of the best one."""
+    """Check that two checkpoints have the same content, and the same data about the best one."""
     for name in ("last", "best"):
         assert_same_checkpoint(stored(run, name), stored(whole, name))
     assert stored(run)["callbacks"]["Checkpoints"] == stored(whole)["callbacks"]["Checkpoints"]

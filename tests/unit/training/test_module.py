@@ -1,4 +1,4 @@
-"""Loss, learning-rate schedules and weight averaging against their formulas."""
+"""Loss, learning-rate schedules and weight averaging compared with their formulas."""
 
 from __future__ import annotations
 
@@ -169,7 +169,7 @@ def update(callback: WarmAverage, model: Network, step: int) -> None:
 
 
 class Network(L.LightningModule):
-    """Weights, a constant of another precision, and an integer."""
+    """Module with weights, a constant of another precision, and an integer."""
 
     def __init__(self) -> None:
         super().__init__()

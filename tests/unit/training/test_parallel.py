@@ -1,4 +1,4 @@
-"""Several processes train like one: the loss is a mean over all nodes, a type that one of them lacks does no harm, and their weights stay equal."""
+"""Several processes train like one: the loss is a mean over all nodes, a type may be absent in one process, and weights stay equal."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_gradients_are_summed_and_what_a_rank_lacks_is_zero(tmp_path: Path) -> N
 
 
 def graph(num_nodes: int, present: tuple[str, ...], seed: int) -> HeteroData:
-    """A graph of both materials' types with nodes of some."""
+    """Return a graph with the types of both materials and nodes of some."""
     state = scenes.state(num_nodes, present, seed=seed)
     if present != MATERIALS:  # a column per parameter of all materials
         names = param_names(MATERIALS)
@@ -110,7 +110,7 @@ def test_the_loss_is_the_mean_over_the_nodes_of_all_ranks(tmp_path: Path) -> Non
 
 @pytest.fixture
 def mixed(tmp_path: Path, new_trajectory: Callable[..., Trajectory]) -> Path:
-    """Trajectories of sand with snow and of sand alone, of 8 to 30 nodes."""
+    """Make trajectories of sand with snow and of sand alone, of 8 to 30 nodes."""
     names = param_names(MATERIALS)
 
     def trajectory(seed: int, num_nodes: int, with_snow: bool, split: str) -> Trajectory:
@@ -136,7 +136,7 @@ SETTINGS = TrainingSettings(
 
 
 class Recorded(TrainingModule):
-    """Keeps what each step was given: windows and the number of nodes of each material."""
+    """Module that records the input of each step: windows and the number of nodes of each material."""
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
@@ -156,7 +156,7 @@ class Recorded(TrainingModule):
 
 
 def trained(root: Path, run: Path, rank: int, num_ranks: int, size: BatchSize, num_steps: int = 20, late: bool = False) -> dict[str, Any]:
-    """Weights, and what each step of this rank was given."""
+    """Return the weights and the input of each step of this rank."""
     kind: Sampling = "activity" if late else "uniform"
     data = TrajectoryDataModule(root, GraphConfig(history=2), Noise(0.0, 0.1), size, seed=1, sampling=kind)
     torch.manual_seed(5 + rank)  # ranks start from the weights of the first

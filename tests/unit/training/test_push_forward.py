@@ -1,4 +1,4 @@
-"""Where a simulator has come to by itself, training goes on; what it did on the way gets no gradient."""
+"""Push-forward: training continues from states of the simulator's unroll, and the unroll gets no gradient."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A run's folder: whose it is, and whose model another run may take."""
+"""The folder of a run: its owner, and models that another run may use."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A scene in other units of length and time trains, is validated and is evaluated as it is in metres and seconds."""
+"""A scene in other units of length and time is trained, validated and evaluated as in metres and seconds."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from tests import scenes
 NUM_FRAMES, FRAME_DT, SPACING = 16, 0.01, 0.1
 STEPS, INTERVAL = 12, 4
 UNIT_OF = {**UNITS, "skipping_mse": "m^2"}
-"""Metrics without an entry have no unit."""
+"""Units of metrics; those without an entry have no unit."""
 
 
 def scene(seed: int, length: float, time: float, dim: int = 2, mesh: bool = False) -> Trajectory:
@@ -84,7 +84,7 @@ def model(name: str, spec: Any) -> torch.nn.Module:
 
 
 class Recorded(TrainingModule):
-    """Keeps the losses of training."""
+    """Callback that records the losses of training."""
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
         super().__init__(*arguments, **settings)
@@ -98,7 +98,7 @@ class Recorded(TrainingModule):
 
 
 def data(root: Path, length: float, time: float, dim: int = 2, mesh: bool = False) -> TrajectoryDataModule:
-    """Two scenes for each split."""
+    """Make two scenes for each split."""
     train, val, test = ([scene(first + k, length, time, dim, mesh) for k in range(2)] for first in (0, 2, 4))
     report = save_dataset(root, "scaled", train=train, val=val, test=test)
     config = GraphConfig(history=2, islands=True, mesh=mesh)
@@ -115,7 +115,7 @@ def new_module(data: TrajectoryDataModule, name: str) -> Recorded:
 
 
 def trained(root: Path, length: float, time: float) -> tuple[list[float], int, list[Row]]:
-    """Losses of a short training, the step of its best checkpoint, and what this was evaluated to."""
+    """Return losses of a short training, the step of its best checkpoint, and the result of its evaluation."""
     datamodule = data(root, length, time)
     module = new_module(datamodule, "GPE")
     settings = TrainingSettings(
@@ -144,7 +144,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def in_units(metric: str, length: float, time: float) -> float:
-    """What a number of this metric is multiplied by."""
+    """Return the factor that converts a metric to other units."""
     powers = {name: int(power or 1) for name, power in re.findall(r"(?<!/)\b([ms])(?:\^(\d))?", UNIT_OF.get(metric, "1").split("/")[0])}
     below = 1 if "/s" in UNIT_OF.get(metric, "1") else 0
     return length ** powers.get("m", 0) / time**below
@@ -169,7 +169,7 @@ def test_powers_of_two_change_nothing_but_the_units(length: int, time: int, tmp_
 
 
 def losses(data: TrajectoryDataModule, name: str, num_steps: int) -> list[float]:
-    """Of the first steps of training."""
+    """Return the losses of the first steps of training."""
     module = new_module(data, name)
     optimizer = torch.optim.Adam(module.parameters(), lr=1e-3)
     found = []

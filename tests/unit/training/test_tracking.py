@@ -1,4 +1,4 @@
-"""Runs in W&B: where they go, and that a user's wish and a missing network are respected."""
+"""Runs in W&B: their location, the user's settings, and a missing network."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gpe_pl.training.tracking import LoggerSettings, TrackingError, publish, run
 
 
 class Recorder(Logger):
-    """Stands for ``WandbLogger``; in modes that fail it ends with ``error``."""
+    """Stand-in for ``WandbLogger``; in modes that fail it ends with ``error``."""
 
     name, version = "recorder", 0
     modes: ClassVar[list[str]] = []

@@ -1,4 +1,4 @@
-"""Own arrays become trajectories, or an error that names argument, frame and node; and as data sets they are written once."""
+"""A user's arrays become trajectories, or give an error that names argument, frame and node; data sets of them are written once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cells with fewer corners than others: what is averaged over them, and which rows are no cells."""
+"""Cells with fewer corners than others: averages over them, and rows that are not cells."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_a_mean_counts_every_corner_once(kind: Callable[[np.ndarray], Any]) -> N
 
 
 def padded(state: State) -> State:
-    """The same triangles as they are stored beside quadrilaterals."""
+    """Return the triangles in the form in which they are stored beside quadrilaterals."""
     assert state.cells is not None
     return replace(state, cells=torch.cat([state.cells, state.cells[:, -1:]], dim=1))
 

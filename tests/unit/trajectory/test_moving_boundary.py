@@ -1,4 +1,4 @@
-"""Walls that move in a prescribed way: stored, learned from, rolled out and shown where they are in each frame."""
+"""Walls with prescribed motion are stored, learned from, rolled out, and shown at their position in each frame."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ DT, NUM_FRAMES, SPACING = 0.01, 12, 0.05
 
 
 def paddle(turn: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
-    """A row of nodes that turns about its middle and rises: positions [frame, node, 2] and its normals of the first frame."""
+    """Return a row of nodes that rotates about its middle and rises: positions [frame, node, 2] and normals of the first frame."""
     row, time = np.stack([np.linspace(-0.15, 0.15, 7), np.zeros(7)], axis=1), DT * np.arange(NUM_FRAMES)
     angle = turn * time
     rotation = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]).transpose(2, 0, 1)
@@ -44,7 +44,7 @@ def paddle(turn: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def scene(seed: int = 0) -> Trajectory:
-    """Drops that fall onto a paddle beside a floor that stands still."""
+    """Return drops that fall onto a paddle beside a floor at rest."""
     rng, time = np.random.default_rng(seed), DT * np.arange(NUM_FRAMES)[:, None, None]
     block = SPACING * np.stack(np.meshgrid(np.arange(6), np.arange(4)), axis=-1).reshape(-1, 2) + [0.37, 0.4]
     pos = block + rng.uniform(-0.3, 0.3, 2) * time + 0.5 * np.array([0, -9.81]) * time**2 + 0.001 * rng.normal(size=block.shape)

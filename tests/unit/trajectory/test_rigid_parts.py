@@ -1,4 +1,4 @@
-"""Normals of moving boundaries turn with the rigid part that each node belongs to, which its motion shows, and with nothing else."""
+"""Normals of moving boundaries rotate with the rigid part of each node, which is found from the motion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ UP = np.tile([0.0, 1.0], (len(FLOOR), 1))
 
 
 def rotation(angle: np.ndarray, dim: int = 2) -> np.ndarray:
-    """About the origin or the z axis [..., dim, dim]."""
+    """Return rotations about the origin or the z axis [..., dim, dim]."""
     turn = np.zeros((*np.shape(angle), dim, dim))
     turn[..., range(dim), range(dim)] = 1.0
     turn[..., 0, 0] = turn[..., 1, 1] = np.cos(angle)
@@ -30,7 +30,7 @@ def still(nodes: np.ndarray) -> np.ndarray:
 
 
 def turned(nodes: np.ndarray, turn: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Positions [frame, node, dim] of nodes that turn about a place."""
+    """Return positions [frame, node, dim] of nodes that rotate about a point."""
     return centre + np.einsum("fde,ne->fnd", turn, nodes - centre)
 
 

@@ -1,4 +1,4 @@
-"""The store: what is written comes back, and damage is noticed."""
+"""The store: written data read back unchanged, and damage is noticed."""
 
 from __future__ import annotations
 

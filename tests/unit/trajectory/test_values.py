@@ -1,4 +1,4 @@
-"""Values that break the rules of the schema are found wherever arrays come in: from the store, from memory, and in the state that a rollout starts from."""
+"""Values that break the rules of the schema are found in the store, in arrays from memory, and in the initial state of a rollout."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ NAN, INF = float("nan"), float("inf")
 
 @pytest.fixture
 def trajectory(trajectory: Trajectory) -> Trajectory:
-    """Without jumps, which training leaves out."""
+    """Return a trajectory without jumps, which training would leave out."""
     return replace(trajectory, pos=trajectory.pos[:1] + 0.01 * (trajectory.pos - trajectory.pos[:1]))
 
 
 def with_value(trajectory: Trajectory, key: str, index: Any, value: float) -> Trajectory:
-    """The trajectory with a value put into one of its stored fields."""
+    """Return the trajectory with a value in one of its stored fields."""
     name = key.removeprefix("boundary_")
     owner: Any = trajectory.boundary if name != key else trajectory
     array = np.array(getattr(owner, name))

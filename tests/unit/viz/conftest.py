@@ -61,7 +61,7 @@ def stopped(prediction) -> Trajectory:
 
 
 def block(dim: int, side: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [node, dim] of a grid, and cells: quadrilaterals, or six tetrahedra in each cube (Kuhn 1960)."""
+    """Return positions [node, dim] of a grid, and cells: quadrilaterals, or six tetrahedra in each cube (Kuhn 1960)."""
     grid = np.stack(np.meshgrid(*[np.arange(side + 1)] * dim, indexing="ij"), axis=-1).reshape(-1, dim)
     number = {tuple(p): k for k, p in enumerate(grid.tolist())}
     paths = [[(0, 0), (1, 0), (1, 1), (0, 1)]]
@@ -80,7 +80,7 @@ def mesh(dim) -> Trajectory:
 
 
 def falling_mesh(dim: int) -> Trajectory:
-    """A block that falls, with stress that grows, beside two particles of no cell."""
+    """Return a falling block with growing stress, and two particles without cells."""
     base = falling(dim)
     rest, cells = block(dim)
     rest = np.concatenate([0.4 + 0.2 * rest, np.full((1, dim), 0.8), np.full((1, dim), 0.85)])

@@ -1,4 +1,4 @@
-"""Pictures say whether they show ground truth or a prediction, and of which material with which parameter."""
+"""Pictures state whether they show ground truth or a prediction, and the material and its parameter."""
 
 import html
 import json
@@ -41,7 +41,7 @@ def predicted() -> Trajectory:
 
 
 def mixed() -> Trajectory:
-    """Half of it sand, half an elastomer whose stiffness varies."""
+    """Return a scene that is half sand, half an elastomer of varying stiffness."""
     t = truth()
     types, params = t.node_type.copy(), np.full((t.num_nodes, 2), np.nan, np.float32)
     types[::2] = node_code("elastomer")
@@ -55,7 +55,7 @@ def texts(figure: Figure) -> list[str]:
 
 
 def page(path: Path) -> tuple[str, str, list[str]]:
-    """Title and heading of a viewer, and the names of what it shows."""
+    """Return title and heading of a viewer, and the names of its trajectories."""
     text = path.read_text(encoding="utf-8")
     title, heading = (html.unescape(re.sub("<[^>]*>", "", re.findall(f"<{tag}>(.*?)</{tag}>", text)[0])) for tag in ("title", "h1"))
     scene = json.loads(re.findall(r'id="scene">(.*?)</script>', text)[0])

@@ -12,7 +12,7 @@ def pixels(figure) -> np.ndarray:
 
 
 def colourful(image) -> np.ndarray:
-    """Where a picture shows neither paper nor grey lines: its particles."""
+    """Return the pixels of a picture that show particles, not paper or grey lines."""
     return np.ptp(image, axis=-1) > 20
 
 

@@ -15,7 +15,7 @@ from gpe_pl.viz.panel import HIDDEN, Panel, drawn_faces, outline
 
 
 class Diamond:
-    """A shape that no module has heard of."""
+    """Shape of a kind unknown to all modules."""
 
     kind: ClassVar[str] = "diamond"
     friction, restitution, extent = 0.3, 0.0, 0.5
@@ -51,7 +51,7 @@ def pixels(panel) -> np.ndarray:
 
 
 def at(panel, image, point) -> np.ndarray:
-    """Colour of the pixel that shows a point of the scene."""
+    """Return the colour of the pixel that shows a point of the scene."""
     column, row = panel.axes.transData.transform(panel.camera.project(np.asarray(point, float))[0])
     return image[image.shape[0] - 1 - int(row), int(column)]
 

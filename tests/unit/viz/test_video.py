@@ -17,7 +17,7 @@ def frames_of(path) -> list[np.ndarray]:
 
 
 def particles(image) -> np.ndarray:
-    """Row and column of the coloured pixels."""
+    """Return row and column of the coloured pixels."""
     return np.argwhere(np.ptp(image, axis=-1) > 40)
 
 

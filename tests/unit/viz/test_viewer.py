@@ -13,7 +13,7 @@ from gpe_pl.viz.viewer import FASTEST, ViewerError, write_viewer
 
 
 class Page:
-    """What a written page holds, read back as its script reads it."""
+    """Content of a written page, read as its script reads it."""
 
     def __init__(self, path) -> None:
         self.text = path.read_text()
@@ -30,7 +30,7 @@ class Page:
                 self.arrays[name] = np.frombuffer(data, kind)
 
     def positions(self, number: int) -> np.ndarray:
-        """[frame, node, dim] in m; NaN where a node is not shown."""
+        """Return positions [frame, node, dim] in m; NaN where a node is not shown."""
         dim = self.scene["dim"]
         level = self.arrays[f"t{number}_pos"].reshape(-1, self.scene["nodes"], dim).astype(float)
         low, extent = (np.array(self.scene["position"][key][:dim]) for key in ("low", "extent"))

@@ -1,4 +1,4 @@
-"""Faults in small numbers: what is wrong is refused, and the judges see it when it is not."""
+"""The faults suite in small numbers: faults are refused, and the suite notices when they are not."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def spec() -> DatasetSpec:
 
 
 def bad(faults: list[Fault], folder: Path) -> list[tuple[str, str, Verdict]]:
-    """Faults of which nothing good came."""
+    """Return the faults with a bad outcome."""
     found = []
     for k, fault in enumerate(faults):
         own = folder / str(k)
@@ -222,7 +222,7 @@ def test_what_takes_longer_than_it_may_hangs(tmp_path: Path, monkeypatch: pytest
 
 @dataclass
 class Ends:
-    """A command that has ended already."""
+    """A command that has already ended."""
 
     exitcode: int
 
@@ -237,7 +237,7 @@ HELD = "error: runs/fit: another command writes to it (process 7 on here, since 
 
 
 def ends_at_once(monkeypatch: pytest.MonkeyPatch, codes: tuple[int, ...], said: str, found: dict[str, str]) -> None:
-    """Commands end with these codes, say this where it is not 0, and leave files with these digests."""
+    """Let commands end with these codes, print this if the code is not 0, and leave files with these digests."""
     ended = iter(codes)
 
     def start(module: str, arguments: list[str], output: Path) -> Ends:

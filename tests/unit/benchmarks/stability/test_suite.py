@@ -1,4 +1,4 @@
-"""The stress tests: what holds passes, what does not fails, what crashes has failed, and everything reaches the table."""
+"""The stress tests: they pass and fail as they should, a crash counts as a failure, and all results reach the table."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def scenes(spec: DatasetSpec) -> list[Trajectory]:
 
 
 def subject(spec: DatasetSpec, scenes: list[Trajectory], **settings: str) -> Subject:
-    """An untrained model."""
+    """Return an untrained model as a subject."""
     torch.manual_seed(0)
     build = GraphBuilder(GraphConfig(history=2, islands=True), scenes[0].metadata)
     simulator = LearnedSimulator(GPE(build.spec, num_message_passing_steps=2, hidden_channels=8, **settings), build).eval()  # type: ignore[arg-type]

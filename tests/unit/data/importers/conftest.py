@@ -1,4 +1,4 @@
-"""Four good records, for tests to damage."""
+"""Four valid records, which tests damage."""
 
 from __future__ import annotations
 
@@ -13,6 +13,6 @@ from tests.sources import motion
 
 @pytest.fixture
 def records(tmp_path: Path) -> list[bytes]:
-    """Four training records of water, and the description beside them."""
+    """Write four training records of water and the description beside them."""
     sources.gns_metadata(tmp_path / "raw", motion())
     return [sources.record(sources.gns_record(motion(seed=k), WATER, k)) for k in range(4)]

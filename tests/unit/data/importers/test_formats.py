@@ -1,4 +1,4 @@
-"""Every format comes back as it was written, by writers that know the format's description only."""
+"""Every format is read back as written, with writers that follow only the description of the format."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CANYON = Path(__file__).resolve().parents[5] / "shared" / "data" / "canyon.msgpa
 
 
 def imported(tmp_path: Path, source: Path, format: Any, **settings: Any) -> tuple[Report, dict[str, list[Trajectory]]]:
-    """The report and the trajectories by split of a conversion without violations."""
+    """Return the report, and the trajectories by split, of a conversion without violations."""
     report = import_dataset(tmp_path / "data", ImportSettings(format, str(source), "set", **settings))
     folder = tmp_path / "data" / "set" / "imported"
     assert not [str(v) for v in validate([folder]).violations]
@@ -45,7 +45,7 @@ def assert_stored(trajectory: Trajectory, pos: np.ndarray, dt: float = DT) -> No
 
 @pytest.fixture
 def particles() -> list[tuple[np.ndarray, np.ndarray]]:
-    """Three scenes with sand, water, goop and boundary nodes that are still; the second lacks goop."""
+    """Write three scenes with sand, water, goop and boundary nodes at rest; the second lacks goop."""
     scenes = []
     for seed in range(3):
         pos, types = motion(seed=seed), np.array([6] * 10 + [5] * 5 + [3] * 2 + [6 if seed == 1 else 7] * 3)
@@ -148,7 +148,7 @@ def test_what_a_number_means_can_be_said(tmp_path: Path) -> None:
 
 
 def drift(seed: int = 0, dim: int = 2, num_nodes: int = 20) -> np.ndarray:
-    """Positions that leave the unit box through its sides and come in again."""
+    """Return positions that leave the unit box through its sides and enter again."""
     pos = motion(seed=seed, dim=dim, num_nodes=num_nodes) + 0.09 * np.arange(10, dtype=np.float32)[:, None, None]
     return pos % np.float32(1.0)
 
@@ -381,7 +381,7 @@ def test_dpinet_without_a_bath(tmp_path: Path) -> None:
 
 
 def falling_blobs(gravity: float, dt: float, seed: int = 0) -> np.ndarray:
-    """Positions [frame, node, 3] of two blobs above the ground that fall with a gravity of their own, and of a puddle on it that moves to and fro."""
+    """Return positions [frame, node, 3] of two blobs that fall with a given gravity, and of a puddle below them that moves to and fro."""
     rng = np.random.default_rng(seed)
     places = np.array([[0.0, 1.0, 0.0], [2.0, 1.5, 0.0], [1.0, 0.06, 2.0]])
     lattice = SPACING * np.stack(np.meshgrid(*[np.arange(3)] * 3), axis=-1).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Whatever is wrong with a source: it is refused with the reason, in the trajectory and frame that it concerns, and nothing half done stays behind."""
+"""Invalid sources are refused with the reason, for the trajectory and frame that it concerns, and nothing partial stays behind."""
 
 from __future__ import annotations
 

@@ -100,7 +100,7 @@ def test_damage_within_an_array(tmp_path: Path) -> None:
 
 
 class Payload:
-    """Creates a file when it is unpickled."""
+    """Object that creates a file when it is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -134,12 +134,12 @@ def test_pickles_in_own_arrays_are_never_opened(tmp_path: Path) -> None:
 
 
 def headed(text: str) -> bytes:
-    """An array file with a header of its own and four bytes of data."""
+    """Return an array file with a given header and four bytes of data."""
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text.encode() + b"\0" * 4
 
 
 def npy(shape: tuple[int, ...], data: bytes, dtype: str = "<f4") -> bytes:
-    """An array file that claims a shape and has other data."""
+    """Return an array file that claims a shape and has other data."""
     header = repr({"descr": dtype, "fortran_order": False, "shape": shape}).encode()
     header += b" " * (-(len(header) + 11) % 64) + b"\n"
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + data

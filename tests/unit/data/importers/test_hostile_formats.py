@@ -148,7 +148,7 @@ def test_a_scene_that_cannot_be_used(tmp_path: Path, content: Any, message: str)
 
 
 def of_two_parts(pos: np.ndarray, names: tuple[str, str], **static: np.ndarray) -> dict[str, list[dict[str, Any]]]:
-    """Frames by name of file, without numbers, so that only the files say what follows what; ``static`` goes into the first of each."""
+    """Return frames by name of file, without numbers, so that only the files give the order; the first of each part contains ``static``."""
     vel, half = np.gradient(pos, 0.02, axis=0), len(pos) // 2
     parts = [sources.dmcf_frames(x, v, 0, **static) for x, v in ((pos[:half], vel[:half]), (pos[half:], vel[half:]))]
     return {name: [{k: v for k, v in frame.items() if k != "frame_id"} for frame in part] for name, part in zip(names, parts, strict=True)}

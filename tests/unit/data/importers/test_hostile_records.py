@@ -1,4 +1,4 @@
-"""Damaged records and descriptions beside them: refused with the reason, and nothing half done stays behind."""
+"""Damaged records and descriptions are refused with the reason, and nothing partial stays behind."""
 
 from __future__ import annotations
 

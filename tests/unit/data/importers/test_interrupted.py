@@ -1,4 +1,4 @@
-"""Conversions that end before they are done leave nothing, and the next one does all of it."""
+"""Interrupted conversions leave nothing, and the next conversion starts from the beginning."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ OFFSET = np.array([5000.0, -70000.0])
 
 
 def swinging(seed: int = 0, num_frames: int = 12) -> np.ndarray:
-    """Positions [frame, node, dim] in double precision of a lattice whose nodes swing by millimetres."""
+    """Return positions [frame, node, dim] in double precision of a lattice whose nodes swing by millimetres."""
     rng = np.random.default_rng(seed)
     lattice = 0.3 + SPACING * np.stack(np.meshgrid(np.arange(6), np.arange(6)), axis=-1).reshape(-1, 2)
     phase = rng.uniform(0, 2 * np.pi, lattice.shape)
@@ -42,7 +42,7 @@ def converted(tmp_path: Path, name: str, arrays: list[np.ndarray], **changes: An
 
 
 def stored(report: Report) -> list[Trajectory]:
-    """In the source's order: what is missing is taken from the end of train, ``val`` first."""
+    """Return the stored trajectories in the source's order; missing splits come from the end of train, ``val`` first."""
     return [t for split in ("train", "test", "val") for t in iter_trajectories(Path(report.folder), split)]
 
 

@@ -1,4 +1,4 @@
-"""Headers of arrays that others wrote are text, and can hold anything."""
+"""Headers of foreign arrays are text with any content."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_file_of_very_many_groups_is_not_listed(tmp_path: Path, monkeypatch: p
 
 
 def packed(path: Path, name: str, shape: str, size: int, dtype: str = "<f4") -> None:
-    """An archive of one array of zeros, which packs to a thousandth."""
+    """Return an archive of one array of zeros, compressed to a thousandth."""
     header = f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}}}".encode()
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open(f"{name}.npy", "w", force_zip64=True) as file:
         file.write(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header)
