@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpe_pl.graphs.features import history_of
 from gpe_pl.graphs.islands import islands_within
 from gpe_pl.graphs.multiscale import cell_edges
 from gpe_pl.graphs.neighbors import radius_between
@@ -73,7 +72,7 @@ class Sleeping(_Batched):
 
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
         plans = [self._awake_and_seen(state) for state in states]
-        parts = [_part(state, seen) for state, (_, seen) in zip(states, plans, strict=True)]
+        parts = [state.take(seen) for state, (_, seen) in zip(states, plans, strict=True)]
         stepped = iter(step_all(self.simulator, [part for part in parts if part.num_nodes]))
         results: list[State | SimulationError] = []
         for state, part, (awake, seen) in zip(states, parts, plans, strict=True):
@@ -123,17 +122,14 @@ class Sleeping(_Batched):
         is_slow = vel.norm(dim=1) < skips.rest_step_spacings * unit
         calm = is_slow & ((vel - state.vel).norm(dim=1) < skips.rest_step_change_spacings * unit)
         count = torch.where(awake, torch.where(calm, _rest_of(state) + 1, 0), _rest_of(state))
-        return replace(
-            state,
-            pos=pos,
-            vel=vel,
-            velocity_history=torch.cat([history_of(state)[:, 1:], vel[:, None]], dim=1),
-            time=state.time + self.dt,
+        return state.later(
+            self.dt,
+            pos,
+            vel,
             stress=_combined_stress(state, after, awake, moved),
             num_asleep=int((~awake).sum()),
             lost_impulse=float((state.mass * state.vel.norm(dim=1))[~awake].sum()),
             internal=_Rest(count),
-            boundary=state.boundary.at(1),
         )
 
 
@@ -148,16 +144,6 @@ def _in_the_same_island(chosen: np.ndarray, label: np.ndarray) -> np.ndarray:
     holds = np.zeros(label.max(initial=-1) + 1, dtype=bool)
     holds[label[chosen]] = True
     return holds[label]
-
-
-def _part(state: State, kept: Tensor) -> State:
-    """Some of the nodes [node] and the cells between them, without what belongs to a simulator."""
-    values: dict[str, Any] = {name: getattr(state, name)[kept] for name in ("pos", "vel", "node_type", "mass", "material_params")}
-    values["velocity_history"] = history_of(state)[kept]
-    if state.rest_pos is not None and state.cells is not None:
-        row = torch.cumsum(kept, dim=0) - 1
-        values |= {"rest_pos": state.rest_pos[kept], "cells": row[state.cells[kept[state.cells[:, 0]]]]}
-    return replace(state, **values, stress=None, internal=None)
 
 
 def _combined_stress(state: State, after: State, awake: Tensor, moved: Tensor) -> Stress | None:
@@ -209,13 +195,5 @@ class Holding(_Batched):
 
     def _go_on(self, state: State, held: _Held) -> State:
         pos, vel = integrators.advance(state.pos, state.vel, held.acceleration, self.dt)
-        return replace(
-            state,
-            pos=state.periodicity.wrapped(pos),
-            vel=vel,
-            velocity_history=torch.cat([history_of(state)[:, 1:], vel[:, None]], dim=1),
-            time=state.time + self.dt,
-            lost_impulse=0.0,
-            internal=replace(held, frames=held.frames - 1),
-            boundary=state.boundary.at(1),
-        )
+        internal = replace(held, frames=held.frames - 1)
+        return state.later(self.dt, pos, vel, stress=state.stress, num_asleep=state.num_asleep, internal=internal)

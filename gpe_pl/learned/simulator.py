@@ -415,9 +415,7 @@ class LearnedSimulator(nn.Module):
         for material in self.builder.spec.materials:
             island[graph[material].node_id] = graph[material].island
         held = is_held(state.vel, new.vel, island, self.supported(graph), self.slowest(state.gravity))[:, None]
-        vel = torch.where(held, 0.0, new.vel)
-        history = torch.cat([history_of(new)[:, :-1], vel[:, None]], dim=1)
-        return replace(new, pos=torch.where(held, state.pos, new.pos), vel=vel, velocity_history=history)
+        return new.corrected(torch.where(held, state.pos, new.pos), torch.where(held, 0.0, new.vel))
 
     def slowest(self, gravity: Tensor) -> Tensor:
         """Speed [m/s] below which static friction holds."""
@@ -444,17 +442,7 @@ class LearnedSimulator(nn.Module):
     def advance(self, state: State, acc: Tensor) -> State:
         """The next state under a given acceleration [m/s²], gravity included."""
         dt = self.builder.metadata.frame_dt
-        pos, vel = integrators.advance(state.pos, state.vel, acc, dt)
-        history = torch.cat([history_of(state)[:, 1:], vel[:, None]], dim=1)
-        return replace(
-            state,
-            pos=state.periodicity.wrapped(pos),
-            vel=vel,
-            velocity_history=history,
-            time=state.time + dt,
-            stress=None,
-            boundary=state.boundary.at(1),
-        )
+        return state.later(dt, *integrators.advance(state.pos, state.vel, acc, dt))
 
     @classmethod
     def _check_size(cls, description: dict[str, Any], weights: dict[str, Tensor]) -> None:

@@ -1,7 +1,7 @@
 """Trivial simulators that any learned model has to beat."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from array_api_compat import array_namespace
 
@@ -14,12 +14,6 @@ from gpe_pl.trajectory.state import State
 NUM_BISECTIONS = 30
 
 
-def _later(state: State, dt: float, pos: Array, vel: Array) -> State:
-    return replace(
-        state, pos=pos, vel=vel, velocity_history=None, time=state.time + dt, stress=None, boundary=state.boundary.at(1), internal=None
-    )
-
-
 @dataclass(frozen=True)
 class ConstantVelocity:
     """Every node keeps its velocity and ignores walls."""
@@ -27,8 +21,7 @@ class ConstantVelocity:
     dt: float
 
     def step(self, state: State) -> State:
-        pos = state.periodicity.wrapped(state.pos + state.vel * self.dt)
-        return _later(state, self.dt, pos, state.vel)
+        return state.later(self.dt, state.pos + state.vel * self.dt, state.vel)
 
 
 @dataclass(frozen=True)
@@ -70,7 +63,7 @@ def _sticking(state: State, dt: float, acceleration: Array) -> State:
         pos = xp.where(hit[:, None], _touchdown(state, pos), pos)
     pos = xp.where(stuck[:, None], state.pos, pos)
     vel = xp.where((hit | stuck)[:, None], xp.zeros_like(vel), vel)
-    return _later(state, dt, state.periodicity.wrapped(pos), vel)
+    return state.later(dt, pos, vel)
 
 
 def _touchdown(state: State, end: Array) -> Array:

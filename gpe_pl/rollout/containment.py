@@ -47,11 +47,7 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
     new_pos, vel = xp.asarray(pos, copy=True), xp.asarray(state.vel, copy=True)
     new_pos[rows] = state.periodicity.wrapped(moved)
     vel[rows] = vel[rows] + (moved - pos[rows]) / dt
-    history = state.velocity_history
-    if history is not None:
-        history = xp.asarray(history, copy=True)
-        history[:, -1] = vel
-    return replace(state, pos=new_pos, vel=vel, velocity_history=history), inside
+    return state.corrected(new_pos, vel), inside
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from gpe_pl.geometry.repeated_shapes import is_covered, repeated
 from gpe_pl.geometry.shapes import Shape, surface_tolerance
 from gpe_pl.schema import STICKY
 from gpe_pl.trajectory.arrays import ArrayError, numbers, per_node, positive
+from gpe_pl.trajectory.kinds import NODE, SCENE, names_of
 from gpe_pl.trajectory.rigid_parts import carried_along
 
 Array = Any
@@ -41,6 +42,10 @@ class Motion:
         """That of the frames ``start:stop``."""
         return Motion(self.pos[start:stop], self.vel[start:stop], self.normal[start:stop])
 
+    def take(self, nodes: np.ndarray) -> Motion:
+        """That of some boundary nodes: row numbers, or a mask."""
+        return Motion(self.pos[:, nodes], self.vel[:, nodes], self.normal[:, nodes])
+
 
 @dataclass(frozen=True)
 class Boundary:
@@ -56,13 +61,13 @@ class Boundary:
         motion: where the nodes go, if they move; its first frame is what ``pos``, ``vel`` and ``normal`` say.
     """
 
-    pos: Array
-    vel: Array
-    normal: Array
-    friction: Array
-    restitution: Array
-    shapes: tuple[Shape, ...] = ()
-    motion: Motion | None = None
+    pos: Array = field(metadata=NODE)
+    vel: Array = field(metadata=NODE)
+    normal: Array = field(metadata=NODE)
+    friction: Array = field(metadata=NODE)
+    restitution: Array = field(metadata=NODE)
+    shapes: tuple[Shape, ...] = field(default=(), metadata=SCENE)
+    motion: Motion | None = field(default=None, metadata=SCENE)
 
     @classmethod
     def sample(cls, shapes: tuple[Shape, ...], spacing: float, dim: int, periodicity: Periodicity = NOWHERE) -> Boundary:
@@ -175,17 +180,17 @@ class Boundary:
         shapes = repeated(self.shapes, periodicity)
         free = ~is_covered(self.pos, self.normal, self.shapes, shapes)
         kept = np.setdiff1d(np.flatnonzero(free), i[same])
-        if motion is not None:
-            motion = Motion(motion.pos[:, kept], motion.vel[:, kept], motion.normal[:, kept])
-        pos, vel, normal, friction, restitution = (x[kept] for x in (pos, self.vel, self.normal, self.friction, self.restitution))
-        return Boundary(pos, vel, normal, friction, restitution, shapes, motion)
+        return replace(replace(self, pos=pos).take(kept), shapes=shapes)
+
+    def take(self, nodes: Array) -> Boundary:
+        """Some of the boundary nodes, with their motion and all shapes: row numbers, or a mask [boundary_node]."""
+        values = {name: getattr(self, name)[nodes] for name in names_of(self, NODE)}
+        return replace(self, **values, motion=None if self.motion is None else self.motion.take(nodes))
 
     def to_numpy(self) -> Boundary:
         """The same with NumPy arrays of its own."""
-        pos, vel, normal, friction, restitution = (
-            np.array(_numpy(x)) for x in (self.pos, self.vel, self.normal, self.friction, self.restitution)
-        )
-        return Boundary(pos, vel, normal, friction, restitution, self.shapes, self.motion)
+        values: dict[str, Any] = {name: np.array(_numpy(getattr(self, name))) for name in names_of(self, NODE)}
+        return replace(self, **values)
 
     def at(self, frame: int, stop: int | None = None) -> Boundary:
         """The boundary so many frames later, with its motion up to the frame ``stop``; the same object if it does not move.

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace
+from array_api_compat import array_namespace, device
 
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
+from gpe_pl.trajectory.arrays import ArrayError
 from gpe_pl.trajectory.boundary import Array, Boundary
+from gpe_pl.trajectory.kinds import CELL, NODE, SCENE, STEP, names_of
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,8 @@ def von_mises(stress: Array) -> Array:
 class State:
     """Everything a ``Simulator`` needs to know at one instant; arrays of one backend.
 
+    Every field declares its kind (``kinds``). ``take``, ``joined`` and ``later`` follow from the kinds, so a new field is declared here only.
+
     Attributes:
         pos: positions of the dynamic nodes [node, dim] in m.
         vel: velocities [node, dim] in m/s.
@@ -71,25 +77,25 @@ class State:
         periodicity: axes along which space repeats.
     """
 
-    pos: Array
-    vel: Array
-    node_type: Array
-    mass: Array
-    material_params: Array
-    boundary: Boundary
-    gravity: Array
-    velocity_history: Array | None = None
-    time: float = 0.0
-    rest_pos: Array | None = None
-    cells: Array | None = None
-    stress: Stress | None = None
-    cell_dim: int | None = None
-    num_substeps: int = 0
-    num_corrected: int = 0
-    num_asleep: int = 0
-    lost_impulse: float = 0.0
-    internal: Any = None
-    periodicity: Periodicity = NOWHERE
+    pos: Array = field(metadata=NODE)
+    vel: Array = field(metadata=NODE)
+    node_type: Array = field(metadata=NODE)
+    mass: Array = field(metadata=NODE)
+    material_params: Array = field(metadata=NODE)
+    boundary: Boundary = field(metadata=SCENE)
+    gravity: Array = field(metadata=SCENE)
+    velocity_history: Array | None = field(default=None, metadata=NODE)
+    time: float = field(default=0.0, metadata=SCENE)
+    rest_pos: Array | None = field(default=None, metadata=NODE)
+    cells: Array | None = field(default=None, metadata=CELL)
+    stress: Stress | None = field(default=None, metadata=STEP)
+    cell_dim: int | None = field(default=None, metadata=SCENE)
+    num_substeps: int = field(default=0, metadata=STEP)
+    num_corrected: int = field(default=0, metadata=STEP)
+    num_asleep: int = field(default=0, metadata=STEP)
+    lost_impulse: float = field(default=0.0, metadata=STEP)
+    internal: Any = field(default=None, metadata=STEP)
+    periodicity: Periodicity = field(default=NOWHERE, metadata=SCENE)
 
     @property
     def num_nodes(self) -> int:
@@ -98,6 +104,74 @@ class State:
     @property
     def dim(self) -> int:
         return self.pos.shape[1]
+
+    def take(self, nodes: Array) -> State:
+        """Some of the nodes, in the given order, and the cells that have all their corners among them.
+
+        Fields of kind ``STEP`` get their defaults: they describe the nodes of the whole scene.
+
+        Args:
+            nodes: row numbers [chosen], or a mask [node]. The rows of a mesh do not repeat.
+        """
+        xp = array_namespace(self.pos)
+        rows = xp.asarray(nodes, device=device(self.pos))
+        rows = xp.nonzero(rows)[0] if rows.dtype == xp.bool else rows
+        values = {name: value[rows] for name in names_of(self, NODE) if (value := getattr(self, name)) is not None}
+        for name in names_of(self, CELL):
+            if (cells := getattr(self, name)) is not None:
+                number = xp.full((self.num_nodes,), -1, dtype=xp.int64, device=device(self.pos))
+                number[rows] = xp.arange(rows.shape[0], dtype=xp.int64, device=device(self.pos))
+                cells = number[cells]
+                values[name] = cells[xp.all(cells >= 0, axis=1)]
+        return replace(self, **values, **_nothing_known(self))
+
+    @staticmethod
+    def joined(states: Sequence[State]) -> State:
+        """The nodes and cells of several states in one, in their order, in the scene of the first.
+
+        Fields of kind ``STEP`` get their defaults.
+
+        Raises:
+            ArrayError: some of the states have a field that others lack.
+        """
+        first, values = states[0], dict[str, Array]()
+        xp = array_namespace(first.pos)
+        starts = [0, *accumulate(state.num_nodes for state in states)]
+        for name in (*names_of(first, NODE), *names_of(first, CELL)):
+            parts = [getattr(state, name) for state in states]
+            lacking = [k for k, part in enumerate(parts) if part is None]
+            if len(lacking) == len(parts):
+                continue
+            if lacking:
+                raise ArrayError(f"{name}: state {lacking[0]} has none, others have; give it to all states or to none")
+            if name in names_of(first, CELL):
+                parts = [part + start for part, start in zip(parts, starts, strict=False)]
+            values[name] = xp.concat(parts)
+        return replace(first, **values, **_nothing_known(first))
+
+    def later(self, dt: float, pos: Array, vel: Array, **values: Any) -> State:
+        """The state one frame later.
+
+        The velocity history moves on where there is one, a moving boundary moves on, and fields of kind ``STEP`` get their defaults.
+
+        Args:
+            dt: frame interval [s].
+            pos: positions [node, dim] in m; folded into a periodic domain.
+            vel: velocities [node, dim] in m/s.
+            values: other fields, by name.
+        """
+        if self.velocity_history is not None and "velocity_history" not in values:
+            xp = array_namespace(vel)
+            values["velocity_history"] = xp.concat([self.velocity_history[:, 1:], vel[:, None]], axis=1)
+        known: dict[str, Any] = {"time": self.time + dt, "boundary": self.boundary.at(1), **_nothing_known(self), **values}
+        return replace(self, pos=self.periodicity.wrapped(pos), vel=vel, **known)
+
+    def corrected(self, pos: Array, vel: Array) -> State:
+        """The same instant with other positions [m] and velocities [m/s]; the last velocity of the history changes with them."""
+        history = self.velocity_history
+        if history is not None:
+            history = array_namespace(vel).concat([history[:, :-1], vel[:, None]], axis=1)
+        return replace(self, pos=pos, vel=vel, velocity_history=history)
 
     def to_torch(self, device: Any = "cpu") -> State:
         """The same state as float64 tensors on a device (``internal`` is dropped: it belongs to a solver)."""
@@ -108,11 +182,16 @@ class State:
                 x = torch.from_numpy(x.astype(np.float64 if np.issubdtype(x.dtype, np.floating) else np.int64))
             return x.to(device, torch.float64 if x.is_floating_point() else torch.int64)
 
-        b = self.boundary
-        boundary = replace(b, **{name: tensor(getattr(b, name)) for name in ("pos", "vel", "normal", "friction", "restitution")})
-        arrays = {name: tensor(getattr(self, name)) for name in ("pos", "vel", "node_type", "mass", "material_params", "gravity")}
-        for name in ("velocity_history", "rest_pos", "cells"):
-            value = getattr(self, name)
-            arrays[name] = None if value is None else tensor(value)
-        stress = None if self.stress is None else Stress(tensor(self.stress.node), tensor(self.stress.cell))
-        return replace(self, **arrays, boundary=boundary, stress=stress, internal=None)
+        def tensors(part: Any) -> dict[str, Any]:
+            values = {declared.name: getattr(part, declared.name) for declared in fields(part)}
+            return {name: tensor(value) for name, value in values.items() if isinstance(value, (np.ndarray, torch.Tensor))}
+
+        boundary = replace(self.boundary, **tensors(self.boundary))
+        stress = None if self.stress is None else replace(self.stress, **tensors(self.stress))
+        return replace(self, **tensors(self) | {"boundary": boundary, "stress": stress, "internal": None})
+
+
+def _nothing_known(state: State) -> dict[str, Any]:
+    """Defaults of the fields of kind ``STEP``."""
+    defaults = {declared.name: declared.default for declared in fields(state)}
+    return {name: defaults[name] for name in names_of(state, STEP)}

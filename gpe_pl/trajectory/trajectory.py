@@ -329,7 +329,7 @@ class Trajectory:
         def extended(values: np.ndarray, more: Any) -> np.ndarray:
             return np.concatenate([values, np.broadcast_to(more, (count, *values.shape[1:])).astype(values.dtype)])
 
-        b, way, stress = self.boundary, motion.frames(0, self.num_frames), self.stress
+        way, stress = motion.frames(0, self.num_frames), self.stress
         if stress is not None:
             stress = Stress(np.pad(stress.node, ((0, 0), (0, count), (0, 0))), stress.cell)
         return replace(
@@ -339,7 +339,7 @@ class Trajectory:
             node_type=extended(self.node_type, node_code(BOUNDARY)),
             mass=extended(self.mass, 0.0),
             material_params=extended(self.material_params, np.nan),
-            boundary=Boundary(b.pos[still], b.vel[still], b.normal[still], b.friction[still], b.restitution[still], b.shapes),
+            boundary=replace(self.boundary.take(still), motion=None),
             rest_pos=None if self.rest_pos is None else np.concatenate([self.rest_pos, motion.pos[0, moves].astype(self.rest_pos.dtype)]),
             stress=stress,
         )

@@ -12,7 +12,6 @@ of a cell. Contact of the solid with itself is not computed: a scene holds one b
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Annotated, ClassVar, no_type_check
 
 import numpy as np
@@ -122,16 +121,8 @@ class FEM:
         if status != OK:
             raise self._error(status, node, pos[:, :dim], vel[:, :dim], state.gravity)
         pos, vel = np.array(pos[:, :dim], order="C"), np.array(vel[:, :dim], order="C")
-        return replace(
-            state,
-            pos=pos,
-            vel=vel,
-            velocity_history=None,
-            time=state.time + self.frame_dt,
-            stress=cauchy_stress(mesh, pos, lam, mu),
-            num_substeps=substeps,
-            internal=None,
-        )
+        stress = cauchy_stress(mesh, pos, lam, mu)
+        return state.later(self.frame_dt, pos, vel, velocity_history=None, stress=stress, num_substeps=substeps)
 
     def compile_kernels(self) -> None:
         """Compile every kernel into Numba's disk cache, so that worker processes started later only load them."""

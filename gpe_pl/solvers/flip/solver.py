@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -205,9 +205,7 @@ class FLIP:
         _idle[grid] = fields
         self._survey(pos, vel)
         self._leave_solids(state.boundary, solids, pos, vel)
-        return replace(
-            state, pos=pos, vel=vel, velocity_history=None, time=state.time + self.frame_dt, num_substeps=substeps, internal=None
-        )
+        return state.later(self.frame_dt, pos, vel, velocity_history=None, num_substeps=substeps)
 
     def rasterize(
         self, pos: np.ndarray, vel: np.ndarray, mass: np.ndarray, viscosity_of_node: np.ndarray, solids: Solids, fields: Fields

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -161,15 +161,8 @@ class MPM:
         )
         if status != OK:
             raise self._error(status, node, particles.pos, particles.vel, state.gravity)
-        return replace(
-            state,
-            pos=particles.pos,
-            vel=particles.vel,
-            velocity_history=None,
-            time=state.time + self.frame_dt,
-            num_substeps=num_substeps,
-            internal=MPMInternal(particles.deformation, particles.affine, particles.gradient, particles.plastic, np.array(last_substep)),
-        )
+        internal = MPMInternal(particles.deformation, particles.affine, particles.gradient, particles.plastic, np.array(last_substep))
+        return state.later(self.frame_dt, particles.pos, particles.vel, velocity_history=None, num_substeps=num_substeps, internal=internal)
 
     def _require_undeformed(self, state: State) -> None:
         remedy = "start at frame 0 of a scene, or step on from the state that the solver returned"
