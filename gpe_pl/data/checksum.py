@@ -1,4 +1,4 @@
-"""What data are known by: a checksum of what they hold, wherever they lie and however they are spread over shards."""
+"""Checksums that identify the content of a split, independent of its folder and of how trajectories are spread over shards."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from pathlib import Path
 from gpe_pl.trajectory.store import ATTRIBUTES, open_group, open_shard, read_text, shards
 
 LENGTH = 16
-"""Hexadecimal digits that are kept: enough to tell apart all data that anyone will have."""
+"""Number of hexadecimal digits that are kept. They distinguish more data sets than anyone will have."""
 
 
 def split_checksum(root: Path | str, split: str) -> str:
-    """The beginning of the SHA-256 over the digests and attributes that the trajectories of a split were stored with, in order.
+    """Return the first digits of a SHA-256 over the stored digests and attributes of a split's trajectories, in order.
 
-    Reads no arrays: milliseconds per shard. That they agree with their digest is for ``read_trajectory(verify=True)`` to say.
+    Arrays are not read, so it takes milliseconds per shard. ``read_trajectory(verify=True)`` checks arrays against their digest.
     """
     sha = hashlib.sha256()
     for path in shards(root, split):

@@ -29,24 +29,28 @@ from gpe_pl.trajectory.store import StoreError
 from gpe_pl.trajectory.trajectory import Trajectory
 
 NUM_VAL_GRAPHS = 8
-"""In a validation batch, where no number of nodes limits it. The error is a quotient of sums over all nodes, whatever the batches."""
+"""Graphs in a validation batch, if no number of nodes limits it. The error does not depend on batches, because it is a quotient of sums over all nodes."""
 
 
 ENOUGH = 0.25
-"""Fraction of the windows for statistics: what may be in fewer of them gets as many windows of its own."""
+"""Fraction of the statistics windows. Node types that occur in fewer windows get this many additional windows."""
 FEW_CONTACTS = 1 / 16
-"""Fraction of these windows: contacts that fewer of them have are looked for in others."""
+"""Fraction of the statistics windows. Contacts that occur in fewer windows are searched for in additional windows."""
 MOST_SEARCHED = 8
-"""Windows that are looked at for rare contacts, in units of those for statistics."""
+"""Maximum number of windows searched for rare contacts, as a multiple of the number of statistics windows."""
 
 
 def data_statistics(root: Path | str) -> dict[str, float]:
-    """Statistics of the train split, as written beside it by ``simulate``."""
+    """Read the statistics of the train split, which ``simulate`` or ``convert`` has written.
+
+    Raises:
+        StoreError: the statistics are missing or damaged, or belong to other data.
+    """
     path = Path(root) / "statistics.json"
     try:
         statistics = sealed.read(path, "generate or import the data again")
         if statistics["data_sha256"] != split_checksum(root, "train"):
-            raise StoreError(f"{path}: cannot be used (it is of other data than those in train); generate or import the data again")
+            raise StoreError(f"{path}: cannot be used (it belongs to other data than those in train); generate or import the data again")
         return {"acceleration_std": float(statistics["acceleration_std"])}
     except StoreError:
         raise
@@ -59,22 +63,22 @@ def data_statistics(root: Path | str) -> dict[str, float]:
 
 
 class TrajectoryDataModule(L.LightningDataModule):
-    """Training windows in an endless, resumable, seeded order; a fixed, noise-free sample of validation windows.
+    """Training windows in an endless, resumable, seeded order, and a fixed sample of validation windows without noise.
 
     Args:
         root: folder of the data set.
-        graph: how states become graphs.
-        noise: on training inputs.
-        batch_size: samples per step, all ranks together; its nodes are also the most in a batch of validation windows.
-        seed: of order and noise.
-        num_workers: processes that build graphs; 0 builds them in the training process.
-        num_val_windows: windows of the one-step validation loss, evenly spread over the ``val`` split.
-        stress: samples also hold the stress; see ``WindowDataset``.
+        graph: settings of the graphs.
+        noise: noise on training inputs.
+        batch_size: samples per step over all ranks. Its number of nodes also limits batches of validation windows.
+        seed: seed of order and noise.
+        num_workers: number of processes that build graphs; 0 builds them in the training process.
+        num_val_windows: number of windows of the one-step validation loss, evenly spread over the ``val`` split.
+        stress: add the stress to samples; see ``WindowDataset``.
         sampling: how often each training window is drawn.
-        num_statistics_windows: windows that features are standardised by, evenly spread over the ``train`` split.
+        num_statistics_windows: number of windows from which features are standardised, evenly spread over the ``train`` split.
 
     Attributes:
-        push_forward: when batches are starts for own steps of the model rather than graphs; None: never.
+        push_forward: settings of the push-forward trick, in whose steps batches are starts of unrolls instead of graphs; None if it is not used.
 
     Raises:
         StoreError: a split or its statistics are missing or damaged.
@@ -115,14 +119,17 @@ class TrajectoryDataModule(L.LightningDataModule):
             self.train_set.probability = probabilities(self.train_set.activity())
 
     def statistics_sample(self) -> StatisticsSample:
-        """Training graphs, noise included, for the standardisation of features: evenly spread over the split, and over the trajectories of what is rare."""
+        """Sample training graphs with noise for the standardisation of features.
+
+        They are evenly spread over the split. Rare node types and contacts get additional graphs.
+        """
         windows = _spread(len(self.train_set), self.num_statistics_windows)
         return StatisticsSample([self.train_set[int(window)] for window in windows], self._rare_graphs, self._touching_graphs)
 
     def _rare_graphs(self, roles: frozenset[str]) -> list[HeteroData]:
-        """Graphs evenly spread over the trajectories that have nodes of all these roles.
+        """Sample graphs evenly from the trajectories that have nodes of all these roles.
 
-        None where the sample of the whole split has enough of such trajectories, or all or no trajectories are such.
+        The list is empty if the sample of the whole split has enough such trajectories, or if all or no trajectories have these roles.
         """
         has = np.array([roles <= own for own in self._roles])
         if has.all() or not has.any():
@@ -136,13 +143,13 @@ class TrajectoryDataModule(L.LightningDataModule):
         return [self.train_set[int(windows[k])] for k in _spread(len(windows), enough)]
 
     def _touching_graphs(self, relation: EdgeType, known: list[HeteroData]) -> list[HeteroData]:
-        """Graphs with edges of a relation, from random windows, where few of the known graphs have any; otherwise the known ones."""
+        """Search random windows for graphs with edges of a relation, if few of the known graphs have any; otherwise return the known ones."""
         num_known = sum(graph[relation].edge_index.shape[1] > 0 for graph in known)
         if num_known >= max(1, round(FEW_CONTACTS * self.num_statistics_windows)):
             return known
         has = np.array([{role(relation[0]), role(relation[2])} <= own for own in self._roles])
         windows = np.flatnonzero(np.repeat(has, np.diff(self.train_set.ends, prepend=0)))
-        if len(windows) <= len(known):  # these are all
+        if len(windows) <= len(known):  # all windows are known already
             return known
         order = np.random.default_rng(0).permutation(windows)[: MOST_SEARCHED * self.num_statistics_windows]
         graphs = (self.train_set[int(window)] for window in order)
@@ -152,7 +159,7 @@ class TrajectoryDataModule(L.LightningDataModule):
 
     @cached_property
     def _roles(self) -> list[frozenset[str]]:
-        """What each training trajectory has nodes of."""
+        """Roles of nodes that occur in each training trajectory."""
         found = []
         for stored in self.train_set.trajectories:
             first = stored.window(0, 1)
@@ -165,7 +172,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         return found
 
     def parameter_ranges(self) -> dict[str, torch.Tensor]:
-        """Lowest and highest value [2, 1] of each material's parameter in all training trajectories; of materials that occur."""
+        """Lowest and highest value [2, 1] of the parameter of each material that occurs in the training trajectories."""
         found: dict[str, list[np.ndarray]] = {}
         for stored in self.train_set.trajectories:
             first = stored.window(0, 1)
@@ -177,11 +184,11 @@ class TrajectoryDataModule(L.LightningDataModule):
         return {m: torch.tensor([[np.min(pairs)], [np.max(pairs)]], dtype=torch.float32) for m, pairs in found.items()}
 
     def trained_scene(self) -> np.ndarray:
-        """What gravity and boundary nodes of all training trajectories have, as in ``scene_ranges``."""
+        """Ranges of gravity and of boundary nodes over all training trajectories; see ``scene_ranges``."""
         return united(map(_scene, self.train_set.trajectories))
 
     def val_trajectories(self, count: int) -> list[Trajectory]:
-        """The first ``count`` trajectories of the ``val`` split that are long enough."""
+        """Read the first ``count`` trajectories of the ``val`` split that are long enough."""
         return list(islice(long_enough(self.root, "val", self.builder.config.history), count))
 
     def train_dataloader(self) -> DataLoader:
@@ -213,7 +220,7 @@ def _spread(length: int, count: int) -> np.ndarray:
 
 def _set_up_worker(_: int) -> None:
     torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the training needs its workers until it has saved
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes, but training needs its workers until it has saved
 
 
 def _scene(stored: StoredTrajectory) -> np.ndarray:

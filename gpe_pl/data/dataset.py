@@ -1,6 +1,6 @@
 """Training samples: short windows of trajectories as graphs with a target acceleration.
 
-A sample is a pure function of (split, seed, sample number): runs resume exactly, whatever the number of workers. Stored arrays are read-only.
+A sample is a pure function of split, seed and sample number. Runs therefore resume exactly, with any number of workers. Stored arrays are read-only.
 """
 
 from __future__ import annotations
@@ -31,9 +31,14 @@ log = logging.getLogger(__name__)
 
 
 class StartKey(NamedTuple):
-    """A window to start from for steps of the model's own; batches of the same ``lane`` go on where the last one has come to.
+    """Key of a push-forward sample. Batches in one lane continue the previous unroll.
 
-    ``correction`` is the share of what the velocity has gone astray by in these steps that the target takes back within one.
+    Attributes:
+        sample: sample number.
+        window: number of the window at which the unroll starts.
+        own_steps: number of steps of the unroll.
+        lane: number of the lane.
+        correction: fraction of the velocity's deviation after the unroll that the target removes within one step.
     """
 
     sample: int
@@ -44,21 +49,30 @@ class StartKey(NamedTuple):
 
 
 Key = int | tuple[int, int] | StartKey
-"""A window's number; or sample number and window; or a start."""
+"""The number of a window, or sample number and window, or the key of a push-forward sample."""
 
 CACHE_BYTES = 2 * 1024**3
-"""Splits smaller than this are held in memory; larger ones are read from disk window by window. Graphs that are needed again are held up to as much."""
+"""Splits smaller than this are cached in memory. Larger splits are read from disk window by window. Also the maximum memory for cached graphs [bytes]."""
 
 
 MAX_DAMAGED = 0.2
-"""Share of a split's trajectories that may be left out; one may always."""
+"""Maximum fraction of a split's trajectories that may be left out. One trajectory may always be left out."""
 MAX_JUMP, MIN_RATIO = 2.0, 10.0
-"""A way within a frame longer than so many neighbour radii, and so many times that within the frame before or after it, is a fault of the data."""
+"""A node that moves more than MAX_JUMP neighbour radii in one frame, and more than MIN_RATIO times as far as in the frame before or after, marks corrupt
+data."""
 
 
 @dataclass(frozen=True)
 class StoredTrajectory:
-    """Where a trajectory lies, and the trajectory itself if the split is held in memory and nothing is wrong with it."""
+    """The place of a stored trajectory, and the trajectory itself if it is cached.
+
+    Attributes:
+        path: shard.
+        name: name of the trajectory in the shard.
+        num_frames: number of frames.
+        num_nodes: number of dynamic nodes.
+        held: the trajectory if the split is cached in memory and its values are valid, else None.
+    """
 
     path: Path
     name: str
@@ -67,18 +81,22 @@ class StoredTrajectory:
     held: Trajectory | None
 
     def window(self, start: int, stop: int) -> Trajectory:
-        """Frames ``start:stop``; raises ``StoreError``, also for values that nothing can be learned from."""
+        """Return the frames ``start:stop``.
+
+        Raises:
+            StoreError: the trajectory cannot be read, or has values that nothing can be learned from.
+        """
         if self.held is not None:
             return self.held.frames(start, stop)
         return read_trajectory(self.path, self.name, frames=slice(start, stop))
 
     def whole(self) -> Trajectory:
-        """All frames, compared with the digest that they were stored with; raises ``StoreError`` as ``window`` does."""
+        """Return all frames, checked against their stored digest; raises ``StoreError`` as ``window`` does."""
         return read_trajectory(self.path, self.name, verify=True) if self.held is None else self.held
 
 
 def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> list[StoredTrajectory]:
-    """Index all trajectories of a split, holding them in memory if they are small enough."""
+    """Index all trajectories of a split, and cache them in memory if the split is small enough."""
     paths = shards(root, split)
     hold = 2 * sum(p.stat().st_size for p in paths) <= cache_bytes
     stored = []
@@ -88,14 +106,17 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
         for name, (num_frames, num_nodes) in shapes.items():
             held = None
             if hold:
-                with suppress(UnsoundError):  # which ``usable`` will meet again
+                with suppress(UnsoundError):  # ``usable`` reports it
                     held = _read_only(read_trajectory(path, name, verify=True))
             stored.append(StoredTrajectory(path, name, num_frames, num_nodes, held))
     return stored
 
 
 def long_enough(root: Path | str, split: str, history: int) -> Iterator[Trajectory]:
-    """The undamaged trajectories of a split that have a frame with so many velocities and one to predict; warns of the others."""
+    """Yield the valid trajectories of a split with at least ``history + 2`` frames; warns of the others.
+
+    A model needs ``history`` velocities before a frame and one frame to predict.
+    """
     for path in shards(root, split):
         for name in trajectory_names(path):
             try:
@@ -117,10 +138,10 @@ def _warn(path: Path, name: str, fault: str) -> None:
 
 
 def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
-    """Those that can be learned from; warns of the others.
+    """Return the trajectories that can be learned from; warns of the others.
 
     Raises:
-        StoreError: more than one, and more than ``MAX_DAMAGED`` of them, cannot be.
+        StoreError: none can be used, or more than one and more than a fraction ``MAX_DAMAGED`` of them cannot.
     """
     found = []
     for stored in trajectories:
@@ -140,7 +161,7 @@ def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
 
 
 def damage(trajectory: Trajectory) -> str | None:
-    """Why a trajectory whose values are sound cannot be learned from, with the frame and node, or None."""
+    """Describe why a trajectory with valid values cannot be learned from, with frame and node; None if it can."""
     pos, metadata = trajectory.pos, trajectory.metadata
     if trajectory.num_nodes == 0:
         return "it has no nodes"
@@ -148,18 +169,18 @@ def damage(trajectory: Trajectory) -> str | None:
     width = np.ptp(bounds, axis=1)
     low, high = (
         limits.astype(pos.dtype) for limits in (bounds[:, 0] - width, bounds[:, 1] + width)
-    )  # long trajectories would not fit twice
+    )  # converting positions instead would copy a long trajectory
     near = (pos >= low) & (pos <= high)
     if not near.all():
         frame, node = np.argwhere(~near)[0, :2]
-        return f"the position of node {node} in frame {frame} is farther outside the domain than this is wide"
+        return f"the position of node {node} in frame {frame} lies outside the domain by more than its width"
     return _jump(trajectory)
 
 
 def _jump(trajectory: Trajectory) -> str | None:
-    """A node that goes farther than neighbours see between two frames, but hardly moves before or after them.
+    """Describe the first node that moves farther than ``MAX_JUMP`` radii between two frames, but hardly moves before or after them.
 
-    What is fast is so for more than a frame; a frame that went wrong is the largest of all accelerations, and the scale to which all others are related.
+    A fast node is fast for more than one frame. A corrupt frame would be the largest acceleration of all, and would distort the scale of all others.
     """
     limit = MAX_JUMP * trajectory.metadata.connectivity_radius
     for start in range(0, trajectory.num_frames - 1, FRAMES_AT_ONCE):
@@ -177,7 +198,7 @@ def _jump(trajectory: Trajectory) -> str | None:
 
 
 def _read_only(trajectory: Trajectory) -> Trajectory:
-    """The same trajectory; writing to its arrays raises."""
+    """Make the arrays of a trajectory read-only, and return it."""
     parts = (trajectory, trajectory.boundary, *([motion] if (motion := trajectory.boundary.motion) else []))
     for array in (value for part in parts for value in vars(part).values()):
         if isinstance(array, np.ndarray):
@@ -187,15 +208,15 @@ def _read_only(trajectory: Trajectory) -> Trajectory:
 
 @dataclass(frozen=True)
 class Start:
-    """A state for a model to start from, and what truly follows.
+    """The start of an unroll with the ground truth that follows.
 
     Attributes:
-        state: with noise, as float64 tensors.
-        truth: positions [own_steps + 2, node, dim] of the frames from the state's on [m].
-        stress: true Cauchy stress [own_steps + 1, node, component] of the frames after the state's [Pa], where it is asked for.
-        position_correction: share of the distance from the true position that the target takes back within a step; see ``Noise``.
-        velocity_correction: the same of the velocity, after own steps; as in the key.
-        about: trajectory and frame, and the weight in the loss if there is one.
+        state: initial state with noise, as float64 tensors.
+        truth: true positions [own_steps + 2, node, dim] in m of the frames from the state's on.
+        stress: true Cauchy stress [own_steps + 1, node, component] in Pa of the frames after the state's, if it is asked for.
+        position_correction: fraction of the deviation from the true position that the target removes within one step; see ``Noise``.
+        velocity_correction: fraction of the deviation from the true velocity that the target removes within one step, after the unroll; as in the key.
+        about: numbers of trajectory and frame, and the weight in the loss if there is one.
         sample, lane: as in the key.
     """
 
@@ -210,23 +231,23 @@ class Start:
 
     @property
     def own_steps(self) -> int:
-        """How many steps a model is to make by itself."""
+        """Number of steps of the unroll."""
         return self.truth.shape[0] - 2
 
     def to(self, device: Any) -> Start:
-        """The same on a device."""
+        """Return the same start on another device."""
         stress = None if self.stress is None else self.stress.to(device)
         return replace(self, state=self.state.to_torch(device), truth=self.truth.to(device), stress=stress)
 
     def graph(self, builder: GraphBuilder, state: State, step: int) -> HeteroData:
-        """The training graph of the state that a model has come to in so many steps.
+        """Create the training graph of the state that the model has reached after ``step`` steps.
 
-        Its target is the true velocity that follows, plus what is to remain of the distance from the true velocity, minus what is to be taken back of that
-        from the true position.
+        The target velocity is the next true velocity, plus the part of the velocity's deviation that remains, minus the part of the position's deviation that
+        is removed.
         """
         dt, where = builder.metadata.frame_dt, state.periodicity
         vel = integrators.velocities(self.truth[step : step + 2], dt, where)[0]
-        if step:  # the noise of the start is taken back as a whole
+        if step:  # the velocity noise of the start is removed entirely
             before = integrators.velocities(self.truth[step - 1 : step + 1], dt, where)[0]
             vel = vel + (1 - self.velocity_correction) * (state.vel - before)
         astray = integrators.velocities(torch.stack([self.truth[step], state.pos]), dt, where)[0]
@@ -235,7 +256,7 @@ class Start:
 
 
 def training_graph(builder: GraphBuilder, state: State, target: Tensor, stress: Tensor | None, about: dict[str, Any]) -> HeteroData:
-    """The graph of a state with what is to be predicted for each node: ``target`` [m/s²], and ``stress_target`` [Pa] where it is known."""
+    """Create the graph of a state with the targets of each node: ``target`` [node, dim] in m/s² and, if given, ``stress_target`` [node, component] in Pa."""
     data = builder(state)
     for material in builder.spec.materials:
         data[material].target = target.float()[data[material].node_id]
@@ -248,17 +269,21 @@ def training_graph(builder: GraphBuilder, state: State, target: Tensor, stress: 
 
 
 Samples: TypeAlias = HeteroData | list[Start]
-"""What an optimiser step takes: graphs as one, or starts for own steps of the model."""
+"""Samples of an optimiser step: one batch of graphs, or the starts of unrolls."""
 
 
 def collated(samples: list[HeteroData | Start]) -> Samples:
-    """Samples of one kind together."""
+    """Join samples of one kind: graphs become one batch, starts a list."""
     starts = [sample for sample in samples if isinstance(sample, Start)]
     return starts or batched(samples)
 
 
 def window_counts(trajectories: Sequence[StoredTrajectory], history: int) -> list[int]:
-    """How many windows of frames t − H … t + 1 each trajectory of a split has; raises ``StoreError`` where none has any."""
+    """Count the windows of frames t − H … t + 1 in each trajectory of a split.
+
+    Raises:
+        StoreError: no trajectory is long enough for a window.
+    """
     counts = [max(0, t.num_frames - history - 1) for t in trajectories]
     if not any(counts):
         longest = max((t.num_frames for t in trajectories), default=0)
@@ -271,22 +296,23 @@ def window_counts(trajectories: Sequence[StoredTrajectory], history: int) -> lis
 class WindowDataset(Dataset[HeteroData | Start]):
     """Windows x[t−H … t+1] of a split as graphs at frame t.
 
-    Every material's store has ``target`` [node, dim]: the acceleration from t to t+1 without gravity [m/s²], from float64 differences. The graph carries
-    ``trajectory`` and ``frame`` numbers for error messages.
+    Every material's store has ``target`` [node, dim] in m/s²: the acceleration from t to t+1 without gravity, from float64 differences. The graph has the
+    numbers ``trajectory`` and ``frame`` for error messages.
 
     Args:
-        trajectories: of the split.
-        builder: makes the graphs.
-        noise: applied to inputs; None for evaluation.
+        trajectories: trajectories of the split.
+        builder: builder of the graphs.
+        noise: noise on inputs; None for evaluation.
         velocity_unit: root mean square acceleration × frame interval [m/s], the unit of velocity noise.
-        seed: of the noise.
-        stress: also give the Cauchy stress at t+1, ``stress_target`` [node, component] in Pa, of materials that have one.
+        seed: seed of the noise.
+        stress: also give the Cauchy stress at t+1 of materials that have one, as ``stress_target`` [node, component] in Pa.
 
     Attributes:
-        probability: of each window to be drawn, where they are not drawn alike; graphs then carry ``weight``, its inverse over that of equal chances.
+        probability: probability of drawing each window [window], or None if all are equal. With it, graphs have a ``weight``: the uniform probability
+            divided by this one.
 
     Raises:
-        StoreError: no trajectory is long enough, or a window holds values that nothing can be learned from.
+        StoreError: no trajectory is long enough, or a window has values that nothing can be learned from.
     """
 
     def __init__(
@@ -307,17 +333,17 @@ class WindowDataset(Dataset[HeteroData | Start]):
         return int(self.ends[-1])
 
     def locate(self, window: int) -> tuple[int, int]:
-        """Trajectory number and frame t of a window."""
+        """Return trajectory number and frame t of a window."""
         trajectory = int(np.searchsorted(self.ends, window, side="right"))
         start = 0 if trajectory == 0 else int(self.ends[trajectory - 1])
         return trajectory, window - start + self.builder.config.history
 
     def num_nodes(self, window: int) -> int:
-        """Nodes of a window, without those of the boundary and of coarser levels."""
+        """Number of dynamic nodes in a window, without boundary nodes and virtual nodes."""
         return self.trajectories[self.locate(window)[0]].num_nodes
 
     def activity(self) -> np.ndarray:
-        """Root mean square of the acceleration without gravity [m/s²] in each window; reads the whole split."""
+        """Root mean square acceleration without gravity of each window [window] in m/s²; reads the whole split."""
         values = []
         for stored in self.trajectories:
             trajectory = stored.window(0, stored.num_frames)
@@ -334,7 +360,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
     def __getitem__(self, key: StartKey) -> Start: ...
 
     def __getitem__(self, key: Key) -> HeteroData | Start:
-        """The graph of a window, or where own steps are asked for, a start for them: as many as the trajectory is long enough for."""
+        """Return the graph of a window, or the start of an unroll for a ``StartKey``. The trajectory's length limits the unroll."""
         start = key if isinstance(key, StartKey) else None
         sample, window = (key, key) if isinstance(key, int) else key[:2]
         number, frame = self.locate(window)
@@ -380,11 +406,11 @@ class WindowDataset(Dataset[HeteroData | Start]):
 
 
 class HeldGraphs(Dataset[HeteroData]):
-    """Windows of a data set as graphs that are built when they are first asked for.
+    """Windows as graphs that are built at first use and then cached.
 
     Args:
-        windows: their data set.
-        cache_bytes: of the graphs that are held in memory; those that come when it is used up are built every time.
+        windows: data set of the windows.
+        cache_bytes: maximum memory of cached graphs [bytes]. Further graphs are built at every use.
     """
 
     def __init__(self, windows: WindowDataset, cache_bytes: int = CACHE_BYTES) -> None:

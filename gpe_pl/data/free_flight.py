@@ -1,7 +1,7 @@
-"""Groups of nodes in free flight: what touches nothing accelerates by the gravity of the data.
+"""Groups of nodes in free flight. They touch nothing, so their acceleration should be the gravity of the data.
 
-A group is a connected component of the graph, an island. It is in free flight if no boundary node lies within the neighbour radius of its nodes and this was so
-in the frame before, as one island or several. Nothing in the graph tells a model to move it other than by gravity.
+A group is a connected component of the graph, an island. It is in free flight if no boundary node lies within the neighbour radius of its nodes, in this frame
+and in the frame before (where its nodes may form several islands). Nothing in the graph tells a model to move such a group other than by gravity.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from gpe_pl.graphs.islands import Islands, free_since, islands_within
 from gpe_pl.trajectory.trajectory import Metadata
 
 TOLERANCE = 1e-3
-"""A free group accelerates with gravity up to this fraction of it; without gravity, of the rms acceleration of all nodes."""
+"""Tolerance for the acceleration of a free group, as a fraction of gravity; without gravity, of the rms acceleration of all nodes."""
 
 SCATTER = 0.25
-"""Free groups agree on another acceleration if they differ among themselves, in the median, by less than this fraction of its distance from gravity."""
+"""Free groups agree on another acceleration if their median scatter is below this fraction of that acceleration's distance from gravity."""
 
 SUBSTANTIAL = 0.1
-"""Another acceleration differs from gravity by at least this fraction of gravity and of the rms acceleration of all nodes; less is a disturbance."""
+"""Another acceleration must differ from gravity by at least this fraction of gravity and of the rms acceleration of all nodes. Less is a disturbance."""
 
 MOST_FRAMES = 50
-"""Frames of a trajectory, evenly spread, in which groups are looked at."""
+"""Maximum number of frames of a trajectory, evenly spread, in which groups are examined."""
 
 
 @dataclass(frozen=True)
 class FreeFlight:
-    """Free groups of one frame, or of many.
+    """Free groups of one or more frames.
 
     Attributes:
-        num_islands: groups in all frames that were looked at, free or not.
-        acceleration: mean acceleration of each free group [group, dim] in m/s², from the second difference of positions that models learn from.
-        gravity: that of its trajectory [group, dim] in m/s².
-        resolution: what rounding of positions leaves uncertain in ``acceleration`` [group] in m/s².
+        num_islands: number of groups in all examined frames, free or not.
+        acceleration: mean acceleration of each free group [group, dim] in m/s², from second differences of the positions that models learn from.
+        gravity: gravity of the group's trajectory [group, dim] in m/s².
+        resolution: uncertainty of ``acceleration`` due to rounding of positions [group] in m/s².
         scale: rms acceleration of all nodes in the group's frame [group] in m/s².
     """
 
@@ -52,25 +52,25 @@ class FreeFlight:
 
     @property
     def tolerance(self) -> np.ndarray:
-        """By how much [group] in m/s² a group may differ from gravity."""
+        """Allowed difference between a group's acceleration and gravity [group] in m/s²."""
         strength = np.linalg.norm(self.gravity, axis=-1)
         return np.maximum(TOLERANCE * np.where(strength > 0, strength, self.scale), self.resolution)
 
     @property
     def num_disturbed(self) -> int:
-        """Free groups that do not accelerate with gravity."""
+        """Number of free groups that do not accelerate with gravity."""
         return int((np.linalg.norm(self.acceleration - self.gravity, axis=-1) > self.tolerance).sum())
 
     @property
     def typical(self) -> np.ndarray:
-        """Median acceleration of the groups [dim] in m/s²; components below their scatter are 0. Needs a free group."""
+        """Median acceleration of the groups [dim] in m/s². Components below their scatter are 0. There must be at least one free group."""
         middle = np.median(self.acceleration, axis=0)
         noise = np.maximum(np.median(np.abs(self.acceleration - middle), axis=0), np.median(self.resolution))
         return np.where(np.abs(middle) > noise, middle, 0.0)
 
     @property
     def agrees_on_another(self) -> bool:
-        """Whether the groups share an acceleration that is not gravity."""
+        """Whether the groups share an acceleration that differs from gravity."""
         if not self.num_free or 2 * self.num_disturbed <= self.num_free:
             return False
         excess = self.acceleration - self.gravity
@@ -80,34 +80,34 @@ class FreeFlight:
         return bool(distance > SUBSTANTIAL * strength and scatter < SCATTER * distance)
 
     def under(self, gravity: tuple[float, ...]) -> FreeFlight:
-        """The same groups, compared with another gravity [dim] in m/s²."""
+        """Return the same groups, compared with another gravity [dim] in m/s²."""
         return replace(self, gravity=np.broadcast_to(np.asarray(gravity, np.float64), self.acceleration.shape))
 
 
 def joined(flights: Iterable[FreeFlight], dim: int) -> FreeFlight:
-    """All groups of several frames or trajectories."""
+    """Join the groups of several frames or trajectories."""
     flights = [nothing(dim), *flights]
     parts = (np.concatenate([getattr(f, name) for f in flights]) for name in ("acceleration", "gravity", "resolution", "scale"))
     return FreeFlight(sum(f.num_islands for f in flights), *parts)
 
 
 def nothing(dim: int) -> FreeFlight:
-    """No groups at all."""
+    """Return an object without groups."""
     return FreeFlight(0, np.empty((0, dim)), np.empty((0, dim)), np.empty(0), np.empty(0))
 
 
 def free_flights(metadata: Metadata, arrays: dict[str, np.ndarray], most_frames: int = MOST_FRAMES) -> Iterator[FreeFlight]:
-    """Free groups of a trajectory, frame by frame.
+    """Find the free groups of a trajectory, frame by frame.
 
     Args:
-        metadata: of the trajectory.
-        arrays: by the names of ``schema.FIELDS``: ``pos``, ``mass``, ``boundary_pos`` and, for meshes, ``cells``.
-        most_frames: that are looked at.
+        metadata: metadata of the trajectory.
+        arrays: arrays by their names in ``schema.FIELDS``: ``pos``, ``mass``, ``boundary_pos`` and, for meshes, ``cells``.
+        most_frames: maximum number of frames that are examined.
     """
     pos, mass = arrays["pos"].astype(np.float64), arrays["mass"].astype(np.float64)
     gravity, dt, radius = np.asarray(metadata.gravity), metadata.frame_dt, metadata.connectivity_radius
     half_step = float(np.finfo(arrays["pos"].dtype).eps) / 2 * float(np.max(np.abs(pos), initial=0.0))
-    resolution = 4 * half_step * math.sqrt(metadata.dim) / dt**2  # (x₂ − 2 x₁ + x₀)/Δt² has at most four such errors along each axis
+    resolution = 4 * half_step * math.sqrt(metadata.dim) / dt**2  # (x₂ − 2 x₁ + x₀)/Δt² has at most four such errors per axis
     boundary = arrays["boundary_pos"].astype(np.float64)
     cells = arrays.get("cells", np.empty((0, 2), np.int64)).astype(np.int64)
     mesh = np.concatenate([np.stack([cells[:, 0], cells[:, k]]) for k in range(1, cells.shape[1])], axis=1)
@@ -120,7 +120,7 @@ def free_flights(metadata: Metadata, arrays: dict[str, np.ndarray], most_frames:
         count = len(islands.is_free)
         free = free_since(before, islands)
         window = pos[frame - 1 : frame + 2]
-        if metadata.periodicity:  # relative to the middle, so that crossing the seam is no jump
+        if metadata.periodicity:  # relative to the middle frame, so that crossing the seam is not a jump
             window = metadata.periodicity.shortest(window - pos[frame])
         of_nodes = np.diff(window, 2, axis=0)[0] / dt**2
         acceleration = islands.mean(of_nodes, mass)[free]
@@ -130,7 +130,7 @@ def free_flights(metadata: Metadata, arrays: dict[str, np.ndarray], most_frames:
 
 
 def _independent(label: np.ndarray, pos: np.ndarray, count: int) -> np.ndarray:
-    """Nodes of each island [island] whose positions [node, dim] are rounded independently: in the rows of a lattice all are rounded alike."""
+    """Number of different coordinates in each island [island], the minimum over axes. Equal coordinates, as in rows of a lattice, are rounded alike."""
     different = []
     for x in pos.T:
         order = np.lexsort((x, label))
@@ -140,5 +140,5 @@ def _independent(label: np.ndarray, pos: np.ndarray, count: int) -> np.ndarray:
 
 
 def vector(values: Iterable[float]) -> str:
-    """An acceleration for messages."""
+    """Format an acceleration for messages."""
     return f"({', '.join(f'{value:.3g}' for value in values)}) m/s²"

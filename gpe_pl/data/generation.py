@@ -1,12 +1,12 @@
 """Parallel, resumable generation of data sets.
 
-Every trajectory is a pure function (see ``ground_truth``) and every shard appears atomically, so a run that was killed resumes where it stopped and
-leaves the same bytes as one that was not. A shard that can be opened counts as complete; ``discard_damaged`` looks at every byte. Layout::
+Every trajectory is a pure function (see ``ground_truth``) and every shard appears atomically. A killed run therefore resumes where it stopped and leaves the
+same bytes as an uninterrupted run. A shard that can be opened counts as complete; ``discard_damaged`` checks every byte. Layout::
 
-    {root}/{name}/{size}/dataset.json            the spec and its hash, written first
+    {root}/{name}/{size}/dataset.json            the spec and its checksum, written first
     {root}/{name}/{size}/{split}/shard-00000.h5
-    {root}/{name}/{size}/statistics.json         of the train split, written when all its shards are there
-    {root}/{name}/{size}/contact_sheet.png       one scene under several parameter values, to look at
+    {root}/{name}/{size}/statistics.json         statistics of the train split, written when all its shards exist
+    {root}/{name}/{size}/contact_sheet.png       one scene with several parameter values, for inspection
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ CONTACT_SHEET_FILE = "contact_sheet.png"
 SHEET_ROWS = 5
 
 SCENES_LOOKED_AT = 8
-"""For meshes that are too thin: bodies of one data set differ."""
+"""Number of scenes that are checked for meshes that are too thin, because bodies of one data set differ."""
 
 ROUNDING_REFUSED = 0.5
-"""Fraction of the accelerations that rounding of stored positions must not exceed; above ``ROUNDING_SHARE`` there is a warning."""
+"""Maximum rounding error of accelerations due to stored positions, as a fraction of the accelerations. Above ``ROUNDING_SHARE`` a warning is logged."""
 
 # --- shards --------------------------------------------------------------------------------------------------------------------------------
 
@@ -67,7 +67,7 @@ def _shard_indices(spec: DatasetSpec, split: str, shard: int) -> range:
 
 
 def _shards(spec: DatasetSpec, part: tuple[int, int] = (0, 1)) -> list[tuple[str, int]]:
-    """Split and number of each shard, or of every n-th from the k-th on."""
+    """Return split and number of each shard, or with ``part = (k, n)`` of every n-th shard from the k-th on."""
     if not 0 <= part[0] < part[1]:
         raise ValueError(f"part must be (k, n) with 0 <= k < n, got {part}")
     every = [(split, k) for split, count in spec.counts.items() for k in range(math.ceil(count / spec.trajectories_per_shard))]
@@ -75,7 +75,7 @@ def _shards(spec: DatasetSpec, part: tuple[int, int] = (0, 1)) -> list[tuple[str
 
 
 def _is_complete(spec: DatasetSpec, folder: Path, split: str, shard: int) -> bool:
-    """A shard that is there and readable is complete, because it is written atomically."""
+    """Whether a shard exists and is readable. It is then complete, because it is written atomically."""
     try:
         return trajectory_names(shard_path(folder, split, shard)) == [f"{i:05d}" for i in _shard_indices(spec, split, shard)]
     except StoreError:
@@ -83,24 +83,24 @@ def _is_complete(spec: DatasetSpec, folder: Path, split: str, shard: int) -> boo
 
 
 def _fault(path: Path) -> tuple[Path, str]:
-    """Why a shard cannot be used, or nothing where all that it holds agrees with its checksums."""
+    """Return the path of a shard and why it cannot be used, or an empty text if its content agrees with its checksums."""
     try:
         for name in trajectory_names(path):
             read_trajectory(path, name, verify=True)
     except StoreError as error:
-        return path, str(error).partition("; ")[0]  # without the advice, which is about to be followed
+        return path, str(error).partition("; ")[0]  # without the advice: the caller follows it now
     return path, ""
 
 
 def _write_shard(spec: DatasetSpec, folder: Path, split: str, shard: int) -> int:
-    """Generate one shard; returns the number of its trajectories."""
+    """Generate one shard, and return the number of its trajectories."""
     indices = _shard_indices(spec, split, shard)
     write_shard(shard_path(folder, split, shard), (generate_trajectory(spec, split, i) for i in indices), (f"{i:05d}" for i in indices))
     return len(indices)
 
 
 def _bytes_per_trajectory(spec: DatasetSpec) -> int:
-    """Uncompressed; nodes and cells at most as many as the scene says, boundary nodes of the first scene."""
+    """Estimate the uncompressed size of a trajectory [bytes], with the scene's maximum of nodes and cells, and the first scene's boundary nodes."""
     dim = len(spec.scene.bounds)
     per_frame = 2 * dim * spec.scene.max_nodes
     if spec.solver.stores_stress:
@@ -110,7 +110,7 @@ def _bytes_per_trajectory(spec: DatasetSpec) -> int:
 
 
 def dataset_bytes(spec: DatasetSpec) -> int:
-    """Estimate of what a complete data set takes on disk at most: compression saves a part of it."""
+    """Estimate the maximum size of a complete data set on disk [bytes]. Compression reduces it."""
     return sum(spec.counts.values()) * _bytes_per_trajectory(spec)
 
 
@@ -119,13 +119,13 @@ def dataset_bytes(spec: DatasetSpec) -> int:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is missing of a data set, and what it takes to generate it.
+    """The missing part of a data set, and the room that it needs.
 
     Attributes:
-        missing: split and number of each shard that is not there.
-        num_done, num_missing: trajectories that are there and that are not.
-        bytes_needed: on disk, at most.
-        bytes_free: on the disk.
+        missing: split and number of each missing shard.
+        num_done, num_missing: numbers of existing and of missing trajectories.
+        bytes_needed: maximum size of the missing shards on disk.
+        bytes_free: free bytes on the disk.
     """
 
     missing: tuple[tuple[str, int], ...]
@@ -141,7 +141,7 @@ class Plan:
 
 
 def plan(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1)) -> Plan:
-    """What ``generate`` does with the same arguments."""
+    """Return the plan that ``generate`` follows with the same arguments."""
     folder = Path(root) / spec.name / spec.size
     own = _shards(spec, part)
     missing = tuple((split, k) for split, k in own if not _is_complete(spec, folder, split, k))
@@ -150,10 +150,10 @@ def plan(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1)) ->
 
 
 def discard_damaged(root: Path | str, spec: DatasetSpec, num_workers: int = 1, part: tuple[int, int] = (0, 1)) -> None:
-    """Read all shards and statistics that are there and delete those whose content disagrees with their checksums, so that ``generate`` makes them again.
+    """Delete shards and statistics that do not agree with their checksums, so that ``generate`` creates them again.
 
-    Each of them is logged. This takes about a twentieth of the time to generate them. Where nothing is damaged, nothing is written. Arguments and errors are
-    those of ``generate``.
+    Each deleted file is logged. Reading everything takes about a twentieth of the time to generate it. If nothing is damaged, nothing is written. Arguments and
+    errors are those of ``generate``.
     """
     folder = Path(root) / spec.name / spec.size
     paths = [path for shard in _shards(spec, part) if (path := shard_path(folder, *shard)).is_file()]
@@ -177,7 +177,7 @@ def discard_damaged(root: Path | str, spec: DatasetSpec, num_workers: int = 1, p
 
 
 def is_complete(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1)) -> bool:
-    """Whether ``generate`` with the same arguments would only read."""
+    """Whether ``generate`` with the same arguments would have nothing to write."""
     return not plan(root, spec, part).missing and _is_described(Path(root) / spec.name / spec.size, part)
 
 
@@ -195,7 +195,7 @@ def _has_intact_statistics(path: Path) -> bool:
 
 
 def _has_statistics(folder: Path) -> bool:
-    """Whether the statistics in a folder are of the training shards that are there, and not of earlier ones."""
+    """Whether the statistics in a folder belong to its current training shards."""
     try:
         return bool(sealed.read(folder / STATISTICS_FILE, "")["data_sha256"] == split_checksum(folder, "train"))
     except (OSError, ValueError, KeyError):
@@ -203,19 +203,22 @@ def _has_statistics(folder: Path) -> bool:
 
 
 def _compile(spec: DatasetSpec) -> None:
-    """Compile the solver, or load what was compiled before, which is too quick to be spoken of."""
+    """Compile the solver, or load it from the cache. A log line appears only if this takes more than 3 s."""
     notice = threading.Timer(3.0, log.info, ["compiling the solver, once on this machine: about a minute"])
     notice.daemon = True
     notice.start()
     try:
-        with contextlib.suppress(SimulationError):  # settings that cannot work are reported by the first trajectory, with its seed
+        with contextlib.suppress(SimulationError):  # the first trajectory reports impossible settings with its seed
             spec.solver.compile_kernels()
     finally:
         notice.cancel()
 
 
 def seconds_per_trajectory(spec: DatasetSpec, budget: float = 10.0) -> float:
-    """Estimate [s] on one core: the mean over random training trajectories, as many as take ``budget`` seconds and at least one."""
+    """Estimate the time to generate a trajectory on one core [s]: the mean over random training trajectories.
+
+    Trajectories are generated until ``budget`` [s] is used up, and at least one.
+    """
     _compile(spec)
     order = np.random.default_rng(0).permutation(spec.num_train).tolist()
     started, count = time.perf_counter(), 0
@@ -226,16 +229,16 @@ def seconds_per_trajectory(spec: DatasetSpec, budget: float = 10.0) -> float:
 
 
 def check_rounding(spec: DatasetSpec) -> None:
-    """Refuse a frame interval so short that stored accelerations would be rounding, and warn of one that is nearly so short.
+    """Check that the frame interval is not so short that rounding dominates stored accelerations; warns if it is nearly so short.
 
-    Where the bounds alone do not exclude it, a training trajectory is simulated and measured.
+    If the bounds alone cannot exclude this, a training trajectory is simulated and measured.
 
     Raises:
-        GenerationError: rounding of float32 positions is more than ``ROUNDING_REFUSED`` of the accelerations, or the trajectory failed.
+        GenerationError: rounding of float32 positions is more than a fraction ``ROUNDING_REFUSED`` of the accelerations, or the trajectory failed.
     """
     dt = spec.solver.frame_dt
     rounding = float(rounding_of(np.abs(np.array(spec.scene.bounds)).max(axis=1), dt).max())
-    if rounding <= ROUNDING_SHARE * float(np.linalg.norm(spec.scene.gravity)):  # what meets a wall accelerates by this much at least
+    if rounding <= ROUNDING_SHARE * float(np.linalg.norm(spec.scene.gravity)):  # nodes that meet a wall accelerate at least as much
         return
     trajectory = generate_trajectory(spec, "train", 0)
     acceleration = motion_of(trajectory.metadata, trajectory.pos).acceleration
@@ -249,25 +252,25 @@ def check_rounding(spec: DatasetSpec) -> None:
 def generate(
     root: Path | str, spec: DatasetSpec, num_workers: int = 1, on_progress: Progress | None = None, part: tuple[int, int] = (0, 1)
 ) -> Path:
-    """Generate what is missing of a data set.
+    """Generate the missing part of a data set.
+
+    Waits while another process generates the same data. A complete data set is only read.
 
     Args:
         root: folder of all data sets.
         spec: the data set.
-        num_workers: processes; 1 simulates in this process.
-        on_progress: called with the trajectories done and their total, once at the start and after each shard.
-        part: ``(k, n)`` does every n-th shard from the k-th on, so that n machines with one disk share the work. Whoever finds all training shards
-            in place writes the statistics.
+        num_workers: number of processes; 1 simulates in this process.
+        on_progress: called with the number of finished trajectories and their total, at the start and after each shard.
+        part: ``(k, n)`` generates every n-th shard from the k-th on, so that n machines with one disk share the work. The process that finds all training
+            shards complete writes the statistics.
 
     Returns:
         The folder of the data set, ``root/name/size``.
 
-    Waits while another process generates the same data. A data set that is complete is only read.
-
     Raises:
         GenerationError: the folder holds a data set of another spec, the disk is too small, or a trajectory failed.
         WorkerError: a process died.
-        FolderError: the folder cannot be made or written.
+        FolderError: the folder cannot be created or written.
     """
     if num_workers < 1:
         raise ValueError(f"num_workers must be at least 1, got {num_workers}")
@@ -291,7 +294,7 @@ def generate(
 
 
 def written(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1), waits: bool = False) -> AbstractContextManager[None]:
-    """Inside, no other process writes the data set, or the same part of it; arguments and errors are those of ``locks.held``."""
+    """Keep other processes from writing the data set, or the same part of it, inside the block; arguments and errors are those of ``locks.held``."""
     folder = Path(root) / spec.name / spec.size
     if part[1] == 1:
         return held(folder, "paths.data", waits)
@@ -299,7 +302,7 @@ def written(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1),
 
 
 def _generate(folder: Path, to_do: Plan, spec: DatasetSpec, num_workers: int, on_progress: Progress | None, part: tuple[int, int]) -> None:
-    with held(folder, "paths.data", waits=True):  # where parts are generated at once, one of them says what the data are
+    with held(folder, "paths.data", waits=True):  # of parts generated at the same time, one writes the spec
         _claim(folder, spec)
     if not to_do.fits:
         raise GenerationError(
@@ -341,7 +344,7 @@ def _without_orphans(folder: Path) -> Iterator[None]:
 
 
 def _draw_contact_sheet(spec: DatasetSpec, path: Path, workers: Executor | None) -> None:
-    """A training scene with as many of the materials as possible, under parameter values from the smallest to the largest."""
+    """Draw a training scene with as many materials as possible, for parameter values from the smallest to the largest."""
     from gpe_pl.viz.captions import row_label
     from gpe_pl.viz.contact_sheet import contact_sheet
     from gpe_pl.viz.saving import save_figure
@@ -360,10 +363,10 @@ def _draw_contact_sheet(spec: DatasetSpec, path: Path, workers: Executor | None)
 
 
 def _most_varied_scene(spec: DatasetSpec) -> int:
-    """Index of the training scene with the most materials, among the first ones."""
+    """Return the index of the scene with the most materials among the first 32 training scenes."""
     best, most = 0, 1
     for index in range(min(spec.num_train, 32)):
-        if most == len(spec.scene.materials):  # also where there is but one
+        if most == len(spec.scene.materials):  # also if the data set has only one
             break
         number = len(np.unique(initial_state(spec, "train", index).node_type))
         if number > most:
@@ -376,7 +379,7 @@ def _labelled_trajectory(spec: DatasetSpec, index: int, label: str, values: dict
 
 
 def _claim(folder: Path, spec: DatasetSpec) -> None:
-    """Write the spec into the folder, or check that the one there is the same, and that nothing in it leads elsewhere."""
+    """Write the spec into the folder, or check that the existing one is the same; also check that no link leads out of the folder."""
     refuse_links(folder)
     path, values = folder / SPEC_FILE, spec.as_dict()
     if not path.is_file():
@@ -390,15 +393,15 @@ def _claim(folder: Path, spec: DatasetSpec) -> None:
     except sealed.SealError as error:
         raise GenerationError(str(error)) from None
     if not (isinstance(stored, dict) and isinstance(stored.get("spec"), dict)):
-        raise GenerationError(f"{path}: unreadable, as it describes no data set; {advice}")
+        raise GenerationError(f"{path}: unreadable, it does not describe a data set; {advice}")
     differing = _differences(stored["spec"], values)
     if not differing and stored.get("sha256") != sealed.checksum(values):
         raise GenerationError(f"{path}: was changed or damaged since it was written (checksum mismatch); {advice}")
     made_by, now = (spec["solver"] if isinstance(spec.get("solver"), dict) else {} for spec in (stored["spec"], values))
     if made_by.get("name") == now.get("name") and made_by.get("version") != now.get("version"):
         raise GenerationError(
-            f"{folder}: holds data of version {made_by.get('version')} of the solver {now['name']}; this is version {now['version']}, whose trajectories are "
-            "others. Delete the folder to generate the data again, or choose another data set name"
+            f"{folder}: holds data of version {made_by.get('version')} of the solver {now['name']}; this is version {now['version']}, whose trajectories "
+            "differ. Delete the folder to generate the data again, or choose another data set name"
         )
     if differing:
         raise GenerationError(
@@ -408,7 +411,7 @@ def _claim(folder: Path, spec: DatasetSpec) -> None:
 
 
 def _differences(stored: Any, wanted: Any, key: str = "") -> list[str]:
-    """Leaves in which two nested mappings differ, as ``key: stored, now wanted``."""
+    """List the values in which two nested mappings differ, as ``key is stored, now wanted``."""
     if isinstance(stored, dict) and isinstance(wanted, dict):
         names = sorted(stored.keys() | wanted.keys())
         return [d for n in names for d in _differences(stored.get(n), wanted.get(n), f"{key}.{n}" if key else n)]

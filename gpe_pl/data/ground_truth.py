@@ -1,6 +1,6 @@
-"""Ground truth of one scene: what a data set is made of, and any of its trajectories by split and index.
+"""Specification of generated data sets, and simulation of any of their trajectories.
 
-Every trajectory is a pure function of ``(spec, split, index)``; ``generation`` stores them.
+Every trajectory is a pure function of ``(spec, split, index)``. ``generation`` stores trajectories.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 MOST = 1_000_000
-"""Trajectories of a split, and frames of a trajectory: far more than anyone needs, and few enough to be listed."""
+"""Maximum number of trajectories of a split, and of frames of a trajectory. It is far more than anyone needs, and small enough to be listed."""
 
 Count = Annotated[int, Field(ge=0, le=MOST)]
 
 
 class GenerationError(GpeError):
-    """Data could not be generated. Names split, index and seed of the trajectory that failed, where there is one."""
+    """Raised when data cannot be generated; names split, index and seed of the trajectory that failed, if there is one."""
 
     def __init__(self, message: str, split: str = "", index: int = -1, seed: int = -1) -> None:
         super().__init__(message)
@@ -45,7 +45,7 @@ class GenerationError(GpeError):
 
 @runtime_checkable
 class Solver(Simulator, Protocol):
-    """A simulator whose results depend on nothing but its settings, name and version."""
+    """A simulator whose results depend only on its settings, name and version."""
 
     name: ClassVar[str]
     version: ClassVar[str]
@@ -68,11 +68,12 @@ class Solver(Simulator, Protocol):
 
 @dataclass(frozen=True, config={"extra": "forbid"})
 class ParameterValues:
-    """Values of a material's parameter.
+    """Values of a material's parameter in a data set.
 
     Attributes:
-        seen: in ``train``, ``val`` and ``test``, dealt in turn.
-        interpolated, extrapolated: in even and in odd trajectories of ``test_unseen``: inside and outside the range of ``seen``.
+        seen: values in ``train``, ``val`` and ``test``, used in turn.
+        interpolated: values inside the range of ``seen``, in trajectories of ``test_unseen`` with even index.
+        extrapolated: values outside the range of ``seen``, in trajectories of ``test_unseen`` with odd index.
     """
 
     seen: Annotated[tuple[float, ...], Field(min_length=1)]
@@ -92,17 +93,17 @@ class ParameterValues:
 
 @dataclass(frozen=True, config={"extra": "forbid", "arbitrary_types_allowed": True})
 class DatasetSpec:
-    """Everything that determines the bytes of a data set.
+    """Specification of a data set, which determines all its bytes.
 
     Attributes:
-        name, size: folder names.
+        name, size: names of its folders.
         parameters: values of each material's parameter.
-        num_train, num_val, num_test, num_test_unseen: trajectories per split.
-        num_frames: stored frames per trajectory, the initial one included.
-        trajectories_per_shard: the unit of work and of resuming.
-        seed: of the data set.
+        num_train, num_val, num_test, num_test_unseen: numbers of trajectories per split.
+        num_frames: number of stored frames per trajectory, including the initial one.
+        trajectories_per_shard: number of trajectories in a shard, the unit of work and of resuming.
+        seed: seed of the data set.
         scene: distribution of scenes.
-        solver: what simulates them.
+        solver: solver that simulates them.
     """
 
     name: DataName
@@ -143,7 +144,7 @@ class DatasetSpec:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Trajectories per split."""
+        """Number of trajectories per split."""
         return dict(zip(SPLITS, (self.num_train, self.num_val, self.num_test, self.num_test_unseen), strict=True))
 
     @property
@@ -156,22 +157,25 @@ class DatasetSpec:
         }
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain JSON values; includes what else the bytes depend on: the solver's name, version and largest substep, and the content of the scene's files."""
+        """Convert to plain JSON values.
+
+        They include everything else that the bytes depend on: the solver's name, version and largest substep, and checksums of the scene's files.
+        """
         files = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in self.scene.input_files.values()}
         return json.loads(json.dumps({**asdict(self), **self.provenance, "input_files": files}))  # type: ignore[call-overload]
 
 
 def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:
-    """Seed of one scene: different for every data set seed, split and index."""
+    """Seed of one scene, which differs for every seed of the data set, split and index."""
     words = np.random.SeedSequence((spec.seed, SPLITS.index(split), index)).generate_state(2, np.uint32)
     return int(words[0]) << 32 | int(words[1])
 
 
 def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[str, float], ParameterGroup]:
-    """Value of each material's parameter in one trajectory, and the group that they belong to.
+    """Return the parameter of each material in one trajectory, and the group that these values belong to.
 
-    A first material's values are dealt in turn. Every other one's are too, but each round of them in an order of its own, so that no material's
-    parameter tells another's.
+    The values of the first material are used in turn. The values of any other material are also used in turn, but each round has a random order, so that
+    parameters of different materials are independent.
     """
     group: ParameterGroup = "seen"
     if split == "test_unseen":
@@ -186,7 +190,7 @@ def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[st
 
 
 def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
-    """Metadata of one trajectory."""
+    """Return the metadata of one trajectory."""
     return describe(
         spec.scene,
         spec.solver.frame_dt,
@@ -202,7 +206,11 @@ def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
 
 
 def initial_state(spec: DatasetSpec, split: str, index: int, values: Mapping[str, float] | None = None) -> State:
-    """The scene of one trajectory, on request with other parameter values; raises ``GenerationError`` if it is impossible."""
+    """Sample the initial state of one trajectory, optionally with other parameter values.
+
+    Raises:
+        GenerationError: the scene is impossible.
+    """
     seed = scene_seed(spec, split, index)
     try:
         return spec.scene.sample(values or parameter_values(spec, split, index)[0], seed)
@@ -213,10 +221,10 @@ def initial_state(spec: DatasetSpec, split: str, index: int, values: Mapping[str
 def generate_trajectory(
     spec: DatasetSpec, split: str, index: int, values: Mapping[str, float] | None = None, num_frames: int | None = None
 ) -> Trajectory:
-    """Simulate one trajectory, on request with other parameter values or fewer frames.
+    """Simulate one trajectory, optionally with other parameter values or another number of frames.
 
     Raises:
-        GenerationError: the scene is impossible or the solver gives up.
+        GenerationError: the scene is impossible, or the simulation stopped early.
     """
     metadata = trajectory_metadata(spec, split, index)
     label = f"split {split}, index {index}, seed {metadata.seed}"

@@ -1,11 +1,11 @@
-"""How nodes move from frame to frame, and what of it is rounding.
+"""Motion of nodes from frame to frame, and the error of accelerations due to rounding of positions.
 
-Positions that are rounded to multiples of q have the error q/√12 (rms, evenly spread over ±q/2). An acceleration is (x₂ − 2 x₁ + x₀)/Δt², so its error is
+Positions that are rounded to multiples of q have the error q/√12 (rms, uniform in ±q/2). An acceleration is (x₂ − 2 x₁ + x₀)/Δt², so its error is
 
     q/√12 · √(1 + 4 + 1) / Δt² = q / (√2 Δt²)
 
-where q is the distance of neighbouring floating-point numbers, which grows with the distance from the origin, or of the marks on which a source has its
-positions: a text file's last digit, a camera's pixels.
+Here q is the distance of neighbouring floating-point numbers, which grows with the distance from the origin. If a source has positions on a grid of marks,
+such as the last digit in a text file or the pixels of a camera, q is the distance of these marks.
 """
 
 from __future__ import annotations
@@ -23,45 +23,52 @@ Precision = type[np.float16] | type[np.float32] | type[np.float64]
 PRECISIONS: tuple[Precision, ...] = (np.float16, np.float32, np.float64)
 
 ROUNDING_SHARE = 0.1
-"""Share of the accelerations that rounding may be: a hundredth of their variance, which no model can learn."""
+"""Largest acceptable rounding error of accelerations, as a fraction of the accelerations. It is a hundredth of their variance, which no model can learn."""
 
 
 ENOUGH_CHANGES = 100
-"""Changes of velocity that tell marks from chance."""
+"""Number of velocity changes that distinguish marks from chance."""
 
 CHANGES_PER_WINDOW = 20_000
+"""Number of velocity changes that are sampled from each part of the frames, at most."""
 
 OFF_MARK = 0.1
-"""Fraction of the distance of marks by which second differences of positions on them may miss a multiple, for the rounding of floating-point numbers."""
+"""Tolerance for second differences of positions to be multiples of the marks' distance, as a fraction of it. Floating-point rounding makes it necessary."""
 
 ON_MARKS = 0.99
-"""Fraction of changes that are such multiples; a node that crosses a seam may make another one."""
+"""Fraction of second differences that must be such multiples. A node that crosses a seam may give another value."""
 
 
 def rounding_to(step: np.ndarray, frame_dt: float) -> np.ndarray:
-    """Error of accelerations [dim] in m/s², rms, where positions are rounded to multiples of ``step`` [dim] in m."""
+    """Rms error of accelerations [dim] in m/s² if positions are rounded to multiples of ``step`` [dim] in m."""
     return step / (math.sqrt(2) * frame_dt**2)
 
 
 def rounding_of(farthest: np.ndarray, frame_dt: float, precision: Precision = np.float32) -> np.ndarray:
-    """Error of accelerations [dim] in m/s², rms, where positions as far as ``farthest`` [dim] in m from the origin are rounded to a precision."""
+    """Rms error of accelerations [dim] in m/s² if positions at most ``farthest`` [dim] in m from the origin are rounded to a precision."""
     return rounding_to(np.spacing(np.abs(farthest).astype(precision)).astype(np.float64), frame_dt)
 
 
 def rounding_fault(rounding: float, acceleration: float, where: str = "in float32") -> str:
-    """What to say where rounding of positions, ``where`` they are so, is too large a part of the accelerations, both rms in m/s²; empty where it is not."""
+    """Describe a rounding error of accelerations that is too large; empty if it is acceptable.
+
+    Args:
+        rounding: rms error of accelerations due to rounding of positions [m/s²].
+        acceleration: rms acceleration of the data [m/s²].
+        where: how positions are rounded, for the message.
+    """
     if rounding <= ROUNDING_SHARE * acceleration:
         return ""
     return f"positions {where} round accelerations by {rounding:.3g} m/s², those of the data are {acceleration:.3g} m/s² rms"
 
 
 def marks(changes: np.ndarray, rounding: float) -> float:
-    """Distance [m] of the marks on which coordinates lie, 0 where there are none that floating-point numbers do not explain.
+    """Distance of the marks on which coordinates lie [m]; 0 if there are no marks, or floating-point numbers explain them.
 
-    Coordinates on marks have second differences that are multiples of their distance, of both signs: rounding has no direction, which gravity has.
+    Second differences of coordinates on marks are multiples of the marks' distance and have both signs. Rounding has no direction, unlike gravity.
 
     Args:
-        changes: second differences from frame to frame [change] in m.
+        changes: second differences of coordinates from frame to frame [change] in m.
         rounding: distance of neighbouring floating-point numbers [m].
     """
     changes = changes[np.abs(changes) > 16 * rounding]
@@ -75,16 +82,18 @@ def marks(changes: np.ndarray, rounding: float) -> float:
 
 @dataclass(frozen=True)
 class MotionSummary:
-    """What is known of a trajectory's motion.
+    """Summary of a trajectory's motion.
 
     Attributes:
         low, high: smallest and largest positions [dim] in m.
         frame_dt: time between frames [s].
-        precision: the coarsest floating-point type that holds all positions, whatever type they came in.
-        marks: distance of the marks on which positions lie [dim] in m, 0 where there are none coarser than ``precision``.
-        acceleration: rms without gravity [m/s²].
-        mean_acceleration: mean without gravity [dim] in m/s².
-        step: the farthest that a node moves between two frames [m]; it arrives in ``frame`` and is ``node``.
+        precision: coarsest floating-point type that represents all positions exactly, independent of the array's type.
+        marks: distance of the marks on which positions lie [dim] in m; 0 if there are none coarser than ``precision``.
+        acceleration: rms acceleration without gravity [m/s²].
+        mean_acceleration: mean acceleration without gravity [dim] in m/s².
+        step: largest displacement of a node between two frames [m].
+        frame: frame in which this displacement ends.
+        node: node of this displacement.
     """
 
     low: np.ndarray
@@ -99,22 +108,27 @@ class MotionSummary:
     node: int
 
     def rounding(self, precision: Precision, origin: np.ndarray) -> np.ndarray:
-        """Error of accelerations [dim] in m/s², rms, where positions are rounded in coordinates with this origin [dim] in m."""
+        """Rms error of accelerations [dim] in m/s² if positions are rounded to a precision in coordinates with this origin [dim] in m."""
         return rounding_of(np.maximum(np.abs(self.low - origin), np.abs(self.high - origin)), self.frame_dt, precision)
 
     @property
     def rounding_to_marks(self) -> np.ndarray:
-        """Error of accelerations [dim] in m/s², rms, that a source's marks leave."""
+        """Rms error of accelerations [dim] in m/s² due to the source's marks."""
         return rounding_to(self.marks, self.frame_dt)
 
     def with_gravity(self, change: np.ndarray) -> MotionSummary:
-        """The same with another gravity, which differs by ``change`` [dim] in m/s²."""
+        """Return the summary for another gravity, which differs by ``change`` [dim] in m/s²."""
         squares = self.acceleration**2 + float(np.mean(change * (change - 2 * self.mean_acceleration)))
         return replace(self, acceleration=math.sqrt(max(squares, 0.0)), mean_acceleration=self.mean_acceleration - change)
 
 
 def motion_of(m: Metadata, pos: np.ndarray) -> MotionSummary:
-    """Measure the motion of a trajectory with these metadata and positions [frame, node, dim] of 3 frames or more, some frames at a time."""
+    """Measure the motion of a trajectory of at least 3 frames, a part of the frames at a time.
+
+    Args:
+        m: metadata of the trajectory.
+        pos: positions [frame, node, dim] in m.
+    """
     precisions = list(PRECISIONS)
     squares, total, farthest = 0.0, np.zeros(pos.shape[2]), (-1.0, 0, 0)
     changes: list[np.ndarray] = []
@@ -130,7 +144,7 @@ def motion_of(m: Metadata, pos: np.ndarray) -> MotionSummary:
         step = np.linalg.norm(vel, axis=-1) * m.frame_dt
         frame, node = np.unravel_index(step.argmax(), step.shape)
         farthest = max(farthest, (float(step[frame, node]), start + int(frame) + 1, int(node)))
-        with np.errstate(over="ignore"):  # what a type cannot hold, it does not hold exactly either
+        with np.errstate(over="ignore"):  # an overflow counts as not exact
             precisions = [p for p in precisions if (window.astype(p) == window).all()]
     low, high = pos.min(axis=(0, 1)).astype(np.float64), pos.max(axis=(0, 1)).astype(np.float64)
     rounding = np.spacing(np.maximum(np.abs(low), np.abs(high)).astype(precisions[0])).astype(np.float64)
@@ -149,9 +163,9 @@ def motion_of(m: Metadata, pos: np.ndarray) -> MotionSummary:
 
 
 def better_origin(motions: list[MotionSummary], tolerance: float) -> np.ndarray:
-    """The origin [dim] in m that stored positions need so that float32 rounds accelerations by no more than ``tolerance`` [m/s²].
+    """Choose the origin [dim] in m that stored positions need so that float32 rounds accelerations by at most ``tolerance`` [m/s²].
 
-    A round number near the middle of all positions, along axes where this helps positions that are finer than float32; 0 along the others.
+    It is a round number near the middle of all positions along axes where this helps, and 0 along other axes. It is 0 unless positions are finer than float32.
     """
     low, high = np.min([m.low for m in motions], axis=0), np.max([m.high for m in motions], axis=0)
     nowhere, digits = np.zeros(len(low)), -math.ceil(math.log10((high - low).max()))

@@ -1,11 +1,11 @@
-"""Training noise: new position windows, consistent in velocity and position; the stored data is never touched.
+"""Training noise on windows of positions. Noisy velocities are consistent with noisy positions. Stored data are never changed.
 
-A window holds positions x[t−H … t+1] [history + 2, node, dim]. Both noises are added to positions, so velocities and the target acceleration follow from
-the noisy window by the integrator's own formulas.
+A window has positions x[t−H … t+1] [history + 2, node, dim]. Both kinds of noise are added to positions. Velocities and the target acceleration follow from
+the noisy window by the formulas of the integrator.
 
-- Position noise: the same offset on every position, the target's included (paper, section 3.2): velocities and target stay as they are.
-- Velocity noise: a random walk over the H velocities, integrated to positions; the next velocity stays the true one, so the target corrects the velocity
-  noise exactly and the position noise not at all [Sanchez-Gonzalez et al. 2020, as in their published code].
+- Position noise: the same offset on every position, including the target's (paper, section 3.2). It does not change velocities and target.
+- Velocity noise: a random walk over the H velocities, integrated to positions. The next velocity is the true one, so the target corrects the velocity noise
+  entirely and the resulting position noise not at all [Sanchez-Gonzalez et al. 2020, as in their published code].
 """
 
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ from gpe_pl.errors import GpeError
 from gpe_pl.trajectory.trajectory import Metadata
 
 MAX_SPACINGS = 0.5
-"""Largest standard deviation of noise in rest spacings: beyond it, nodes change places with their neighbours."""
+"""Largest standard deviation of noise in rest spacings. With more noise, nodes change places with their neighbours."""
 ROUNDING = 1e-5
-"""Of the largest value that a message names."""
+"""Relative tolerance for a value that was copied, rounded, from a message."""
 
 
 class NoiseError(GpeError, ValueError):
-    """Noise is too large for the spacing of the data; the message names the key, its value and the largest that is allowed."""
+    """Raised for noise that is too large for the spacing of the data; the message names the key, its value and the largest allowed value."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Noise:
     Attributes:
         position_of_domain: standard deviation of the position noise, as a fraction of the domain's longest side.
         velocity_of_change: standard deviation of the velocity noise in units of one frame's velocity change, which is the root mean square acceleration
-            (without gravity's) × frame interval.
-        correction: fraction of the noise on the last position that the target takes back within the step; a model that is to bring nodes back to where they
-            belong needs some [γ of Pfaff et al. 2021, appendix A.2.2]; the paper has none.
+            without gravity × frame interval.
+        correction: fraction of the noise on the last position that the target removes within the step [γ of Pfaff et al. 2021, appendix A.2.2]. A model
+            needs some to learn to correct positions; the paper uses none.
     """
 
     position_of_domain: Annotated[float, Field(ge=0, le=1)] = 0.0
@@ -45,14 +45,14 @@ class Noise:
     correction: Annotated[float, Field(ge=0, le=1)] = 0.0
 
     def check(self, metadata: Metadata, velocity_unit: float = 0.0) -> None:
-        """Refuse noise that is large beside the spacing of a data set.
+        """Check that the noise is not too large for the spacing of a data set.
 
         Args:
-            metadata: of the data set.
-            velocity_unit: root mean square acceleration × frame interval [m/s]; 0 where it is not known yet: then velocity noise is not checked.
+            metadata: metadata of the data set.
+            velocity_unit: root mean square acceleration × frame interval [m/s]. With 0, if it is not known yet, velocity noise is not checked.
 
         Raises:
-            NoiseError: the noise on positions, or on the way within a frame, has a standard deviation of more than ``MAX_SPACINGS``.
+            NoiseError: the noise on positions, or on the displacement in one frame, has a standard deviation of more than ``MAX_SPACINGS`` spacings.
         """
         spacing = metadata.spacing
         for key, value, unit in (
@@ -73,11 +73,11 @@ class Noise:
         frame_dt: float,
         rng: np.random.Generator,
     ) -> Float64[np.ndarray, "window node dim"]:
-        """A noisy copy of a position window; without noise the window itself.
+        """Return a noisy copy of a position window, or the window itself if there is no noise.
 
         Args:
-            window: x[t−H … t+1] in m.
-            longest_side: of the domain [m].
+            window: positions x[t−H … t+1] in m.
+            longest_side: longest side of the domain [m].
             velocity_unit: root mean square acceleration × frame interval [m/s].
             frame_dt: frame interval [s].
             rng: source of randomness.

@@ -1,4 +1,4 @@
-"""Which windows an optimiser step takes: an endless order that starts anywhere, and is the same whatever the number of processes."""
+"""Order of the training windows: endless, starting at any step, and the same for any number of processes."""
 
 from __future__ import annotations
 
@@ -16,17 +16,21 @@ from gpe_pl.system import ranks
 from gpe_pl.trajectory.store import StoreError
 
 Sampling = Literal["uniform", "activity"]
-"""How often each window is drawn: all alike, or the more often the more happens in it."""
+"""How often windows are drawn: ``uniform`` draws all equally often, ``activity`` in proportion to their rms acceleration."""
 
 UNIFORM_SHARE = 0.2
-"""Of ``activity``: the share that is drawn from all windows alike, which limits their weights to five."""
+"""Fraction of samples that ``activity`` sampling draws uniformly, which limits the weights to 5."""
 
 
 def probabilities(activity: np.ndarray) -> np.ndarray:
-    """Probability of each window under ``activity`` sampling.
+    """Probability of each window [window] with ``activity`` sampling.
 
-    The gradient of a squared error grows with the error, and that with what there is to predict: to draw in proportion to it, and to weigh by the
-    inverse, scatters least and leaves the expected gradient as it is [importance sampling, Katharopoulos and Fleuret 2018, arXiv 1803.00942].
+    The gradient of a squared error grows with the error, and the error grows with the acceleration to predict. Drawing in proportion to the acceleration and
+    weighting by the inverse reduces the variance and does not change the expected gradient [importance sampling, Katharopoulos and Fleuret 2018,
+    arXiv 1803.00942].
+
+    Args:
+        activity: rms acceleration without gravity of each window [window].
     """
     total = activity.sum()
     if not total > 0:
@@ -35,19 +39,21 @@ def probabilities(activity: np.ndarray) -> np.ndarray:
 
 
 NUM_LANES = 16
-"""Batches that are under way at a time. Steps of the optimiser that follow on each other take them in turn, so that they are about different scenes."""
+"""Number of unrolls that are active at a time. Consecutive optimiser steps take them in turn, so that they train on different scenes."""
 
 
 @dataclass(frozen=True)
 class PushForward:
-    """Late in training samples are states that the model itself has come to from a true state, in up to ``max_steps`` steps of its own, which the gradient
-    does not see [the push-forward trick of Brandstetter et al. 2022, section 3.1].
+    """Settings of the push-forward trick: late in training, samples are states that the model itself has reached from a true state.
+
+    Such an unroll has up to ``max_steps`` steps, without gradient [Brandstetter et al. 2022, section 3.1].
 
     Attributes:
-        first_step: of the optimiser from which this is done.
-        max_steps: own steps. A batch is trained on at its true state and after each of these steps, then the next one takes its lane.
-        correction: share of what velocities have gone astray by that the target takes back within a step. The trick takes all, which suits what friction
-            slows down anyway; bodies that swing would have to be stopped by forces that they do not have.
+        first_step: first optimiser step with unrolls.
+        max_steps: maximum number of steps of an unroll. A batch is trained on at its true state and after each step of its unroll; then the next batch takes
+            its lane.
+        correction: fraction of the velocities' deviation that the target removes within one step. The original trick removes all of it, which suits material
+            that friction slows down anyway. For swinging bodies the target would contain forces that do not exist.
     """
 
     first_step: Annotated[int, Field(ge=0)]
@@ -55,8 +61,9 @@ class PushForward:
     correction: Annotated[float, Field(ge=0, le=1)] = 1.0
 
     def starts(self, batches: Iterator[list[tuple[int, int]]]) -> Iterator[list[StartKey]]:
-        """The starts of each optimiser step from ``first_step`` on. The lanes begin with different numbers of own steps, so that all numbers are about as
-        frequent at any time.
+        """Yield the starts of each optimiser step from ``first_step`` on.
+
+        Lanes begin with unrolls of different lengths, so that all lengths are about equally frequent at any time.
         """
         num_visits = self.max_steps + 1
         lanes = [next(batches) for _ in range(NUM_LANES)]
@@ -72,10 +79,10 @@ class StepSampler(Sampler[tuple[int, int]]):
     """Endless shuffled passes over a data set as (sample number, window), starting at any sample number.
 
     Args:
-        num_windows: size of the data set.
-        seed: of the order; every pass has its own.
-        start: called when iteration begins; the number of samples already consumed.
-        probability: of each window; a pass is then as many independent draws. None: a pass has every window once.
+        num_windows: number of windows in the data set.
+        seed: seed of the order. Every pass has its own order.
+        start: returns the number of samples already used; called when iteration begins.
+        probability: probability of each window [window]; a pass then consists of ``num_windows`` independent draws. With None a pass has every window once.
     """
 
     def __init__(self, num_windows: int, seed: int, start: Callable[[], int] = lambda: 0, probability: np.ndarray | None = None) -> None:
@@ -97,18 +104,19 @@ class StepSampler(Sampler[tuple[int, int]]):
 
 @dataclass(frozen=True)
 class BatchSize:
-    """How many samples an optimiser step takes, all ranks together.
+    """Number of samples in an optimiser step over all ranks.
 
     Attributes:
-        num_graphs: so many.
-        max_nodes: if given, instead: the next ones in the order whose nodes (see ``WindowDataset.num_nodes``) are at most so many together, at least one.
+        num_graphs: number of samples, unless ``max_nodes`` is given.
+        max_nodes: maximum number of nodes (see ``WindowDataset.num_nodes``). A step then takes the next samples in the order until this limit, and at least
+            one.
     """
 
     num_graphs: Annotated[int, Field(ge=1)]
     max_nodes: Annotated[int, Field(ge=1)] | None = None
 
     def batches(self, data: WindowDataset, seed: int, step: int) -> Iterator[list[tuple[int, int]]]:
-        """The samples of each optimiser step, from a step on, without end."""
+        """Yield the samples of each optimiser step, from ``step`` on, without end."""
         if self.max_nodes is None:
             samples = iter(StepSampler(len(data), seed, lambda: step * self.num_graphs, data.probability))
             while True:
@@ -119,7 +127,7 @@ class BatchSize:
             )
 
     def once(self, data: WindowDataset, windows: list[int]) -> list[list[int]]:
-        """Batches that take each of these windows once, in their order."""
+        """Return batches that contain each of these windows once, in order."""
         if self.max_nodes is None:
             return [windows[k : k + self.num_graphs] for k in range(0, len(windows), self.num_graphs)]
         return [[window for _, window in batch] for batch in self._packed(data, enumerate(windows), self.max_nodes)]
@@ -137,14 +145,14 @@ class BatchSize:
 
 
 class BatchSampler(Sampler[list[Key]]):
-    """What this rank takes of the samples of each optimiser step. The order is one for all ranks, and the same as that of a single process.
+    """Samples of this rank in each optimiser step. All ranks follow one order, which is also the order of a single process.
 
     Args:
         data: training windows.
-        size: of the batches.
-        seed: of the order.
-        step: called when iteration begins; the number of optimiser steps already taken.
-        push_forward: from which step on samples have own steps of the model.
+        size: size of the batches.
+        seed: seed of the order.
+        step: returns the number of optimiser steps already taken; called when iteration begins.
+        push_forward: settings of the push-forward trick, or None.
 
     Raises:
         StoreError: batches may have fewer samples than there are ranks.
@@ -172,7 +180,7 @@ class BatchSampler(Sampler[list[Key]]):
                 yield [*starts]
 
     def _part(self, batch: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Samples dealt by their nodes, the largest first, each to the rank that has the fewest so far."""
+        """Select the samples of this rank. Each sample, the largest first, goes to the rank with the fewest nodes so far."""
         if ranks.num_ranks() == 1:
             return batch
         nodes = {sample: self.data.num_nodes(window) for sample, window in batch}

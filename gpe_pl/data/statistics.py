@@ -1,4 +1,4 @@
-"""Statistics of a train split, written beside it: what training noise and figures are scaled by."""
+"""Statistics of a train split, which scale training noise and figures. They are stored in the folder of the data set."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from gpe_pl.trajectory.trajectory import Trajectory
 STATISTICS_FILE = "statistics.json"
 
 FRAMES_AT_ONCE = 2048
-"""Public data have trajectories of tens of thousands of frames, which in double precision would fill the memory."""
+"""Number of frames converted to float64 at a time. Public data have trajectories of tens of thousands of frames, which would fill the memory."""
 
 
 def shard_moments(path: Path) -> tuple[str, dict[str, Any]]:
-    """Sums over one shard from which the statistics follow, and its path."""
+    """Return the path of a shard and the sums over it from which the statistics follow."""
     sums: dict[str, Any] = {"velocity": [0, 0.0], "acceleration": [0, 0.0], "params": None, "nodes": 0, "frames": 0, "trajectories": 0}
     for name in trajectory_names(path):
         trajectory = read_trajectory(path, name)
@@ -41,14 +41,14 @@ def shard_moments(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def acceleration_std(trajectories: Iterable[Trajectory]) -> float:
-    """Root mean square per component of accelerations other than gravity's, m/s²."""
+    """Root mean square per component of accelerations without gravity [m/s²]."""
     sums = [(float(np.sum(v * v)), v.size) for t in trajectories for key, v in motion(t) if key == "acceleration"]
     power, count = np.sum(sums, axis=0)
     return math.sqrt(power / max(1, count))
 
 
 def motion(trajectory: Trajectory) -> Iterator[tuple[str, np.ndarray]]:
-    """Velocities and accelerations other than gravity's [frame, node, dim], part by part, each with its name."""
+    """Yield velocities [m/s] and accelerations without gravity [m/s²] by name, each [frame, node, dim], for a part of the frames at a time."""
     dt = trajectory.metadata.frame_dt
     for start in range(0, max(1, trajectory.num_frames - 2), FRAMES_AT_ONCE):
         pos = trajectory.pos[start : start + FRAMES_AT_ONCE + 2].astype(np.float64)
@@ -58,14 +58,18 @@ def motion(trajectory: Trajectory) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _scaled(trajectory: Trajectory) -> np.ndarray:
-    """Material parameters [node, param], those on a logarithmic scale as natural logarithms."""
+    """Material parameters [node, param]; natural logarithms of those with a logarithmic scale."""
     scale = {p.name: p.scale for p in MATERIALS.values()}
     columns = trajectory.material_params.astype(np.float64).T
     return np.stack([np.log(c) if scale[n] == "log" else c for n, c in zip(trajectory.metadata.param_names, columns, strict=True)], axis=-1)
 
 
 def combined(moments: list[dict[str, Any]]) -> dict[str, Any]:
-    """Root mean squares per component, and mean and standard deviation of the material parameters on the scale that ``schema`` gives them."""
+    """Combine the sums of shards into statistics.
+
+    They are root mean squares per component of velocities and accelerations, and mean and standard deviation of material parameters on the scale that
+    ``schema`` gives them.
+    """
     rms = {}
     for key in ("velocity", "acceleration"):
         rms[key] = math.sqrt(math.fsum(m[key][1] for m in moments) / sum(m[key][0] for m in moments))

@@ -1,10 +1,10 @@
-"""Names everything that is wrong with stored trajectories, and prints the page that describes their format.
+"""Validation of stored trajectories, and the page that describes their format.
 
-    python -m gpe_pl.data.validate PATH [PATH ...]     shards, or folders of shards; exit status 1 when anything is violated
+    python -m gpe_pl.data.validate PATH [PATH ...]     shards, or folders of shards; exit status 1 if any rule is violated
     python -m gpe_pl.data.validate --format-page       Markdown, kept in data/README.md
 
-The reader in ``gpe_pl.trajectory.store`` refuses what it cannot read; this module also looks at the meaning: units, ranges, completeness. Each
-check reports its first offender with frame and node, and how many more there are.
+The reader in ``gpe_pl.trajectory.store`` refuses data that it cannot read. This module also checks the meaning: units, ranges and completeness. Each check
+reports the first violation with frame and node, and the number of further ones.
 """
 
 from __future__ import annotations
@@ -49,11 +49,12 @@ Finding = tuple[str, str]
 """Name of the field or attribute, and what is wrong with it."""
 
 SAME_IN_A_DATASET = ("dataset", "materials", "param_names", "frame_dt", "spacing", "connectivity_radius", "dim")
+"""Metadata that must be equal in all trajectories of a data set."""
 
 
 @dataclass(frozen=True)
 class Violation:
-    """One thing that is wrong; ``trajectory`` and ``field`` are empty where the whole file is meant."""
+    """A violated rule. ``trajectory`` and ``field`` are empty if it concerns the whole file."""
 
     path: Path
     trajectory: str
@@ -67,7 +68,7 @@ class Violation:
 
 @dataclass
 class Group:
-    """What the sound trajectories of one data set and split have in common."""
+    """Summary of the valid trajectories of one data set and split."""
 
     metadata: Metadata
     frames: list[int] = field(default_factory=list)
@@ -81,7 +82,7 @@ class Group:
     rounding: tuple[float, str] = (0.0, "in float32")
 
     def add(self, metadata: Metadata, arrays: dict[str, np.ndarray]) -> None:
-        """Count one more trajectory."""
+        """Add a trajectory to the summary."""
         pos, vel = arrays["pos"], arrays["vel"].astype(np.float64)
         self.frames.append(pos.shape[0])
         self.nodes.append(pos.shape[1])
@@ -118,7 +119,7 @@ class Group:
 
     @property
     def flight(self) -> FreeFlight:
-        """Groups in free flight of all trajectories."""
+        """Free groups of all trajectories."""
         return joined(self.flights, self.metadata.dim)
 
     def _about_rounding(self) -> Iterator[str]:
@@ -131,33 +132,33 @@ class Group:
         flight = self.flight
         if flight.num_free:
             disturbed, free, islands = flight.num_disturbed, flight.num_free, flight.num_islands
-            yield f"islands in free flight accelerate by {vector(flight.typical)} (median), gravity is {vector(np.median(flight.gravity, axis=0))}"
+            yield f"free groups accelerate by {vector(flight.typical)} (median), gravity is {vector(np.median(flight.gravity, axis=0))}"
             yield (
-                f"of {free} islands in free flight ({islands} island-frames in all), {disturbed} do not accelerate with g: "
-                f"{disturbed / free:.3%} of those in flight, {disturbed / islands:.3%} of all; "
+                f"{disturbed} of {free} free groups do not accelerate with gravity "
+                f"({disturbed / free:.3%} of the free groups, {disturbed / islands:.3%} of all {islands} groups in the examined frames); "
                 + (
-                    "they agree on another acceleration: gravity, frame_dt or the unit of length is not that of the data"
+                    "they agree on another acceleration: gravity, frame_dt or the unit of length does not fit the data"
                     if flight.agrees_on_another
                     else "above 0.1 % choose a larger connectivity_radius, unless positions are measured or air resists"
                 )
             )
         elif flight.num_islands:
-            yield f"of {flight.num_islands} island-frames none is in free flight: whether the graph shows what the solver does was not tested"
+            yield f"none of {flight.num_islands} groups in the examined frames is free: the connectivity radius was not tested against the solver"
 
 
 @dataclass
 class Result:
-    """Violations, and the groups of everything that has none."""
+    """Violations, and summaries of the trajectories without violations by data set and split."""
 
     violations: list[Violation] = field(default_factory=list)
     groups: dict[tuple[str, str], Group] = field(default_factory=dict)
 
 
 def validate(paths: Iterable[Path | str]) -> Result:
-    """Check shards and folders of shards; never raises because of their content."""
+    """Check shards and folders of shards. No content raises an error."""
     result = Result()
-    seen: dict[str, str] = {}  # digest -> where it was first
-    reference: dict[str, tuple[str, Metadata]] = {}  # data set -> where, and the metadata that all its trajectories share
+    seen: dict[str, str] = {}  # digest -> place of its first trajectory
+    reference: dict[str, tuple[str, Metadata]] = {}  # data set -> place and metadata of its first trajectory
     for path in map(Path, paths):
         files = sorted(path.rglob("*.h5")) if path.is_dir() else [path]
         if not files:
@@ -169,7 +170,7 @@ def validate(paths: Iterable[Path | str]) -> Result:
 
 def _check_file(path: Path, result: Result, seen: dict[str, str], reference: dict[str, tuple[str, Metadata]]) -> None:
     def violation(trajectory: str, field: str, message: str) -> None:
-        # the reader's messages begin with file and trajectory, which a violation names already
+        # Messages of the reader begin with file and trajectory, which the violation already names.
         for prefix in (f"{path}:{trajectory}: ", f"{path}: "):
             message = message.removeprefix(prefix)
         result.violations.append(Violation(path, trajectory, field, message))
@@ -220,7 +221,11 @@ def _check_shard(file: h5py.File) -> Iterator[Finding]:
 
 
 def _check_trajectory(group: h5py.Group, path: Path) -> tuple[Metadata, dict[str, np.ndarray], str, list[Finding]]:
-    """Metadata, readable arrays, digest and findings of one trajectory; raises ``StoreError`` where not even the metadata can be read."""
+    """Check one trajectory, and return its metadata, readable arrays, digest and findings.
+
+    Raises:
+        StoreError: the metadata cannot be read.
+    """
     metadata = metadata_of(group)
     findings = list(_check_metadata(metadata, path))
     arrays: dict[str, np.ndarray] = {}
@@ -237,7 +242,7 @@ def _check_trajectory(group: h5py.Group, path: Path) -> tuple[Metadata, dict[str
     if digest(arrays, {key: read_text(group, key) for key in ("metadata", "shapes", "node_types")}) != sha:
         findings.append(("sha256", "does not match the content; delete the shard and generate or import the data again"))
     complete = all(key in arrays for key, spec in FIELDS.items() if spec.required)
-    if complete and not conflicts:  # the checks of meaning rely on consistent shapes
+    if complete and not conflicts:  # the following checks need consistent shapes
         names = node_types_of(group)
         unsound = list(faults(arrays, names, [m for m in metadata.materials if m in MATERIALS], metadata.param_names))
         findings += [(fault.field, fault.message) for fault in unsound]
@@ -252,7 +257,7 @@ def _check_trajectory(group: h5py.Group, path: Path) -> tuple[Metadata, dict[str
 def _check_metadata(m: Metadata, path: Path) -> Iterator[Finding]:
     for key in ("dataset", "solver", "solver_version"):
         if not getattr(m, key):
-            yield key, "is empty; it is needed to tell where the data come from"
+            yield key, "is empty; it must say where the data come from"
     yield from m.violations()
     try:
         parsed(m.config)
@@ -270,7 +275,7 @@ def _check_metadata(m: Metadata, path: Path) -> Iterator[Finding]:
 
 
 def _offenders(key: str, bad: np.ndarray) -> str | None:
-    """Where a check fails: first place, and how many; None where it holds."""
+    """Describe where a check fails: the first place, and the number of further ones; None if it holds."""
     if not bad.any():
         return None
     place = np.argwhere(bad)[0]
@@ -297,7 +302,7 @@ def _check_motion(m: Metadata, arrays: dict[str, np.ndarray]) -> Iterator[Findin
         yield "pos", f"has {pos.shape[0]} frames and {pos.shape[1]} nodes; at least 2 frames and 1 node are needed"
         return
     for axis, (low, high) in enumerate(m.bounds):
-        slack = 1e-5 * max(abs(low), abs(high), high - low)  # float32, and the solvers' own margin
+        slack = 1e-5 * max(abs(low), abs(high), high - low)  # rounding to float32, and the margin of the solvers
         outside = (pos[..., axis] < low - slack) | (pos[..., axis] > high + slack)
         if m.periodic[axis : axis + 1] != (True,) and (where := _offenders("pos", outside)):
             yield (
@@ -307,12 +312,12 @@ def _check_motion(m: Metadata, arrays: dict[str, np.ndarray]) -> Iterator[Findin
 
 
 def _check_shapes(m: Metadata, arrays: dict[str, np.ndarray], shapes: tuple[Shape, ...], sound: bool) -> Iterator[Finding]:
-    """Shapes, and whether boundary nodes lie on them where their positions are ``sound``."""
+    """Check shapes, and if positions are ``sound``, that boundary nodes lie on the shapes."""
     pos = arrays["boundary_pos"]
     if (wrong := shapes_fault(shapes, m.periodicity)) is not None:
         yield "shapes", wrong
         return
-    if shapes and sound and m.spacing > 0 and not m.solver.startswith("import/"):  # of imported boundaries some may be known by points only
+    if shapes and sound and m.spacing > 0 and not m.solver.startswith("import/"):  # imported boundaries may have nodes without shapes
         distance = np.min([np.abs(shape.signed_distance(pos.astype(np.float64))) for shape in shapes], axis=0)
         if where := _offenders("boundary_pos", distance > 0.1 * m.spacing):
             yield "boundary_pos", f"{where}: {distance[distance > 0.1 * m.spacing][0]:.4g} m away from every shape that it could belong to"
@@ -322,7 +327,7 @@ def _check_shapes(m: Metadata, arrays: dict[str, np.ndarray], shapes: tuple[Shap
 
 
 def format_page() -> str:
-    """Markdown that describes the store, generated from the schema."""
+    """Create the Markdown page that describes the store, from the schema."""
     meaning = _documented_attributes(Metadata)
     rows = {
         "fields": [
@@ -343,7 +348,7 @@ def format_page() -> str:
 
 
 def _documented_attributes(cls: type) -> dict[str, str]:
-    """Names and descriptions under ``Attributes:`` in a Google docstring."""
+    """Return the attributes and their descriptions in a Google docstring."""
     section = inspect.cleandoc(cls.__doc__ or "").split("Attributes:\n", 1)[1]
     meaning: dict[str, str] = {}
     for names, text in re.findall(r"^    ([\w, ]+): (.*(?:\n        .*)*)", section, re.MULTILINE):
@@ -355,27 +360,27 @@ _PAGE = """\
 # The trajectory store
 
 This page is generated: `python -m gpe_pl.data.validate --format-page > data/README.md`. Generated and imported data sets go into this folder and are not
-kept in version control. Check any of them with `python -m gpe_pl.data.validate data`.
+kept in version control. Check them with `python -m gpe_pl.data.validate data`.
 
-Schema version {version}. One HDF5 file per shard, a group per trajectory, SI units, little-endian:
+Schema version {version}. There is one HDF5 file per shard and one group per trajectory. Values are in SI units and little-endian:
 
 ```
 {{data set}}/{{size}}/{{split}}/shard-00000.h5
     attributes: schema_version, units (JSON), num_trajectories
-    00000/  00001/  …                      a trajectory each
-        attributes: metadata (JSON), shapes (JSON), node_types (JSON), sha256; start_time (JSON, s) of parts that begin later than their
-                    scene; prediction of what a model made
-        pos  vel  …                        fields, each with its attribute unit
+    00000/  00001/  …                      one trajectory each
+        attributes: metadata (JSON), shapes (JSON), node_types (JSON), sha256; start_time (JSON, s) if the trajectory begins later than
+                    its scene; prediction if a model predicted it
+        pos  vel  …                        fields, each with an attribute unit
 ```
 
-Imported data sets have the size `imported`, and beside their splits a `report.md` of where they come from.
+Imported data sets have the size `imported`. Their folder also has a `report.md` about the source.
 
-Files are written under a temporary name and renamed, so a file that exists is complete. Equal content gives equal bytes. Every array has a
-fletcher32 checksum per chunk; arrays with frames are cut along them. `sha256` covers names, shapes, types and bytes of all arrays and the
-other attributes but `prediction`. Arrays are compressed without loss (shuffle and gzip, which every HDF5 library reads). Text has a fixed length, and nothing
+Files are written under a temporary name and then renamed, so an existing file is complete. Equal content gives equal bytes. Every array has a
+fletcher32 checksum per chunk. Arrays with frames are chunked along the frames. `sha256` covers names, shapes, types and bytes of all arrays, and all
+other attributes except `prediction`. Arrays are compressed without loss (shuffle and gzip, which every HDF5 library reads). Text has a fixed length. No file
 refers to another file.
 
-Splits: {splits}. The material parameters of the first three have the trained values; those of the last one lie between or outside them, as
+Splits: {splits}. In the first three, material parameters have the trained values. In the last one they lie between or outside the trained values, as
 `parameter_group` says ({groups}).
 
 ## Fields
@@ -384,9 +389,9 @@ Splits: {splits}. The material parameters of the first three have the trained va
 |---|---|---|---|---|---|
 {fields}
 
-Values are finite and at most 1.8e19 in magnitude. The reader refuses others, and names file, trajectory, field, frame and node.
+Values are finite and at most 1.8e19 in magnitude. The reader refuses other values, and names file, trajectory, field, frame and node.
 
-`node_type` is an index into the attribute `node_types`: {codes}. Dynamic nodes only: `{boundary}` nodes have fields of their own.
+`node_type` is an index into the attribute `node_types`: {codes}. It covers dynamic nodes only; `{boundary}` nodes have separate fields.
 
 ## Materials and their parameters
 
@@ -400,12 +405,12 @@ Values are finite and at most 1.8e19 in magnitude. The reader refuses others, an
 |---|---|
 {metadata}
 
-`shapes` holds the geometry that the boundary nodes were sampled from; `gpe_pl.geometry.shape_values` rebuilds it.
+`shapes` describes the geometry from which boundary nodes were sampled; `gpe_pl.geometry.shape_values` rebuilds it.
 """
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line; returns the exit status."""
+    """Run the command line, and return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m gpe_pl.data.validate", description="Check stored trajectories.")
     parser.add_argument("paths", nargs="*", metavar="PATH", help="shard, or folder of shards")
     parser.add_argument("--format-page", action="store_true", help="print the description of the format as Markdown")

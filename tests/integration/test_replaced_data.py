@@ -116,7 +116,7 @@ def test_statistics_of_other_data_are_not_used(tmp_path: Path) -> None:
     for shard in shards:
         write_shard(shard, [replace(t, pos=1.5 * t.pos) for t in (read_trajectory(shard, n) for n in trajectory_names(shard))])
     with pytest.raises(
-        StoreError, match=r"statistics.json: cannot be used \(it is of other data than those in train\); generate or import"
+        StoreError, match=r"statistics.json: cannot be used \(it belongs to other data than those in train\); generate or import"
     ):
         data_statistics(root)
     assert before["acceleration_std"] > 0

@@ -264,7 +264,7 @@ def moved(frame: int, to: float) -> Callable[[Trajectory], Trajectory]:
     ("change", "message"),
     [
         (moved(3, np.nan), r"field 'pos': frame 3, node 0, dim 0 and \d+ more: not finite"),
-        (moved(3, 1e9), r"the position of node 0 in frame 3 is farther outside the domain than this is wide"),
+        (moved(3, 1e9), r"the position of node 0 in frame 3 lies outside the domain by more than its width"),
         (moved(4, 0.5), r"node \d+ jumps by .* m between frames 3 and 4"),
         (moved(0, 0.5), r"node \d+ jumps by .* m between frames 0 and 1"),
         (lambda t: replace(t, mass=0 * t.mass), r"field 'mass': node 0 and \d+ more: must be positive and finite, is 0"),

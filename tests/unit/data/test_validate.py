@@ -378,7 +378,7 @@ def test_report_counts_disturbed_islands(
 ) -> None:
     write_shard(tmp_path / "shard-00000.h5", [falling(new_trajectory, 0.1)])
     assert main([str(tmp_path)]) == 0
-    assert "of 4 islands in free flight (8 island-frames in all), 4 do not accelerate with g: 100.000%" in capsys.readouterr().out
+    assert "4 of 4 free groups do not accelerate with gravity (100.000% of the free groups, 50.000% of all 8 groups" in capsys.readouterr().out
 
 
 def test_an_island_that_was_tied_a_frame_ago_is_not_in_free_flight(new_trajectory: Callable[..., Trajectory]) -> None:
@@ -403,7 +403,7 @@ def test_free_flight_is_compared_with_gravity(
     """What falls with another acceleration than the stored one does not ask for a larger radius."""
     t = falling(new_trajectory, 0.0)
     report = report_of(tmp_path, capsys, replace(t, metadata=replace(t.metadata, gravity=gravity)))
-    assert "islands in free flight accelerate by (0, -9.8" in report
+    assert "free groups accelerate by (0, -9.8" in report
     assert f"(median), gravity is (0, {gravity[1]:.3g}) m/s²" in report
     assert ("they agree on another acceleration: gravity, frame_dt or the unit of length" in report) == (gravity[1] == -0.1)
     assert ("larger connectivity_radius" in report) == (gravity[1] == -9.81)
