@@ -1,14 +1,14 @@
-"""Your own arrays, as archives that NumPy writes.
+"""Importer of your own arrays in NumPy archives.
 
-``source`` is a folder with ``train/``, ``val/``, ``test/`` and ``test_unseen/``, or a folder of files, which are ``.npz`` archives with one trajectory each::
+``source`` is a folder with ``train/``, ``val/``, ``test/`` and ``test_unseen/``, or a folder of files. Files are ``.npz`` archives with one trajectory each::
 
     np.savez("train/00.npz", pos=pos, frame_dt=0.01, materials="fluid", params_fluid=1e-3, bounds=bounds, periodic=[True, False])
 
-Keys are the arguments of ``Trajectory.from_numpy``, which documents them; ``params_{material}`` stands for ``params[material]``, ``cells_{kind}`` for
-``cells[kind]``, and ``boundary_pos``, ``boundary_normal``, ``boundary_vel``, ``boundary_friction`` and ``boundary_restitution`` for the arguments of
-``Boundary.from_numpy``, or of ``Boundary.moving`` if ``boundary_pos`` is [frame, boundary_node, dim], where ``boundary_normal`` may be of the first frame or of
-every frame. Without it normals are estimated. Needed are ``pos``, ``frame_dt``, ``materials`` and ``params_…``; the settings of the command override what the
-files say.
+Keys are the arguments of ``Trajectory.from_numpy``, which documents them. ``params_{material}`` stands for ``params[material]``, and ``cells_{kind}`` for
+``cells[kind]``. ``boundary_pos``, ``boundary_normal``, ``boundary_vel``, ``boundary_friction`` and ``boundary_restitution`` are arguments of
+``Boundary.from_numpy``, or of ``Boundary.moving`` if ``boundary_pos`` is [frame, boundary_node, dim]. ``boundary_normal`` may then have the first frame or
+every frame. Without ``boundary_normal``, normals are estimated. Required keys are ``pos``, ``frame_dt``, ``materials`` and ``params_…``. Settings of the
+command override the files.
 """
 
 from __future__ import annotations
@@ -57,15 +57,17 @@ KEYS = (
     *(f"boundary_{name}" for name in ("pos", "normal", "vel", "friction", "restitution")),
 )
 PREFIXES = ("params_", "cells_")
-"""Keys that begin so end in a material, or in a kind of cells."""
+"""Prefixes of keys, followed by a material or a kind of cells."""
 PER_NODE = ("frame_dt", "materials", "mass", "bounds", "periodic", "gravity", "spacing", "connectivity_radius")
-"""Keys, and those that begin with ``params_``, that have a value for each node at most, or ``FEW`` for the scene."""
+"""Keys with at most one value per node, or ``FEW`` values for the scene. Keys that begin with ``params_`` belong to them too."""
 FEW = 6
+"""Maximum number of values that describe a scene."""
 SCALARS = ("frame_dt", "spacing", "connectivity_radius")
+"""Keys with one value."""
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
-    """A data set in this format; raises ``ImportFailure``."""
+    """Open a data set in this format; raises ``ImportFailure`` if it cannot be read."""
     folders, warnings = split_folders(path)
     files = {
         split: sorted(folder.glob("*.npz"), key=lambda file: natural(file.name)) for split, folder in (folders or {"train": path}).items()
@@ -81,7 +83,7 @@ def _load(path: Path, facts: Facts) -> Loaded:
     try:
         names = npz.names(path)
         values: dict[str, Any] = {}
-        for name in sorted(names, key="pos".__ne__):  # which says how many nodes there are
+        for name in sorted(names, key="pos".__ne__):  # "pos" first, because it determines the number of nodes
             if name in KEYS or name.startswith(PREFIXES):
                 pos = values.get("pos")
                 few = pos is not None and pos.ndim > 1 and (name in PER_NODE or name.startswith("params_"))
@@ -123,7 +125,7 @@ def _load(path: Path, facts: Facts) -> Loaded:
             wall["normal"] = estimated_normals(points, visited, space)
             notes.append("normals of boundary nodes are estimated: they point to where the other nodes have been")
         if moves:
-            wall.pop("vel", None)  # follows from the positions
+            wall.pop("vel", None)  # velocities follow from the positions
             wall |= {"frame_dt": values["frame_dt"], "periodicity": space}
         make = Boundary.moving if moves else Boundary.from_numpy
         values["boundary"] = make(wall.pop("pos"), wall.pop("normal"), **wall)
@@ -136,9 +138,9 @@ def _load(path: Path, facts: Facts) -> Loaded:
 
 
 def _periodicity(values: dict[str, Any]) -> Periodicity:
-    """Where the space of a file repeats, after what the settings say instead."""
+    """Return the periodicity of a file, after the settings have overridden it."""
     if "bounds" not in values:
-        return NOWHERE  # a periodic axis without bounds is refused with the trajectory
+        return NOWHERE  # a periodic axis without bounds is refused later, with the trajectory
     dim = numbers("pos", values["pos"], {"frame": None, "node": None, "dim": None}).shape[2]
     rows = numbers("bounds", values["bounds"], {"axis": dim, "low and high": 2})
     return Periodicity(tuple((float(low), float(high)) for low, high in rows), flags("periodic", values.get("periodic"), dim))

@@ -1,4 +1,4 @@
-"""From a source to a data set of the store: two passes, checks between trajectories, statistics and the report."""
+"""Conversion of a source to a data set of the store: two passes, checks across trajectories, statistics and the report."""
 
 from __future__ import annotations
 
@@ -35,35 +35,37 @@ from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 from gpe_pl.trajectory.values import faults, size_conflicts
 
 FOLDER = "imported"
-"""Folder of imported data in that of a data set, where generated data have their size."""
+"""Folder of imported data in the folder of a data set. Generated data have folders named by their size."""
 
 CONTACT_SHEET_FILE = "contact_sheet.png"
 VERSION = "1"
+"""Version of the conversion, stored as ``solver_version``."""
 TRAJECTORIES_PER_SHARD = 8
 NUM_SAMPLED = 8
-"""Training trajectories from which spacing and neighbours are taken, …"""
+"""Number of training trajectories from which spacing and neighbours are measured."""
 FRAMES_SAMPLED = 3
-"""… and frames of each, evenly spread, in which neighbours are counted."""
+"""Number of frames of each sampled trajectory, evenly spread, in which neighbours are counted."""
 FLIGHT_FRAMES = 25
-"""Frames of each of these trajectories in which groups in free flight are looked for."""
+"""Number of frames of each sampled trajectory in which groups in free flight are searched for."""
 ENOUGH_GROUPS = 20
-"""Groups in free flight, in all frames that were looked at, that tell the gravity of data which do not say it."""
+"""Number of groups in free flight, over all examined frames, from which the gravity of a source is measured if it does not state one."""
 NUM_SHOWN = 4
-"""Rows of the contact sheet."""
+"""Number of rows of the contact sheet."""
 
 FEWEST_NEIGHBOURS, MOST_NEIGHBOURS = 3.0, 60.0
+"""A warning is given for a mean number of neighbours outside this range."""
 SPACING_RATIO = 3.0
-"""A source's spacing and that of its nodes disagree beyond this ratio."""
+"""A warning is given if the spacing and the distance of nearest nodes differ by more than this factor."""
 LONG_ENOUGH = HISTORY + 2
-"""Frames that a model's history and a step take."""
+"""Number of frames that a model needs with the default history."""
 COINCIDENCE = 1e-3
-"""Of the median distance to the nearest node: nodes that are closer in the first frame are at one place."""
+"""Nodes closer than this fraction of the median distance to the nearest node, in the first frame, count as at one place."""
 VELOCITY_RATIO = 1.25
-"""Positions and velocities of a source disagree about time beyond this ratio, …"""
+"""A warning is given if displacements and velocities of a source differ by more than this factor."""
 FRAMES_COMPARED = 200
-"""… in these first frames."""
+"""Number of first frames in which displacements and velocities are compared."""
 TYPED = ("gns", "lagrangebench", "meshgraphnets")
-"""Formats with types of nodes."""
+"""Formats with node types."""
 
 
 def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Progress | None = None, contact_sheet: bool = False) -> Report:
@@ -71,12 +73,12 @@ def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Prog
 
     Args:
         root: folder of all data sets.
-        settings: what to read, and what to take instead of what it says.
-        on_progress: called after each trajectory that was read, with the number of those and how often one will be.
-        contact_sheet: draw it, as ``draw_contact_sheet`` does, before the data set appears.
+        settings: the source, and values that override it.
+        on_progress: called for each trajectory that is read, with the number of reads so far and the total number of reads.
+        contact_sheet: draw the contact sheet before the data set appears; see ``draw_contact_sheet``.
 
     Raises:
-        ImportFailure: the source cannot be read, none of its training trajectories can be used, the disk is too small, or the data set exists already.
+        ImportFailure: the source cannot be read, no training trajectory can be used, the disk is too small, or the data set exists already.
     """
     path = Path(settings.source).expanduser()
     name = settings.name or path.name.partition(".")[0]
@@ -96,17 +98,17 @@ def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Prog
 
 
 def save_dataset(root: Path | str, name: str, holdout: float = 0.1, **splits: Iterable[Trajectory]) -> Report:
-    """Write trajectories of your own as ``{root}/{name}/imported``, which ``python -m gpe_pl.fit data=imported data.name={name}`` trains on.
+    """Write your own trajectories to ``{root}/{name}/imported``. ``python -m gpe_pl.fit data=imported data.name={name}`` trains on them.
 
     Args:
-        root: folder of all data sets, ``data`` unless the command gets another ``paths.data``.
-        name: of the data set.
-        holdout: share of ``train`` that becomes ``val`` and ``test`` where these are not given.
-        splits: ``train=[…]``, ``val=[…]``, ``test=[…]`` and ``test_unseen=[…]``; see ``Trajectory.from_numpy``. Each trajectory is asked for twice. A
-            sequence that makes its trajectories when they are asked for is never in memory as a whole; other iterables become lists first.
+        root: folder of all data sets; ``data`` unless the command gets another ``paths.data``.
+        name: name of the data set.
+        holdout: fraction of ``train`` that becomes each of ``val`` and ``test`` if they are not given.
+        splits: ``train=[…]``, ``val=[…]``, ``test=[…]`` and ``test_unseen=[…]``; see ``Trajectory.from_numpy``. Each trajectory is requested twice. A
+            sequence that creates trajectories on request is never in memory as a whole. Other iterables are converted to lists first.
 
     Raises:
-        ImportFailure: nothing to train on, something else than trajectories, or the data set exists already.
+        ImportFailure: there is nothing to train on, an item is not a trajectory, or the data set exists already.
     """
     for split, trajectories in splits.items():
         if isinstance(trajectories, Trajectory):
@@ -125,7 +127,7 @@ def save_dataset(root: Path | str, name: str, holdout: float = 0.1, **splits: It
 
 
 def draw_contact_sheet(report: Report) -> Path:
-    """Some scenes of an imported data set, to look at; returns the picture's path."""
+    """Draw some scenes of an imported data set, and return the path of the picture."""
     return _draw_contact_sheet(Path(report.folder), next(iter(report.splits)))
 
 
@@ -171,7 +173,22 @@ def _check_free(folder: Path) -> None:
 
 @dataclass
 class _Survey:
-    """What the first pass learns."""
+    """Facts collected in the first pass.
+
+    Attributes:
+        good: usable trajectories by split.
+        materials: materials of all trajectories.
+        bounds: bounds of each trajectory, ``(low, high)`` per axis [m].
+        spacings, distances, radii: spacing, median distance to the nearest node, and connectivity radius of each sampled trajectory [m].
+        velocity_ratios: mean displacement over mean velocity × frame interval, of each sampled trajectory.
+        scenes: name of each trajectory, by the digest of its positions.
+        motions: split, name and motion of each trajectory.
+        assumes_gravity: whether the gravity of each trajectory is the usual one of the format.
+        suspects: warnings about trajectories.
+        num_bytes: size of all arrays.
+        flights: of each sampled trajectory, whether its gravity is assumed, and its groups in free flight.
+        common: frame interval [s], dimension and periodic axes of all trajectories.
+    """
 
     good: dict[str, list[Item]] = field(default_factory=dict)
     materials: set[str] = field(default_factory=set)
@@ -190,12 +207,12 @@ class _Survey:
 
 
 class _Conversion:
-    """One data set on its way into the store."""
+    """The conversion of one data set."""
 
     def __init__(
         self, name: str, folder: Path, source: Source, holdout: float, about: dict[str, Any], on_progress: Progress | None = None
     ) -> None:
-        # training first: what all splits share is taken from it, and of a scene that is in two splits the later one is refused
+        # Training comes first, because shared facts are taken from it. If a scene is in two splits, the later one is refused.
         self.source = replace(source, splits={split: source.splits[split] for split in SPLITS if split in source.splits})
         self.facts, self.holdout, self.folder, self.about = source.facts, holdout, folder, about
         self.report = Report(name, about["format"], about["source"], str(folder), warnings=list(source.warnings))
@@ -205,14 +222,14 @@ class _Conversion:
         self.on_progress, self.num_read = on_progress, 0
 
     def run(self, contact_sheet: bool = False) -> Report:
-        """Look, decide, write; the folder appears with all that belongs into it."""
+        """Run both passes; the folder appears with its complete content."""
         with held(self.folder, "paths.data", makes=False):
-            _check_free(self.folder)  # again: the other command may just have ended
+            _check_free(self.folder)  # again, because another command may just have written it
             self._look()
             self._decide()
             self._require_room()
             with replacing(self.folder) as part:
-                for split in SPLITS:  # train first: what is unseen is told by it
+                for split in SPLITS:  # train first, because it determines which parameters are unseen
                     if split in self.survey.good:
                         self._write(part, split, self.survey.good[split])
                 self._summarize(part)
@@ -233,7 +250,7 @@ class _Conversion:
     # --- first pass ------------------------------------------------------------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Read every trajectory once: refuse what cannot be used, and see what the others have in common."""
+        """Read every trajectory once, refuse those that cannot be used, and collect facts about the others."""
         for split, items in self.source.splits.items():
             for item in items:
                 try:
@@ -258,11 +275,11 @@ class _Conversion:
             raise Refusal(f"{error} (connectivity_radius=…)") from None
         except GpeError:
             raise
-        except (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError) as error:  # what no reader has foreseen
+        except (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError) as error:  # unforeseen damage
             raise Refusal(f"cannot be read ({type(error).__name__}: {error})") from error
 
     def _accept(self, split: str, name: str, loaded: Loaded) -> None:
-        """Add a trajectory to what is known; raises ``Refusal`` where it does not fit the others."""
+        """Add a trajectory to the survey; raises ``Refusal`` if it is invalid or does not fit the others."""
         survey, trajectory = self.survey, loaded.trajectory
         m, where = trajectory.metadata, f"{split}, {name}"
         arrays = stored_arrays(trajectory)
@@ -307,7 +324,7 @@ class _Conversion:
                 survey.velocity_ratios.append(float(step / (speed * m.frame_dt)))
 
     def _decide(self) -> None:
-        """Fill in what the source does not say, and the splits that it does not have."""
+        """Choose values that the source does not state, and splits that it does not have."""
         survey, report = self.survey, self.report
         trains = bool(self.source.splits.get("train"))
         if not (survey.good.get("train") if trains else survey.good):
@@ -353,7 +370,7 @@ class _Conversion:
             )
 
     def _compare_gravity(self, dim: int) -> None:
-        """Compare gravity with the acceleration of groups in free flight, which decides where nothing else says what it is."""
+        """Compare gravity with the acceleration of groups in free flight. If gravity is only assumed, the measured one replaces it."""
         report, flights, usual = self.report, self.survey.flights, self.facts.usual_gravity
         if any(self.survey.assumes_gravity) and usual is not None:
             known = f"gravity is not in the source; {vector(usual[:dim])} is the format's usual one"
@@ -386,7 +403,7 @@ class _Conversion:
             )
 
     def _compare_with_rounding(self) -> None:
-        """Choose the origin that float32 needs, and name the trajectories whose accelerations are rounding all the same."""
+        """Choose the origin that float32 needs, and warn of trajectories with a large rounding error even so."""
         report, suspects, motions = self.report, self.survey.suspects, self.survey.motions
         typical = float(np.median([motion.acceleration for _, _, motion in motions]))
         nowhere = np.zeros_like(motions[0][2].low)
@@ -408,14 +425,14 @@ class _Conversion:
                     break
 
     def _look_for_jumps(self, radius: float) -> None:
-        """Name the nodes that get farther than a model can see."""
+        """Warn of nodes that move farther than the connectivity radius in one frame."""
         for split, name, motion in self.survey.motions:
             if motion.step > radius:
                 what = f"node {motion.node} moves by {motion.step:.4g} m in one frame, farther than the connectivity radius {radius:.4g} m"
                 self.survey.suspects.append(Event(split, name, motion.frame, f"{what}: a fault of the source, or too few frames"))
 
     def _hold_out(self) -> None:
-        """Take ``val`` and ``test`` from the end of the training trajectories where the source has none."""
+        """Take missing ``val`` and ``test`` splits from the end of the training trajectories."""
         good, report = self.survey.good, self.report
         train = good.get("train", [])
         missing = [split for split in ("val", "test") if not good.get(split)]
@@ -441,7 +458,7 @@ class _Conversion:
             for item in part:
                 try:
                     trajectory = self._unified(self._load(item).trajectory, split)
-                except (Refusal, ArrayError) as refusal:  # which the facts of the whole data set have shown
+                except (Refusal, ArrayError) as refusal:  # it does not fit the facts of the whole data set
                     self.report.refusals.append(Event(split, item.name, refusal.frame, str(refusal)))
                     continue
                 counts.add(trajectory.num_frames, trajectory.num_nodes, len(trajectory.boundary.pos))
@@ -455,7 +472,7 @@ class _Conversion:
             raise ImportFailure(f"{self.report.source}: no trajectory of {split} can be used: {self.report.refusals[-1]}")
 
     def _unified(self, trajectory: Trajectory, split: str) -> Trajectory:
-        """With the metadata and material columns of the whole data set."""
+        """Give a trajectory the origin, metadata and material columns of the whole data set."""
         if self.origin.any():
             trajectory = trajectory.seen_from(self.origin)
         facts, m = self.facts, trajectory.metadata
@@ -473,7 +490,7 @@ class _Conversion:
         return replace(trajectory, metadata=metadata, material_params=columns)
 
     def _parameter_group(self, columns: np.ndarray, names: tuple[str, ...]) -> ParameterGroup:
-        """Whether parameters of ``test_unseen`` lie inside or outside the range of the trained ones."""
+        """Whether parameters of ``test_unseen`` lie inside or outside the range of the training values."""
         for column, name in zip(columns.T, names, strict=True):
             low, high = self.trained.get(name, (np.inf, -np.inf))
             if (column < low).any() or (column > high).any():
@@ -481,7 +498,7 @@ class _Conversion:
         return "interpolated"
 
     def _count(self, trajectory: Trajectory, split: str) -> None:
-        """Add one stored trajectory to the report."""
+        """Add a stored trajectory to the report."""
         report, m = self.report, trajectory.metadata
         so_far = report.bounds or m.bounds
         report.bounds = [[min(a[0], b[0]), max(a[1], b[1])] for a, b in zip(so_far, m.bounds, strict=True)]
@@ -502,7 +519,7 @@ class _Conversion:
                 entry["low"], entry["high"] = min(entry["low"], float(values.min())), max(entry["high"], float(values.max()))
 
     def _summarize(self, folder: Path) -> None:
-        """Statistics and neighbours of the training trajectories."""
+        """Write statistics of the training trajectories, and report their neighbours and motion."""
         split = "train" if "train" in self.survey.good else next(iter(self.survey.good))
         shards = sorted((folder / split).glob("shard-*.h5"))
         statistics = combined([shard_moments(path)[1] for path in shards])
@@ -541,14 +558,14 @@ class _Conversion:
 
 
 def _faults(m: Metadata, arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
-    """Why the store would not read a trajectory again."""
+    """Yield reasons why the store could not read a trajectory again."""
     yield from (f"{key} {violation}" for key, violation in m.violations())
     yield from size_conflicts(arrays, m.dim, len(m.param_names))
     yield from map(str, faults(arrays, NODE_TYPES, m.materials, m.param_names))
 
 
 def _free_flight(trajectory: Trajectory) -> FreeFlight:
-    """Groups in free flight of a trajectory, in the precision that its source has."""
+    """Find the groups in free flight of a trajectory, in the precision of its source."""
     b = trajectory.boundary
     arrays = {"pos": trajectory.pos, "mass": trajectory.mass, "boundary_pos": b.pos[None] if b.motion is None else b.motion.pos}
     if trajectory.cells is not None:
@@ -557,7 +574,7 @@ def _free_flight(trajectory: Trajectory) -> FreeFlight:
 
 
 def _degrees(trajectory: Trajectory) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Neighbours of each dynamic node among dynamic nodes and among boundary nodes, in some frames."""
+    """Yield the numbers of dynamic and of boundary neighbours of each dynamic node [node], for some frames."""
     m, count = trajectory.metadata, trajectory.num_nodes
     walls = np.ascontiguousarray(trajectory.boundary.pos, dtype=np.float64)
     for frame in np.unique(np.linspace(0, trajectory.num_frames - 1, FRAMES_SAMPLED).astype(int)):

@@ -1,12 +1,12 @@
-"""Fluids of DeepLagrangianFluids (Continuous Convolutions) and DMCF.
+"""Importer of the fluids of DeepLagrangianFluids (Continuous Convolutions) and DMCF.
 
-``source`` is a folder with ``train/``, ``valid/`` and ``test/``, a folder of files, or one file. Files are ``sim_{seed}_{part}.msgpack.zst``, where the parts
-of a scene follow each other in time, or have any other name and a whole scene. A file is a list of frames, each with ``pos`` and ``vel`` [node, 3], ``m`` and
-``viscosity`` [node], ``frame_id`` and ``scene_id``; the first frame of a scene also has ``box`` and ``box_normals`` [boundary_node, 3], and some have ``grav``.
-Two-dimensional scenes have a third coordinate that never changes, which is dropped.
+``source`` is a folder with ``train/``, ``valid/`` and ``test/``, a folder of files, or one file. Files named ``sim_{seed}_{part}.msgpack.zst`` contain
+consecutive parts of a scene; a file with any other name contains a whole scene. A file is a list of frames with ``pos`` and ``vel`` [node, 3], ``m`` and
+``viscosity`` [node], ``frame_id`` and ``scene_id``. The first frame of a scene also has ``box`` and ``box_normals`` [boundary_node, 3], and in some data sets
+``grav``. Two-dimensional scenes have a constant third coordinate, which is dropped.
 
-The time between frames is not in these files: 0.02 s unless ``frame_dt`` says otherwise (DMCF's WBC-SPH has 2.5e-3). The report compares it with how far
-particles move at the velocities of the source. Needs ``msgpack`` and ``zstandard`` (``pip install 'gpe_pl[import]'``).
+The files do not contain the time between frames. It is 0.02 s unless ``frame_dt`` is given (DMCF's WBC-SPH has 2.5e-3 s). The report compares it with the
+displacements and velocities of particles. The importer needs ``msgpack`` and ``zstandard`` (``pip install 'gpe_pl[import]'``).
 
 Sources: Ummenhofer et al. 2020, Prantl et al. 2022, and the layout of github.com/isl-org/DeepLagrangianFluids; msgpack-numpy for how arrays are stored.
 """
@@ -40,19 +40,20 @@ from gpe_pl.files.hdf5_arrays import most_unpacked
 
 ENDING = ".msgpack.zst"
 PART = re.compile(r"(_\d+)_(\d+)$")
-"""The number of a part at the end of a file's name, which the number of its scene precedes."""
+"""End of a file's name: the number of the scene and the number of the part."""
 FRAME_DT = 0.02
+"""Usual time between frames of the format [s]."""
 GRAVITY = (0.0, -9.81, 0.0)
-"""Usual in the format [m/s²], where a scene has no ``grav``."""
+"""Usual gravity of the format [m/s²], for scenes without ``grav``."""
 MAX_BYTES = 2**32
-"""Of one file, unpacked; and no more than ``most_unpacked`` of its size, which zstandard exceeds with constants only."""
+"""Maximum unpacked size of a file. The limit ``most_unpacked`` applies too; zstandard exceeds it only with constant data."""
 BYTES_AT_ONCE = 2**20
 MOST = {"max_array_len": 2**16, "max_map_len": 2**10, "max_str_len": 2**16, "max_ext_len": 0}
-"""Frames of a file, entries of a frame, text in one: lists that claim more would be allocated before they are read."""
+"""Limits on the frames of a file, the entries of a frame and the text in them. Longer lists would be allocated before they are read."""
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
-    """A data set in this format; raises ``ImportFailure``."""
+    """Open a data set in this format; raises ``ImportFailure`` if it cannot be read."""
     _libraries()
     if path.is_file():
         scenes, warnings = {"train": [[path]]}, tuple[str, ...]()
@@ -81,7 +82,7 @@ def _scene_of(path: Path) -> str:
 
 
 def _scenes(folder: Path) -> list[list[Path]]:
-    """Files of each scene, in order of their parts."""
+    """Return the files of each scene, in order of their parts."""
     scenes: dict[str, list[Path]] = {}
     for path in sorted(folder.glob(f"*{ENDING}"), key=lambda file: natural(file.name)):
         scenes.setdefault(_scene_of(path), []).append(path)
@@ -143,7 +144,7 @@ def _load(parts: list[Path], facts: Facts) -> Loaded:
         nodes.repairs.append(Repair("the third coordinate never changes and was dropped: the scene is two-dimensional"))
         nodes.pos, nodes.vel = pos[..., :2], vel[..., :2]
         if walls is not None:
-            flat = np.linalg.norm(walls[1][:, :2], axis=1) > 0.5  # the others close the third dimension
+            flat = np.linalg.norm(walls[1][:, :2], axis=1) > 0.5  # the other nodes are walls across the third dimension
             nodes.walls = walls[0][flat, :2], walls[1][flat, :2]
     return build(nodes, facts)
 
@@ -191,7 +192,7 @@ def _number(frame: dict[str, Any], name: str, number: int) -> float:
 
 
 def _array(frame: dict[str, Any], name: str, number: int) -> np.ndarray:
-    """An array as msgpack-numpy stores it, a map of ``nd``, ``type``, ``kind``, ``shape`` and ``data``; those of Python objects are refused."""
+    """Read an array as msgpack-numpy stores it: a map of ``nd``, ``type``, ``kind``, ``shape`` and ``data``. Arrays of Python objects are refused."""
     stored = frame.get(name)
     if isinstance(stored, (int, float)) and not isinstance(stored, bool):
         return np.asarray(stored)

@@ -1,10 +1,11 @@
-"""Particles of DPI-Net: fluid that falls, and a rigid box in a bath.
+"""Importer of the particles of DPI-Net: falling fluid (FluidFall), and a rigid box in a bath (BoxBath).
 
-``source`` is a folder ``data_{Environment}`` with ``train/`` and ``valid/``; each holds a folder per rollout with a file ``{frame}.h5`` per frame, which has
-``positions`` [node, 3] and ``velocities`` [node, 3] in m/s, 1/60 s apart. BoxBath files also have ``clusters``: there the first 64 nodes are the rigid box,
-which becomes a ``solid``; all other nodes are ``fluid``. The y axis points up, the ground is at y = 0, and the bath's walls are where particles end.
+``source`` is a folder ``data_{Environment}`` with ``train/`` and ``valid/``. Each has a folder per rollout with a file ``{frame}.h5`` per frame. A file has
+``positions`` [node, 3] and ``velocities`` [node, 3] in m/s. Frames are 1/60 s apart. BoxBath files also have ``clusters``; their first 64 nodes are the rigid
+box, which becomes a ``solid``. All other nodes are ``fluid``. The y axis points up and the ground is at y = 0. The bath's walls are at the extremes of all
+positions.
 
-FluidShake and RiceGrip also store moving walls and grippers as the poses of bodies (``shape_quats``), without their shape: they are refused.
+FluidShake and RiceGrip also store moving walls and grippers as the poses of bodies (``shape_quats``), without their shape. They are refused.
 
 Source: Li et al. 2019, and the layout of the data of github.com/YunzhuLi/DPI-Net.
 """
@@ -34,15 +35,17 @@ from gpe_pl.data.importers.source import (
 from gpe_pl.files.hdf5_arrays import is_named
 
 FRAME_DT = 1 / 60
+"""Time between frames [s]; it is not in the files."""
 GRAVITY = (0.0, -9.8, 0.0)
-"""Usual in the format [m/s²], but not in the files; in some of its data sets other forces nearly cancel it."""
+"""Usual gravity of the format [m/s²]; it is not in the files. In some data sets other forces nearly cancel it."""
 NUM_RIGID = 64
-"""Nodes of the box in BoxBath; they come first."""
+"""Number of nodes of the box in BoxBath, which come first."""
 GROUND_FRICTION = 0.5
+"""Assumed friction coefficient of ground and walls."""
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
-    """A data set in this format; raises ``ImportFailure``."""
+    """Open a data set in this format; raises ``ImportFailure`` if it cannot be read."""
     folders, warnings = split_folders(path)
     if not folders:
         raise ImportFailure(f"{path}: {'no such folder' if not path.exists() else 'holds no folder train or valid'}")
@@ -65,7 +68,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
 
 
 def _numbered(folder: Path, ending: str) -> list[Path]:
-    """What has a number as name, in order of the numbers."""
+    """Return files and folders with a number as name, in order of the numbers."""
     found = [p for p in folder.iterdir() if re.fullmatch(rf"[0-9]+{re.escape(ending)}", p.name)]
     return sorted(found, key=lambda p: natural(p.name))
 

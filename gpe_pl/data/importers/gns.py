@@ -1,14 +1,14 @@
-"""Particles of "Learning to Simulate" and of its PyTorch successor.
+"""Importer of the particles of "Learning to Simulate" (GNS) and of its PyTorch successor.
 
 ``source`` is a folder with ``metadata.json`` and ``train``, ``valid`` and ``test`` as one of
 
 - ``.tfrecord``: a ``SequenceExample`` per trajectory with ``particle_type`` (int64 [node]) in its context and ``position`` (float32 [node × dim]) per frame;
 - ``.npz``: an object array ``(position [frame, node, dim], particle_type [node] or scalar[, material_property])`` per trajectory, or one array of such
-  tuples. These are pickles: they are read with ``allow_pickle=true`` only;
+  tuples. These are pickles, which are read only with ``allow_pickle=true``;
 - ``.h5``: a group per trajectory with ``positions``, ``particle_type`` and ``material_property``.
 
-``metadata.json`` has ``bounds``, ``dt``, ``default_connectivity_radius``, ``dim`` and ``sequence_length``, which is the number of frames, or one less; the
-positions themselves say how many there are. Its ``vel_mean`` … are per frame and not used: the project computes its own statistics from the train split.
+``metadata.json`` has ``bounds``, ``dt``, ``default_connectivity_radius``, ``dim`` and ``sequence_length``, which is the number of frames, or one less. The
+number of frames is taken from the positions. Statistics such as ``vel_mean`` are per frame and not used; the project computes its own from the train split.
 
 Types are 0 rigid, 3 boundary, 5 water, 6 sand and 7 goop, which is plastic and becomes ``snow``. Bounds are walls. The property of sand is tan φ.
 Gravity is not in these files.
@@ -48,15 +48,15 @@ from gpe_pl.files.hdf5_arrays import is_named
 
 TYPES = {0: "solid", 3: "boundary", 5: "fluid", 6: "sand", 7: "snow"}
 PACKED = "gns_data"
-"""The one array of an archive that holds all trajectories."""
+"""Name of the array in an archive whose only array contains all trajectories."""
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
-    """A data set in this format; raises ``ImportFailure``."""
+    """Open a data set in this format; raises ``ImportFailure`` if it cannot be read."""
     files = split_files(path, (".tfrecord", ".npz", ".h5"))
     described = (path if path.is_dir() else path.parent) / "metadata.json"
     values = read_json(described)
-    if "bounds" not in values and isinstance(values.get("train"), dict):  # newer files say it apart for training and rollout
+    if "bounds" not in values and isinstance(values.get("train"), dict):  # newer files have separate values for training and rollout
         values = values["train"]
     bounds = bounds_in(values, described)
     walls = {f"{axis}_{side}": ASSUMED_FRICTION for axis in "xyz"[: len(bounds)] for side in ("low", "high")}
@@ -119,7 +119,7 @@ def _in_records(path: Path, dim: int, length: int | None, settings: ImportSettin
 
 
 def _buffer(feature: tfrecord.Feature | None, name: str, dtype: str) -> np.ndarray:
-    """Numbers that a feature holds as one string of bytes."""
+    """Return the numbers that a feature stores as one string of bytes."""
     if not isinstance(feature, list) or len(feature) != 1 or len(feature[0]) % np.dtype(dtype).itemsize:
         found = "missing" if feature is None else f"{len(feature)} values of {'bytes' if isinstance(feature, list) else feature.dtype}"
         raise Refusal(f"{name} is {found}, expected one string of bytes of {np.dtype(dtype)}")

@@ -1,4 +1,4 @@
-"""Arrays out of HDF5 files that others wrote: checked before they are read, and never from another file."""
+"""Reading of arrays from untrusted HDF5 files. Arrays are checked before they are read, and no other file is opened."""
 
 from __future__ import annotations
 
@@ -16,7 +16,12 @@ from gpe_pl.files.hdf5_arrays import dataset_in, is_named, is_own, obstacle
 
 @contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """A file for reading; whatever HDF5 raises on a damaged one becomes a ``Refusal``."""
+    """Open a file for reading.
+
+    Raises:
+        ImportFailure: the file does not exist.
+        Refusal: the file is damaged; replaces the various errors of HDF5.
+    """
     if not path.is_file():
         raise ImportFailure(f"{path}: no such file")
     try:
@@ -32,12 +37,16 @@ def opened(path: Path) -> Iterator[h5py.File]:
         TypeError,
         MemoryError,
         AttributeError,
-    ) as error:  # all of these come out of HDF5 and h5py
+    ) as error:  # h5py raises all of these on damaged files
         raise Refusal(f"{path.name}: not a readable HDF5 file (damaged or truncated: {error})") from None
 
 
 def groups(path: Path) -> list[str]:
-    """Names of a file's groups, by their numbers; raises ``ImportFailure``."""
+    """Return the names of a file's groups, in order of their numbers.
+
+    Raises:
+        ImportFailure: the file cannot be read, or has no groups or too many.
+    """
     try:
         with opened(path) as file:
             if len(file) > MAX_TRAJECTORIES:
@@ -53,16 +62,16 @@ def groups(path: Path) -> list[str]:
 
 
 def array(group: h5py.Group, name: str, axes: str, kinds: str = "fiu") -> np.ndarray:
-    """One array.
+    """Read an array.
 
     Args:
         group: file or group.
-        name: in the group.
-        axes: names of its axes, for messages; as many as the array must have.
-        kinds: NumPy's letters for the types that it may have.
+        name: name of the array in the group.
+        axes: names of the axes, separated by commas. The array must have as many axes.
+        kinds: NumPy's letters for the allowed types.
 
     Raises:
-        Refusal: it is missing, of another type or shape, larger than the file can hold, stored in a way that takes far more than it holds, or damaged.
+        Refusal: the array is missing, damaged, of another type or shape, larger than its file, or needs far more memory or time to read than its size.
     """
     if not is_named(group, name):
         raise Refusal(f"has no {name!r}; there are {', '.join(map(repr, sorted(group)[:10])) or 'no arrays'}")

@@ -1,11 +1,11 @@
-"""Particles of LagrangeBench, whose domains are periodic.
+"""Importer of the particles of LagrangeBench, which has periodic domains.
 
-``source`` is a folder with ``metadata.json`` and ``train.h5``, ``valid.h5`` and ``test.h5``, each with a group per trajectory: ``position`` (float32
+``source`` is a folder with ``metadata.json`` and ``train.h5``, ``valid.h5`` and ``test.h5``. A file has a group per trajectory with ``position`` (float32
 [frame, node, dim]) and ``particle_type`` ([node]; −1 padding, 0 fluid, 1 solid wall, 2 moving wall, 3 rigid body). The time between frames is
-``dt × write_every``. Lengths are in units of the case; the reference density is 1, so ``viscosity`` is kinematic.
+``dt × write_every``. Lengths are in units of the case. The reference density is 1, so ``viscosity`` is kinematic.
 
-A moving wall slides steadily along a periodic axis: it is stored still, with its velocity. A ``force.py`` beside the data is code and is never run; the
-force of a dam break is gravity, others that ``g_ext_magnitude`` announces depend on the place and are left to learn.
+A moving wall slides steadily along a periodic axis. It is stored at its first position, with its velocity. A file ``force.py`` in the folder is code and is
+never run. The force of a dam break is gravity. Other forces, which ``g_ext_magnitude`` announces, depend on the place; models have to learn them.
 
 Source: Toshev et al. 2023, and the layout that github.com/tumaer/lagrangebench writes.
 """
@@ -38,12 +38,14 @@ from gpe_pl.data.importers.source import (
 from gpe_pl.schema import STICKY
 
 PADDING = -1
+"""Particle type of padding nodes."""
 TYPES = {0: "fluid", 1: "boundary", 2: "boundary", 3: "solid"}
 DAM_BREAKS = ("DAM", "DB")
+"""Values of ``case`` in dam breaks."""
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
-    """A data set in this format; raises ``ImportFailure``."""
+    """Open a data set in this format; raises ``ImportFailure`` if it cannot be read."""
     files = split_files(path, (".h5",))
     folder = path if path.is_dir() else path.parent
     described = folder / "metadata.json"

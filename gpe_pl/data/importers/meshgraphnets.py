@@ -1,14 +1,15 @@
-"""Meshes of MeshGraphNets that move: cloth and deforming solids.
+"""Importer of moving meshes of MeshGraphNets: cloth and deforming solids.
 
 ``source`` is a folder with ``meta.json`` and ``train``, ``valid`` and ``test`` as ``.tfrecord`` (an ``Example`` per trajectory, each field one string of
-bytes) or ``.h5`` (a group per trajectory with a data set per field). ``meta.json`` gives ``field_names``, ``trajectory_length``, ``dt``, and of each of the
-``features`` its ``type`` (``static`` has one frame, ``dynamic`` all, ``dynamic_varlen`` another number of nodes in each), ``dtype`` and ``shape``. Read are
-``world_pos`` [frame, node, 3], ``mesh_pos`` [1, node, 2 or 3], ``cells`` [1, cell, corner] and ``node_type`` [1, node, 1]. Cells of four corners are
-quadrilaterals where ``mesh_pos`` lies in a plane, else tetrahedra.
+bytes) or ``.h5`` (a group per trajectory with a data set per field). ``meta.json`` gives ``field_names``, ``trajectory_length``, ``dt``, and for each of the
+``features`` its ``type`` (``static`` has one frame, ``dynamic`` all frames, ``dynamic_varlen`` a varying number of nodes), ``dtype`` and ``shape``. The
+importer reads ``world_pos`` [frame, node, 3], ``mesh_pos`` [1, node, 2 or 3], ``cells`` [1, cell, corner] and ``node_type`` [1, node, 1]. Cells of four corners
+are quadrilaterals if ``mesh_pos`` lies in a plane, else tetrahedra.
 
-Types are 0 normal, 1 obstacle, 3 handle and 6 wall. Normal nodes become an ``elastomer``, the others boundary nodes, still or moving as the source has
-them: cells with such nodes are left out, and the neighbour radius connects a handle to its cloth. Without ``world_pos`` the mesh is still and a field moves on
-it (``cylinder_flow``, ``airfoil``), which is no trajectory of nodes. The source's ``stress`` is von Mises' only, which does not give a stress tensor: left out.
+Types are 0 normal, 1 obstacle, 3 handle and 6 wall. Normal nodes become an ``elastomer``. The others become boundary nodes, still or moving as in the source.
+Cells with boundary nodes are left out; the neighbour radius connects a handle to its cloth. Data without ``world_pos`` (``cylinder_flow``, ``airfoil``) are
+fields on a still mesh and are refused, because their nodes have no trajectory. The ``stress`` of a source is the von Mises stress only. It does not determine
+the stress tensor and is left out.
 
 Source: Pfaff et al. 2021, and the layout of github.com/google-deepmind/deepmind-research, meshgraphnets.
 """
@@ -44,7 +45,7 @@ NEEDED = ("world_pos", "mesh_pos", "cells", "node_type")
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
-    """A data set in this format; raises ``ImportFailure``."""
+    """Open a data set in this format; raises ``ImportFailure`` if it cannot be read."""
     files = split_files(path, (".tfrecord", ".h5"))
     described = (path if path.is_dir() else path.parent) / "meta.json"
     meta = read_json(described)
@@ -103,7 +104,10 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
 
 
 def _decoded(stored: tfrecord.Feature | None, name: str, feature: Mapping[str, Any], num_nodes: int | None = None) -> np.ndarray:
-    """A field [frame, row, component] from its bytes, by the type and shape that ``meta.json`` gives: one frame, or as many as there are of all nodes."""
+    """Decode a field [frame, row, component] by the type and shape in ``meta.json``.
+
+    With ``num_nodes`` the field has that many rows, and the number of frames follows from its size. Without it the field has one frame.
+    """
     if not isinstance(stored, list) or len(stored) != 1:
         raise Refusal(f"{name} is {'missing' if stored is None else 'not one string of bytes'}")
     data = stored[0]
@@ -136,7 +140,7 @@ def _loaded(fields: Mapping[str, np.ndarray], length: int, settings: ImportSetti
     if rest.shape[1] != num_nodes or types.shape[1:] != (num_nodes, 1) or not 1 <= rest.shape[2] <= dim:
         raise Refusal(f"world_pos, mesh_pos and node_type are {list(pos.shape)}, {list(rest.shape)} and {list(types.shape)}")
     warnings = length_warning(len(pos), "trajectory_length", length)
-    flat = np.zeros((num_nodes, dim), np.float64)  # a sheet lies in a plane when at rest
+    flat = np.zeros((num_nodes, dim), np.float64)  # the rest positions of a sheet lie in a plane
     flat[:, : rest.shape[2]] = rest[0]
     is_sheet = dim == 2 or cells.shape[2] == 3 or (np.ptp(flat, axis=0) == 0).any()
     kind = ({3: "triangle", 4: "quadrilateral"} if is_sheet else {4: "tetrahedron", 8: "hexahedron"}).get(cells.shape[2])

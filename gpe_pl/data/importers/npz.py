@@ -1,4 +1,4 @@
-"""Arrays out of ``.npz`` archives that others wrote: headers are checked before anything is read, and pickles are refused unless they are asked for."""
+"""Reading of arrays from untrusted ``.npz`` archives. Headers are checked before anything is read, and pickles are refused by default."""
 
 from __future__ import annotations
 
@@ -22,15 +22,19 @@ from gpe_pl.files.zip_members import num_members
 HEADERS: dict[tuple[int, int], Any] = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 
 DAMAGE = (
-    *(OSError, EOFError, KeyError, ValueError, TypeError, ArithmeticError, SyntaxError),  # the last ones of a header's text
+    *(OSError, EOFError, KeyError, ValueError, TypeError, ArithmeticError, SyntaxError),  # the last two from the text of a header
     *(MemoryError, RuntimeError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
     *(pickle.UnpicklingError, AttributeError, ImportError),
 )
-"""What reading a damaged archive, or a pickle that was asked for, can raise."""
+"""Errors that reading a damaged archive or a pickle can raise."""
 
 
 def names(path: Path) -> list[str]:
-    """Names of the arrays in an archive, in its order; raises ``ImportFailure``."""
+    """Return the names of the arrays in an archive, in its order.
+
+    Raises:
+        ImportFailure: the archive cannot be read, or has too many arrays.
+    """
     try:
         regular_files.check(path)
         if (count := num_members(path)) > MAX_TRAJECTORIES:
@@ -44,11 +48,17 @@ def names(path: Path) -> list[str]:
 
 
 def read(path: Path, name: str, allow_pickle: bool = False, most_values: int | None = None) -> np.ndarray:
-    """One array, of at most so many values.
+    """Read an array.
+
+    Args:
+        path: archive.
+        name: name of the array.
+        allow_pickle: read arrays of Python objects, which can run any code.
+        most_values: maximum number of values, or None.
 
     Raises:
-        Refusal: it is damaged, larger than the archive can hold, unpacks to far more than is stored, or has more values.
-        ImportFailure: it holds Python objects, and ``allow_pickle`` is false.
+        Refusal: the array is damaged, larger than the archive, unpacks to far more than is stored, or has more than ``most_values`` values.
+        ImportFailure: the array has Python objects, and ``allow_pickle`` is false.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -87,7 +97,7 @@ def read(path: Path, name: str, allow_pickle: bool = False, most_values: int | N
 
 
 def _header(file: Any, version: tuple[int, int], name: str) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type of an array; NumPy reads headers as Python text, for which damaged ones raise anything."""
+    """Read shape and type of an array. NumPy parses headers as Python text, so damaged headers can raise any error."""
     try:
         shape, _, dtype = HEADERS[version](file)
     except Exception as error:

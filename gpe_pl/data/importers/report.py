@@ -1,4 +1,4 @@
-"""What a conversion found, assumed, repaired and refused: printed, and written beside the data as JSON and Markdown."""
+"""Report of an import: facts, assumptions, repairs and refusals. It is printed, and written into the data's folder as JSON and Markdown."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from gpe_pl.schema import MATERIALS
 REPORT_FILE = "report.json"
 PAGE_FILE = "report.md"
 MAX_LISTED = 20
-"""Warnings, repairs or refusals that are printed; the JSON file has all of them."""
+"""Maximum number of warnings, repairs or refusals that are printed. The JSON file has all of them."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something about one trajectory; ``frame`` is -1 where it concerns none in particular."""
+    """A statement about one trajectory; ``frame`` is -1 if it concerns no particular frame."""
 
     split: str
     trajectory: str
@@ -34,7 +34,7 @@ class Event:
 
 @dataclass
 class SplitCounts:
-    """Trajectories of a split, and the fewest and most frames and nodes that one has."""
+    """Number of trajectories of a split, and ranges ``[fewest, most]`` of their frames, nodes and boundary nodes."""
 
     trajectories: int = 0
     frames: list[int] = field(default_factory=lambda: [0, 0])
@@ -42,7 +42,7 @@ class SplitCounts:
     boundary_nodes: list[int] = field(default_factory=lambda: [0, 0])
 
     def add(self, frames: int, nodes: int, boundary_nodes: int) -> None:
-        """Count one more trajectory."""
+        """Add a trajectory to the counts."""
         for name, value in (("frames", frames), ("nodes", nodes), ("boundary_nodes", boundary_nodes)):
             low, high = getattr(self, name) if self.trajectories else (value, value)
             setattr(self, name, [min(low, value), max(high, value)])
@@ -51,24 +51,26 @@ class SplitCounts:
 
 @dataclass
 class Report:
-    """The result of a conversion; lengths in m, times in s.
+    """The result of an import; lengths in m, times in s.
 
     Attributes:
-        name, format, source, folder: what became what.
+        name: name of the data set.
+        format, source: format and path of the source.
+        folder: folder of the data set.
         dim: space dimension.
-        frame_dt, bounds, periodic, gravity, spacing, connectivity_radius: as stored.
-        materials: number of nodes, and the parameter's name, unit and smallest and largest value, by material.
+        frame_dt, bounds, periodic, gravity, spacing, connectivity_radius: stored values.
+        materials: number of nodes, and smallest and largest value of the parameter, by material.
         splits: counts by split.
-        neighbours: dynamic neighbours of a dynamic node within the radius: ``mean``, ``min``, ``max``, and its ``boundary`` neighbours.
-        max_speed, velocity_std, acceleration_std: of the train split [m/s, m/s²], the last without gravity.
-        mean_acceleration: of the train split, per axis [m/s²]: what falls freely shows its gravity here.
-        free_groups: number of groups of nodes in free flight, in the frames that were looked at.
-        free_acceleration: median of theirs, per axis [m/s²]; empty if there is none.
-        step_in_spacings: the farthest that a node moves in a frame.
-        notes: what was assumed or left out, for the whole data set.
-        warnings: what looks wrong, and what to do; about the whole data set first, then by trajectory.
-        origin: where the origin of stored positions lies in the source's coordinates [m].
-        repairs, refusals: by trajectory.
+        neighbours: number of dynamic neighbours of a dynamic node within the radius (``mean``, ``min``, ``max``), and mean number of ``boundary`` neighbours.
+        max_speed, velocity_std, acceleration_std: statistics of the train split [m/s, m/s, m/s²]; the last without gravity.
+        mean_acceleration: mean acceleration in the train split per axis [m/s²]. In free fall it is gravity.
+        free_groups: number of groups of nodes in free flight, over the examined frames.
+        free_acceleration: median acceleration of these groups per axis [m/s²]; empty if there are none.
+        step_in_spacings: largest displacement of a node in one frame, in spacings.
+        notes: assumptions and omissions that concern the whole data set.
+        warnings: what looks wrong, and what to do. Warnings about the whole data set come first, then those by trajectory.
+        origin: origin of stored positions in the source's coordinates [m].
+        repairs, refusals: repairs and refusals by trajectory.
     """
 
     name: str
@@ -99,12 +101,12 @@ class Report:
     refusals: list[Event] = field(default_factory=list)
 
     def write(self, folder: Path) -> None:
-        """Write both files, atomically."""
+        """Write both files atomically."""
         for name, text in ((REPORT_FILE, json.dumps(asdict(self), indent=1) + "\n"), (PAGE_FILE, self.markdown())):
             replace_text(folder / name, text)
 
     def text(self) -> str:
-        """What the command prints."""
+        """Format the report as the command prints it."""
         lines = [f"{self.name}: {self.format} data of {printable(self.source)}"]
         lines += [f"  {key:<14}{value}" for key, value in self._facts()]
         for title, items in self._lists():
@@ -114,7 +116,7 @@ class Report:
         return "\n".join(lines)
 
     def markdown(self) -> str:
-        """The page beside the data."""
+        """Format the report as the Markdown page in the data's folder."""
         lines = [f"# {self.name}", "", f"Imported from `{printable(self.source)}` ({self.format}).", "", "| | |", "|---|---|"]
         lines += [f"| {key} | {value.replace('|', '/')} |" for key, value in self._facts()]
         for title, items in self._lists():
@@ -123,7 +125,7 @@ class Report:
         return "\n".join(lines) + "\n"
 
     def _facts(self) -> list[tuple[str, str]]:
-        """What to look at, by name."""
+        """Return the main facts as pairs of name and text."""
         axes = "xyz"[: self.dim]
         box = ", ".join(
             f"{axis} {low:.6g} … {high:.6g}{' periodic' if repeats else ''}"

@@ -1,4 +1,7 @@
-"""What an importer has to provide: the facts of a data set, and its trajectories one by one, each of which can be refused."""
+"""Interface of importers, and functions that they share.
+
+An importer provides the facts of a data set, and its trajectories one by one. Each trajectory can be refused.
+"""
 
 from __future__ import annotations
 
@@ -26,33 +29,34 @@ from gpe_pl.trajectory.trajectory import Trajectory
 Format = Literal["gns", "lagrangebench", "meshgraphnets", "dpinet", "dmcf", "arrays"]
 
 SPLIT_NAMES = {"train": "train", "valid": "val", "validation": "val", "val": "val", "test": "test", "test_unseen": "test_unseen"}
-"""Names of splits in public data sets, and those of the store."""
+"""Names of splits in the store, by their names in public data sets."""
 
 ASSUMED_PARAMETERS = {"sand": 30.0, "snow": 8.0, "fluid": 1e-3, "elastomer": 1e5, "solid": 1e6}
-"""Material parameters that are stored where a source has none."""
+"""Material parameters that are stored if a source has none, in the units of ``schema.MATERIALS``."""
 
 ASSUMED_FRICTION = 0.5
+"""Friction coefficient that is stored if a source has none."""
 
 SMALLEST = float(np.finfo(np.float32).tiny)
-"""Lengths and times of a source are at least this: what is positive in the precision that is stored."""
+"""Smallest length or time of a source that is positive in the stored precision."""
 
 STILL = 1e-2
-"""Boundary nodes that never get farther than this share of the spacing from where they should be are still, or slide steadily."""
+"""Boundary nodes are still, or slide steadily, if they never deviate from this motion by more than this fraction of the spacing."""
 
 WIDEST = 1.05
-"""Periods that nodes may spread over in a first frame."""
+"""Largest extent of the nodes in a first frame, in periods."""
 
 MAX_JSON_BYTES = 2**24
 MAX_TRAJECTORIES = 100_000
-"""In one file; a file of 100 MB can name millions of empty ones."""
+"""Maximum number of trajectories in one file. A file of 100 MB can name millions of empty ones."""
 
 
 class ImportFailure(GpeError, ValueError):
-    """A source cannot be imported at all; the message names the file and what to do."""
+    """Raised when a source cannot be imported at all; the message names the file and says what to do."""
 
 
 class Refusal(GpeError, ValueError):
-    """One trajectory of a source cannot be used; ``frame`` is -1 where the reason concerns none in particular."""
+    """Raised when one trajectory of a source cannot be used; ``frame`` is -1 if the reason concerns no particular frame."""
 
     def __init__(self, reason: str, frame: int = -1) -> None:
         super().__init__(reason)
@@ -61,24 +65,24 @@ class Refusal(GpeError, ValueError):
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """What is imported, and what is said about it that the source does not say, or says wrongly. None takes what the source has.
+    """Settings of an import. Values that are not None override the source, or add what it lacks.
 
     Attributes:
-        format: of the source.
+        format: format of the source.
         source: file or folder.
-        name: of the data set, a folder's name; None takes that of the source.
+        name: name of the data set, which becomes a folder; None takes the name of the source.
         frame_dt: time between frames [s].
         bounds: ``[low, high]`` of the domain per axis [m].
-        periodic: per axis.
+        periodic: whether space repeats, per axis.
         gravity: external acceleration per axis [m/s²].
         spacing: rest spacing of neighbours [m].
         connectivity_radius: neighbour radius [m].
-        walls: friction of walls at the bounds, by side (``x_low``, ``x_high``, …); ``{}`` for none.
-        materials: material, or ``boundary``, of node types of the source, by their number; the others are as the format has them.
-        parameters: parameter of materials of which the source has none.
-        max_trajectories: per split, from its start.
-        holdout: share of the training trajectories that become ``val`` and ``test`` where the source has none, at least one each; 0 for none.
-        allow_pickle: read object arrays, which can run code; for files that you trust.
+        walls: friction of walls at the bounds, by side (``x_low``, ``x_high``, …); ``{}`` for no walls.
+        materials: material, or ``boundary``, of node types of the source, by their number. Other types keep the material of the format.
+        parameters: parameter of each material for which the source has none.
+        max_trajectories: maximum number of trajectories per split, from its start.
+        holdout: fraction of the training trajectories that becomes each of ``val`` and ``test`` if the source has none, at least one trajectory; 0 for none.
+        allow_pickle: read object arrays, which can run code. Use it only for files that you trust.
     """
 
     format: Format
@@ -108,18 +112,20 @@ class ImportSettings:
 
 @dataclass(frozen=True)
 class Facts:
-    """What is the same for all trajectories of a data set; None where it is not known.
+    """Facts that all trajectories of a data set share; None if unknown.
 
     Attributes:
         frame_dt: time between frames [s].
-        bounds, periodic: of the domain, per axis.
+        bounds: ``(low, high)`` of the domain per axis [m].
+        periodic: whether space repeats, per axis.
         gravity: external acceleration per axis [m/s²].
-        spacing, connectivity_radius: in m.
+        spacing: rest spacing of neighbours [m].
+        connectivity_radius: neighbour radius [m].
         walls: friction of walls at the bounds, by side.
-        parameters: of materials, where all nodes have the same.
-        usual_gravity: what data in the format usually have, per axis [m/s²]; taken where neither the source nor a setting has any, unless groups of nodes in
-            free flight show another one.
-        notes: what is assumed, or left out, about all of it; one sentence each.
+        parameters: parameter of each material of which all nodes have the same value.
+        usual_gravity: usual gravity of the format per axis [m/s²]. It is used if neither the source nor a setting states one, unless groups of nodes in free
+            flight show another one.
+        notes: assumptions and omissions that concern the whole data set, one sentence each.
     """
 
     frame_dt: float | None = None
@@ -138,7 +144,7 @@ class Facts:
         return NOWHERE if self.bounds is None or self.periodic is None else Periodicity(self.bounds, self.periodic)
 
     def overridden(self, settings: ImportSettings) -> Facts:
-        """These facts, with those that the settings name."""
+        """Return these facts, overridden by the settings."""
         names = ("frame_dt", "bounds", "periodic", "gravity", "spacing", "connectivity_radius", "walls")
         given = {name: getattr(settings, name) for name in names if getattr(settings, name) is not None}
         given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
@@ -148,7 +154,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Repair:
-    """What was changed in a trajectory so that it could be stored; ``frame`` is the first one concerned, -1 for all or none."""
+    """A change to a trajectory so that it could be stored; ``frame`` is the first changed frame, -1 for all or none in particular."""
 
     what: str
     frame: int = -1
@@ -156,8 +162,14 @@ class Repair:
 
 @dataclass(frozen=True)
 class Loaded:
-    """A trajectory with what was changed in it, what was assumed about the whole data set, what looks wrong about the trajectory, and whether its gravity is
-    the usual one of the format, because nothing says what it is.
+    """A trajectory that was read.
+
+    Attributes:
+        trajectory: the trajectory.
+        repairs: changes to the trajectory.
+        notes: assumptions about the whole data set.
+        warnings: what looks wrong about the trajectory.
+        assumes_gravity: whether its gravity is the usual one of the format, because neither source nor settings state one.
     """
 
     trajectory: Trajectory
@@ -169,7 +181,7 @@ class Loaded:
 
 @dataclass(frozen=True)
 class Item:
-    """One trajectory of a source: its name there, and how to read it. Reading raises ``Refusal`` or ``ArrayError`` for what cannot be used."""
+    """One trajectory of a source: its name, and the function that reads it. Reading raises ``Refusal`` or ``ArrayError`` if it cannot be used."""
 
     name: str
     load: Callable[[Facts], Loaded]
@@ -177,30 +189,32 @@ class Item:
 
 @dataclass(frozen=True)
 class Source:
-    """A data set in a public format: what is known about it, the trajectories of each split that it has, and what looks wrong about all of it."""
+    """A data set in a public format: its facts, the trajectories of each split, and warnings about the whole data set."""
 
     facts: Facts
     splits: Mapping[str, Sequence[Item]]
     warnings: tuple[str, ...] = ()
 
 
-# --- what several formats share ------------------------------------------------------------------------------------------------------------
+# --- functions for several formats ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass
 class Nodes:
-    """Arrays of one trajectory as a source has them, in SI units.
+    """Arrays of one trajectory of a source, in SI units.
 
     Attributes:
-        pos: positions [frame, node, dim].
-        kind: ``schema.NODE_TYPES`` name of each node [node]; boundary nodes are taken out of ``pos``.
-        vel: velocities [frame, node, dim], where the source has them.
-        mass: of each node, or of all.
-        gravity: [dim] in m/s², where the source has it for each trajectory.
-        parameters: of materials, per node or for all.
-        walls: positions and normals [boundary_node, dim] of further boundary nodes.
-        cells: of a mesh, by kind [cell, corner].
-        rest_pos: of a mesh.
+        pos: positions [frame, node, dim] in m.
+        kind: node type of each node, a name of ``schema.NODE_TYPES`` [node]. ``build`` separates boundary nodes from the others.
+        vel: velocities [frame, node, dim] in m/s, if the source has them.
+        mass: mass of each node [node], or of all, in kg.
+        gravity: gravity [dim] in m/s², if the source has it per trajectory.
+        parameters: parameter of each material, per node [node] or for all nodes.
+        walls: positions and normals [boundary_node, dim] of additional boundary nodes.
+        cells: cells of a mesh by kind [cell, corner].
+        rest_pos: rest positions of a mesh [node, dim] in m.
+        friction: friction coefficient of boundary nodes.
+        repairs, notes, warnings: as in ``Loaded``.
     """
 
     pos: np.ndarray
@@ -219,10 +233,11 @@ class Nodes:
 
 
 def build(nodes: Nodes, facts: Facts) -> Loaded:
-    """The trajectory of a source's arrays, with boundary nodes apart, and parameters and normals assumed where the source has none.
+    """Build a trajectory from a source's arrays. Boundary nodes are separated, and missing parameters and normals are assumed.
 
     Raises:
-        Refusal: there are only boundary nodes, or the facts have other axes.
+        ImportFailure: ``frame_dt`` is unknown.
+        Refusal: there are only boundary nodes, or the facts have another number of axes.
         ArrayError: see ``Trajectory.from_numpy``.
     """
     if facts.frame_dt is None:
@@ -277,7 +292,7 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
 
 
 def _wider_than_periods(first: np.ndarray, periodicity: Periodicity) -> Iterator[str]:
-    """What speaks against the periods: a first frame [node, dim] that is wider than one."""
+    """Yield a warning for each periodic axis along which the first frame [node, dim] is wider than the period."""
     for axis in periodicity.axes:
         width, period = np.ptp(first[:, axis]), periodicity.period[axis]
         if width > WIDEST * period:
@@ -285,7 +300,7 @@ def _wider_than_periods(first: np.ndarray, periodicity: Periodicity) -> Iterator
 
 
 def _cells_of(nodes: Nodes, moving: np.ndarray, repairs: list[Repair]) -> dict[str, np.ndarray] | None:
-    """Cells between moving nodes by kind, renumbered."""
+    """Return the cells between dynamic nodes by kind, with node numbers among the dynamic nodes."""
     if nodes.cells is None:
         return None
     row = np.full(nodes.pos.shape[1], -1)
@@ -306,7 +321,7 @@ def _cells_of(nodes: Nodes, moving: np.ndarray, repairs: list[Repair]) -> dict[s
 
 
 def _boundary(nodes: Nodes, visited: np.ndarray, facts: Facts) -> tuple[Boundary, list[Repair], list[str]]:
-    """Boundary nodes of the source, further wall points, and walls at the bounds."""
+    """Collect boundary nodes of the source, additional wall points, and walls at the bounds."""
     dim = nodes.pos.shape[2]
     parts: list[Boundary] = []
     repairs: list[Repair] = []
@@ -333,7 +348,7 @@ def _boundary(nodes: Nodes, visited: np.ndarray, facts: Facts) -> tuple[Boundary
 
 
 def walls_at_bounds(facts: Facts, dim: int) -> Boundary:
-    """The walls that the facts name, where bounds are known."""
+    """Sample the walls that the facts name; there are none if bounds are unknown."""
     if not facts.walls or facts.bounds is None:
         return Boundary.empty(dim)
     spacing = facts.spacing or (max(high - low for low, high in facts.bounds) / 50)
@@ -344,7 +359,7 @@ def walls_at_bounds(facts: Facts, dim: int) -> Boundary:
 
 
 def joined(dim: int, *parts: Boundary) -> Boundary:
-    """All boundary nodes of several boundaries, of which those that move have motions of equally many frames."""
+    """Join the nodes of several boundaries. All moving boundaries must have the same number of frames."""
     parts = (Boundary.empty(dim), *parts)
     pos, vel, normal, friction, restitution = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("pos", "vel", "normal", "friction", "restitution")
@@ -361,12 +376,14 @@ def joined(dim: int, *parts: Boundary) -> Boundary:
 
 
 def _sliding(pos: np.ndarray, facts: Facts, repairs: list[Repair]) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity [boundary_node, dim] of boundary nodes, and which of them [boundary_node] neither are still nor slide steadily along a periodic axis, as a lid.
+    """Return velocities of boundary nodes [boundary_node, dim] in m/s, and a mask [boundary_node] of the nodes that move otherwise.
+
+    A node without the mask is still, or slides steadily along a periodic axis, like a lid.
 
     Args:
-        pos: their positions [frame, boundary_node, dim].
-        facts: of the data set.
-        repairs: what slides is added to these.
+        pos: positions of boundary nodes [frame, boundary_node, dim] in m.
+        facts: facts of the data set.
+        repairs: list to which sliding nodes are added.
     """
     assert facts.frame_dt is not None
     path = np.cumsum(facts.periodicity.shortest(np.diff(pos.astype(np.float64), axis=0)), axis=0)
@@ -384,14 +401,17 @@ def _sliding(pos: np.ndarray, facts: Facts, repairs: list[Repair]) -> tuple[np.n
 
 
 def typed(pos: np.ndarray, types: np.ndarray, table: Mapping[int, str], settings: ImportSettings, **arrays: Any) -> Nodes:
-    """Nodes by a source's integer types [node]; raises ``Refusal`` for one that is not known.
+    """Convert a source's integer types to node types.
 
     Args:
-        pos: positions [frame, node, dim].
-        types: of the nodes.
-        table: what types of the format become, unless the settings say otherwise.
-        settings: of the conversion.
-        arrays: further arguments of ``Nodes``.
+        pos: positions [frame, node, dim] in m.
+        types: types of the nodes [node].
+        table: node type of each type of the format; the settings override it.
+        settings: settings of the import.
+        arrays: other arguments of ``Nodes``.
+
+    Raises:
+        Refusal: a type is unknown.
     """
     known = {**table, **(settings.materials or {})}
     unknown = [code for code in np.unique(types).tolist() if code not in known]
@@ -406,7 +426,7 @@ def typed(pos: np.ndarray, types: np.ndarray, table: Mapping[int, str], settings
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object; raises ``ImportFailure``."""
+    """Read a JSON object; raises ``ImportFailure`` if that is impossible."""
     try:
         regular_files.check(path)
         if path.stat().st_size > MAX_JSON_BYTES:
@@ -422,7 +442,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def number(values: Mapping[str, Any], key: str, path: Path, low: float = -math.inf) -> float:
-    """A finite number of a JSON object, at least ``low``; raises ``ImportFailure`` that names file and key."""
+    """Return a finite number of a JSON object, at least ``low``; otherwise raises ``ImportFailure`` that names file and key."""
     value = values.get(key)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value < low:
         at_least = "" if low == -math.inf else f" of at least {low:g}"
@@ -431,7 +451,7 @@ def number(values: Mapping[str, Any], key: str, path: Path, low: float = -math.i
 
 
 def bounds_in(values: Mapping[str, Any], path: Path) -> tuple[tuple[float, float], ...]:
-    """``bounds`` of a JSON object: ``[low, high]`` of 2 or 3 axes."""
+    """Return ``bounds`` of a JSON object, ``[low, high]`` of 2 or 3 axes; otherwise raises ``ImportFailure``."""
     rows = values.get("bounds")
     try:
         array = np.asarray(rows, np.float64)
@@ -443,14 +463,14 @@ def bounds_in(values: Mapping[str, Any], path: Path) -> tuple[tuple[float, float
 
 
 def length_warning(num_frames: int, key: str, length: int | None) -> list[str]:
-    """What to say of a trajectory whose frames are neither as many as the source's description says nor one more, which is how some formats count."""
+    """Return a warning if a trajectory has neither ``length`` nor ``length + 1`` frames. Formats count the frames in either way."""
     if length is None or num_frames in (length, length + 1):
         return []
     return [f"has {num_frames} frames, which were taken; {key} = {length} stands for {length} or {length + 1}"]
 
 
 def count_in(values: Mapping[str, Any], key: str, path: Path) -> int | None:
-    """A number of things in a JSON object, None where it is not said; raises ``ImportFailure``."""
+    """Return a non-negative integer of a JSON object, or None if it is missing; otherwise raises ``ImportFailure``."""
     value = values.get(key)
     if value is not None and (type(value) is not int or value < 0):
         raise ImportFailure(f"{path}: {key} = {value!r}, expected an integer")
@@ -458,13 +478,13 @@ def count_in(values: Mapping[str, Any], key: str, path: Path) -> int | None:
 
 
 def natural(name: str) -> tuple[Any, ...]:
-    """Sorting key by which ``traj2`` comes before ``traj10``."""
-    parts = re.split(r"([0-9]+)", name)  # text and digits in turn; digits compare by length first, however many there are
+    """Sorting key that puts ``traj2`` before ``traj10``."""
+    parts = re.split(r"([0-9]+)", name)  # text and digits in turn; digits compare by length first, so that no number is too long
     return tuple((len(digits := part.lstrip("0")), digits) if k % 2 else part for k, part in enumerate(parts)), name
 
 
 def split_files(path: Path, endings: Sequence[str]) -> dict[str, Path]:
-    """Files ``train``, ``valid`` and ``test`` with one of the endings in a folder, by split; a single file is one of training data."""
+    """Find the files ``train``, ``valid`` and ``test`` with one of the endings in a folder, by split. A single file counts as training data."""
     if path.is_file():
         return {SPLIT_NAMES.get(path.name.partition(".")[0], "train"): path}
     there = [(split, path / f"{name}{ending}") for name, split in SPLIT_NAMES.items() for ending in endings]
@@ -476,7 +496,7 @@ def split_files(path: Path, endings: Sequence[str]) -> dict[str, Path]:
 
 
 def split_folders(path: Path) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Folders ``train``, ``valid``, ``test`` and ``test_unseen`` in a folder, by split, and a warning for each other one beside them."""
+    """Find the folders ``train``, ``valid``, ``test`` and ``test_unseen`` in a folder, by split; also returns a warning for each other folder."""
     if not path.is_dir():
         return {}, ()
     folders = {entry.name: entry for entry in path.iterdir() if entry.is_dir() and not entry.name.startswith(".")}
@@ -486,7 +506,7 @@ def split_folders(path: Path) -> tuple[dict[str, Path], tuple[str, ...]]:
 
 
 def _one_each(path: Path, found: Sequence[tuple[str, Path]]) -> dict[str, Path]:
-    """What was found by split; raises ``ImportFailure`` where two places are the same split."""
+    """Return the place of each split; raises ``ImportFailure`` if a split has two places."""
     places: dict[str, Path] = {}
     for split, place in found:
         if split in places:

@@ -1,8 +1,8 @@
-"""TFRecord files and the protocol buffers in them, read without TensorFlow.
+"""Reading of TFRecord files and the protocol buffers in them, without TensorFlow.
 
 A record is a length n (uint64, little-endian), a checksum of these 8 bytes, n bytes of data, and a checksum of the data. A checksum is the CRC-32C c
 (Castagnoli) as ``((c >> 15) | (c << 17)) + 0xa282ead8`` modulo 2³². The data are an ``Example`` (named features) or a ``SequenceExample`` (named features,
-and named lists of features with one entry per frame), where a feature is a list of byte strings, floats or integers.
+and named lists of features with one entry per frame). A feature is a list of byte strings, floats or integers.
 
 Sources: TensorFlow, "TFRecord and tf.train.Example" (guide) and tensorflow/core/example/{example,feature}.proto; RFC 3720, appendix B.4, for the CRC;
 "Encoding", the wire format of Protocol Buffers.
@@ -23,18 +23,18 @@ from gpe_pl.data.importers.source import MAX_TRAJECTORIES, ImportFailure, Refusa
 from gpe_pl.files import regular_files
 
 Feature = list[bytes] | np.ndarray
-"""Byte strings, or numbers as float32 or int64."""
+"""A feature's values: byte strings, or numbers as float32 or int64."""
 
 _POLYNOMIAL = 0x82F63B78  # Castagnoli, bits reversed
 _MASK = 0xA282EAD8
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 
 MAX_NAMES = 128
-"""Features of an ``Example``; those of the formats that are read have fewer than ten."""
+"""Maximum number of features of an ``Example``. The supported formats have fewer than ten."""
 MAX_STRINGS = 1024
-"""In one feature; the features that are used have one."""
+"""Maximum number of strings in one feature. The features that are used have one."""
 MAX_FIELDS = 2**22
-"""Of one number in one message, such as frames."""
+"""Maximum number of fields with one number in a message, such as frames."""
 
 _ENDS, _LONG, _WIRE, _SIZE, _MANY = range(1, 6)
 FAULTS = {
@@ -73,7 +73,14 @@ def masked_crc(data: bytes) -> int:
 
 @dataclass(frozen=True)
 class Record:
-    """Where a record's data lie; ``fault`` says why it and all that follows cannot be read."""
+    """The place of a record's data.
+
+    Attributes:
+        path: file.
+        start: position of the data in the file [bytes].
+        size: size of the data [bytes].
+        fault: why this record and all that follow cannot be read; empty if it can.
+    """
 
     path: Path
     start: int
@@ -81,7 +88,7 @@ class Record:
     fault: str = ""
 
     def read(self) -> bytes:
-        """The data; raises ``Refusal`` where they do not match their checksum."""
+        """Read the data; raises ``Refusal`` if they do not match their checksum."""
         if self.fault:
             raise Refusal(self.fault)
         with open(self.path, "rb") as file:
@@ -93,7 +100,11 @@ class Record:
 
 
 def records(path: Path) -> list[Record]:
-    """All records of a file. Where its structure breaks, the last one says so; what comes after cannot be found."""
+    """Find all records of a file. If its structure is damaged, the last record has a ``fault``; later records cannot be found.
+
+    Raises:
+        ImportFailure: the file cannot be read, or has too many records.
+    """
     try:
         regular_files.check(path)
         total = path.stat().st_size
@@ -134,14 +145,18 @@ def records(path: Path) -> list[Record]:
 
 @dataclass(frozen=True)
 class _Message:
-    """A part of a record's data."""
+    """A protocol buffer message: the bytes ``start`` to ``stop`` of a record's data."""
 
     data: np.ndarray
     start: int
     stop: int
 
     def fields(self, number: int) -> np.ndarray:
-        """Wire type, start, and size of each field [field, 3] of a number; of an integer its value in the place of the size. Raises ``Refusal``."""
+        """Return wire type, start and size of each field [field, 3] with this number. An integer field has its value instead of the size.
+
+        Raises:
+            Refusal: the message is damaged.
+        """
         rows, fault, detail = _fields(self.data, self.start, self.stop, number)
         if fault:
             what, place = (int(value) for value in detail)
@@ -149,28 +164,28 @@ class _Message:
         return rows
 
     def messages(self, number: int) -> Iterator[_Message]:
-        """The messages in the fields of a number."""
+        """Yield the messages in the fields with this number."""
         for wire, start, size in self.fields(number).tolist():
             if wire != _BYTES:
                 raise Refusal("not a protocol buffer: a number where a message should be")
             yield _Message(self.data, start, start + size)
 
     def only(self, number: int) -> _Message:
-        """The message in the first field of a number; empty where there is none."""
+        """Return the message in the first field with this number; empty if there is none."""
         return next(self.messages(number), _Message(self.data, 0, 0))
 
     def content(self) -> bytes:
         return self.data[self.start : self.stop].tobytes()
 
     def named(self) -> dict[str, _Message]:
-        """Values of a map by their keys."""
+        """Return the values of a map by their keys."""
         if (count := len(self.fields(1))) > MAX_NAMES:
             raise Refusal(f"holds {count} features, at most {MAX_NAMES} are read")
         entries = [(entry.alone(1).content(), entry.alone(2)) for entry in self.messages(1)]
         return {key.decode("utf-8", "replace"): value for key, value in entries}
 
     def alone(self, number: int) -> _Message:
-        """The message in the one field of a number; empty where there is none."""
+        """Return the message in the only field with this number; empty if there is none. Several fields raise ``Refusal``."""
         if len(self.fields(number)) > 1:
             raise Refusal("not an Example: an entry of a map has several names or values")
         return self.only(number)
@@ -193,7 +208,7 @@ class _Message:
 
 
 class Features(Mapping[str, Feature]):
-    """Features by name, which are decoded when they are looked up; raises ``Refusal``."""
+    """Features by name, decoded when they are looked up; a lookup raises ``Refusal`` on damaged data."""
 
     def __init__(self, features: _Message) -> None:
         self._named = features.named()
@@ -209,7 +224,7 @@ class Features(Mapping[str, Feature]):
 
 
 class Frames:
-    """Features with an entry per frame, which are decoded when they are wanted; raises ``Refusal``."""
+    """A feature per frame, decoded when it is looked up; a lookup raises ``Refusal`` on damaged data."""
 
     def __init__(self, entries: _Message) -> None:
         self._data, self._rows = entries.data, entries.fields(1)
@@ -227,17 +242,17 @@ class Frames:
         return (self[frame] for frame in range(len(self)))
 
     def strings(self, size: int) -> np.ndarray:
-        """Bytes [frame, byte] of the frames before the first that is not one string of ``size`` bytes."""
+        """Return the bytes [frame, byte] of the frames before the first one that is not a single string of ``size`` bytes."""
         return np.asarray(_strings(self._data, self._rows, size))
 
 
 def example(data: bytes) -> Features:
-    """Features of an ``Example`` by name; raises ``Refusal``."""
+    """Return the features of an ``Example`` by name; raises ``Refusal`` on damaged data."""
     return Features(_whole(data).only(1))
 
 
 def sequence_example(data: bytes) -> tuple[Features, dict[str, Frames]]:
-    """Context features, and features by name with an entry per frame, of a ``SequenceExample``; raises ``Refusal``."""
+    """Return the context features of a ``SequenceExample``, and its features per frame by name; raises ``Refusal`` on damaged data."""
     message = _whole(data)
     return Features(message.only(1)), {name: Frames(entries) for name, entries in message.only(2).named().items()}
 
@@ -249,7 +264,7 @@ def _whole(data: bytes) -> _Message:
 @njit(cache=True)
 @no_type_check
 def _varint(data, place, stop):
-    """Value modulo 2⁶⁴, as it is in int64, and where the next begins; a fault, negative, in its place."""
+    """Return a value modulo 2⁶⁴ as int64, and the place after it; the second is a negative fault if there is one."""
     value = np.int64(0)
     for k in range(10):
         if place >= stop:
@@ -265,7 +280,7 @@ def _varint(data, place, stop):
 @njit(cache=True)
 @no_type_check
 def _field(data, place, stop):
-    """Number, wire type, start, size or value, and where the next begins; a fault, negative, in its place."""
+    """Return number, wire type, start, size or value of a field, and the place after it; the last is a negative fault if there is one."""
     key, place = _varint(data, place, stop)
     number, wire, value = (key >> 3) & 0x1FFFFFFFFFFFFFFF, key & 7, np.int64(0)
     if place < 0:
@@ -292,7 +307,7 @@ def _field(data, place, stop):
 @njit(cache=True)
 @no_type_check
 def _fields(data, start, stop, wanted):
-    """Rows of ``_Message.fields``; or a fault, with a value and a place that explain it."""
+    """Return the rows of ``_Message.fields``, a fault (0: none), and a value and a place that explain the fault."""
     count, place = 0, start
     rows, detail = np.empty((0, 3), np.int64), np.zeros(2, np.int64)
     while place < stop:
@@ -316,7 +331,7 @@ def _fields(data, start, stop, wanted):
 @njit(cache=True)
 @no_type_check
 def _joined(data, rows):
-    """The bytes of fields, one after the other."""
+    """Return the bytes of fields, one after the other."""
     joined, end = np.empty(rows[:, 2].sum(), np.uint8), 0
     for k in range(len(rows)):
         start, size = rows[k, 1], rows[k, 2]
@@ -328,7 +343,7 @@ def _joined(data, rows):
 @njit(cache=True)
 @no_type_check
 def _integers(data, rows):
-    """Integers in fields, of one number each or of many, and whether all were whole."""
+    """Return the integers in fields, which have one or many each, and whether all were complete."""
     count = 0
     for k in range(len(rows)):
         if rows[k, 0] == _VARINT:
@@ -355,7 +370,7 @@ def _integers(data, rows):
 @njit(cache=True)
 @no_type_check
 def _strings(data, rows, size):
-    """Bytes of the frames [frame, byte] in fields, up to the first that does not hold one string of ``size`` bytes in the way that writers do."""
+    """Return the bytes [frame, byte] of the frames in fields, up to the first that is not a single string of ``size`` bytes in the usual encoding."""
     starts = np.empty(len(rows), np.int64)
     count = 0
     for k in range(len(rows)):
