@@ -1,4 +1,4 @@
-"""Forward times of the models of a sweep, for the column of its table."""
+"""Forward times of the models of a sweep, for a column of its table."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from gpe_pl.reports.sweep_table import FORWARD_TIMES, variants_of
 from gpe_pl.system.timing import paired_ratio, paired_times
 
 NUM_NODES, NUM_EDGES = 600, 6000
-"""Of the graph: one layer of sand."""
+"""Size of the graph, which has one layer of sand."""
 
 
 def measure_forward_times(folder: Path, runs: list[Run], num_rounds: int = 30) -> None:
     """Write the forward time of one model per variant over that of the first variant: the median of paired ratios on one graph.
 
-    All models compute by PyTorch's operations alone, which all variants have in common. Nothing is measured where runs are of several models or domains, where
-    there is one variant, where models know other materials than sand, or where the variants were measured before.
+    All models use only PyTorch's operations, which all variants share. Nothing is measured if the runs have several models or domains, if there is one variant,
+    if models know other materials than sand, or if the variants were measured before.
 
     Args:
-        folder: of the sweep; ``forward_times.json`` is written there.
-        runs: of the sweep, all finished.
-        num_rounds: of the measurement.
+        folder: folder of the sweep, where ``forward_times.json`` is written.
+        runs: runs of the sweep, all finished.
+        num_rounds: number of rounds of the measurement.
     """
     runs = distinct_runs(runs)
     path = folder / FORWARD_TIMES

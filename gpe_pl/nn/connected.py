@@ -1,4 +1,7 @@
-"""Nodes with edges, and the order of nodes. Nodes without an edge take no part in message passing, and nodes of one edge should be near in memory."""
+"""Nodes that edges touch, and their order in memory.
+
+Nodes without an edge take no part in message passing, and nodes of one edge should be near each other in memory.
+"""
 
 from __future__ import annotations
 

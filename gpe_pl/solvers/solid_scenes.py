@@ -48,7 +48,7 @@ class SolidScene:
     Attributes:
         bounds: ``(low, high)`` of the domain along each axis [m].
         cell: kind of mesh cell; tetrahedra in 3D, the others in 2D.
-        num_cells: approximate number of cells, the same in every scene.
+        num_cells: approximate number of cells in every scene.
         body_size: edge of the square (3D: cube) that has the area (volume) of the body [m].
         density: density at rest [kg/m³].
         gravity: acceleration of gravity [m/s²].

@@ -1,16 +1,16 @@
 // Arrays of the page: base64 of zlib. See viewer.py, which packs them.
 
-/** Bytes behind a packed array. */
+/** Returns the bytes of a packed array. */
 async function inflate(element) {
   const text = atob(element.textContent);
   const bytes = new Uint8Array(text.length);
   for (let k = 0; k < text.length; k++) bytes[k] = text.charCodeAt(k);
-  element.remove(); // the text is no longer needed
+  element.remove(); // frees the text
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/** Differences from frame to frame, modulo 2^16, all low bytes before all high bytes, become values. */
+/** Decodes values from differences between frames, modulo 2^16, with all low bytes before all high bytes. */
 function integrate(bytes, width) {
   const count = bytes.length / 2;
   const values = new Uint16Array(count);
@@ -18,7 +18,7 @@ function integrate(bytes, width) {
   return values;
 }
 
-/** All arrays of the page by name. */
+/** Returns all arrays of the page by name. */
 async function unpack() {
   const kinds = { uint8: Uint8Array, uint32: Uint32Array, float32: Float32Array };
   const arrays = {};
@@ -30,7 +30,7 @@ async function unpack() {
   return arrays;
 }
 
-/** A number with a prefix of the SI where a unit follows. */
+/** Formats a number, with an SI prefix if a unit follows. */
 function withUnit(value, unit) {
   if (!unit) return String(Number(value.toPrecision(3)));
   if (value === 0) return `0 ${unit}`;

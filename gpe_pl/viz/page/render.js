@@ -1,5 +1,5 @@
 // Draws panels with WebGL 2: one canvas, a viewport per panel.
-// Positions arrive as 16-bit integers of a range that all trajectories share; their largest value means that a node is not shown.
+// Positions are 16-bit integers in a range that all trajectories share; the largest value marks a node that is not shown.
 
 const PROJECT = `
 uniform vec3 u_center, u_right, u_up, u_toward;
@@ -81,7 +81,7 @@ precision highp float;
 in vec3 v_color; out vec4 color;
 void main() { color = vec4(v_color, 1.0); }`;
 
-// Discs on a surface, seen from its free side: where they overlap they look like it.
+// Discs on a surface, visible from its free side; overlapping discs look like the surface.
 const SURFACE_VERTEX = `#version 300 es
 in vec3 a_pos; in vec3 a_normal; in float a_radius;
 uniform float u_pixels;
@@ -128,7 +128,7 @@ void main() {
   color = vec4(mix(vec3(0.82), vec3(0.15), line), max(inside, line));
 }`;
 
-/** Draws trajectories. ``scene`` and ``arrays`` are those of the page. */
+/** Draws trajectories from the ``scene`` and ``arrays`` of the page. */
 class Renderer {
   constructor(canvas, scene, arrays) {
     const gl = canvas.getContext("webgl2", { antialias: arrays.triangles.length > 0, alpha: false });
@@ -223,7 +223,7 @@ class Renderer {
     };
   }
 
-  /** Clears the canvas and fits it to its place on the screen. */
+  /** Clears the canvas and fits it to its size on the screen. */
   begin() {
     const { gl, canvas } = this;
     this.ratio = window.devicePixelRatio || 1;
@@ -265,7 +265,7 @@ class Renderer {
     if (this.solid) this.#drawLines(shared);
     if (this.flats) {
       this.#colored(shared, this.flats);
-      gl.enable(gl.POLYGON_OFFSET_FILL); // lines along the edges stay visible
+      gl.enable(gl.POLYGON_OFFSET_FILL); // keeps lines along the edges visible
       gl.polygonOffset(1, 1);
       gl.drawArrays(gl.TRIANGLES, 0, this.flats.count);
       gl.disable(gl.POLYGON_OFFSET_FILL);
@@ -293,7 +293,7 @@ class Renderer {
     this.gl.drawArrays(this.gl.LINES, 0, this.lines.count);
   }
 
-  /** Puts those faces or edges into the bound buffer that do not reach across a whole periodic domain. */
+  /** Writes faces or edges to the bound buffer, except those that reach across a whole periodic domain. */
   #leaveOutSeams(indices, pos) {
     const { gl, scene } = this, { data, corners } = indices, kept = [];
     const limit = scene.periods.map((period, k) => (period ? 0.5 * period / scene.position.extent[k] * 65535 : Infinity));

@@ -1,4 +1,4 @@
-// The page: what is shown when, and from where.
+// The page: panels, time, camera and controls.
 
 const scene = JSON.parse(document.getElementById("scene").textContent);
 const $ = (id) => document.getElementById(id);
@@ -27,7 +27,7 @@ class Camera {
     return [place([-sin, cos, 0]), place([-rise * cos, -rise * sin, flat]), place([flat * cos, flat * sin, rise])];
   }
 
-  /** Half of width and height of the scene as seen [m]. */
+  /** Half of the visible width and height of the scene [m]. */
   extent() {
     const half = scene.focus.low.map((low, k) => (scene.focus.high[k] - low) / 2);
     if (scene.round) return [half[0], half[0]];
@@ -56,7 +56,7 @@ class Camera {
     }
   }
 
-  /** Zooms and keeps what lies at (x, y), from the middle of the box, where it is. */
+  /** Zooms about the point (x, y), measured from the middle of the box. */
   scale(factor, x, y, box) {
     const before = this.view(box);
     this.zoom = Math.min(200, Math.max(0.2, this.zoom * factor));
@@ -93,7 +93,7 @@ class Recording {
   }
 }
 
-/** Distance [m] of a node of one trajectory from itself in another. */
+/** Distance [m] between the positions of a node in two trajectories. */
 function distance(a, b, frame) {
   const p = a.pos(frame), q = b.pos(frame), { dim } = scene;
   if (!p || !q) return null;
@@ -160,7 +160,7 @@ class Viewer {
     this.draw();
   }
 
-  /** What stands around a panel: its name, the meaning of its colours, and a ring for the node under the mouse. */
+  /** Draws the frame of a panel: its name, the meaning of its colours, and a ring around the node under the mouse. */
   #frameOf(panel) {
     const element = document.createElement("section");
     element.className = "panel";
@@ -190,19 +190,19 @@ class Viewer {
     return element;
   }
 
-  /** Places of all nodes on the colour map, negative where a node has no value. */
+  /** Returns the positions of all nodes on the colour map, negative for a node without a value. */
   #shade(number, { of, by }) {
     const shades = (this.shades[number] ??= new Float32Array(scene.nodes));
     const { low, high } = this.colors[by];
     const value = this.#quantity(of, by);
     for (let node = 0; node < scene.nodes; node++) {
       const v = value ? (value(node) - low) / (high - low) : -1;
-      shades[node] = v >= 0 ? v : v < 0 && value ? 0 : -1; // a NaN is neither
+      shades[node] = v >= 0 ? v : v < 0 && value ? 0 : -1; // NaN is neither
     }
     return shades;
   }
 
-  /** A function of the node, or null where the trajectory does not have the quantity. */
+  /** Returns a function of the node, or null if the trajectory does not have the quantity. */
   #quantity(of, by) {
     if (by === "error") return of === this.truth ? null : distance(of, this.truth, this.frame);
     const fixed = this.arrays[`all_${by}`];
@@ -223,7 +223,7 @@ class Viewer {
     $("time").textContent = `${(this.frame * scene.frameInterval).toFixed(scene.decimals)} s   frame ${this.frame * scene.stride}`;
     this.#markCurve();
     this.#point();
-    this.drawMilliseconds = performance.now() - started; // of this thread; the graphics card may take longer
+    this.drawMilliseconds = performance.now() - started; // time of this thread; the graphics card may take longer
   }
 
   // --- time -------------------------------------------------------------------------------------------------------------------------------
@@ -238,10 +238,10 @@ class Viewer {
     this.playback = from;
     const tick = (now) => {
       if (!this.playing || this.playback !== from) return;
-      const seconds = Math.max(0, now - from.time) / 1000; // the first picture may have begun before the click
-      const frame = from.frame + Math.floor(seconds * Number($("rate").value)); // skips frames rather than time
+      const seconds = Math.max(0, now - from.time) / 1000; // the first picture may have an earlier time than the click
+      const frame = from.frame + Math.floor(seconds * Number($("rate").value)); // skips frames to keep time
       if (Math.min(frame, this.truth.frames - 1) !== this.frame) this.#show(frame);
-      if (frame >= this.truth.frames - 1 + Number($("rate").value) / 2) Object.assign(from, { frame: 0, time: now }); // from the start, after a look at the end
+      if (frame >= this.truth.frames - 1 + Number($("rate").value) / 2) Object.assign(from, { frame: 0, time: now }); // starts again after showing the last frame
       requestAnimationFrame(tick);
     };
     requestAnimationFrame(tick);
@@ -344,14 +344,14 @@ class Viewer {
     }, { passive: false });
   }
 
-  /** Place of a position in a panel [CSS pixels] and towards the viewer [m]. */
+  /** Returns the point of a position in a panel [CSS pixels], and its distance towards the viewer [m]. */
   #onScreen(pos, { box }) {
     const view = this.camera.view(box), r = pos.map((p, k) => p - view.u_center[k]);
     const dot = (axis) => axis[0] * r[0] + axis[1] * r[1] + axis[2] * r[2];
     return [box.x + box.width / 2 + dot(view.u_right) * view.pixels, box.y + box.height / 2 - dot(view.u_up) * view.pixels, dot(view.u_toward), view.pixels];
   }
 
-  /** The node under the mouse: the nearest one to the viewer among those that the mouse touches. */
+  /** Returns the node under the mouse that is nearest to the viewer. */
   #nearest(panel, x, y) {
     const origin = this.#onScreen([0, 0, 0], panel), unit = [[1, 0, 0], [0, 1, 0], [0, 0, 1]].map((e) => this.#onScreen(e, panel));
     const pos = panel.of.pos(this.frame), { dim, position } = scene;
@@ -373,7 +373,7 @@ class Viewer {
     return best;
   }
 
-  /** Shows the node under the mouse in all panels, and what is known about it. */
+  /** Marks the node under the mouse in all panels, and shows its values. */
   #point(x, y) {
     const node = this.hovered, tooltip = $("tooltip");
     for (const panel of this.panels) {
