@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 from torch_geometric.data import HeteroData
 
@@ -24,6 +24,7 @@ from gpe_pl.files.markdown import table_row
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.lattice import lattice_graph, lattice_scene
 from gpe_pl.graphs.neighbors import radius_pairs
+from gpe_pl.models.base import Model
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS
@@ -99,7 +100,7 @@ class Case:
             return "directed, plain"
         return None if self.is_fused else "directed, factored"
 
-    def build(self, spec: FeatureSpec, num_steps: int, hidden: int, seed: int = 0) -> nn.Module:
+    def build(self, spec: FeatureSpec, num_steps: int, hidden: int, seed: int = 0) -> Model:
         """Build the model; equal parameters get equal weights in all cases."""
         torch.manual_seed(seed)
         if self.model == "GNS":
@@ -132,7 +133,7 @@ def cases(compiled: bool, reduced: bool) -> dict[str, Case]:
     return found | {name: Case(model=name) for name in ("GNS", "DPINet", "ContinuousConvNet")}
 
 
-def flop(model: nn.Module, graph: HeteroData) -> int:
+def flop(model: Model, graph: HeteroData) -> int:
     """Count the floating-point operations of a forward pass's matrix products, on the meta device, where no fused passes hide products."""
     with torch.inference_mode(), FlopCounterMode(display=False) as counter:
         model.to("meta")(graph.clone().to("meta"))
@@ -159,14 +160,14 @@ def training_pass(case: Case, settings: Settings) -> Callable[[], Any]:
     return synchronized(case.runs(training_step(*_built(case, settings))), settings.device)
 
 
-def _built(case: Case, settings: Settings) -> tuple[nn.Module, HeteroData]:
+def _built(case: Case, settings: Settings) -> tuple[Model, HeteroData]:
     torch.set_num_threads(settings.num_threads)
     builder, graph = lattice_graph(settings.num_nodes, settings.num_edges, GraphConfig())
     model = case.build(builder.spec, settings.num_message_passing_steps, settings.hidden_channels, settings.seed).to(settings.device)
     return _compiled(model, settings.device) if case.compiled else model, graph.to(settings.device)
 
 
-def training_step(model: nn.Module, graph: HeteroData) -> Callable[[], Any]:
+def training_step(model: Model, graph: HeteroData) -> Callable[[], Any]:
     """Return a step of forward and backward pass, clipping, and Adam with learning rate zero."""
     optimizer = torch.optim.Adam(model.parameters(), lr=0.0, fused=True)
 
@@ -181,10 +182,9 @@ def training_step(model: nn.Module, graph: HeteroData) -> Callable[[], Any]:
     return step
 
 
-def _compiled(model: nn.Module, device: str) -> nn.Module:
-    fast: Any = model
+def _compiled(model: Model, device: str) -> Model:
     mode = "reduce-overhead" if device == "cuda" else None  # uses CUDA graphs
-    fast.compute = torch.compile(fast.compute, dynamic=device != "cuda", mode=mode)
+    model.compute = torch.compile(model.compute, dynamic=device != "cuda", mode=mode)
     return model
 
 

@@ -6,7 +6,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
 
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -56,6 +55,6 @@ def model_label(simulator: LearnedSimulator) -> str:
     """Return class, depth, width, and all other settings that differ from the default."""
     cls, settings = type(simulator.model), dict(simulator.description()["settings"])
     depth = next((settings.pop(k) for k in DEPTHS if k in settings), "")
-    plain = cast(Any, cls)(simulator.builder.spec).settings
+    plain = cls(simulator.builder.spec).settings
     other = [str(v) for k, v in settings.items() if k != "hidden_channels" and v != plain.get(k)]
     return " ".join([f"{cls.__name__} {depth} × {settings['hidden_channels']}", *other])

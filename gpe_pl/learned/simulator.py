@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.graphs.standardizer import GraphStandardizer, StatisticsSample, named
 from gpe_pl.learned.checkpoint_archive import check_archive, check_values
 from gpe_pl.learned.pretrained import checkpoint_path, names
-from gpe_pl.models.base import Prediction
+from gpe_pl.models.base import Model, Prediction
 from gpe_pl.nn.static_friction import is_held, supported
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.rollout.skips import Skips
@@ -66,7 +66,7 @@ class LearnedSimulator(nn.Module):
     """Advances a state by one frame with a learned acceleration.
 
     Args:
-        model: any ``models.base.Model``; its ``settings`` rebuild it from a checkpoint.
+        model: the network; its ``settings`` rebuild it from a checkpoint.
         builder: makes the graphs.
 
     Attributes:
@@ -78,13 +78,14 @@ class LearnedSimulator(nn.Module):
     All may be changed at any time; a checkpoint that ``save`` writes keeps ``static_friction`` alone.
     """
 
+    model: Model
     acceleration_std: Tensor
     stress_std: Tensor
     trained_scene: Tensor
     trained_mass: Tensor
     holds_parameters: bool = True
 
-    def __init__(self, model: nn.Module, builder: GraphBuilder) -> None:
+    def __init__(self, model: Model, builder: GraphBuilder) -> None:
         super().__init__()
         self.model, self.builder = model, builder
         self._static_friction = 0.0
@@ -114,7 +115,7 @@ class LearnedSimulator(nn.Module):
     @skips.setter
     def skips(self, skips: Skips) -> None:
         self.builder = replace(self.builder, skips=skips)
-        cast(Any, self.model).skips = skips
+        self.model.skips = skips
 
     def configured(
         self, *, skips: Skips | None = None, holds_parameters: bool | None = None, static_friction: float | None = None
@@ -145,7 +146,7 @@ class LearnedSimulator(nn.Module):
     @property
     def num_hops(self) -> int:
         """How many edges away a node can still count."""
-        return int(cast(Any, self.model).num_hops)
+        return self.model.num_hops
 
     @torch.no_grad()
     def fit_statistics(
@@ -488,7 +489,7 @@ class LearnedSimulator(nn.Module):
         return {
             "format": CHECKPOINT_FORMAT,
             "model": f"{cls.__module__}.{cls.__qualname__}",
-            "settings": dict(cast(Any, self.model).settings),
+            "settings": dict(self.model.settings),
             "graph": asdict(self.builder.config),
             "metadata": asdict(self.builder.metadata),
             "static_friction": self.static_friction,
@@ -578,7 +579,7 @@ class UnknownModelError(GpeError, ValueError):
     """A dotted name that is not a model of this package."""
 
 
-def model_class(target: str) -> type[nn.Module]:
+def model_class(target: str) -> type[Model]:
     """The model class of a dotted name; only classes under ``gpe_pl.models`` are accepted, because names come from files.
 
     Raises:
@@ -591,6 +592,6 @@ def model_class(target: str) -> type[nn.Module]:
         cls = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError):
         raise UnknownModelError(f"model {target!r} does not exist in this version of gpe_pl") from None
-    if not (inspect.isclass(cls) and issubclass(cls, nn.Module)):
+    if not (inspect.isclass(cls) and issubclass(cls, Model)):
         raise UnknownModelError(f"{target!r} is not a model")
     return cls

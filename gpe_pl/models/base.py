@@ -1,9 +1,11 @@
-"""The contract of all models: they map a graph to one prediction per dynamic node type."""
+"""The base class of all models: they map a graph to one prediction per dynamic node type."""
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
+from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
 from gpe_pl.rollout.skips import Skips
@@ -23,22 +25,45 @@ class Prediction:
     stress: dict[str, Tensor] = field(default_factory=dict)
 
 
-class Model(Protocol):
-    """Network whose constructor takes a ``FeatureSpec`` first and keyword settings after it.
+class Model(nn.Module, ABC):
+    """Network whose constructor takes a ``FeatureSpec`` first and annotated keyword settings after it, and passes all of them on to this one.
 
-    ``forward`` takes a graph with standardised features. ``settings`` holds the keyword arguments as plain values, so that a checkpoint can rebuild
-    the model. ``compute`` does the work of ``forward`` on tensors in dictionaries and tuples; ``torch.compile`` compiles this part. ``skips`` lists what
-    ``forward`` may leave out in evaluation mode; a model may ignore it. ``num_hops`` is the number of ``radius`` edges to the farthest node that can influence
-    a prediction, apart from paths inside meshes.
+    A subclass calls ``super().__init__(spec, width=width, …)`` before it makes its layers, so that ``type(model)(spec, **model.settings)`` rebuilds it.
+
+    Args:
+        spec: channels of the graphs.
+        settings: the keyword arguments of the subclass, as plain values.
+
+    Attributes:
+        spec: channels of the graphs.
+        settings: keyword arguments that rebuild the model; a checkpoint stores them.
+        skips: what ``forward`` may leave out in evaluation mode; a model may ignore it.
     """
 
     spec: FeatureSpec
     settings: dict[str, Any]
-    skips: Skips
+    skips: Skips = Skips()
+    compute: Callable[..., Any]
+    """Does the work of ``forward`` on tensors in dictionaries and tuples. ``torch.compile`` compiles this part and replaces it on one model."""
+
+    def __init__(self, spec: FeatureSpec, **settings: Any) -> None:
+        super().__init__()
+        self.spec, self.settings = spec, settings
+
+    if TYPE_CHECKING:  # nn.Module says that any call returns anything
+
+        def __call__(self, data: HeteroData) -> Prediction: ...
 
     @property
-    def num_hops(self) -> int: ...
+    @abstractmethod
+    def num_hops(self) -> int:
+        """Number of ``radius`` edges to the farthest node that can influence a prediction, apart from paths inside meshes."""
 
-    def forward(self, data: HeteroData) -> Prediction: ...
+    @property
+    def is_fused(self) -> bool:
+        """Whether the model has fused passes for CPUs, where ``torch.compile`` then gains nothing."""
+        return False
 
-    def compute(self, *args: Any) -> Any: ...
+    @abstractmethod
+    def forward(self, data: HeteroData) -> Prediction:
+        """Return the prediction for a graph, or a batch of graphs, with standardised features; it leaves the stores of the graph as they are."""

@@ -25,7 +25,7 @@ from torch.nn import functional
 from torch_geometric.data import HeteroData
 
 from gpe_pl.errors import GpeError
-from gpe_pl.models.base import Prediction
+from gpe_pl.models.base import Model, Prediction
 from gpe_pl.nn.continuous_conv import ContinuousConv, interpolate
 from gpe_pl.nn.homogeneous import Homogeneous, first_rows
 from gpe_pl.schema import BOUNDARY, RADIUS, EdgeType, FeatureSpec
@@ -38,7 +38,7 @@ class NotAParticleGraphError(GpeError, ValueError):
     """The graph has relations that cannot be convolved."""
 
 
-class ContinuousConvNet(nn.Module):
+class ContinuousConvNet(Model):
     """Network of the paper.
 
     Args:
@@ -58,14 +58,13 @@ class ContinuousConvNet(nn.Module):
         hidden_channels: Annotated[int, Field(ge=2, le=4096)] = 64,
         kernel_size: Annotated[int, Field(ge=2, le=16)] = 4,
     ) -> None:
-        super().__init__()
+        super().__init__(spec, num_convolutions=num_convolutions, hidden_channels=hidden_channels, kernel_size=kernel_size)
         others = sorted({r[1] for r in spec.relations} - {RADIUS})
         if others:
             raise NotAParticleGraphError(
                 f"ContinuousConvNet convolves over {RADIUS} edges; the graph also has {', '.join(others)}: set graph.mesh=false"
             )
-        self.settings = {"num_convolutions": num_convolutions, "hidden_channels": hidden_channels, "kernel_size": kernel_size}
-        self.spec, self.kernel_size = spec, kernel_size
+        self.kernel_size = kernel_size
         self.particles = Homogeneous(spec, spec.materials)
         in_channels, first = self.particles.node_channels + self.particles.num_kinds, hidden_channels // 2
         self.conv_boundary = ContinuousConv(spec.node_channels[BOUNDARY], first, spec.dim, kernel_size)

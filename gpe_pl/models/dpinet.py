@@ -31,7 +31,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch_geometric.data import HeteroData
 
-from gpe_pl.models.base import Prediction
+from gpe_pl.models.base import Model, Prediction
 from gpe_pl.nn.blocks import EdgeLinear, ReluMLP
 from gpe_pl.nn.homogeneous import Edges, Homogeneous, first_rows, present
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, RADIUS, SAME, EdgeType, FeatureSpec
@@ -70,7 +70,7 @@ class Stage(nn.Module):
         return h
 
 
-class DPINet(nn.Module):
+class DPINet(Model):
     """Model of the paper.
 
     Args:
@@ -85,9 +85,8 @@ class DPINet(nn.Module):
         num_propagation_steps: Annotated[int, Field(ge=1, le=64)] = 2,
         hidden_channels: Annotated[int, Field(ge=2, le=4096)] = 200,
     ) -> None:
-        super().__init__()
-        self.settings = {"num_propagation_steps": num_propagation_steps, "hidden_channels": hidden_channels}
-        self.spec, self.num_propagation_steps, self.hidden_channels = spec, num_propagation_steps, hidden_channels
+        super().__init__(spec, num_propagation_steps=num_propagation_steps, hidden_channels=hidden_channels)
+        self.num_propagation_steps, self.hidden_channels = num_propagation_steps, hidden_channels
         self.graph = Homogeneous(spec, spec.node_types)
         names = ("leaves", "up", "same", "down") if spec.num_levels else ("leaves",)
         node_channels = self.graph.node_channels + self.graph.num_kinds

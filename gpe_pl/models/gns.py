@@ -25,7 +25,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
-from gpe_pl.models.base import Prediction
+from gpe_pl.models.base import Model, Prediction
 from gpe_pl.nn.blocks import EdgeLinear, ReluMLP
 from gpe_pl.nn.homogeneous import Edges, Homogeneous, present
 from gpe_pl.schema import FeatureSpec
@@ -49,7 +49,7 @@ class InteractionNetwork(nn.Module):
         return self.node(torch.cat([h, total], dim=1)), messages
 
 
-class GNS(nn.Module):
+class GNS(Model):
     """Model of the paper.
 
     Args:
@@ -68,14 +68,13 @@ class GNS(nn.Module):
         num_hidden_layers: Annotated[int, Field(ge=1, le=8)] = 2,
         type_channels: Annotated[int, Field(ge=1, le=1024)] = 16,
     ) -> None:
-        super().__init__()
-        self.settings = {
-            "num_message_passing_steps": num_message_passing_steps,
-            "hidden_channels": hidden_channels,
-            "num_hidden_layers": num_hidden_layers,
-            "type_channels": type_channels,
-        }
-        self.spec = spec
+        super().__init__(
+            spec,
+            num_message_passing_steps=num_message_passing_steps,
+            hidden_channels=hidden_channels,
+            num_hidden_layers=num_hidden_layers,
+            type_channels=type_channels,
+        )
         self.graph = Homogeneous(spec, spec.node_types)
         hidden, layers = hidden_channels, num_hidden_layers
         self.type_embedding = nn.Embedding(self.graph.num_kinds, type_channels)

@@ -22,12 +22,11 @@ from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
 from gpe_pl.errors import GpeError
-from gpe_pl.models.base import Prediction
+from gpe_pl.models.base import Model, Prediction
 from gpe_pl.nn.blocks import MLP
 from gpe_pl.nn.connected import Edges, order_of_edges, renumbered, reordered, touched
 from gpe_pl.nn.island_momentum import IslandMomentum, conserve, rigid_part
 from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction, MomentumConv, orient
-from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import CELL, DOWN, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
 
 Decoder = Literal["node", "pair", "contact"]
@@ -154,7 +153,7 @@ def _grouped(data: HeteroData, materials: Iterable[str], name: str, count: Tenso
     return torch.cat([s.mass for s in stores]), torch.cat([s.pos for s in stores]), group
 
 
-class GPE(nn.Module):
+class GPE(Model):
     """Model of the paper and its variants.
 
     Args:
@@ -183,8 +182,6 @@ class GPE(nn.Module):
             decoder with meshes beside other materials, and nothing that conserves the sum of momentum.
     """
 
-    skips = Skips()
-
     def __init__(
         self,
         spec: FeatureSpec,
@@ -201,21 +198,21 @@ class GPE(nn.Module):
         node_norm: NodeNorm = "none",
         island_momentum: IslandMomentum = "ignored",
     ) -> None:
-        super().__init__()
-        self.settings = {
-            "interaction": interaction,
-            "decoder": decoder,
-            "edge_state": edge_state,
-            "material_embedding": material_embedding,
-            "num_message_passing_steps": num_message_passing_steps,
-            "hidden_channels": hidden_channels,
-            "implementation": implementation,
-            "level_weights": level_weights,
-            "schedule": schedule,
-            "stress": stress,
-            "node_norm": node_norm,
-            "island_momentum": island_momentum,
-        }
+        super().__init__(
+            spec,
+            interaction=interaction,
+            decoder=decoder,
+            edge_state=edge_state,
+            material_embedding=material_embedding,
+            num_message_passing_steps=num_message_passing_steps,
+            hidden_channels=hidden_channels,
+            implementation=implementation,
+            level_weights=level_weights,
+            schedule=schedule,
+            stress=stress,
+            node_norm=node_norm,
+            island_momentum=island_momentum,
+        )
         if island_momentum != "ignored" and not spec.islands:
             raise IslandError(f"model.island_momentum={island_momentum} needs graph.islands=true")
         self.bodies = tuple(r[0] for r in spec.relations if r[1] == CELL) if decoder == "contact" else ()
@@ -231,7 +228,7 @@ class GPE(nn.Module):
             raise StressError(
                 f"model.stress=true, but the data set stores no stress of {', '.join(spec.materials)}; choose model.stress=false or data=fem"
             )
-        self.spec, self.interaction, self.decoder, self.edge_state = spec, interaction, decoder, edge_state
+        self.interaction, self.decoder, self.edge_state = interaction, decoder, edge_state
         self.level_weights, self.schedule = level_weights, schedule
         self.num_message_passing_steps = num_message_passing_steps
         hidden, norm = hidden_channels, node_norm == "layer"

@@ -122,9 +122,9 @@ class TrainingModule(L.LightningModule):
     @contextmanager
     def compiled(self) -> Iterator[None]:
         """Inside, training steps run the model's ``compute`` through ``torch.compile``, if that is wanted and works here."""
-        model: Any = self.simulator.model
+        model = self.simulator.model
         is_long = self.num_steps - self.global_step >= COMPILE_PAYS_AFTER
-        is_fast_already = self.device.type == "cpu" and getattr(model, "is_fused", False)
+        is_fast_already = self.device.type == "cpu" and model.is_fused
         wanted = self.compile_mode == "on" or (self.compile_mode == "auto" and is_long and not is_fast_already)
         if wanted and self.compile_mode == "auto" and not has_cpp_compiler():
             log.warning("compile: auto found no C++ compiler, training runs without torch.compile")

@@ -8,7 +8,7 @@ import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -53,7 +53,7 @@ def silenced(simulator: LearnedSimulator) -> LearnedSimulator:
 def test_a_copy_with_other_settings_leaves_the_original_unchanged(new_trajectory: Callable[..., Trajectory]) -> None:
     simulator = learned(builder_of(new_trajectory(), islands=True))
     other = simulator.configured(skips=replace(simulator.skips, stress=True), holds_parameters=False, static_friction=0.5)
-    own, others = (cast(Any, s.model).skips.stress for s in (simulator, other))
+    own, others = (s.model.skips.stress for s in (simulator, other))
     assert (other.skips.stress, others, other.holds_parameters, other.static_friction) == (True, True, False, 0.5)
     assert (simulator.skips.stress, own, simulator.holds_parameters, simulator.static_friction) == (
         False,

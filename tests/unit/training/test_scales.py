@@ -26,6 +26,7 @@ from gpe_pl.geometry.shapes import Box, Shape, Sphere, domain_walls
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import UNITS
+from gpe_pl.models.base import Model
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS
@@ -73,7 +74,7 @@ def scene(seed: int, length: float, time: float, dim: int = 2, mesh: bool = Fals
     )  # fmt: skip
 
 
-def model(name: str, spec: Any) -> torch.nn.Module:
+def model(name: str, spec: Any) -> Model:
     if name == "GNS":
         return GNS(spec, num_message_passing_steps=2, hidden_channels=8)
     if name == "DPINet":
