@@ -1,7 +1,7 @@
 """Configuration: Hydra entry points with readable errors, and construction of checked objects from config nodes.
 
-Hydra composes; nothing else in the package knows it. A misspelt key, group or choice is refused at composition with the valid ones; a value of the wrong
-type or out of range is refused by the signature of the class or function that takes it.
+Hydra composes configurations; only this room and the commands import it. Composition refuses a misspelt key, group or choice and lists the valid ones. The
+signature of a class or function refuses values of the wrong type or out of range.
 """
 
 from __future__ import annotations
@@ -44,40 +44,45 @@ from gpe_pl.system import early_interrupts
 from gpe_pl.system.signatures import checked, parameters
 
 WITHOUT_KEY = {"comparison", "experiment", "recipe", "scene", "solver"}
-"""Config groups that fill other keys than one of their own."""
+"""Config groups that set keys under other names than their own."""
 
-plugins.register()  # conf/ names them
+plugins.register()  # files in conf/ use the plugins
 OmegaConf.register_new_resolver("times", lambda a, b: a * b, replace=True)  # ${times:a,b} in conf/
 
 
 def _for_model(values: Mapping[str, Any], target: str) -> Any:
-    """``${for_model:values,target}`` in conf/: what a table holds for a model's class, or its ``default``."""
+    """Resolver ``${for_model:values,target}`` in conf/: the entry of a table for a model's class, or the entry ``default``."""
     return values.get(target.rpartition(".")[2], values["default"])
 
 
 OmegaConf.register_new_resolver("for_model", _for_model, replace=True)
 OmegaConf.register_new_resolver("model_name", model_name, replace=True)  # ${model_name:checkpoint,runs}
 
-OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # ${run_name:name}: of a folder of results in conf/
+OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # ${run_name:name} in conf/ checks the name of a results folder
 OmegaConf.register_new_resolver("sweep_name", sweep_name, replace=True)
 
 T = TypeVar("T")
 
 
 class ConfigError(GpeError, ValueError):
-    """A config value is not allowed; the message names key, value and what is allowed."""
+    """Raised for a config value that is not allowed; the message names key, value and the allowed values."""
 
 
 _results: list[Path] = []
-"""Folder of the results of this process, where a ``Report`` knows it."""
+"""Results folders of this process, which ``Report`` adds."""
 
 LARGEST_INTEGER = 2**63 - 1
-"""Of settings: what NumPy, PyTorch and ``range`` can count with."""
+"""Largest integer setting, a limit of NumPy and PyTorch."""
 
 
 @dataclass(frozen=True)
 class Paths:
-    """Folders, relative to the current one: generated and imported data sets, and results."""
+    """Folders, relative to the current folder.
+
+    Attributes:
+        data: folder of generated and imported data sets.
+        runs: folder of results.
+    """
 
     data: str
     runs: str
@@ -87,22 +92,22 @@ def construct(target: Callable[..., T], settings: Mapping[str, Any], path: str, 
     """Call ``target(**settings, **given)`` after checking ``settings`` against the types and ranges of its signature.
 
     Args:
-        target: class or function whose parameters are annotated; ranges as ``Annotated[int, pydantic.Field(ge=1)]``.
-        settings: a config node.
-        path: of the node in the config, for messages.
-        given: arguments that do not come from the config, passed unchecked.
+        target: class or function with annotated parameters; ranges are annotated as ``Annotated[int, pydantic.Field(ge=1)]``.
+        settings: config node.
+        path: path of the node in the config, for messages.
+        given: arguments that do not come from the config; they are passed unchecked.
 
     Raises:
-        ConfigError: unknown or missing key, wrong type or value out of range.
+        ConfigError: a key is unknown or missing, a type is wrong, or a value is out of range.
     """
     return bind(target, settings, path, *given)(**given)
 
 
 def construct_target(settings: Any, path: str, package: str) -> Any:
-    """``construct`` of the class that ``_target_`` names; it must lie below ``package``.
+    """Construct the class that ``_target_`` names from the other settings. It must lie in ``package``.
 
     Raises:
-        ConfigError: no such class there, or settings that do not fit it.
+        ConfigError: the package has no such class, or the settings do not fit it.
     """
     if not isinstance(settings, Mapping):
         raise ConfigError(f"{path}={settings!r}: must be a table with a _target_, a class of {package.rstrip('.')}")
@@ -119,7 +124,7 @@ def construct_target(settings: Any, path: str, package: str) -> Any:
 
 
 def bind(target: Callable[..., T], settings: Mapping[str, Any], path: str, *later: str) -> Callable[..., T]:
-    """``construct`` in two steps: checks the settings now, calls the target when the arguments ``later`` are known."""
+    """Check settings as ``construct`` does, and return a function that calls the target once the arguments ``later`` are known."""
     values: Any = OmegaConf.to_container(settings, resolve=True) if isinstance(settings, DictConfig) else dict(settings)
     valid = parameters(target, *later)
     unknown = set(values) - set(valid)
@@ -136,7 +141,7 @@ def bind(target: Callable[..., T], settings: Mapping[str, Any], path: str, *late
     def call(**given: Any) -> T:
         try:
             return target(**arguments, **given)
-        except ValidationError as error:  # of a class that checks how its values fit together
+        except ValidationError as error:  # from a class that checks combinations of its values
             raise ConfigError(_one_line(error, path)) from None
         except ValueError as error:
             if isinstance(error, GpeError):
@@ -147,7 +152,7 @@ def bind(target: Callable[..., T], settings: Mapping[str, Any], path: str, *late
 
 
 def _integers(value: Any, path: str) -> Iterator[tuple[str, int]]:
-    """All integers in nested settings, with their paths."""
+    """Yield all integers in nested settings with their paths."""
     if isinstance(value, dict):
         for key, item in value.items():
             yield from _integers(item, f"{path}.{key}")
@@ -170,9 +175,9 @@ def _one_line(error: ValidationError, path: str) -> str:
 
 
 def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], Any]]:
-    """``hydra.main`` for one of the files in ``conf/``, with one-line errors: ``GpeError`` and configuration errors exit with 2 and no traceback.
+    """Create the main function of a command from a file in ``conf/``; a decorator like ``hydra.main``, with one-line errors.
 
-    Set HYDRA_FULL_ERROR=1 to see tracebacks.
+    ``GpeError`` and configuration errors end the process with status 2 and without a traceback. Set HYDRA_FULL_ERROR=1 to see tracebacks.
     """
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], Any]:
@@ -204,7 +209,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
                 GpeError,
                 OmegaConfBaseException,
                 OSError,
-            ) as error:  # OSError: full disks, folders that cannot be written, files that are gone
+            ) as error:  # OSError: full disks, folders that cannot be written, missing files
                 if verbose:
                     raise
                 _fail(unnamed(error, _written(cfg.paths)) if isinstance(error, OSError) else error)
@@ -216,7 +221,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             speak_utf8()
             clean_messages()
             sys.argv[1:] = [quoted(argument) for argument in sys.argv[1:]]
-            os.environ["HYDRA_FULL_ERROR"] = "1"  # let exceptions reach us instead of Hydra's own report
+            os.environ["HYDRA_FULL_ERROR"] = "1"  # exceptions reach this function, without Hydra's report
             try:
                 return hydra.main(version_base="1.3", config_path=str(CONF), config_name=config_name)(run)()
             except KeyboardInterrupt:
@@ -224,11 +229,11 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
                 sys.exit(early_interrupts.STATUS)
             except SweepError as error:
                 _fail(error)
-            except (HydraException, OmegaConfBaseException, ValueError) as error:  # some of Hydra's are an OSError too
+            except (HydraException, OmegaConfBaseException, ValueError) as error:  # before OSError: some errors of Hydra are one too
                 if verbose or (is_composed and isinstance(error, ValueError)):
                     raise
                 _fail(ConfigError(explain(error, config_name, sys.argv[1:])))
-            except OSError as error:  # before the command itself begins: Hydra makes the folder of the results
+            except OSError as error:  # Hydra creates the results folder before the command begins
                 if verbose:
                     raise
                 if error.filename is None:
@@ -245,17 +250,17 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 
 
 def quoted(argument: str) -> str:
-    """An override whose value is a path that exists and holds ``=``, as folders of sweeps do, in the quotes that Hydra wants around it."""
+    """Quote the value of an override if it is an existing path that contains ``=``. Folders of sweeps do, and Hydra requires quotes then."""
     key, _, value = argument.partition("=")
     is_path = "=" in value and value[0] not in "\"'[{" and os.path.exists(value)  # Path.exists fails on names that are too long
     return f'{key}="{value}"' if is_path else argument
 
 
 def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
-    """The resolved config of a command, without running it: what ``python -m gpe_pl.{config_name} {overrides}`` would get.
+    """Return the resolved config of ``python -m gpe_pl.{config_name} {overrides}`` without running the command.
 
     Raises:
-        ConfigError: an override does not fit; the message names the valid keys.
+        ConfigError: an override is not valid; the message names the valid keys.
     """
     try:
         if GlobalHydra.instance().is_initialized():
@@ -270,22 +275,22 @@ def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
 
 
 def _written(paths: Mapping[str, str] | None = None) -> list[Path]:
-    """Folders that this process writes to, its own and those of libraries."""
+    """Return the folders that this process and its libraries write to."""
     own = [*_results] if paths is None else [*paths.values()]
     temporary: list[str] = []
-    with contextlib.suppress(FileNotFoundError):  # where none can be written
+    with contextlib.suppress(FileNotFoundError):  # no temporary folder can be written
         temporary.append(tempfile.gettempdir())
     return [Path(folder) for folder in (*own, os.environ.get("NUMBA_CACHE_DIR", "."), *temporary, Path.cwd())]
 
 
 def _fail(error: Exception) -> None:
-    with contextlib.suppress(OSError):  # into a file on a full disk
+    with contextlib.suppress(OSError):  # the standard error may be a file on a full disk
         print(f"error: {one_line(str(error))}", file=sys.stderr)
     sys.exit(USAGE_ERROR if RESULT in os.environ and isinstance(error, (ConfigError, NameRefused)) else 2)
 
 
 def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
-    """One line for a composition error, with the valid keys or choices."""
+    """Explain a composition error in one line, with the valid keys or choices."""
     text = " ".join(str(error).split())
     if f"{NameRefused.__name__} raised" in text:
         return re.sub(r"^.*? raised while resolving interpolation: | full_key: .*", "", text)
@@ -293,7 +298,7 @@ def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
         return f"data=imported: {config_name} takes data that it simulates; fit and evaluate take imported ones"
     match = re.search(r"Could not override '([^']+)'", text)
     if match is None:
-        override = getattr(error, "override", None)  # of a syntax error
+        override = getattr(error, "override", None)  # syntax errors have it
         text = re.sub(r" ?Config search path:.*| ?Set the environment variable.*| See https://.*", "", text)
         text = f"{override}: {text}" if override and override not in text else text
         return f"{text}; a value that holds = needs quotes: 'KEY=\"VALUE\"'" if override and override.count("=") > 1 else text
@@ -309,7 +314,7 @@ def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
         with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
             node: Any = hydra.compose(config_name, others)
             while parent and not isinstance(OmegaConf.select(node, parent), DictConfig):
-                parent = parent.rpartition(".")[0]  # the misspelling is higher up
+                parent = parent.rpartition(".")[0]  # the misspelt part is further up in the key
                 leaf = key.removeprefix(f"{parent}.").partition(".")[0]
             node = OmegaConf.select(node, parent) if parent else node
             keys = ", ".join(sorted({*map(str, node), *(() if parent else _groups(config_name))}))
@@ -332,38 +337,36 @@ def _check_top_level(cfg: DictConfig, config_name: str) -> None:
 
 
 def _first_choice(override: str) -> str:
-    """The first of the values that an override sweeps over."""
+    """Reduce a sweep override to the first of its values."""
     parsed = OverridesParser.create().parse_override(override)
     return f"{override.partition('=')[0]}={next(parsed.sweep_string_iterator())}" if parsed.is_sweep_override() else override
 
 
 def _groups(config_name: str) -> set[str]:
-    """The config groups that a command takes."""
+    """Return the config groups of a command."""
     defaults = OmegaConf.load(CONF / f"{config_name}.yaml").defaults
     return {str(group) for entry in defaults if isinstance(entry, DictConfig) for group in entry if "/" not in str(group)}
 
 
 def output_dir(cfg: DictConfig) -> Path:
-    """Folder of the running job; without one, as in a notebook, that of a single run."""
+    """Return the results folder of the running job. Without a job, as in a notebook, it is the folder of a single run."""
     return Path(HydraConfig.get().runtime.output_dir) if HydraConfig.initialized() else Path(cfg.paths.runs) / run_name(cfg.name)
 
 
 def num_processes(cfg: DictConfig) -> int:
-    """How many processes a training is to have, as Lightning starts or finds them; 1 where the setting is not one that ``fit`` accepts."""
+    """Return the number of processes of a training, which Lightning starts or finds; 1 if ``fit`` does not accept the setting."""
     counts = [OmegaConf.select(cfg, f"trainer.{key}") for key in ("devices", "num_nodes")]
     return math.prod(count if type(count) is int else 1 for count in counts)
 
 
 class Report(Callback):
-    """Holds the folder of the results of a command, a single run or a sweep, from before anything is written to it, and writes tables and figures when the
-    command ends.
-    """
+    """Hydra callback that locks the results folder of a run or sweep before anything is written, and writes tables and figures at the end."""
 
     def __init__(self) -> None:
         self._lock = contextlib.ExitStack()
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        with contextlib.suppress(OmegaConfBaseException):  # of a name that is refused; Hydra meets it again, and ends
+        with contextlib.suppress(OmegaConfBaseException):  # a refused name, which Hydra resolves again and reports
             self._hold(Path(config.hydra.run.dir), config, num_processes(config))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
@@ -371,7 +374,10 @@ class Report(Callback):
             self._hold(Path(config.hydra.sweep.dir), config)
 
     def _hold(self, folder: Path, config: DictConfig, num_processes: int = 1) -> None:
-        """Until the process ends. Ends it where the folder cannot be used: Hydra turns an exception of a callback into a warning, and goes on."""
+        """Lock the folder until the process ends, and end the process if the folder cannot be used.
+
+        Hydra would turn an exception of a callback into a warning and continue.
+        """
         from gpe_pl.system.locks import held, is_later_process
         from gpe_pl.system.provenance import recorded
 
@@ -388,7 +394,7 @@ class Report(Callback):
         atexit.register(self._release)
 
     def _release(self) -> None:
-        with contextlib.suppress(GpeError):  # of a folder that was deleted meanwhile; the command has ended with it
+        with contextlib.suppress(GpeError):  # the folder was deleted, which has already ended the command
             self._lock.close()
 
     def on_run_end(self, config: DictConfig, **_: Any) -> None:
@@ -398,7 +404,10 @@ class Report(Callback):
         self._report(Path(config.hydra.sweep.dir), is_sweep=True)
 
     def _report(self, folder: Path, is_sweep: bool) -> None:
-        """Ends the process on failure: Hydra turns an exception of a callback into a warning, and the command would seem to have succeeded."""
+        """Write tables and figures, and end the process on failure.
+
+        Hydra would turn an exception of a callback into a warning, and the command would seem to have succeeded.
+        """
         try:
             if is_sweep:
                 from gpe_pl.benchmarks.forward_times import measure_forward_times
@@ -408,7 +417,7 @@ class Report(Callback):
                 runs = finished_runs(folder)
                 measure_forward_times(folder, runs)
                 table = write_tables(folder, runs)
-                if table.exists():  # not where no run has finished
+                if table.exists():  # at least one run has finished
                     print(table.read_text(encoding="utf-8"))
             else:
                 from gpe_pl.reports.sweep_table import conclusion, report
@@ -417,7 +426,7 @@ class Report(Callback):
                 if (folder / "metrics.csv").exists():
                     print(conclusion(folder))
             print(folder)
-            self._lock.close()  # refuses a folder that was deleted meanwhile
+            self._lock.close()  # raises if the folder was deleted meanwhile
         except GpeError as error:
             _fail(error)
         except Exception as error:

@@ -1,4 +1,4 @@
-"""Where the files of ``conf/`` are."""
+"""Location of the folder ``conf/``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def conf_folder(package: Path) -> Path:
-    """The copy of ``conf/`` in an installed package, or the folder beside the package in a clone."""
+    """Return the copy of ``conf/`` in an installed package, or the folder at the root of a clone."""
     copy = package / "conf"
     return copy if copy.is_dir() else package.parent / "conf"
 

@@ -1,11 +1,11 @@
-"""Hydra launchers that run each job of a sweep as the plain command that would run it alone, with a log file in its own folder.
+"""Hydra launchers that run each job of a sweep as a separate command, with a log file in the job's folder.
 
-``hydra/launcher=processes``  side by side on this machine
+``hydra/launcher=processes``  in parallel on this machine
 ``hydra/launcher=ray``        on the machines of a Ray cluster
 ``hydra/launcher=slurm``      as jobs of Slurm, through submitit
 
-All of them need nothing of a job but its command, so a run is the same wherever it ran, and the same sweep started again, by whichever launcher, runs only
-what is not finished. Machines share a disk and have the same environment.
+A job is the command that would also run it alone, so results do not depend on the launcher. A sweep that is started again, by any launcher, runs only its
+unfinished jobs. The machines must share a disk and have the same environment.
 """
 
 from __future__ import annotations
@@ -37,27 +37,36 @@ from gpe_pl.files.run_folder import RunError, refuse_links
 from gpe_pl.printable import one_line
 
 LOG = "output.log"
+"""Name of the log file in the folder of a run."""
 RESULT = "GPE_PL_RESULT"
-"""Environment variable: the file in which a command leaves the value that it returns."""
+"""Environment variable with the file to which a command writes its return value."""
 USAGE_ERROR = 64
-"""Exit status of a run whose configuration is wrong: the rest of the sweep is not started."""
+"""Exit status of a run with a wrong configuration. The remaining runs of the sweep are not started."""
 GRACE_SECONDS = 30.0
-"""That a run has to save its training when its sweep is gone, as Slurm and Kubernetes give."""
+"""Time that a run has to save its training after its sweep has ended [s]; the same as in Slurm and Kubernetes."""
 REPORT = "hydra.callbacks.report"
-"""Belongs to the sweep as a whole."""
+"""Key of the report callback. The sweep reports as a whole, so its runs drop the key."""
 
 
 class SweepError(GpeError, RuntimeError):
-    """Runs of a sweep failed; names them, their errors and their logs."""
+    """Raised when runs of a sweep failed; the message names them, their errors and their logs."""
 
 
 class UsageError(SweepError):
-    """The configuration of a run is wrong."""
+    """Raised when the configuration of a run is wrong."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run of a sweep: what the command line gets, where it is run, and where its results go."""
+    """One run of a sweep.
+
+    Attributes:
+        overrides: overrides on the command line.
+        sweep_folder: folder of the sweep, relative to ``directory``.
+        name: path of the run's folder in the sweep's folder.
+        directory: working directory of the command.
+        settings: additional command line arguments.
+    """
 
     overrides: list[str]
     sweep_folder: Path
@@ -90,14 +99,14 @@ class Job:
         return JobReturn(self.overrides, status=JobStatus.COMPLETED, _return_value=value)
 
     def failed(self, error: Exception) -> JobReturn:
-        """What is returned for a job that failed."""
+        """Return the result of a failed job, which holds the error."""
         return JobReturn(self.overrides, status=JobStatus.FAILED, _return_value=error)
 
     def outcome(self, get: Callable[[], JobReturn]) -> JobReturn:
-        """What a cluster returns; where it lost the job, the failure."""
+        """Return the result that a cluster gives, or a failure if the cluster has lost the job."""
         try:
             return get()
-        except Exception as error:  # of each cluster its own
+        except Exception as error:  # each cluster has its own errors
             lines = str(error).strip().splitlines() or [""]
             return self.failed(SweepError(f"{type(error).__name__}: {lines[-1]} (see {self.folder / LOG})"))
 
@@ -108,9 +117,9 @@ class Job:
 
 
 def end_with_sweep() -> None:
-    """End this run when the sweep that started it is gone, however it ended: the pipe that is its standard input then closes.
+    """End this run when the sweep that started it has ended for any reason. The pipe on its standard input then closes.
 
-    Otherwise the same command, given again, would meet the run in its folder. A training has ``GRACE_SECONDS`` to save a checkpoint.
+    Otherwise a restarted sweep would find the old run still writing to its folder. A training has ``GRACE_SECONDS`` to save a checkpoint.
     """
 
     def watch() -> None:
@@ -124,27 +133,28 @@ def end_with_sweep() -> None:
 
 
 class CommandLauncher(Launcher):
-    """Runs jobs as commands; where, is for the subclass to say."""
+    """Launcher that runs jobs as commands. Subclasses decide where they run."""
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         self.hydra_context, self.config = hydra_context, config
 
     @abstractmethod
     def run(self, jobs: Sequence[Job], module: str) -> Iterator[tuple[int, JobReturn]]:
-        """Number and outcome of each job, as they end."""
+        """Yield number and result of each job as they end."""
 
     @abstractmethod
     def place(self, jobs: Sequence[Job]) -> str:
-        """Where the jobs run, for the message at the start."""
+        """Describe where the jobs run, for the message at the start."""
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> list[JobReturn]:
         """Run all jobs.
 
         Returns:
-            What they return, in order. A job that failed holds a ``SweepError`` about all that failed, which is raised when its value is asked for.
+            The results of the jobs in order. A failed job has a ``SweepError`` about all failures, which is raised when its value is accessed.
 
         Raises:
-            UsageError: a run's configuration is wrong; the rest are not run.
+            UsageError: the configuration of a run is wrong; the remaining jobs are not run.
+            SweepError: the sweep was interrupted.
         """
         from rich.console import Console
 
@@ -165,7 +175,7 @@ class CommandLauncher(Launcher):
         except KeyboardInterrupt:
             num_done = sum(r.status is JobStatus.COMPLETED for r in returns.values())
             raise SweepError(
-                f"interrupted with {num_done} of {len(jobs)} runs done; the same command goes on with the others, each {LOG} says from where"
+                f"interrupted with {num_done} of {len(jobs)} runs done; run the same command again to continue, each {LOG} says from where"
             ) from None
         errors = [f"{jobs[k].name}: {r._return_value}" for k, r in sorted(returns.items()) if r.status is JobStatus.FAILED]
         if errors:
@@ -177,16 +187,16 @@ class CommandLauncher(Launcher):
         config: Any = self.hydra_context.config_loader.load_sweep_config(self.config, list(overrides))
         with open_dict(config):
             config.hydra.job.id = config.hydra.job.num = number
-        HydraConfig.instance().set_config(config)  # the folder's name is resolved against it
+        HydraConfig.instance().set_config(config)  # the folder's name is resolved with it
         settings = (f"~{REPORT}",) if OmegaConf.select(config, REPORT) is not None else ()
         return Job(list(overrides), Path(str(config.hydra.sweep.dir)), str(config.hydra.sweep.subdir), settings=settings)
 
 
 class ProcessLauncher(CommandLauncher):
-    """Runs jobs side by side on this machine.
+    """Launcher that runs jobs in parallel on this machine.
 
     Args:
-        num_processes: jobs at once; None: as many as there are cores, at ``trainer.num_threads`` (None: all) for each of ``trainer.devices``.
+        num_processes: number of parallel jobs. None uses all cores, with ``trainer.num_threads`` cores (None: all) for each of ``trainer.devices``.
     """
 
     def __init__(self, num_processes: int | None = None) -> None:
@@ -204,7 +214,7 @@ class ProcessLauncher(CommandLauncher):
             for future in as_completed(waiting):
                 yield waiting[future], future.result()
         finally:
-            pool.shutdown(wait=True, cancel_futures=True)  # a Ctrl-C reaches the runs too: they save, nothing new starts
+            pool.shutdown(wait=True, cancel_futures=True)  # Ctrl-C also reaches the runs, which save; no job is started
 
     def _number(self, jobs: Sequence[Job]) -> int:
         num_threads, devices = (OmegaConf.select(self.config, f"trainer.{key}") for key in ("num_threads", "devices"))
@@ -212,17 +222,17 @@ class ProcessLauncher(CommandLauncher):
 
 
 def default_processes(num_threads: int | None, devices: int = 1) -> int:
-    """Jobs that this machine has cores for."""
+    """Return the number of jobs for which this machine has cores."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // ((num_threads or cores) * devices))
 
 
 class RayLauncher(CommandLauncher):
-    """Runs jobs on the machines of a Ray cluster.
+    """Launcher that runs jobs on the machines of a Ray cluster.
 
     Args:
-        address: of the cluster; None: that of ``RAY_ADDRESS``, or else this machine alone.
-        num_cpus, num_gpus: that a job takes, and waits for.
+        address: address of the cluster. None uses ``RAY_ADDRESS`` if it is set, else only this machine.
+        num_cpus, num_gpus: numbers of CPUs and GPUs that a job needs and waits for.
     """
 
     def __init__(self, address: str | None = None, num_cpus: float = 1.0, num_gpus: float = 0.0) -> None:
@@ -235,7 +245,7 @@ class RayLauncher(CommandLauncher):
         ray = _imported("ray", "ray")
         try:
             ray.init(address=self.address, log_to_driver=False)
-        except Exception as error:  # bare ones too
+        except Exception as error:  # Ray also raises bare exceptions
             raise UsageError(
                 f"hydra/launcher=ray: the cluster does not start or cannot be reached ({' '.join(str(error).split())})"
             ) from None
@@ -247,15 +257,16 @@ class RayLauncher(CommandLauncher):
                 k = waiting.pop(reference)
                 yield k, jobs[k].outcome(partial(ray.get, reference))
         finally:
-            ray.shutdown()  # ends the jobs that are left
+            ray.shutdown()  # ends the remaining jobs
 
 
 class SlurmLauncher(CommandLauncher):
-    """Submits jobs to Slurm, as one array, and waits for them.
+    """Launcher that submits jobs to Slurm as one array and waits for them.
 
     Args:
-        cluster: ``slurm``; to try it without one, ``local`` (processes on this machine) or ``debug`` (this process).
-        parameters: of ``submitit.AutoExecutor.update_parameters``, such as ``timeout_min``, ``cpus_per_task``, ``gpus_per_node``, ``slurm_partition``.
+        cluster: ``slurm``, or for tests without a cluster ``local`` (processes on this machine) or ``debug`` (this process).
+        parameters: arguments of ``submitit.AutoExecutor.update_parameters``, such as ``timeout_min``, ``cpus_per_task``, ``gpus_per_node``,
+            ``slurm_partition``.
     """
 
     def __init__(self, cluster: str = "slurm", parameters: Mapping[str, Any] | None = None) -> None:

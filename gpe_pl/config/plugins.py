@@ -1,4 +1,4 @@
-"""Makes the project's launchers and its sweeper known to Hydra."""
+"""Registration of the project's launchers and sweeper with Hydra."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hydra.core.plugins import Plugins
 from gpe_pl.config import launcher, sweeper
 
 NAMESPACE = "hydra_plugins"
-"""Hydra takes plugins only from this namespace package, which exists where another plugin is installed."""
+"""Namespace package from which Hydra takes plugins. It exists only if another plugin is installed."""
 
 LAUNCHERS: dict[str, tuple[Any, Any]] = {
     "processes": (launcher.ProcessLauncher, launcher.ProcessLauncherConfig),
@@ -25,7 +25,7 @@ SWEEPERS: dict[str, tuple[Any, Any]] = {"optuna": (sweeper.OptunaSweeper, sweepe
 
 
 def register() -> None:
-    """Make ``hydra/launcher=…`` and ``hydra/sweeper=…`` known to Hydra."""
+    """Register the choices of ``hydra/launcher=…`` and ``hydra/sweeper=…``."""
     try:
         package = importlib.import_module(NAMESPACE)
     except ImportError:

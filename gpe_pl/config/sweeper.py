@@ -1,8 +1,8 @@
-"""A Hydra sweeper that lets Optuna choose what to try next: ``hydra/sweeper=optuna``.
+"""A Hydra sweeper in which Optuna chooses the next trials: ``hydra/sweeper=optuna``.
 
-A sweep is an Optuna study that minimises what the command returns. It is kept in a journal in the sweep's folder: the same command resumes it, runs that were
-interrupted first. The best trial so far is run again before: its folder gives the same number at once, or says what has changed since. Any launcher runs the
-trials.
+A sweep is an Optuna study that minimises the value which the command returns. The study is stored in a journal in the sweep's folder. The same command resumes
+it. It first repeats the best trial so far, whose folder returns the same value at once, or says what has changed. Then it continues interrupted trials. Any
+launcher can run the trials.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ BEST = "best.json"
 
 
 class OptunaSweeper(Sweeper):
-    """Tries values that a tree-structured Parzen estimator proposes [Bergstra et al. 2011], in batches.
+    """Sweeper that runs batches of trials proposed by a tree-structured Parzen estimator [Bergstra et al. 2011].
 
     Args:
-        num_trials: in all, those that failed or returned no finite number and those of earlier starts included.
-        num_at_once: trials that are proposed together, to run side by side.
-        seed: of the proposals.
+        num_trials: total number of trials, including failed ones, ones without a finite result, and ones of earlier starts.
+        num_at_once: number of trials that are proposed together and run in parallel.
+        seed: seed of the proposals.
         params: values by key, in Hydra's syntax: ``interval(1e-4, 1e-2)``, ``tag(log, interval(1e-4, 1e-2))``, ``int(interval(1, 8))``, ``choice(a, b)`` or
-            ``a,b``, ``range(1, 5)``; a key given on the command line takes the place of the one here.
+            ``a,b``, ``range(1, 5)``. A key on the command line replaces the key here.
 
     Raises:
-        SweepError: no trial returned a finite number, or those of an earlier start were of other settings or data.
+        SweepError: no trial returned a finite number, or trials of an earlier start used other settings or data.
     """
 
     def __init__(self, num_trials: int = 20, num_at_once: int = 1, seed: int = 0, params: Mapping[str, Any] | None = None) -> None:
@@ -72,13 +72,13 @@ class OptunaSweeper(Sweeper):
             finished, left_over_trials = (study.get_trials(states=[state]) for state in (State.COMPLETE, State.RUNNING))
         except OSError:
             raise
-        except Exception as fault:  # Optuna says nothing of its own about a damaged journal
+        except Exception as fault:  # Optuna has no error of its own for a damaged journal
             raise SweepError(
                 f"{folder / JOURNAL}: damaged ({type(fault).__name__}: {fault}); delete the file to begin the search again"
             ) from None
         if finished:
             self._require_same(study.best_trial, fixed, folder)
-        for left_over in left_over_trials:  # of a sweep that was killed: their folders know how far they are
+        for left_over in left_over_trials:  # trials of a killed sweep; their folders contain their progress
             study.enqueue_trial(left_over.params)
             study.tell(left_over.number, state=State.FAIL)
         error = "no trial has returned a finite number"
@@ -93,7 +93,7 @@ class OptunaSweeper(Sweeper):
                     continue
                 if outcome.status is JobStatus.FAILED:
                     error = str(value)
-                study.tell(trial, state=State.PRUNED)  # which the estimator avoids; Optuna would ask again for one that is not a number
+                study.tell(trial, state=State.PRUNED)  # the estimator avoids pruned trials; Optuna would repeat a trial without a number
         if not study.get_trials(states=[State.COMPLETE]):
             raise SweepError(error)
         best = study.best_trial
@@ -101,7 +101,7 @@ class OptunaSweeper(Sweeper):
         print(f"best of {self.num_trials} trials: {best.value:.6g} with {', '.join(f'{k}={_text(v)}' for k, v in best.params.items())}")
 
     def _require_same(self, trial: Any, fixed: list[str], folder: Path) -> None:
-        """Refuse to go on with numbers that the same trial would not have now."""
+        """Repeat a trial, and raise ``SweepError`` if its value differs from the stored one."""
         assert self.launcher is not None
         (outcome,) = self.launcher.launch([_overrides(fixed, trial)], initial_job_idx=trial.number)
         value = outcome._return_value
@@ -114,7 +114,7 @@ class OptunaSweeper(Sweeper):
             )
 
     def _split(self, arguments: list[str]) -> tuple[list[str], dict[str, Any]]:
-        """Overrides that hold for all trials, and the distributions of the others' values by key."""
+        """Split overrides into those with one value and the distributions of the others by key."""
         given = OverridesParser.create().parse_overrides([f"{key}={value}" for key, value in self.params.items()] + arguments)
         latest = {override.get_key_element(): override for override in given}
         space = {key: _distribution(override) for key, override in latest.items() if override.is_sweep_override()}
@@ -146,7 +146,7 @@ def _distribution(override: Override) -> Any:
 
 
 def _text(value: Any) -> str:
-    return f"{value:.6g}" if isinstance(value, float) else str(value)  # a folder's name is made of it
+    return f"{value:.6g}" if isinstance(value, float) else str(value)  # becomes part of a folder's name
 
 
 @dataclass

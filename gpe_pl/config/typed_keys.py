@@ -1,4 +1,4 @@
-"""Settings that someone types, or sweeps over, and that would have no effect beside the others: refused instead of left unread."""
+"""Check that every override has an effect. Overrides that no other setting would use are refused."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 from gpe_pl.files.run_folder import OFFERED
 
 OF_SWEEPS = "size.comparison.seeds"
-"""Read where a sweep begins, not in its runs."""
+"""Key that is read at the start of a sweep, not in its runs."""
 
 UNREAD: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "training.num_steps": ("training.budget_minutes", lambda minutes: minutes is not None),
@@ -24,15 +24,16 @@ UNREAD: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "graph.num_levels": ("graph.mesh", lambda mesh: not mesh),
     "dimension": ("data.size", lambda size: size == "imported"),
 }
-"""Keys, and for which values of another key nothing reads them. Zero asks for nothing, so it may always be typed."""
+"""Keys that are unused for some values of another key: that key, and the test of its value. The value 0 is always allowed, because it switches the setting
+off."""
 
 
 def without_effect(cfg: DictConfig, overrides: Sequence[str]) -> str:
-    """What to say of the first override that changes nothing; empty if there is none.
+    """Describe the first override without an effect; empty if there is none.
 
     Args:
-        cfg: the composed configuration, unresolved.
-        overrides: as they are typed, ``KEY=VALUE``, or taken from a sweep.
+        cfg: composed configuration, unresolved.
+        overrides: overrides ``KEY=VALUE`` from the command line or a sweep.
     """
     for override in overrides:
         key, _, value = override.lstrip("+").partition("=")
@@ -45,13 +46,13 @@ def without_effect(cfg: DictConfig, overrides: Sequence[str]) -> str:
 
 
 def _is_offer(key: str) -> bool:
-    """Whether a key is part of a table that others may refer to."""
+    """Whether a key belongs to a lookup table."""
     parts = key.split(".")
     return len(parts) > 2 and parts[0] in ("data", "size") and parts[1] in OFFERED
 
 
 def _is_read(cfg: DictConfig, key: str) -> bool:
-    """Whether anything refers to the entry of a table that a key is part of: without it, the configuration cannot be resolved."""
+    """Whether another setting uses the key's entry of a lookup table. If so, the configuration cannot be resolved without the entry."""
     without = copy.deepcopy(cfg)
     group, table, entry = key.split(".")[:3]
     OmegaConf.set_struct(without, False)

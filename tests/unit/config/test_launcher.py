@@ -151,6 +151,6 @@ def test_an_interrupted_sweep_says_how_far_it_is(tmp_path: Path, monkeypatch: py
     launcher.config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}})
     monkeypatch.setattr(launcher, "_job", lambda number, overrides: Job([*overrides], Path("sweep"), f"x={number}", tmp_path))
     with pytest.raises(
-        SweepError, match=r"^interrupted with 1 of 3 runs done; the same command goes on with the others, each output.log says"
+        SweepError, match=r"^interrupted with 1 of 3 runs done; run the same command again to continue, each output.log says"
     ):
         launcher.launch([["x=0"], ["x=1"], ["x=2"]], 0)
