@@ -46,6 +46,7 @@ def benchmark(cfg: DictConfig) -> None:
     from gpe_pl.system.locks import held
     from gpe_pl.system.machine import environment, keep_freed_memory
     from gpe_pl.system.provenance import recorded
+    from gpe_pl.training.run import TrainerSettings
     from gpe_pl.viz.saving import save_figure
 
     suites = sorted(path.stem for path in (CONF / "suite").glob("*.yaml"))
@@ -54,6 +55,7 @@ def benchmark(cfg: DictConfig) -> None:
     suite = _suite(cfg.suite.name)
     values: Any = OmegaConf.to_container(cfg.suite, resolve=True)
     settings = construct(suite.Settings, {k: v for k, v in values.items() if k != "name"}, "suite")
+    construct(TrainerSettings, cfg.trainer, "trainer")  # suites take single values of it
     if getattr(settings, "accelerator", "cpu") == "gpu" and not torch.cuda.is_available():
         raise ConfigError("trainer.accelerator=gpu: PyTorch finds no GPU here; choose trainer=cpu")
     keep_freed_memory()  # as trainings and evaluations do

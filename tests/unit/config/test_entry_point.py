@@ -264,6 +264,8 @@ def test_a_suite_for_a_gpu_says_that_there_is_none(
         (lambda cfg: None, ["+foo=1"], "error: foo: unknown or missing key; valid keys: paths, size, suite, trainer"),
         (benchmark, ["suite.name=nope"], "error: suite.name='nope': must be one of "),
         (benchmark, ["suite.name=trained"], "error: suite.name='trained': must be one of faults, "),
+        (benchmark, ["suite=solvers", "+trainer.typo=1"], "error: trainer.typo: unknown key; valid keys: "),
+        (benchmark, ["suite=solvers", "trainer.accelerator=[1]"], "error: trainer.accelerator=[1]: "),
         (benchmark, ["suite=skip", "suite.edge_states=[]"], "error: suite.edge_states=[]: "),
         (benchmark, ["suite=scaling", "suite.num_nodes=[]"], "error: suite.num_nodes=[]: "),
         (lambda cfg: None, ["suite.name=${nothing}"], "error: Interpolation key 'nothing' not found"),
