@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 GUIDE = ROOT / "docs" / "guide"
 PAGES = (ROOT / "README.md", ROOT / "docs" / "index.md", ROOT / "docs" / "faq.md", *sorted(GUIDE.glob("*.md")))
 MOST_WORDS = 2500  # ten minutes of reading
+CODE_WIDTH = 88  # characters that a built page shows
 NO_COMPOSITION = {"--help", "--cfg", "job", "--resolve", "-m"}
 
 
@@ -103,6 +104,11 @@ def test_every_notebook_is_in_the_table() -> None:
 def test_no_page_takes_more_than_ten_minutes() -> None:
     lengths = {page.name: len(page.read_text().split()) for page in PAGES}
     assert not {name: length for name, length in lengths.items() if length > MOST_WORDS}
+
+
+def test_code_fits_a_built_page() -> None:
+    blocks = ((page.name, block) for page in PAGES for block in re.findall(r"```(?:sh|python)\n(.*?)```", page.read_text(), re.DOTALL))
+    assert not [(name, line) for name, block in blocks for line in block.splitlines() if len(line) > CODE_WIDTH]
 
 
 def test_the_embedded_viewer_is_small() -> None:
