@@ -58,7 +58,7 @@ class Settings:
     def __post_init__(self) -> None:
         for name, values in (("num_nodes", self.num_nodes), ("dimensions", self.dimensions)):
             if len(set(values)) < len(values):
-                raise ValueError(f"{name}: {list(values)} has the same twice")
+                raise ValueError(f"{name}: {list(values)} contains the same value twice")
         if not 0 < self.fitted[0] < self.fitted[1]:
             raise ValueError(f"fitted: {list(self.fitted)} must go from a smaller to a larger number of nodes")
 

@@ -142,7 +142,7 @@ def _cells(trajectory: Trajectory) -> tuple[_Cells, int]:
     kinds, own = kinds_of(cells, trajectory.cell_dim, trajectory.metadata.dim), is_corner(cells)
     if (kinds < 0).any():
         cell = int(kinds.argmin())
-        raise ValueError(f"cell {cell} has the nodes {cells[cell].tolist()}, which is none of {', '.join(CELL_KINDS)}")
+        raise ValueError(f"cell {cell} has the nodes {cells[cell].tolist()}, which form none of {', '.join(CELL_KINDS)}")
     loose = _vertices(np.setdiff1d(np.arange(trajectory.num_nodes), cells))
     mesh = _Cells(cells[own], own.sum(axis=1), np.array([CELL_TYPES[kind] for kind in CELL_KINDS])[kinds])
     return _Cells(*(np.concatenate(parts) for parts in zip(mesh, loose, strict=True))), len(loose.nodes)

@@ -19,22 +19,22 @@ THIN_SHARE = 0.1
 
 
 def unresolved(solver: Any, parameters: Mapping[str, Sequence[float]], scenes: Iterable[State]) -> Iterator[str]:
-    """Yield one sentence for each parameter value or initial state that the solver does not resolve."""
+    """Yield a warning for parameter values, and one for initial states, that the solver does not resolve."""
     for material, smallest in getattr(solver, "smallest_resolved", {}).items():
         name, unit = MATERIALS[material].name, MATERIALS[material].unit
         values = [value for value in parameters.get(material, ()) if value < smallest]
         if values:
             yield (
                 f"{name} = {', '.join(f'{value:g}' for value in values)} {unit} is below {smallest:.3g} {unit}, which the grid of the solver {solver.name} "
-                "adds by itself: such trajectories differ little; choose a smaller grid_spacing, or leave these values out"
+                "adds, so such trajectories differ little; choose a smaller grid_spacing, or leave these values out"
             )
     if solver.stores_stress:
         shares = [float(np.mean(thin_nodes(np.asarray(s.cells), s.num_nodes, s.dim))) for s in scenes if s.cells is not None]
         thin = [share for share in shares if share > THIN_SHARE]
         if thin:
             yield (
-                f"in {len(thin)} of the first {len(shares)} scenes, up to {100 * max(thin):.0f} % of the nodes are where the mesh has fewer than "
-                f"{CELLS_ACROSS} cells across: it is too stiff in bending there; choose more cells (data.scene.num_cells=…)"
+                f"in {len(thin)} of the first {len(shares)} scenes, up to {100 * max(thin):.0f} % of the nodes lie where the mesh has fewer than "
+                f"{CELLS_ACROSS} cells across and is too stiff in bending; choose more cells (data.scene.num_cells=…)"
             )
 
 

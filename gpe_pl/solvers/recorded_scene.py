@@ -232,8 +232,8 @@ class RecordedScene:
         depth = -signed_distance(shapes, pos)
         speed, falling = np.linalg.norm(vel, axis=1), math.sqrt(2 * float(np.linalg.norm(self.gravity)) * height)
         for values, limit, text in (
-            (depth, self.spacing, "lies {:.3g} m deep in the ground or outside the walls; more than the particles' spacing of {:.3g} m"),
-            (speed, FASTEST * falling or math.inf, "moves at {:.3g} m/s; more than {:.3g} m/s no fall through this scene explains"),
+            (depth, self.spacing, "lies {:.3g} m deep in the ground or outside the walls, more than the particle spacing of {:.3g} m"),
+            (speed, FASTEST * falling or math.inf, "moves at {:.3g} m/s, faster than {:.3g} m/s, the limit for a fall through this scene"),
         ):
             wrong = np.flatnonzero(~(values <= limit))
             if len(wrong):

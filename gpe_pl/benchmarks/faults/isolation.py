@@ -56,7 +56,7 @@ def forks() -> Any:
         IsolationError: the system cannot fork processes (Windows).
     """
     if "forkserver" not in multiprocessing.get_all_start_methods():
-        raise IsolationError("suite=faults needs processes that are forked, which this system does not have; run it on Linux")
+        raise IsolationError("suite=faults needs to fork processes, which this system cannot do; run it on Linux")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(PRELOADED)
     return context

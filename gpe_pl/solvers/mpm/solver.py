@@ -167,9 +167,7 @@ class MPM:
     def _require_undeformed(self, state: State) -> None:
         remedy = "start at frame 0 of a scene, or step on from the state that the solver returned"
         if state.time > 0:
-            message = (
-                f"the state at {state.time:g} s has no internal part (how its particles are deformed), which MPM cannot find out; {remedy}"
-            )
+            message = f"the state at {state.time:g} s has no internal part, so MPM does not know how its particles are deformed; {remedy}"
             raise SimulationError(message, reason="input")
         if state.rest_pos is not None and state.cells is not None:
             stretch, node = _largest_stretch(np.asarray(state.pos), np.asarray(state.rest_pos), np.asarray(state.cells))

@@ -49,8 +49,8 @@ def test_steps_of_a_scene_are_timed(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ({"num_nodes": [20, 20]}, "num_nodes: .* the same twice"),
-        ({"dimensions": [2, 2]}, "dimensions: .* the same twice"),
+        ({"num_nodes": [20, 20]}, "num_nodes: .* the same value twice"),
+        ({"dimensions": [2, 2]}, "dimensions: .* the same value twice"),
         ({"fitted": (200, 100)}, "from a smaller to a larger"),
     ],
 )

@@ -139,7 +139,9 @@ def test_vtk_itself_sees_the_kinds(tmp_path: Path, name: str) -> None:
 def test_cells_of_no_kind_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     mesh = falling_mesh(2)
     assert mesh.cells is not None
-    with pytest.raises(ValueError, match=r"cell 0 has the nodes \[.*\], which is none of triangle, quadrilateral, tetrahedron, hexahedron"):
+    with pytest.raises(
+        ValueError, match=r"cell 0 has the nodes \[.*\], which form none of triangle, quadrilateral, tetrahedron, hexahedron"
+    ):
         write_vtk(tmp_path / "a.pvd", replace(mesh, cells=mesh.cells[:, :2]))
     assert not [*tmp_path.iterdir()]
 

@@ -56,7 +56,7 @@ def test_a_thin_mesh_and_a_thin_liquid_are_named():
     pos = np.random.default_rng(0).random((count, 2))
     thick = replace(block((0.2, 0.2), (0.3, 0.3), 0.1, "elastomer"), pos=pos, rest_pos=pos, cells=cells)
     (said,) = unresolved(FEM(bounds=BOX), {"solid": (1e6,)}, [thick, mesh])
-    assert "in 1 of the first 2 scenes, up to 100 % of the nodes are where the mesh has fewer than 4 cells across" in said
+    assert "in 1 of the first 2 scenes, up to 100 % of the nodes lie where the mesh has fewer than 4 cells across" in said
     assert not [*unresolved(FEM(bounds=BOX), {"solid": (1e6,)}, [thick])]
     liquid = FLIP(bounds=BOX, grid_spacing=0.1)
     (said,) = unresolved(liquid, {"fluid": (2e-3, 1e-2)}, [])

@@ -64,7 +64,7 @@ def test_damaged_wrong_and_hostile_checkpoints(checkpoint: Path, tmp_path: Path,
 
 def test_a_system_that_does_not_fork_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(multiprocessing, "get_all_start_methods", lambda: ["spawn"])  # as on Windows
-    with pytest.raises(GpeError, match="suite=faults needs processes that are forked"):
+    with pytest.raises(GpeError, match="suite=faults needs to fork processes"):
         next(verdicts([]), None)
 
 
