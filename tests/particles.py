@@ -51,13 +51,12 @@ def block(
 def together(materials: tuple[str, ...], *states: State) -> State:
     """Join blocks to one scene with the boundary and gravity of the first; ``materials`` are those of the solver."""
     names = param_names(materials)
-    params = []
+    blocks = []
     for state in states:
         columns = np.full((state.num_nodes, len(names)), np.nan)
         columns[:, names.index(MATERIALS[NODE_TYPES[state.node_type[0]]].name)] = state.material_params[:, 0]
-        params.append(columns)
-    pos, vel, node_type, mass = (np.concatenate([getattr(s, name) for s in states]) for name in ("pos", "vel", "node_type", "mass"))
-    return replace(states[0], pos=pos, vel=vel, node_type=node_type, mass=mass, material_params=np.concatenate(params))
+        blocks.append(replace(state, material_params=columns))
+    return State.joined(blocks)
 
 
 def run(solver: Simulator, state: State, num_steps: int) -> State:

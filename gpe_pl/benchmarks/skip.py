@@ -243,17 +243,11 @@ def _step(runner: Simulator, state: State) -> Callable[[], State]:
     return lambda: runner.step(state)
 
 
-NODE_FIELDS = ("pos", "vel", "velocity_history", "node_type", "mass", "material_params")
-
-
-def _joined(scene: State, pos: torch.Tensor, vel: torch.Tensor) -> State:
-    """Add nodes of sand with constant velocities to the scene."""
+def _further(scene: State, pos: torch.Tensor, vel: torch.Tensor) -> State:
+    """Return nodes of sand with constant velocities, without the nodes of the scene."""
     assert scene.velocity_history is not None
-    rows = torch.zeros(len(pos), dtype=torch.int64, device=pos.device)
-    more = {name: getattr(scene, name)[rows] for name in NODE_FIELDS}
-    more |= {"pos": pos, "vel": vel, "velocity_history": vel[:, None].expand(-1, scene.velocity_history.shape[1], -1)}
-    joined: dict[str, Any] = {name: torch.cat([getattr(scene, name), values]) for name, values in more.items()}
-    return replace(scene, **joined)
+    some = scene.take(torch.zeros(len(pos), dtype=torch.int64))
+    return replace(some, pos=pos, vel=vel, velocity_history=vel[:, None].repeat(1, scene.velocity_history.shape[1], 1))
 
 
 def _with_walls(scene: State, count: int) -> State:
@@ -269,14 +263,11 @@ def _falling(scene: State, count: int) -> State:
     side = int(np.ceil(count ** (1 / scene.dim)))
     lattice = np.stack(np.unravel_index(np.arange(count), (side,) * scene.dim), axis=-1)
     pos = FAR + torch.from_numpy(lattice.astype(float)).to(scene.pos.device)
-    joined = _joined(scene, pos, torch.zeros_like(pos))
-    last: dict[str, Any] = {name: getattr(joined, name)[scene.num_nodes :] for name in NODE_FIELDS}
-    return replace(joined, **last)
+    return _further(scene, pos, torch.zeros_like(pos))
 
 
 def _with_falling(scene: State, count: int) -> State:
-    falling = _falling(scene, count)
-    return _joined(scene, falling.pos, falling.vel)
+    return State.joined([scene, _falling(scene, count)])
 
 
 def _with_absent_materials(builder: GraphBuilder, scene: State) -> tuple[GraphBuilder, State]:
@@ -289,4 +280,4 @@ def _with_absent_materials(builder: GraphBuilder, scene: State) -> tuple[GraphBu
 
 def _with_settled(scene: State, count: int) -> State:
     pos = torch.cat([scene.pos + (k + 1) * FAR for k in range(count)])
-    return _joined(scene, pos, torch.zeros_like(pos))
+    return State.joined([scene, _further(scene, pos, torch.zeros_like(pos))])

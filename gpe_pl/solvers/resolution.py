@@ -84,18 +84,7 @@ def _merged_particles(state: State, size: float) -> Resolved:
 
 def _rows(state: State, rows: np.ndarray, pos: np.ndarray, mass: np.ndarray) -> State:
     """Return the particles of these rows with other positions [node, dim] in m and masses [node] in kg."""
-    return replace(
-        state,
-        pos=pos,
-        vel=state.vel[rows],
-        node_type=state.node_type[rows],
-        mass=mass,
-        material_params=state.material_params[rows],
-        velocity_history=None,
-        rest_pos=None,
-        cells=None,
-        internal=None,
-    )
+    return replace(state.take(rows), pos=pos, mass=mass, velocity_history=None, rest_pos=None, cells=None)
 
 
 # --- triangles --------------------------------------------------------------------------------------------------------------------------------
@@ -122,10 +111,9 @@ def _divided_triangles(state: State) -> Resolved:
     def with_middles(values: np.ndarray) -> np.ndarray:
         return np.concatenate([values, values[edges].mean(axis=1)])
 
-    return Resolved(
-        _mesh_state(state, with_middles(state.pos), divided, with_middles(state.vel), with_middles(state.material_params)),
-        lambda pos: pos[:count],
-    )
+    ends = np.concatenate([np.arange(count), edges[:, 0]])
+    new = _mesh_state(state, ends, with_middles(state.pos), divided, with_middles(state.vel))
+    return Resolved(replace(new, material_params=with_middles(state.material_params)), lambda pos: pos[:count])
 
 
 def _remeshed(state: State, spacing: float) -> Resolved:
@@ -141,29 +129,17 @@ def _remeshed(state: State, spacing: float) -> Resolved:
     field = np.linalg.lstsq(linear, state.vel, rcond=None)[0]
     rest = state.vel - linear @ field
     vel = np.column_stack([np.ones(len(points)), points]) @ field + rest[near]
-    state = _mesh_state(state, points, cells, vel, state.material_params[near])
-    return Resolved(state, lambda pos: np.einsum("nc,ncd->nd", weights, pos[nodes]))
+    return Resolved(_mesh_state(state, near, points, cells, vel), lambda pos: np.einsum("nc,ncd->nd", weights, pos[nodes]))
 
 
-def _mesh_state(state: State, pos: np.ndarray, cells: np.ndarray, vel: np.ndarray, params: np.ndarray) -> State:
-    """Return a state with another mesh of the same body and the same total mass."""
+def _mesh_state(state: State, near: np.ndarray, pos: np.ndarray, cells: np.ndarray, vel: np.ndarray) -> State:
+    """Return a state with another mesh of the same body and the same total mass; a new node takes other values from an old one, ``near`` [node]."""
     corners = pos[cells]
     area = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 2
     share = np.bincount(cells.ravel(), np.repeat(area / 3, 3), minlength=len(pos))
     stress = None if state.stress is None else Stress(np.zeros((len(pos), 4)), np.zeros((len(cells), 4)))
-    return replace(
-        state,
-        pos=pos,
-        vel=vel,
-        node_type=np.full(len(pos), state.node_type[0]),
-        mass=share / share.sum() * state.mass.sum(),
-        material_params=params,
-        velocity_history=None,
-        rest_pos=pos.copy(),
-        cells=cells,
-        stress=stress,
-        internal=None,
-    )
+    mass = share / share.sum() * state.mass.sum()
+    return replace(state.take(near), pos=pos, vel=vel, mass=mass, velocity_history=None, rest_pos=pos.copy(), cells=cells, stress=stress)
 
 
 def outline(cells: Int[np.ndarray, "cell 3"]) -> list[list[int]]:

@@ -43,7 +43,7 @@ class Motion:
         return Motion(self.pos[start:stop], self.vel[start:stop], self.normal[start:stop])
 
     def take(self, nodes: np.ndarray) -> Motion:
-        """That of some boundary nodes: row numbers, or a mask."""
+        """Return the motion of some boundary nodes: row numbers, or a mask."""
         return Motion(self.pos[:, nodes], self.vel[:, nodes], self.normal[:, nodes])
 
 
@@ -183,7 +183,7 @@ class Boundary:
         return replace(replace(self, pos=pos).take(kept), shapes=shapes)
 
     def take(self, nodes: Array) -> Boundary:
-        """Some of the boundary nodes, with their motion and all shapes: row numbers, or a mask [boundary_node]."""
+        """Return some of the boundary nodes, with their motion and all shapes: row numbers, or a mask [boundary_node]."""
         values = {name: getattr(self, name)[nodes] for name in names_of(self, NODE)}
         return replace(self, **values, motion=None if self.motion is None else self.motion.take(nodes))
 

@@ -19,5 +19,5 @@ STEP: Kind = {"kind": "step"}
 
 
 def names_of(part: Any, kind: Kind) -> tuple[str, ...]:
-    """Names of the fields of a kind, in the order of their declaration; ``part`` is a dataclass or an instance of one."""
+    """Return the names of the fields of a kind, in the order of their declaration; ``part`` is a dataclass or an instance of one."""
     return tuple(field.name for field in fields(part) if field.metadata == kind)

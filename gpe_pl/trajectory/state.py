@@ -106,7 +106,7 @@ class State:
         return self.pos.shape[1]
 
     def take(self, nodes: Array) -> State:
-        """Some of the nodes, in the given order, and the cells that have all their corners among them.
+        """Return some of the nodes, in the given order, and the cells that have all their corners among them.
 
         Fields of kind ``STEP`` get their defaults: they describe the nodes of the whole scene.
 
@@ -127,7 +127,7 @@ class State:
 
     @staticmethod
     def joined(states: Sequence[State]) -> State:
-        """The nodes and cells of several states in one, in their order, in the scene of the first.
+        """Return the nodes and cells of several states as one state, in the scene of the first.
 
         Fields of kind ``STEP`` get their defaults.
 
@@ -150,7 +150,7 @@ class State:
         return replace(first, **values, **_nothing_known(first))
 
     def later(self, dt: float, pos: Array, vel: Array, **values: Any) -> State:
-        """The state one frame later.
+        """Return the state one frame later.
 
         The velocity history moves on where there is one, a moving boundary moves on, and fields of kind ``STEP`` get their defaults.
 
@@ -167,7 +167,7 @@ class State:
         return replace(self, pos=self.periodicity.wrapped(pos), vel=vel, **known)
 
     def corrected(self, pos: Array, vel: Array) -> State:
-        """The same instant with other positions [m] and velocities [m/s]; the last velocity of the history changes with them."""
+        """Return the same instant with other positions [m] and velocities [m/s]; the last velocity of the history changes with them."""
         history = self.velocity_history
         if history is not None:
             history = array_namespace(vel).concat([history[:, :-1], vel[:, None]], axis=1)
@@ -192,6 +192,6 @@ class State:
 
 
 def _nothing_known(state: State) -> dict[str, Any]:
-    """Defaults of the fields of kind ``STEP``."""
+    """Return the defaults of the fields of kind ``STEP``."""
     defaults = {declared.name: declared.default for declared in fields(state)}
     return {name: defaults[name] for name in names_of(state, STEP)}

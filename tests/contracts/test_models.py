@@ -22,6 +22,7 @@ from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import FeatureSpec
+from gpe_pl.trajectory.state import State
 from tests import scenes
 
 Factory = Callable[[FeatureSpec], Any]
@@ -142,9 +143,7 @@ def test_bodies_out_of_reach_do_not_feel_each_other(make: Factory) -> None:
     build = scenes.builder()
     near, far = scenes.state(20, walls=False, seed=1), scenes.state(15, walls=False, seed=2)
     far = replace(far, pos=far.pos + 10.0)
-    names = ("pos", "vel", "node_type", "mass", "material_params", "velocity_history")
-    joined: dict[str, Any] = {name: np.concatenate([getattr(near, name), getattr(far, name)]) for name in names}
-    both = replace(near, **joined)
+    both = State.joined([near, far])
     model = make(build.spec)
     alone = predict(model, scenes.to_dtype(build(near.to_torch()), torch.float64), 20)
     together = predict(model, scenes.to_dtype(build(both.to_torch()), torch.float64), 35)

@@ -22,7 +22,7 @@ from gpe_pl.solvers.materials import LIMITS, check_limits
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.solid_scenes import SolidScene
 from gpe_pl.trajectory.boundary import Boundary
-from gpe_pl.trajectory.state import State, Stress
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import read_trajectory, write_shard
 from tests.particles import block, run, together
 from tests.scenes import metadata
@@ -303,26 +303,12 @@ def test_translated_scene_gives_translated_result(case):
 def test_order_of_particles_does_not_matter(case):
     solver, state = case
     order = np.random.default_rng(0).permutation(state.num_nodes)
-    shuffled = chosen(state, order)
+    shuffled = state.take(order)
     np.testing.assert_allclose(run(solver, shuffled, 10).pos, run(solver, state, 10).pos[order], atol=1e-9)
 
 
-def chosen(state, rows):
-    """Return some of the particles, with the mesh cells whose corners are all among them."""
-    per_node = ("pos", "vel", "node_type", "mass", "material_params", *(("rest_pos",) if state.rest_pos is not None else ()))
-    part = replace(state, **{name: getattr(state, name)[rows] for name in per_node})
-    if state.cells is None:
-        return part
-    number = np.full(state.num_nodes, -1)
-    number[rows] = np.arange(len(rows))
-    cells = number[state.cells]
-    kept = np.all(cells >= 0, axis=1)
-    stress = None if state.stress is None else Stress(state.stress.node[rows], state.stress.cell[kept])
-    return replace(part, cells=cells[kept], stress=stress)
-
-
 def emptied(state):
-    return chosen(state, np.arange(0))
+    return state.take(np.arange(0))
 
 
 def test_empty_state(case):

@@ -24,32 +24,16 @@ from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 NUM_STEPS = 3
-NODE_FIELDS = ("pos", "vel", "node_type", "mass", "material_params")
 
 
 class Stopped(GpeError):
     """A rollout was stopped by its guard; the message has reason, frame and node."""
 
 
-def rows(state: State, chosen: np.ndarray) -> State:
-    """Return some of the nodes, with the cells between them."""
-    values: dict[str, Any] = {name: getattr(state, name)[chosen] for name in NODE_FIELDS}
-    if state.cells is not None and state.rest_pos is not None:
-        number = np.full(state.num_nodes, -1)
-        number[chosen] = np.arange(len(chosen))
-        whole = (number[state.cells] >= 0).all(axis=1)
-        values |= {"rest_pos": state.rest_pos[chosen], "cells": number[state.cells[whole]]}
-    return replace(state, **values, internal=None, stress=None)
-
-
 def twice(state: State, offset: np.ndarray) -> State:
     """Return the state with a copy of every body at an offset."""
-    values: dict[str, Any] = {name: np.concatenate([getattr(state, name)] * 2) for name in NODE_FIELDS}
-    values["pos"] = np.concatenate([state.pos, state.pos + offset])
-    if state.cells is not None and state.rest_pos is not None:
-        values["rest_pos"] = np.concatenate([state.rest_pos, state.rest_pos + offset])
-        values["cells"] = np.concatenate([state.cells, state.cells + state.num_nodes])
-    return replace(state, **values, internal=None, stress=None)
+    rest_pos = None if state.rest_pos is None else state.rest_pos + offset
+    return State.joined([state, replace(state, pos=state.pos + offset, rest_pos=rest_pos)])
 
 
 def _changed(state: State, name: str, chosen: np.ndarray, value: Any) -> State:
@@ -69,9 +53,9 @@ def _inside(state: State, rng: np.random.Generator) -> State:
 Change = Callable[[State, np.random.Generator], State]
 
 CHANGES: dict[str, Change] = {
-    "no particle": lambda s, rng: rows(s, np.empty(0, np.int64)),
-    "one particle": lambda s, rng: rows(s, rng.integers(s.num_nodes, size=1)),
-    "two particles": lambda s, rng: rows(s, np.sort(rng.permutation(s.num_nodes)[:2])),
+    "no particle": lambda s, rng: s.take(np.empty(0, np.int64)),
+    "one particle": lambda s, rng: s.take(rng.integers(s.num_nodes, size=1)),
+    "two particles": lambda s, rng: s.take(np.sort(rng.permutation(s.num_nodes)[:2])),
     "overlapping bodies": lambda s, rng: twice(s, rng.normal(scale=1e-3, size=s.dim)),
     "bodies in one place": lambda s, rng: twice(s, np.zeros(s.dim)),
     "all particles in one place": lambda s, rng: replace(s, pos=np.broadcast_to(s.pos[:1], s.pos.shape).copy()),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -92,18 +91,12 @@ def cutoff(subject: Subject) -> Outcome:
     for distance in (radius * (1 + 1e-9), radius * (1 - 1e-9)):
         offset = torch.zeros(state.dim, dtype=torch.float64)
         offset[0] = distance
-        both = _with_visitor(state, shifted(visitor, offset))
+        both = State.joined([replace(state, cells=None, rest_pos=None), shifted(visitor, offset)])
         if len(radius_pairs(both.pos.numpy(), radius).T) == 0:
             return inapplicable("no two nodes of the scene are within the radius")
         outputs.append(acceleration(subject.simulator, both))
     jump = float((outputs[1] - outputs[0]).abs().max())
     return Outcome(jump < subject.one_step_rmse, f"{jump / subject.one_step_rmse:.2g} one-step RMSE")
-
-
-def _with_visitor(state: State, visitor: State) -> State:
-    names = ("pos", "vel", "node_type", "mass", "material_params", "velocity_history")
-    values: dict[str, Any] = {n: torch.cat([getattr(state, n), getattr(visitor, n)]) for n in names}
-    return replace(state, **values, cells=None, rest_pos=None)
 
 
 @stress_test(16, "neighbour list", "equal to brute force for 1,000 random moves; pairs are unordered")

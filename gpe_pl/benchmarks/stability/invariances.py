@@ -15,7 +15,6 @@ from gpe_pl.benchmarks.stability.subject import (
     acceleration,
     in_double,
     inapplicable,
-    joined,
     output,
     permuted,
     relative_change,
@@ -177,7 +176,7 @@ def independence(subject: Subject) -> Outcome:
         change = max(change, relative_change(together, single))
     free = subject.free_state()
     far = shifted(free, torch.full((free.dim,), 64 * subject.simulator.builder.scales.radius, dtype=torch.float64))
-    both = acceleration(simulator, joined(free, far))
+    both = acceleration(simulator, State.joined([free, far]))
     single = acceleration(simulator, free)
     copies = max(relative_change(both[: free.num_nodes], single), relative_change(both[free.num_nodes :], single))
     return Outcome(max(change, copies) < 1e-6, f"{change:.1e} in a batch, {copies:.1e} beside a copy")

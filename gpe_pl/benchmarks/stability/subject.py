@@ -208,23 +208,8 @@ def no_boundary(state: State) -> Boundary:
 
 def permuted(state: State, order: Any) -> State:
     """Return the state with its nodes in another order, or with some of them (then without its mesh)."""
-    history = state.velocity_history
-    whole = len(order) == state.num_nodes
-    cells = None
-    if whole and state.cells is not None:
-        cells = torch.argsort(torch.as_tensor(order))[state.cells] if isinstance(state.cells, Tensor) else np.argsort(order)[state.cells]
-    return replace(
-        state,
-        rest_pos=None if state.rest_pos is None or not whole else state.rest_pos[order],
-        cells=cells,
-        pos=state.pos[order],
-        vel=state.vel[order],
-        node_type=state.node_type[order],
-        mass=state.mass[order],
-        material_params=state.material_params[order],
-        velocity_history=None if history is None else history[order],
-        stress=None,
-    )
+    taken = state.take(order)
+    return taken if len(order) == state.num_nodes else replace(taken, cells=None, rest_pos=None)
 
 
 def shifted(state: State, offset: Tensor) -> State:
@@ -237,12 +222,3 @@ def shifted(state: State, offset: Tensor) -> State:
 def with_velocities(state: State, history: Tensor) -> State:
     """Return the state with another velocity history [node, history, dim]."""
     return replace(state, vel=history[:, -1], velocity_history=history)
-
-
-def joined(a: State, b: State) -> State:
-    """Return the nodes of two states as one state, with the boundary of the first."""
-    names = ["pos", "vel", "node_type", "mass", "material_params", "velocity_history"]
-    values: dict[str, Any] = {name: torch.cat([getattr(a, name), getattr(b, name)]) for name in names}
-    if a.cells is not None and b.cells is not None and a.rest_pos is not None and b.rest_pos is not None:
-        values |= {"rest_pos": torch.cat([a.rest_pos, b.rest_pos]), "cells": torch.cat([a.cells, b.cells + a.num_nodes])}
-    return replace(a, **values, stress=None)

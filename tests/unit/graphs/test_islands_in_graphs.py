@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,12 +24,7 @@ def two_clouds(gap: float) -> State:
     """Return a cloud near the floor and one ``gap`` above it, of two materials."""
     low, high = scenes.state(20, TWO, history=2, seed=1, high=0.25), scenes.state(15, TWO, history=2, seed=2, high=0.25)
     high = replace(high, pos=high.pos + np.array([0.3, gap]))
-    assert low.velocity_history is not None and high.velocity_history is not None
-    together: dict[str, Any] = {
-        name: np.concatenate([getattr(low, name), getattr(high, name)])
-        for name in ("pos", "vel", "node_type", "mass", "material_params", "velocity_history")
-    }
-    return replace(low, **together)
+    return State.joined([low, high])
 
 
 def test_islands_are_components_across_materials() -> None:
