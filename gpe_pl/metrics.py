@@ -1,13 +1,13 @@
-"""How far a predicted trajectory is from the ground truth, and how certain that number is.
+"""Errors of predicted trajectories against the ground truth, and their confidence intervals.
 
-Three rules hold for every metric of a rollout:
+Three rules apply to every metric of a rollout:
 
-- frame 0 is the shared initial state and never counts; a horizon ``h`` means frames 1 to ``h``, ``"full"`` all frames of the ground truth;
-- a horizon that the trajectory does not reach is left out, never shortened;
-- a rollout that stopped early, or holds a value that is not finite, is infinitely wrong from there on, so that no failure improves a score.
+- Frame 0 is the shared initial state and does not count. A horizon ``h`` means frames 1 to ``h``; ``"full"`` means all frames of the ground truth.
+- A horizon that the ground truth does not reach is left out, never shortened.
+- The error of a rollout is infinite from the frame where it stopped early or has a value that is not finite, so that no failure improves a score.
 
-Velocities come from positions (``integrators``) for both trajectories: a solver's own velocities are instantaneous, those of a learned
-simulator are averages over a frame, and free fall alone would set them ``g dt / 2`` apart.
+Velocities of both trajectories are computed from positions (``integrators``). A solver's own velocities are instantaneous, and those of a learned simulator are
+averages over a frame. In free fall they would differ by ``g dt / 2``.
 """
 
 import math
@@ -49,7 +49,7 @@ UNITS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Record:
-    """One number: the value of a metric at a horizon, in the unit given by ``UNITS``."""
+    """The value of a metric at a horizon, in the unit given by ``UNITS``."""
 
     metric: str
     horizon: Horizon
@@ -71,26 +71,26 @@ class Interval:
 def displacement(
     pos: Float[np.ndarray, "*axes dim"], reference: Float[np.ndarray, "*axes dim"], metadata: Metadata
 ) -> Float[np.ndarray, "*axes dim"]:
-    """``pos - reference`` [m] in float64; along periodic axes the shortest way around."""
+    """Displacement ``pos - reference`` [m] in float64; the minimum image along periodic axes."""
     return metadata.periodicity.shortest(pos.astype(np.float64) - reference.astype(np.float64))
 
 
 def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.ndarray, "frame"]:
-    """Squared position error [m²] of every frame, averaged over nodes and dimensions.
+    """Mean squared position error of every frame [m²], over nodes and dimensions.
 
     Returns:
-        One value per frame, frame 0 included (it is zero up to rounding). As long as the ground truth when the rollout stopped early, with
-        ``inf`` from the first missing frame on; as long as the prediction when that was meant to be shorter.
+        One value per frame, including frame 0 (zero up to rounding). If the rollout stopped early, the array is as long as the ground truth, with ``inf``
+        from the first missing frame on. If the prediction was meant to be shorter, the array is as long as the prediction.
 
     Raises:
         ValueError: the trajectories do not describe the same nodes from the same start.
     """
     _check_comparable(prediction, ground_truth)
     frames = prediction.num_frames
-    with np.errstate(invalid="ignore", over="ignore"):  # broken frames are dealt with below
+    with np.errstate(invalid="ignore", over="ignore"):  # broken frames are handled below
         error = (displacement(prediction.pos, ground_truth.pos[:frames], ground_truth.metadata) ** 2).mean(axis=(1, 2))
     missing = ground_truth.num_frames - frames if prediction.termination is not None else 0
-    # A frame after a broken one is worthless even if its numbers happen to be finite.
+    # Frames after a broken one are meaningless, even if their numbers are finite.
     broken = np.logical_or.accumulate(~np.isfinite(error))
     return np.concatenate([np.where(broken, math.inf, error), np.full(missing, math.inf)])
 
@@ -124,7 +124,7 @@ def _num_steps(horizon: Horizon, ground_truth: Trajectory) -> int:
 
 
 def _reached(horizons: Sequence[Horizon], error: Float[np.ndarray, "frame"], ground_truth: Trajectory) -> Iterator[tuple[Horizon, int]]:
-    """The horizons that a per-frame error covers, each with its number of steps."""
+    """Yield the horizons that a per-frame error covers, each with its number of steps."""
     for horizon in horizons:
         steps = _num_steps(horizon, ground_truth)
         if 1 <= steps < len(error):
@@ -140,16 +140,16 @@ def energy_distance(
     mass_a: Float[np.ndarray, "node_a"],
     mass_b: Float[np.ndarray, "node_b"],
 ) -> float:
-    """Energy distance [m] between two clouds of particles that carry mass: ``2 E|A - B| - E|A - A'| - E|B - B'|``.
+    """Energy distance [m] between two clouds of particles with mass: ``2 E|A - B| - E|A - A'| - E|B - B'|``.
 
-    It compares where the material is, not which particle is where, so it stays meaningful after chaos has made particle-wise errors
-    meaningless. It is zero for equal distributions only. Exact, without the smoothing length and the stopping rule of a Sinkhorn
-    divergence; O(N²) time, O(N) memory.
+    It compares the distributions of material, not single particles. It therefore stays meaningful when chaos has made particle-wise errors meaningless. It is
+    zero only for equal distributions. The value is exact, without the smoothing length and the stopping rule of a Sinkhorn divergence. It takes O(N²) time and
+    O(N) memory.
 
     Source: Székely and Rizzo, Energy statistics, J. Stat. Plan. Inference 143 (2013).
     """
     between = _mean_distance(a, b, mass_a, mass_b)
-    # Rounding may leave a tiny negative number.
+    # Rounding can give a tiny negative number.
     return max(0.0, 2 * between - _mean_distance(a, a, mass_a, mass_a) - _mean_distance(b, b, mass_b, mass_b))
 
 
@@ -161,7 +161,7 @@ def _mean_distance(a: np.ndarray, b: np.ndarray, mass_a: np.ndarray, mass_b: np.
 
 
 def _cloud_distance(prediction: Trajectory, ground_truth: Trajectory, frame: int) -> float:
-    """Energy distance within each material, averaged by mass: materials that swap places are wrong."""
+    """Energy distance [m] of each material, averaged by mass, so that materials which swap places count as an error."""
     mass, types = ground_truth.mass.astype(np.float64), ground_truth.node_type
     total = 0.0
     for code in np.unique(types):
@@ -172,7 +172,7 @@ def _cloud_distance(prediction: Trajectory, ground_truth: Trajectory, frame: int
 
 
 def _relative_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps: int) -> dict[str, float]:
-    """L2 errors over frames 1 to ``num_steps`` and all nodes, relative to the ground truth's own norm; infinite where that is zero and the error is not."""
+    """L2 errors over frames 1 to ``num_steps`` and all nodes, relative to the norm of the ground truth; infinite if that is zero and the error is not."""
     own, true = prediction.pos[: num_steps + 1], ground_truth.pos[: num_steps + 1]
     metadata = ground_truth.metadata
     steps, true_steps = displacement(own[1:], own[:-1], metadata), displacement(true[1:], true[:-1], metadata)
@@ -188,13 +188,16 @@ def _relative_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps
 
 
 def _stress_error(stress: np.ndarray, reference: np.ndarray, num_steps: int) -> float:
-    """Root mean square error over the first frames, over the root mean square of the reference over all its frames: before an impact there is none."""
+    """Root mean square error over the first frames, relative to the root mean square of the reference over all frames.
+
+    All frames are used for the reference, because there is no stress before an impact.
+    """
     wrong = stress[:num_steps] - reference[:num_steps]
     return _relative(wrong / np.sqrt(wrong.size), reference / np.sqrt(reference.size))
 
 
 def _whole(stress: np.ndarray) -> np.ndarray:
-    """Stresses [..., component] weighted so that the sum of squares is that of the tensor, which holds every shear twice."""
+    """Stresses [..., component] with weighted shears, so that the sum of squares is that of the tensor, which has every shear twice."""
     shears = (1,) if stress.shape[-1] == 4 else (1, 2, 4)
     weight = np.ones(stress.shape[-1])
     weight[[*shears]] = np.sqrt(2)
@@ -211,7 +214,7 @@ def _relative(error: np.ndarray, reference: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class _Motion:
-    """Per-mass quantities of frames 1, 2, …: momentum [m/s], angular momentum about the centre of mass [m²/s], kinetic energy [J/kg]."""
+    """Quantities per mass of frames 1, 2, …: momentum [m/s], angular momentum about the centre of mass [m²/s], kinetic energy [J/kg]."""
 
     momentum: Float[np.ndarray, "frame dim"]
     angular_momentum: Float[np.ndarray, "frame dim dim"]
@@ -220,7 +223,7 @@ class _Motion:
 
 def _motion(trajectory: Trajectory, num_steps: int) -> _Motion:
     pos, dt = trajectory.pos[: num_steps + 1].astype(np.float64), trajectory.metadata.frame_dt
-    if any(trajectory.metadata.periodic):  # unwrap, so that crossing the seam is no jump
+    if any(trajectory.metadata.periodic):  # unwrap, so that crossing the seam is not a jump
         steps = displacement(pos[1:], pos[:-1], trajectory.metadata)
         pos = np.concatenate([pos[:1], pos[:1] + np.cumsum(steps, axis=0)])
     vel, pos = integrators.velocities(pos, dt), pos[1:]
@@ -234,10 +237,10 @@ def _motion(trajectory: Trajectory, num_steps: int) -> _Motion:
 def _motion_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps: int) -> dict[str, float]:
     p, g = _motion(prediction, num_steps), _motion(ground_truth, num_steps)
     energy = p.kinetic_energy - g.kinetic_energy
-    # Relative to the largest ground-truth energy so far: material at rest has none to divide by.
+    # Relative to the largest ground-truth energy up to the horizon, because material at rest has none.
     scale = g.kinetic_energy.max()
     relative = np.divide(energy, scale, out=np.where(energy == 0, 0.0, math.inf), where=scale > 0)
-    # An antisymmetric matrix holds every component of the angular momentum twice.
+    # An antisymmetric matrix has every component of the angular momentum twice.
     spin = np.sqrt(0.5 * ((p.angular_momentum - g.angular_momentum) ** 2).sum(axis=(1, 2)))
     return {
         "momentum_error": float(np.linalg.norm(p.momentum - g.momentum, axis=-1).mean()),
@@ -251,25 +254,25 @@ def _motion_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps: 
 
 
 def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: Sequence[Horizon] = HORIZONS) -> list[Record]:
-    """All metrics of one rollout at all horizons that the ground truth reaches.
+    """Compute all metrics of one rollout at all horizons that the ground truth reaches.
 
     ====================== ====== ====================================================================================================
     rollout_mse            m²     squared position error, mean over frames 1 … h, nodes and dimensions (the paper's average MSE)
     displacement_error     1      ‖x − x̂‖ / ‖x̂ − x̂(0)‖ with x̂ the ground truth, norms over frames, nodes and dimensions
-    velocity_error         1      ‖v − v̂‖ / ‖v̂‖ likewise
-    von_mises_error        1      root mean square error of the von Mises stress at mesh nodes over frames 1 … h, over the root mean square of the ground
-                                  truth's over all its frames; only where both trajectories have a stress
-    stress_error           1      the same of the Cauchy stress tensor
+    velocity_error         1      ‖v − v̂‖ / ‖v̂‖, norms as above
+    von_mises_error        1      root mean square error of the von Mises stress at mesh nodes over frames 1 … h, over the root mean square in all
+                                  frames of the ground truth; only if both trajectories have a stress
+    stress_error           1      the same for the Cauchy stress tensor
     energy_distance        m      between the clouds of frame h, per material, averaged by mass
-    momentum_error         m/s    length of the difference in momentum per mass, mean over frames. Gravity and walls act on the
-                                  ground truth too, so only what the prediction adds or loses remains
+    momentum_error         m/s    length of the difference in momentum per mass, mean over frames. Gravity and walls also act on the
+                                  ground truth, so the difference is what the prediction adds or loses
     angular_momentum_error m²/s   the same for angular momentum about the cloud's own centre of mass
-    kinetic_energy_bias    1      difference in kinetic energy, mean over frames, over the largest of the ground truth up to h
-    kinetic_energy_error   1      the same of absolute differences
-    share_outside          1      predicted particle-frames deeper than a thousandth of the spacing in a wall or obstacle
+    kinetic_energy_bias    1      difference in kinetic energy, mean over frames, over the largest kinetic energy of the ground truth up to h
+    kinetic_energy_error   1      the same for absolute differences
+    share_outside          1      fraction of predicted particle positions deeper than a thousandth of the spacing in a wall or obstacle
     ====================== ====== ====================================================================================================
 
-    Energy distance and angular momentum are not defined, and left out, in periodic domains; the share outside where a boundary is known by its nodes only.
+    Energy distance and angular momentum are undefined in periodic domains and left out. ``share_outside`` is left out if the boundary has no shapes.
 
     Args:
         prediction: rollout from frame 0 of the ground truth.
@@ -277,7 +280,7 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
         horizons: numbers of frames, or ``"full"``.
 
     Raises:
-        ValueError: a horizon that is not positive, or trajectories that do not describe the same nodes from the same start.
+        ValueError: a horizon is not positive, or the trajectories do not describe the same nodes from the same start.
     """
     error = per_frame_mse(prediction, ground_truth)
     periodic = any(ground_truth.metadata.periodic)
@@ -307,9 +310,9 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
 
 
 class OneStepNMSE(Metric):
-    """Noise-free one-step error, ``sum |prediction - target|² / sum |target|²``: 0 is perfect, 1 is what predicting zero achieves.
+    """One-step error without noise, ``sum |prediction - target|² / sum |target|²``. A perfect model has 0; predicting zero gives 1.
 
-    Unlike a training loss it does not depend on the noise added in training, so models trained with different noise compare.
+    Unlike a training loss it does not depend on the training noise, so models trained with different noise can be compared.
     """
 
     higher_is_better = False
@@ -325,8 +328,8 @@ class OneStepNMSE(Metric):
             self.add_state(name, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
 
     def update(self, prediction: Float[Tensor, "node dim"], target: Float[Tensor, "node dim"]) -> None:
-        """Add a batch of nodes; both in the same unit."""
-        if prediction.shape != target.shape:  # broadcasting would give a number, but not an error
+        """Add a batch of nodes. Prediction and target have the same unit."""
+        if prediction.shape != target.shape:  # broadcasting would give a wrong number without an error
             raise ValueError(f"prediction {list(prediction.shape)} and target {list(target.shape)} differ in shape")
         prediction, target = prediction.detach().double(), target.detach().double()
         self.squared_error += ((prediction - target) ** 2).sum()
@@ -339,7 +342,7 @@ class OneStepNMSE(Metric):
 class RolloutMSE(Metric):
     """Mean over trajectories of ``rollout_mse`` [m²] at several horizons (see ``rollout_metrics``).
 
-    Infinite as soon as one rollout fails; ``bootstrap_interval`` of the records gives medians that do not depend on a single failure.
+    The mean is infinite if one rollout fails. ``bootstrap_interval`` of the records gives medians, which do not depend on a single failure.
 
     Args:
         horizons: numbers of frames, or ``"full"``.
@@ -367,7 +370,7 @@ class RolloutMSE(Metric):
             self.count[k] += 1
 
     def compute(self) -> dict[str, Tensor]:
-        """``{"rollout_mse@5": …}`` for the horizons that at least one trajectory reached."""
+        """Return ``{"rollout_mse@5": …}`` for the horizons that at least one trajectory reached."""
         mean = self.total / self.count
         return {f"rollout_mse@{h}": mean[k] for k, h in enumerate(self.horizons) if self.count[k] > 0}
 
@@ -377,7 +380,7 @@ BOTH = (-2, -1)
 
 
 def median_of_means(table: np.ndarray, axis: tuple[int, int]) -> Any:
-    """Over seeds, of means over trajectories: a ``statistic`` of ``bootstrap_interval``."""
+    """Median over seeds of means over trajectories; a ``statistic`` for ``bootstrap_interval``."""
     return np.median(table.mean(axis=axis[1], keepdims=True), axis=axis)
 
 
@@ -388,21 +391,21 @@ def bootstrap_interval(
     num_resamples: int = 2000,
     seed: int = 0,
 ) -> Interval:
-    """Percentile interval of a statistic that varies with training seed and with test trajectory.
+    """Percentile interval of a statistic that varies with training seed and test trajectory.
 
-    Seeds and trajectories are resampled independently of each other: all seeds are tested on the same trajectories, and a hard trajectory
-    is hard for all of them, so drawing trajectories anew within each seed would make the interval too narrow. With few seeds (below about
-    five) any bootstrap is optimistic about the spread between seeds.
+    Seeds and trajectories are resampled independently. All seeds are tested on the same trajectories, and a hard trajectory is hard for all of them, so
+    resampling trajectories within each seed would make the interval too narrow. With fewer than about five seeds, any bootstrap underestimates the spread
+    between seeds.
 
     Args:
         values: one row per training seed, one column per test trajectory; ``inf`` marks a failure.
-        statistic: of a table [seed, trajectory], or of several at once; takes the two axes as ``axis``, as ``np.median`` and ``np.mean`` do.
-        confidence: probability that the interval should cover.
-        num_resamples: bootstrap resamples.
-        seed: of the resampling.
+        statistic: function of tables [..., seed, trajectory] that takes the last two axes as ``axis``, like ``np.median`` and ``np.mean``.
+        confidence: coverage probability of the interval.
+        num_resamples: number of bootstrap resamples.
+        seed: seed of the resampling.
 
     Raises:
-        ValueError: not a table of numbers, or NaN in it.
+        ValueError: ``values`` is not a table of numbers, or has NaN.
 
     Source: Owen, The pigeonhole bootstrap, Ann. Appl. Stat. 1 (2007).
     """
@@ -427,11 +430,13 @@ def bootstrap_ratio(
     num_resamples: int = 2000,
     seed: int = 0,
 ) -> Interval:
-    """Percentile interval of the ratio of a statistic of two models on the same trajectories, which are resampled for both alike; as ``bootstrap_interval``.
+    """Percentile interval of the ratio of a statistic between two models on the same trajectories.
+
+    Trajectories are resampled together for both models. The other arguments are those of ``bootstrap_interval``.
 
     Args:
-        values, reference: of either model, one row per training seed, one column per test trajectory, the same for both. Both may be infinite, which makes
-            a ratio of 1.
+        values, reference: values of the two models, one row per training seed, one column per test trajectory. Trajectories are the same for both. If both
+            statistics are infinite, the ratio is 1.
 
     Raises:
         ValueError: the tables have different numbers of trajectories.
@@ -450,17 +455,17 @@ def bootstrap_ratio(
 
 
 def _drawn(num_resamples: int, rng: np.random.Generator, *counts: int) -> list[np.ndarray]:
-    """For each count, as many indices below it, drawn with replacement, per resample [resample, index]."""
+    """For each count, draw ``count`` indices below it with replacement in each resample [resample, index]."""
     return [rng.integers(count, size=(num_resamples, count)) for count in counts]
 
 
 def _resampled(table: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Tables [resample, seed, trajectory]."""
+    """Resampled tables [resample, seed, trajectory]."""
     return table[rows[:, :, None], columns[:, None, :]]
 
 
 def _interval(estimate: float, resampled: np.ndarray, confidence: float) -> Interval:
-    # Order statistics, because interpolation between infinities is not a number.
+    # Order statistics, because interpolation between infinities gives NaN.
     tail = (1 - confidence) / 2
     low, high = np.quantile(resampled, [tail, 1 - tail], method="inverted_cdf")
     return Interval(estimate, float(low), float(high))

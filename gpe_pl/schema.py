@@ -1,6 +1,6 @@
 """Names shared by every layer: node types, relations, material parameters and stored fields.
 
-This module imports nothing but the standard library, so that solvers, store and models can agree on names without depending on each other.
+This module imports only the standard library, so that solvers, store and models can agree on names without depending on each other.
 """
 
 import math
@@ -11,14 +11,14 @@ SCHEMA_VERSION = 2
 """Version of the HDF5 layout; a reader refuses any other."""
 
 LARGEST = math.sqrt(3.4028234663852886e38)
-"""Squares of larger numbers overflow float32, in which data are stored and trained on."""
+"""Largest magnitude of stored values. Squares of larger numbers overflow float32, in which data are stored and trained on."""
 
 STICKY = 1.0e6
-"""Coulomb friction coefficient that stands for a no-slip boundary (any value this large or larger is no-slip)."""
+"""Coulomb friction coefficient of a no-slip boundary. Larger values are no-slip too."""
 
 
 HISTORY = 5
-"""Velocities per node that a model sees, unless ``graph.history`` says otherwise."""
+"""Default of ``graph.history``, the number of past velocities per node that a model sees."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class MaterialParameter:
 
     @property
     def rule(self) -> str:
-        """What a stored value must be; the solvers accept less, see ``solvers.materials.LIMITS``."""
+        """Rule for stored values. Solvers accept a smaller range; see ``solvers.materials.LIMITS``."""
         return "positive and finite" if self.scale == "log" else "finite and not negative"
 
     def accepts(self, values: Any) -> Any:
-        """Which values of an array or tensor follow the rule; for a number, whether it does."""
+        """Mask of the values of an array or tensor that follow the rule; for a number, whether it does."""
         return ((values > 0.0) if self.scale == "log" else (values >= 0.0)) & (values < LARGEST)
 
 
@@ -55,15 +55,15 @@ MATERIALS: dict[str, MaterialParameter] = {
 """Dynamic node types with their material parameter; the order fixes the integer codes of ``node_type``."""
 
 MESH_MATERIALS = ("elastomer", "solid")
-"""Materials that keep their neighbours: with ``graph.mesh`` they are connected along their cells."""
+"""Materials whose nodes keep their neighbours. With ``graph.mesh`` their nodes are connected along mesh cells."""
 
 CELL_KINDS: dict[str, tuple[int, int]] = {"triangle": (2, 3), "quadrilateral": (2, 4), "tetrahedron": (3, 4), "hexahedron": (3, 8)}
-"""Kinds of mesh cells with their dimension and number of corners, which are in VTK's order."""
+"""Dimension and number of corners of each kind of mesh cell. Corners are in VTK's order."""
 
 BOUNDARY = "boundary"
 NODE_TYPES: tuple[str, ...] = (*MATERIALS, BOUNDARY)
 RADIUS, CELL, SAME, DOWN = "radius", "cell", "same", "down"
-"""Relations: within a radius; in one mesh cell; neighbours of one level of virtual nodes; from a virtual node to its children (``up`` is its reverse)."""
+"""Relations: within a radius; in one mesh cell; neighbouring virtual nodes of one level; from a virtual node to its children (``up`` is the reverse)."""
 
 EdgeType = tuple[str, str, str]
 """``(source node type, relation, target node type)``."""
@@ -74,22 +74,25 @@ ParameterGroup = Literal["seen", "interpolated", "extrapolated"]
 
 
 def grid(level: int) -> str:
-    """Node type of the virtual nodes of a level; level 1 lies above the mesh nodes."""
+    """Node type of the virtual nodes of a level. Level 1 is the first level above the mesh nodes."""
     return f"grid_{level}"
 
 
 def level_of(node_type: str) -> int:
-    """Level of a type of virtual nodes."""
+    """Level of the virtual nodes of a node type."""
     return int(node_type.removeprefix("grid_"))
 
 
 def role(node_type: str) -> str:
-    """What statistics and weights are shared by: the virtual nodes of all levels have one role, every other node type has its own."""
+    """Role of a node type. Types with one role share statistics and weights.
+
+    Virtual nodes of all levels have one role; every other node type has its own.
+    """
     return "grid" if node_type.startswith("grid_") else node_type
 
 
 def is_symmetric(relation: EdgeType) -> bool:
-    """Whether the two ends of an edge can change places: ends of one type, unless one is the parent of the other."""
+    """Whether the ends of an edge can be swapped: they have one type, and neither is the parent of the other."""
     source, name, target = relation
     return source == target and name != DOWN
 
@@ -105,9 +108,9 @@ def param_names(materials: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def radius_relations(materials: tuple[str, ...]) -> tuple[EdgeType, ...]:
-    """Every ``radius`` relation that a data set with these materials can have.
+    """All ``radius`` relations of a data set with these materials.
 
-    Each unordered pair of node types appears once; ``boundary`` is always the source and has no relation with itself.
+    Each unordered pair of node types appears once. ``boundary`` is always the source and has no relation with itself.
     """
     names = [m for m in MATERIALS if m in materials]
     pairs = [(a, RADIUS, b) for i, a in enumerate(names) for b in names[i:]]
@@ -115,7 +118,7 @@ def radius_relations(materials: tuple[str, ...]) -> tuple[EdgeType, ...]:
 
 
 def mesh_relations(materials: tuple[str, ...], num_levels: int) -> tuple[EdgeType, ...]:
-    """The relations that meshes add: along cells, and level by level between virtual nodes and from each to its children."""
+    """Relations of meshes: along cells, between virtual nodes of each level, and from virtual nodes to their children."""
     meshes = [m for m in MESH_MATERIALS if m in materials]
     if not meshes:
         return ()
@@ -131,16 +134,25 @@ Values = Literal[
     "0 to 1",
     "unit vectors",
     "node types",  # of the data set's materials
-    "parameters",  # finite where a node's material has the parameter, and positive where it enters by its logarithm
-    "nodes of cells",  # rows of nodes, as many different ones as a kind of cell has corners
-    "dimension of cells",  # 2 or 3, and at most that of space
+    "parameters",  # finite if the node's material has the parameter, and positive if its scale is logarithmic
+    "nodes of cells",  # rows of nodes; the number of different nodes is that of a kind of cell
+    "dimension of cells",  # 2 or 3, and at most the dimension of space
 ]
-"""What a stored array may hold; ``gpe_pl.trajectory.values`` compares."""
+"""Rules for the values of stored arrays. ``gpe_pl.trajectory.values`` checks them."""
 
 
 @dataclass(frozen=True)
 class Field:
-    """A stored array: its dimensions, in the order of its axes, its unit, its meaning and the values that it may hold."""
+    """A stored array.
+
+    Attributes:
+        dims: names of its axes.
+        dtype: stored type.
+        unit: unit of its values.
+        doc: meaning of its values.
+        required: whether every trajectory has it.
+        values: rule for its values.
+    """
 
     dims: tuple[str, ...]
     dtype: str
@@ -153,15 +165,15 @@ class Field:
 STRESS_COMPONENTS = "xx, xy, yy, zz in plane strain; xx, xy, xz, yy, yz, zz in 3D"
 
 MOTION = "one or frame"
-"""Axis of what stands still, then of length 1, or moves in a prescribed way."""
+"""Axis of boundary arrays: of length 1 if the boundary stands still, else one entry per frame of its prescribed motion."""
 
 FIELDS: dict[str, Field] = {
     "pos": Field(("frame", "node", "dim"), "float32", "m", "positions of the dynamic nodes"),
-    "vel": Field(("frame", "node", "dim"), "float32", "m/s", "velocities of the dynamic nodes as the solver has them at that frame"),
+    "vel": Field(("frame", "node", "dim"), "float32", "m/s", "velocities of the dynamic nodes at the frame, from the solver"),
     "node_type": Field(("node",), "uint8", "1", "index into the attribute node_types", values="node types"),
     "mass": Field(("node",), "float32", "kg", "mass (per metre of depth in 2D)", values="positive"),
     "material_params": Field(
-        ("node", "param"), "float32", "per column", "columns as in param_names; NaN where one does not apply", values="parameters"
+        ("node", "param"), "float32", "per column", "columns as in param_names; NaN if a parameter does not apply", values="parameters"
     ),
     "boundary_pos": Field((MOTION, "boundary_node", "dim"), "float32", "m", "positions of the boundary nodes"),
     "boundary_vel": Field((MOTION, "boundary_node", "dim"), "float32", "m/s", "velocities of the boundary nodes, to the next frame"),
@@ -179,7 +191,7 @@ FIELDS: dict[str, Field] = {
         ("cell", "corner"),
         "int32",
         "1",
-        "node indices of each mesh cell; one with fewer corners than others repeats its last",
+        "node indices of each mesh cell; cells with fewer corners than others repeat their last node",
         required=False,
         values="nodes of cells",
     ),
@@ -187,7 +199,7 @@ FIELDS: dict[str, Field] = {
         ("one",),
         "uint8",
         "1",
-        "dimension of the cells: 2 for triangles and quadrilaterals, 3 for tetrahedra and hexahedra; without it that of space",
+        "dimension of the cells: 2 for triangles and quadrilaterals, 3 for tetrahedra and hexahedra; by default that of space",
         required=False,
         values="dimension of cells",
     ),
@@ -200,19 +212,19 @@ FIELDS: dict[str, Field] = {
 
 @dataclass(frozen=True)
 class FeatureSpec:
-    """Channel counts of a data set's graphs: everything a model needs to know to build its layers.
+    """Channel counts of a data set's graphs, from which a model builds its layers.
 
     Attributes:
         dim: space dimension.
         materials: dynamic node types, in schema order.
-        node_channels: channels of ``x`` per node type, ``boundary`` included.
-        param_channels: material parameters per material.
+        node_channels: number of channels of ``x`` per node type, including ``boundary``.
+        param_channels: number of material parameters per material.
         relations: edge types that can occur.
-        odd_channels: per relation, edge channels that change sign when source and target swap; the first ``dim`` are the relative displacement.
-        even_channels: per relation, edge channels that do not.
-        stress_channels: components of the Cauchy stress per material that has one, in the order of ``STRESS_COMPONENTS``.
-        num_levels: of virtual nodes above meshes.
-        islands: whether graphs say which nodes hang together, and which of these groups nothing else touches.
+        odd_channels: number of edge channels per relation that change sign when source and target swap. The first ``dim`` are the relative displacement.
+        even_channels: number of edge channels per relation that do not change sign.
+        stress_channels: number of components of the Cauchy stress, in the order of ``STRESS_COMPONENTS``, per material that has a stress.
+        num_levels: number of levels of virtual nodes above meshes.
+        islands: whether graphs contain the groups of connected nodes, and which groups touch nothing.
     """
 
     dim: int
