@@ -334,7 +334,7 @@ def _distance(prediction: Trajectory, truth: Trajectory) -> float:
     return energy_distance(prediction.pos[-1], truth.pos[-1], prediction.mass, truth.mass)
 
 
-# --- what follows from the points -------------------------------------------------------------------------------------------------------------
+# --- conclusions from the points --------------------------------------------------------------------------------------------------------------
 
 
 def front(points: Sequence[Point], horizon: str) -> list[Point]:

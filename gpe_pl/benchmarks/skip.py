@@ -216,22 +216,22 @@ def _hold_time_ratio(settings: Settings, edge_state: EdgeState, builder: GraphBu
 def _table(settings: Settings, num_edges: int, lines: list[str], records: list[dict[str, Any]]) -> str:
     calls = {(r["metric"], r["case"]): r["value"] for r in records if r["metric"].endswith("_calls")}
     shares = [f"{r['case']} {100 * r['value']:.0f} %" for r in records if r["metric"] == "hold_time_ratio"]
-    held = f" Frames for which one prediction is held, another approximate level, take of the time: {', '.join(shares)}." if shares else ""
+    held = f" Repeated predictions, another approximate level, take these fractions of the time: {', '.join(shares)}." if shares else ""
     header = ["edge state", "added", "without it [ms]", "level on [ms]", "longer by", "level off [ms]", "longer by"]
     return "\n".join(
         [
             f"A step of {settings.num_nodes} nodes with {num_edges} edges, GPE {settings.num_message_passing_steps} × {settings.hidden_channels}, "
-            f"{settings.num_threads} thread(s), and of the same with what does not matter added; medians, and medians of paired ratios.",
+            f"{settings.num_threads} thread(s), and a step of the same scene with irrelevant parts; medians, and medians of paired ratios.",
             "",
             table_row(header),
             "|" + "---|" * len(header),
             *lines,
             "",
-            f"A step of {settings.num_falling[0]} falling nodes alone calls {calls['falling_message_passing_calls', 'on']} layers with more than one row, "
-            f"with the level off {calls['falling_message_passing_calls', 'off']}; a step without snow and liquid calls "
-            f"{calls['absent_material_calls', 'on']} modules of theirs, with the level off {calls['absent_material_calls', 'off']}. Settled piles are at "
-            "perfect rest here, without gravity and with accelerations next to nothing; they are left alone by an approximate level, which evaluation measures "
-            f"the error of. All others are exact.{held}",
+            f"A step of {settings.num_falling[0]} falling nodes alone calls {calls['falling_message_passing_calls', 'on']} layers with more than one row, or "
+            f"{calls['falling_message_passing_calls', 'off']} with the level off. A step without snow and liquid calls "
+            f"{calls['absent_material_calls', 'on']} of their modules, or {calls['absent_material_calls', 'off']} with the level off. Settled piles are at "
+            "perfect rest here, without gravity and with tiny accelerations. Their level is approximate; evaluation measures its error. All other levels "
+            f"are exact.{held}",
         ]
     )
 

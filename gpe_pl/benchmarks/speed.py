@@ -306,7 +306,7 @@ def table(settings: Settings, num_edges: int, records: list[dict[str, Any]]) -> 
         + ", ".join(f"{name} output by {100 * change:.1g} %" for name, change in reduced.items())
         + " (untrained weights, relative L2)."
         if reduced
-        else "but do not on this machine, so it is not timed."
+        else "but not on this machine, so the case is not timed."
     )
     return "\n".join(
         [
@@ -319,10 +319,10 @@ def table(settings: Settings, num_edges: int, records: list[dict[str, Any]]) -> 
             "|" + "---|" * len(header),
             *lines,
             "",
-            f"Times: medians, each model in a process of its own that keeps its memory. Faster: median of ratios to `{REFERENCE}`, in turns, which multiplies "
-            "the concatenated features of every directed edge. Factored: node features are multiplied before they go to the edges, by PyTorch's operations; "
-            "below, by passes of our own where a name has no addition. Saved: time saved against `directed` of the same implementation; the paper reports 37 % "
-            "for `negated`. Product floor: the case's own matrix products at the measured rate; byte floor: its edge states in and out once per layer at the "
+            f"Times: medians, each model in a separate process that keeps its memory. Faster: median of ratios to `{REFERENCE}`, timed in turns, which "
+            "multiplies the concatenated features of every directed edge. Factored: node features are multiplied before the gather to edges, with PyTorch's "
+            "operations; names without an addition use the fused passes. Saved: time saved against `directed` of the same implementation; the paper reports "
+            "37 % for `negated`. Product floor: the case's matrix products at the measured rate. Byte floor: its edge states in and out once per layer at the "
             "copy rate. Geometry: raw edge features instead of latent edge states. Memory: beyond weights and graph. Medium: products may use bfloat16 inside "
             "(`trainer.matmul_precision=medium`), " + medium,
         ]

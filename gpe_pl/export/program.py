@@ -198,13 +198,13 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
     inputs = {"gravity": Input((dim,), "float64", "m/s^2", "external acceleration")}
     meshes = _meshes(spec)
     is_periodic = bool(builder.metadata.periodicity)
-    positions = "positions; not folded into the domain, so that the nodes of a mesh stay together" if is_periodic else "positions"
+    positions = "positions, not wrapped into the domain, so that the nodes of a mesh stay together" if is_periodic else "positions"
     for m in spec.materials:
         parameter = MATERIALS[m]
         inputs |= {
             f"pos.{m}": Input((m, dim), "float64", "m", positions),
             f"velocity_history.{m}": Input(
-                (m, history, dim), "float64", "m/s", "differences of the last positions by frame_dt, oldest first"
+                (m, history, dim), "float64", "m/s", "differences of the last positions divided by frame_dt, oldest first"
             ),
             f"material_params.{m}": Input((m, 1), "float64", parameter.unit, parameter.name),
             f"mass.{m}": Input((m,), "float64", "kg", "mass (per metre of depth in 2D)"),
@@ -212,16 +212,16 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
         if m in meshes:
             inputs[f"rest_pos.{m}"] = Input((m, dim), "float64", "m", "undeformed positions")
         if spec.islands:
-            doc = "number of the group of nodes that the edges between materials connect"
+            doc = "number of the node's group; edges between materials connect a group"
             inputs[f"island.{m}"] = Input((m,), "int64", "1", doc)
         if spec.islands and m in meshes:
-            doc = "number of the body that a node moves with, below the number of nodes of meshes; -1 for all where there are no cells"
+            doc = "number of the node's body, below the number of nodes of meshes; -1 for all nodes if there are no cells"
             inputs[f"body.{m}"] = Input((m,), "int64", "1", doc)
         if spec.islands and is_periodic:
-            doc = "position relative to the mean of its group, as the edges lead there; 0 in a group that reaches around the domain"
+            doc = "position relative to the mean of the node's group, measured along edges; 0 in a group that reaches around the domain"
             inputs[f"arm.{m}"] = Input((m, dim), "float64", "m", doc)
     if spec.islands:
-        doc = "whether no edge ties a group to the boundary"
+        doc = "whether a group has no edge to the boundary"
         inputs["island_is_free"] = Input(("island",), "bool", "1", doc)
     vector: tuple[int | str, ...] = (BOUNDARY, dim)
     inputs |= {
@@ -229,7 +229,7 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
         "boundary.vel": Input(vector, "float64", "m/s", "their velocities"),
         "boundary.normal": Input(vector, "float64", "1", "unit normals into free space"),
         "boundary.friction": Input((BOUNDARY,), "float64", "1", "Coulomb coefficient; 1e6 or more is no-slip"),
-        "boundary.restitution": Input((BOUNDARY,), "float64", "1", "part of the normal velocity that a bounce returns"),
+        "boundary.restitution": Input((BOUNDARY,), "float64", "1", "fraction of the normal velocity that a bounce returns"),
     }
     for level in range(1, spec.num_levels + 1):
         name = grid(level)

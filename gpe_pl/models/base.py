@@ -44,7 +44,7 @@ class Model(nn.Module, ABC):
     settings: dict[str, Any]
     skips: Skips = Skips()
     compute: Callable[..., Any]
-    """Does the work of ``forward`` on tensors in dictionaries and tuples. ``torch.compile`` compiles this part and replaces it on one model."""
+    """Computes the work of ``forward`` on tensors in dictionaries and tuples. ``torch.compile`` compiles this part and replaces it on one model."""
 
     def __init__(self, spec: FeatureSpec, **settings: Any) -> None:
         super().__init__()
@@ -66,4 +66,4 @@ class Model(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, data: HeteroData) -> Prediction:
-        """Return the prediction for a graph, or a batch of graphs, with standardised features; it leaves the stores of the graph as they are."""
+        """Return the prediction for a graph, or a batch of graphs, with standardised features, without changing the stores of the graph."""

@@ -146,7 +146,7 @@ class Sand:
 
 @dataclass(frozen=True, config={"extra": "forbid"})
 class Snow:
-    """Snow: fixed-corotated elasticity that hardens as it is compacted (Stomakhin et al. 2013). Material parameter: hardening coefficient ξ.
+    """Snow: fixed-corotated elasticity that hardens under compaction (Stomakhin et al. 2013). Material parameter: hardening coefficient ξ.
 
     Attributes:
         youngs_modulus: E₀ [Pa] before any compaction.

@@ -76,7 +76,7 @@ class Command:
         return [*self.arguments, f"paths.data={self.data or folder / 'data'}", f"paths.runs={folder / 'runs'}"]
 
 
-# --- what a command leaves ----------------------------------------------------------------------------------------------------------------
+# --- results of a command -----------------------------------------------------------------------------------------------------------------
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -287,7 +287,7 @@ def damage_faults(command: Command, sound: Path, count: int, seed: int, limit: f
 
 def limit_file_size(size: int) -> None:
     """Limit the size of all files that this process writes from now on; writes then fail as on a full disk, with another error number."""
-    import resource  # Windows has none
+    import resource  # not available on Windows
 
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
