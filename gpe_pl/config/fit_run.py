@@ -19,7 +19,8 @@ from gpe_pl.evaluation.rollouts import LEARNED, EvaluationSettings, evaluate, me
 from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError, claim, without_tables
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.pretrained import fingerprint
-from gpe_pl.learned.simulator import LearnedSimulator, model_class
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.models.lookup import model_class
 from gpe_pl.reports.finished_runs import Run, rollout_errors, table_of
 from gpe_pl.training.budget import PauseForMeasurements, mean_step_time, step_time_key, within_budget
 from gpe_pl.training.module import TrainingModule

@@ -7,8 +7,6 @@ the data set's metadata.
 from __future__ import annotations
 
 import copy
-import importlib
-import inspect
 import io
 import json
 import logging
@@ -33,6 +31,7 @@ from gpe_pl.graphs.standardizer import GraphStandardizer, StatisticsSample, name
 from gpe_pl.learned.checkpoint_archive import check_archive, check_values
 from gpe_pl.learned.pretrained import checkpoint_path, names
 from gpe_pl.models.base import Model, Prediction
+from gpe_pl.models.lookup import model_class
 from gpe_pl.nn.static_friction import is_held, supported
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.rollout.skips import Skips
@@ -573,25 +572,3 @@ def _per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterat
 def reason(error: Exception) -> str:
     """What went wrong, in one line of bounded length."""
     return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
-
-
-class UnknownModelError(GpeError, ValueError):
-    """A dotted name that is not a model of this package."""
-
-
-def model_class(target: str) -> type[Model]:
-    """The model class of a dotted name; only classes under ``gpe_pl.models`` are accepted, because names come from files.
-
-    Raises:
-        UnknownModelError: any other name.
-    """
-    module, _, name = target.rpartition(".")
-    if not module.startswith("gpe_pl.models."):
-        raise UnknownModelError(f"model {target!r} is not one of gpe_pl.models")
-    try:
-        cls = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError):
-        raise UnknownModelError(f"model {target!r} does not exist in this version of gpe_pl") from None
-    if not (inspect.isclass(cls) and issubclass(cls, Model)):
-        raise UnknownModelError(f"{target!r} is not a model")
-    return cls

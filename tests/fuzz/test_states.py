@@ -12,9 +12,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from torch_geometric.data import Batch, HeteroData
 
-from gpe_pl.benchmarks.stability.subject import in_order, permuted
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.testing.changes import in_order, permuted
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import Guard, SimulationError, crowding, rollout

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, inapplicable, no_boundary, permuted, shifted, stress_test
+from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, inapplicable, no_boundary, shifted, stress_test
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.neighbors import radius_pairs
+from gpe_pl.learned.testing.changes import permuted
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.trajectory.state import State
 

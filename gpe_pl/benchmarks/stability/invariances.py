@@ -16,37 +16,17 @@ from gpe_pl.benchmarks.stability.subject import (
     in_double,
     inapplicable,
     output,
-    permuted,
     relative_change,
     shifted,
     stress_test,
     with_velocities,
 )
 from gpe_pl.graphs.batching import batched
-from gpe_pl.schema import FeatureSpec, is_symmetric
+from gpe_pl.learned.testing.changes import permuted, turned
+from gpe_pl.schema import is_symmetric
 from gpe_pl.trajectory.state import State
 
 NUM_DRAWS = 5
-
-
-def turned(data: HeteroData, spec: FeatureSpec, seed: int = 0, *, turn: bool = True, shuffle: bool = True) -> HeteroData:
-    """Return the graph with half of the reversible edges reversed, and with shuffled edges."""
-    out = data.clone()
-    random = torch.Generator().manual_seed(seed)
-    for relation in spec.relations:
-        store = out[relation]
-        count = store.edge_index.shape[1]
-        if turn and is_symmetric(relation):
-            chosen = torch.rand(count, generator=random) < 0.5
-            store.edge_index = torch.where(chosen, store.edge_index.flip(0), store.edge_index)
-            for key in {"odd", "offset"} & set(store.keys()):
-                store[key] = torch.where(chosen[:, None], -store[key], store[key])
-        if shuffle:
-            order = torch.randperm(count, generator=random)
-            store.edge_index = store.edge_index[:, order]
-            for key in {"odd", "even", "offset"} & set(store.keys()):
-                store[key] = store[key][order]
-    return out
 
 
 def relabelling_error(subject: Subject, dtype: torch.dtype, seed: int) -> float:

@@ -19,18 +19,16 @@ from gpe_pl.benchmarks.stability.subject import (
     Subject,
     acceleration,
     in_double,
-    in_order,
     inapplicable,
     output,
-    permuted,
     relative_change,
     stress_test,
-    to_dtype,
 )
 from gpe_pl.geometry.shapes import Box, Sphere
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.testing.changes import in_order, permuted, to_dtype
 from gpe_pl.metrics import per_frame_mse
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import Guard, rollout

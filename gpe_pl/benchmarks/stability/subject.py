@@ -6,7 +6,6 @@ import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.testing.changes import in_order, to_dtype
 from gpe_pl.models.base import Prediction
 from gpe_pl.rollout.loop import Guard
 from gpe_pl.trajectory import integrators
@@ -142,15 +142,6 @@ def inapplicable(reason: str) -> Outcome:
 # --- predictions --------------------------------------------------------------------------------------------------------------------------
 
 
-def in_order(predicted: Prediction, graph: HeteroData, num_nodes: int, dim: int) -> Tensor:
-    """Return predicted accelerations in the order of the state's nodes."""
-    values = [*predicted.acceleration.values()]
-    out = torch.full((num_nodes, dim), float("nan"), dtype=values[0].dtype if values else torch.float64)
-    for material, value in predicted.acceleration.items():
-        out[graph[material].node_id] = value
-    return out
-
-
 @torch.no_grad()
 def output(simulator: LearnedSimulator, graph: HeteroData, num_nodes: int) -> Tensor:
     """Return the network's output for a graph, in units of the acceleration scale, in the order of the state's nodes."""
@@ -191,25 +182,9 @@ def in_double(simulator: LearnedSimulator) -> LearnedSimulator:
     return twin.double().eval()
 
 
-def to_dtype(data: HeteroData, dtype: torch.dtype) -> HeteroData:
-    """Return the graph with all floating-point features in another precision."""
-    out = data.clone()
-    for store in out.stores:
-        for key, value in store.items():
-            if isinstance(value, Tensor) and value.is_floating_point():
-                store[key] = value.to(dtype)
-    return out
-
-
 def no_boundary(state: State) -> Boundary:
     """Return an empty boundary for a state of tensors."""
     return replace(state, boundary=Boundary.empty(state.dim)).to_torch().boundary
-
-
-def permuted(state: State, order: Any) -> State:
-    """Return the state with its nodes in another order, or with some of them (then without its mesh)."""
-    taken = state.take(order)
-    return taken if len(order) == state.num_nodes else replace(taken, cells=None, rest_pos=None)
 
 
 def shifted(state: State, offset: Tensor) -> State:

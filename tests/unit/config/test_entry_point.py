@@ -25,7 +25,7 @@ from gpe_pl.config.entry_point import ConfigError, Report, bind, construct, entr
 from gpe_pl.config.folder import CONF
 from gpe_pl.errors import GpeError
 from gpe_pl.fit import fit
-from gpe_pl.learned.simulator import UnknownModelError
+from gpe_pl.models.lookup import UnknownModelError
 from tests.runs import compose
 
 ROOT = Path(__file__).parents[3]
