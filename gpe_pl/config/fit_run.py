@@ -1,4 +1,4 @@
-"""A training run as the configuration of ``fit`` describes it, in stages that each do one thing."""
+"""A run of ``fit``, divided into stages."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, seed, 
 from gpe_pl.training.tracking import LoggerSettings, publish
 
 OPTIMISATION = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "stress_weight", "compile")
-"""Fields of ``TrainingSettings`` that ``TrainingModule`` takes."""
+"""Fields of ``TrainingSettings`` that are arguments of ``TrainingModule``."""
 
 
 class FitRun:
-    """One run of ``fit``. The constructor checks every setting and does nothing else; the methods are called in the order in which they are written.
+    """One run of ``fit``. The constructor only checks settings. The methods are called in the order of their definition.
 
     Args:
-        cfg: the composed configuration.
-        folder: of the results.
+        cfg: composed configuration.
+        folder: folder of the results.
 
     Raises:
         ConfigError: a setting has the wrong type or value, or does not fit the others.
@@ -66,7 +66,7 @@ class FitRun:
         self.callbacks: list[PauseForMeasurements] = []
 
     def prepare_data(self) -> None:
-        """Generate missing data. A model to start from and noise that do not fit the scenes are refused before."""
+        """Generate missing data, after checking that the noise and the model of ``start_from`` fit the scenes."""
         if self.start is not None or self.training.position_noise_of_domain:
             scenes = scene_metadata(self.cfg, "train")
             self.training.noise.check(scenes)
@@ -77,7 +77,7 @@ class FitRun:
         self.device = set_up(self.trainer)
 
     def choose_num_steps(self) -> None:
-        """Replace a budget of minutes by the number of steps that it allows."""
+        """Replace a time budget by the number of steps that it allows."""
         if self.training.budget_minutes is None:
             return
         checksum = self._checksums["train"] if self._settings["data"]["size"] == IMPORTED else None
@@ -87,39 +87,39 @@ class FitRun:
         self.training = within_budget(self.training, times, key, self._step_time, self.device)
 
     def claim_folder(self) -> None:
-        """Take the folder for this run; raises ``RunError`` where it belongs to a run with another configuration."""
+        """Assign the folder to this run; raises ``RunError`` if it belongs to a run with another configuration."""
         claim(self.folder, self._config)
 
     @property
     def is_evaluated(self) -> bool:
-        """Whether an earlier start has finished the run."""
+        """Whether the run was finished by an earlier start."""
         return self._metrics.exists()
 
     def check_evaluation(self) -> None:
-        """Refuse splits whose trajectories are too short, before the training rather than after it."""
+        """Check before training that the evaluated splits have trajectories that are long enough."""
         for split in self.evaluation.splits:
             window_counts(open_split(self.evaluated_root, split, cache_bytes=0), self.first_frame)
 
     def finished_model(self) -> Path | None:
-        """The best checkpoint of a finished run of the sweep ``reuse`` with the same training."""
+        """Return the best checkpoint of a finished run of the sweep ``reuse`` with the same training, or None."""
         best = None if self.cfg.reuse is None else adopt(self.runs / self.cfg.reuse, self._trained, self.folder)
         if best is not None:
             end_later_processes()
         return best
 
     def train(self) -> Path:
-        """Train to the last step, from the last checkpoint where there is one; returns the best checkpoint."""
+        """Train to the last step, starting from the last checkpoint if there is one, and return the best checkpoint."""
         best = train(self._new_module(self.training), self._data, self.training, self.trainer, self._loggers, self.folder, self.callbacks)
         end_later_processes()
         return best
 
     def evaluate(self, checkpoint: Path) -> None:
-        """Roll the model out on the evaluated splits, and publish the means."""
+        """Roll the model out on the evaluated splits, and log the mean errors."""
         rows = evaluate(LearnedSimulator.from_checkpoint(checkpoint, self.device), self.evaluated_root, self.evaluation, self.folder)
         publish(self._loggers, self.folder, means(rows))
 
     def error(self) -> float:
-        """Mean full-length rollout MSE [m²] on the first evaluated split."""
+        """Return the mean full-length rollout MSE [m²] on the first evaluated split."""
         split = self.evaluation.splits[0]
         run = Run(self.folder, {}, table_of(read_rows(self._metrics)))
         values = [value for errors in rollout_errors([run], split, "full") for value in errors.values()]

@@ -100,7 +100,7 @@ def _fault(part: str) -> str | None:
     if part[0] == ".":
         return "must not begin with a dot, nor lead outside the folder of the results"
     if not part.isprintable():
-        return "holds characters that are not shown; leave them out"
+        return "contains characters that are not printable; remove them"
     if len(part.encode()) > MOST_BYTES:
         return f"has {len(part.encode())} bytes; the name of a folder has at most {MOST_BYTES}"
     if forbidden := FORBIDDEN.intersection(part):

@@ -39,7 +39,7 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
     run_dir.mkdir(parents=True, exist_ok=True)
     path = run_dir / CONFIG
     if any(found.name != CONFIG for pattern in results for found in run_dir.glob(pattern)):
-        different = sorted(differences(config_in(path), config)) if path.exists() else [f"of which there is no {CONFIG}"]
+        different = sorted(differences(config_in(path), config)) if path.exists() else [f"its {CONFIG} is missing"]
         if different:
             raise RunError(
                 f"{run_dir} holds a run with another configuration ({'; '.join(different[:3])}); choose another name=… or delete the folder"

@@ -151,7 +151,7 @@ def _require_countable_elements(path: Path, content: bytes) -> None:
     is_text = re.search(rb"format\s+ascii", head) is not None
     if is_text and (len(content) > MAX_ASCII_BYTES or MAX_ASCII_ELEMENTS < sum(count for _, count in counts) <= len(content)):
         raise TerrainError(
-            f"{path}: too large for text, of which {MAX_ASCII_BYTES} bytes and {MAX_ASCII_ELEMENTS} elements are read; {BINARY['.ply']}"
+            f"{path}: too large for text, at most {MAX_ASCII_BYTES} bytes and {MAX_ASCII_ELEMENTS} elements are read; {BINARY['.ply']}"
         )
 
 

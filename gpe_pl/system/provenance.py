@@ -56,7 +56,7 @@ def recorded(folder: Path, command: str, arguments: Sequence[str], runs: str) ->
             try:
                 sealed.write(path, {"sessions": [*sessions(folder), session]})
             except (OSError, sealed.SealError) as error:
-                log.warning("how these results were made is not noted: %s", error)
+                log.warning("provenance of these results was not recorded: %s", error)
 
 
 def sessions(folder: Path) -> list[dict[str, Any]]:

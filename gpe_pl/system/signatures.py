@@ -39,7 +39,7 @@ def check_plain(values: Any) -> None:
             if abs(value) >= LARGEST_NUMBER:
                 raise ValueError("an integer beyond 64 bits")
         elif not isinstance(value, (float, type(None))):
-            raise ValueError(f"a {type(value).__name__}, where only text, numbers, lists and tables are")
+            raise ValueError(f"a {type(value).__name__}, only text, numbers, lists and tables are allowed")
 
 
 def parameters(target: Callable[..., Any], *later: str) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def test_a_folder_keeps_the_evaluation_that_it_holds(tiny_data: Path, tmp_path: 
         evaluate(tiny_data, tmp_path, run, "evaluation.containment=false")
     assert (folder / "metrics.csv").read_bytes() == before
     (folder / "config.json").unlink()
-    with pytest.raises(RunError, match="of which there is no config.json"):
+    with pytest.raises(RunError, match="its config.json is missing"):
         evaluate(tiny_data, tmp_path, run)
 
 

@@ -119,7 +119,7 @@ def save_dataset(root: Path | str, name: str, holdout: float = 0.1, **splits: It
         raise ImportFailure(
             f"splits: {unknown[0]} is none of train, val, test, test_unseen"
             if unknown
-            else "train has no trajectories; they are what a model learns from"
+            else "train has no trajectories; a model learns from them"
         )
     items = {split: [_member(split, trajectories, k) for k in range(len(trajectories))] for split, trajectories in given.items()}
     about = {"format": "arrays", "source": "memory", "settings": {}}
@@ -305,7 +305,7 @@ class _Conversion:
         nearest = nearest_distances(trajectory.pos[0].astype(np.float64), m.periodicity)
         at_one_place = np.flatnonzero((nearest == 0) | (nearest < COINCIDENCE * np.median(nearest)))
         if len(at_one_place):
-            what = f"{len(at_one_place)} nodes lie where another one is, the first of them node {at_one_place[0]}: do bodies overlap?"
+            what = f"{len(at_one_place)} nodes are at the place of another node, the first is node {at_one_place[0]}: do bodies overlap?"
             survey.suspects.append(Event(split, name, 0, what))
         survey.materials |= set(m.materials)
         survey.num_bytes += sum(array.nbytes for array in arrays.values())
@@ -340,7 +340,7 @@ class _Conversion:
         bounds = facts.bounds
         if facts.spacing is None:
             report.notes.append(
-                f"spacing {spacing:.4g} m is the median of the trajectories' (what they were given, else the distance to the nearest node; spacing=…)"
+                f"spacing {spacing:.4g} m is the median over trajectories (given values, else distances to the nearest node; spacing=…)"
             )
         if facts.connectivity_radius is None:
             report.notes.append(
@@ -349,11 +349,11 @@ class _Conversion:
         if bounds is None and not any(periodic):
             every = np.array(survey.bounds)
             bounds = tuple(zip(every[..., 0].min(axis=0).tolist(), every[..., 1].max(axis=0).tolist(), strict=True))
-            report.notes.append("bounds span those of all trajectories (what they were given, else the extremes of positions; bounds=…)")
+            report.notes.append("bounds enclose the bounds of all trajectories (given values, else the extremes of positions; bounds=…)")
         distance = float(np.median(survey.distances))
         if np.isfinite(distance) and not distance / SPACING_RATIO < spacing < distance * SPACING_RATIO:
             report.warnings.append(
-                f"spacing is said to be {spacing:.4g} m, but nodes are {distance:.4g} m from the nearest one (median of first frames): spacing=… or bounds=… "
+                f"spacing is stored as {spacing:.4g} m, but nodes are {distance:.4g} m from the nearest one (median of first frames): spacing=… or bounds=… "
                 "may be wrong"
             )
         self.facts = replace(facts, frame_dt=frame_dt, periodic=periodic, spacing=spacing, connectivity_radius=radius, bounds=bounds)
@@ -387,7 +387,11 @@ class _Conversion:
                 ]
                 flights = [(assumed, f.under(measured) if assumed else f) for assumed, f in flights]
             elif flight.num_free >= ENOUGH_GROUPS:
-                what = "have other accelerations that differ" if 2 * flight.num_disturbed > flight.num_free else "confirm it"
+                what = (
+                    "have accelerations that differ from it and from each other"
+                    if 2 * flight.num_disturbed > flight.num_free
+                    else "confirm it"
+                )
                 report.notes.append(f"{known} and is stored: {free} {what} (gravity=[…])")
             else:
                 report.notes.append(f"{known} and is stored: {free} are too few to measure it (gravity=[…])")

@@ -96,7 +96,7 @@ def _load(rollout: Path, settings: ImportSettings, facts: Facts) -> Loaded:
         try:
             with hdf5.opened(path) as file:
                 if is_named(file, "shape_quats"):
-                    raise Refusal("has shape_quats: moving walls or grippers, of which the files do not hold the shape")
+                    raise Refusal("has shape_quats: moving walls or grippers, but the files do not contain their shape")
                 clusters = clusters or is_named(file, "clusters")
                 for name, arrays in (("positions", pos), ("velocities", vel)):
                     arrays.append(hdf5.array(file, name, "node, component", "f"))
@@ -107,6 +107,6 @@ def _load(rollout: Path, settings: ImportSettings, facts: Facts) -> Loaded:
     kind = np.full(len(pos[0]), "fluid", dtype="U16")
     if clusters:
         if len(kind) <= NUM_RIGID:
-            raise Refusal(f"has clusters, as BoxBath, but only {len(kind)} nodes, of which the first {NUM_RIGID} should be the box")
+            raise Refusal(f"has clusters, as BoxBath, but only {len(kind)} nodes; the first {NUM_RIGID} should be the box")
         kind[:NUM_RIGID] = "solid"
     return build(Nodes(np.stack(pos), kind, vel=np.stack(vel)), facts)

@@ -60,7 +60,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         values = values["train"]
     bounds = bounds_in(values, described)
     walls = {f"{axis}_{side}": ASSUMED_FRICTION for axis in "xyz"[: len(bounds)] for side in ("low", "high")}
-    notes = [f"walls at the bounds with friction {ASSUMED_FRICTION:g}, which is not in the source (walls={{x_low: …}}, or {{}} for none)"]
+    notes = [f"walls at the bounds with friction {ASSUMED_FRICTION:g}, an assumed value (walls={{x_low: …}}, or {{}} for none)"]
     if settings.gravity is None:
         notes.append("gravity is not in the source; 0 is stored, and models learn it as any other force (gravity=[…])")
     if "context_mean" in values:
@@ -94,7 +94,7 @@ def _loaded(
         if "sand" in set(nodes.kind.tolist()):
             nodes.parameters = {"sand": np.degrees(np.arctan(np.broadcast_to(np.asarray(value, np.float64).ravel(), pos.shape[1])))}
         else:
-            nodes.notes.append("material_property is tan φ of sand, which no particle is: left out")
+            nodes.notes.append("material_property is tan φ of sand, but no particle is sand: left out")
     return build(nodes, facts)
 
 

@@ -50,14 +50,12 @@ def groups(path: Path) -> list[str]:
     try:
         with opened(path) as file:
             if len(file) > MAX_TRAJECTORIES:
-                raise ImportFailure(
-                    f"{path}: holds {len(file)} groups, one of which each trajectory should be; at most {MAX_TRAJECTORIES} are read"
-                )
+                raise ImportFailure(f"{path}: holds {len(file)} groups, at most {MAX_TRAJECTORIES} are read")
             names = [name for name in sorted(file, key=natural) if is_own(file, name) and isinstance(file[name], h5py.Group)]
     except Refusal as refusal:
         raise ImportFailure(f"{path}: {refusal}") from None
     if not names:
-        raise ImportFailure(f"{path}: holds no groups, one of which each trajectory should be")
+        raise ImportFailure(f"{path}: holds no groups; each trajectory should be a group")
     return names
 
 

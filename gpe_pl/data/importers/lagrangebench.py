@@ -61,7 +61,7 @@ def open_source(path: Path, settings: ImportSettings) -> Source:
         gravity = (0.0, -strength, 0.0)[:dim]
     elif strength:
         notes.append(
-            f"an external force of magnitude {strength:g} that depends on the place: models that see no absolute position cannot tell it"
+            f"an external force of magnitude {strength:g} that depends on the place: models without absolute positions cannot learn it"
         )
     if (folder / "force.py").exists():
         notes.append("force.py is code and was not run")

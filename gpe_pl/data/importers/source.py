@@ -338,7 +338,7 @@ def _boundary(nodes: Nodes, visited: np.ndarray, facts: Facts) -> tuple[Boundary
             normal, space = estimated_normals(pos[moves], visited[0], facts.periodicity), facts.periodicity
             way = nodes.pos[:, fixed[moves]]
             parts.append(Boundary.moving(way, normal, facts.frame_dt, friction=nodes.friction, periodicity=space))
-            notes.append(f"{int(moves.sum())} boundary nodes move; a simulator is told where they go, whatever they meet")
+            notes.append(f"{int(moves.sum())} boundary nodes move; their motion is prescribed to simulators and does not react to contacts")
         notes.append("normals of boundary nodes are estimated: they point to where the other nodes have been")
     if nodes.walls is not None:
         parts.append(Boundary.from_numpy(*nodes.walls, friction=nodes.friction))
@@ -395,7 +395,9 @@ def _sliding(pos: np.ndarray, facts: Facts, repairs: list[Repair]) -> tuple[np.n
     slides = ~moves & (np.abs(mean).max(axis=1) * len(path) > tolerance)
     if slides.any():
         repairs.append(
-            Repair(f"{int(slides.sum())} boundary nodes slide along a periodic axis: stored where they are in frame 0, with their velocity")
+            Repair(
+                f"{int(slides.sum())} boundary nodes slide along a periodic axis: stored at their positions of frame 0, with their velocity"
+            )
         )
     return np.where(slides[:, None], mean / facts.frame_dt, 0.0), moves
 

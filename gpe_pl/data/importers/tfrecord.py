@@ -113,7 +113,7 @@ def records(path: Path) -> list[Record]:
             start = 0
             while start < total:
                 if len(found) == MAX_TRAJECTORIES:
-                    raise ImportFailure(f"{path}: holds more than {MAX_TRAJECTORIES} records, one of which each trajectory should be")
+                    raise ImportFailure(f"{path}: holds more than {MAX_TRAJECTORIES} records; each trajectory should be one record")
                 head = file.read(12)
                 if len(head) < 12:
                     found.append(Record(path, start, 0, f"the file ends within the head of a record at {start}: truncated"))

@@ -35,5 +35,5 @@ def test_a_damaged_file_does_not_end_the_command(tmp_path: Path, caplog: pytest.
     (tmp_path / PROVENANCE).write_text("{")
     with recorded(tmp_path, "fit", [], "runs"):
         (tmp_path / "metrics.csv").touch()
-    assert "how these results were made is not noted" in caplog.text
+    assert "provenance of these results was not recorded" in caplog.text
     assert (tmp_path / PROVENANCE).read_text() == "{"

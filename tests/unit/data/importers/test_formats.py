@@ -229,7 +229,7 @@ def test_a_description_that_the_data_contradict_is_doubted(tmp_path: Path) -> No
     report, _ = imported(tmp_path / "out", tmp_path / "raw", "lagrangebench")
     assert any("nodes spread over" in w and "along x in the first frame, which is periodic with 0.5 m" in w for w in report.warnings)
     assert not any("along y in the first frame" in w for w in report.warnings)
-    (spacing,) = (w for w in report.warnings if w.startswith("spacing is said to be 10 m, but nodes are 0.0"))
+    (spacing,) = (w for w in report.warnings if w.startswith("spacing is stored as 10 m, but nodes are 0.0"))
     assert spacing.endswith("spacing=… or bounds=… may be wrong")
     assert "dim = 3 in metadata.json, but bounds have 2 axes, as the data must" in report.warnings
 

@@ -97,7 +97,7 @@ def test_nodes_at_one_place_are_named(tmp_path: Path) -> None:
         made.append(Trajectory.from_numpy(pos, DT, "sand", {"sand": 30.0}, spacing=SPACING))
     report = save_dataset(tmp_path, "sand", train=made)
     assert sorted(w for w in report.warnings if "do bodies overlap?" in w) == [
-        f"{split}, train[{k}], frame 0: 2 nodes lie where another one is, the first of them node 2: do bodies overlap?"
+        f"{split}, train[{k}], frame 0: 2 nodes are at the place of another node, the first is node 2: do bodies overlap?"
         for k, split in ((1, "test"), (0, "train"), (2, "val"))
     ]
 
