@@ -13,7 +13,7 @@ author = "the gpe_pl developers"
 version = release = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["version"]
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx_copybutton"]
-exclude_patterns = ["_build", "results/*/*.md"]  # those tables are included by pages
+exclude_patterns = ["_build", "results/*/*.md"]  # pages include those tables
 templates_path = ["_templates"]
 
 myst_enable_extensions = ["dollarmath"]
@@ -41,18 +41,18 @@ copybutton_exclude = ".linenos, .gp"
 
 
 def escape_bars(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Formulas have norms, |x|, which would be substitutions."""
+    """Escape the bars of norms, |x|, which reStructuredText would read as substitutions."""
     for k, line in enumerate(lines):
         parts = line.split("``")
         lines[k] = "``".join(part if inside % 2 else re.sub(r"\|(?=\S)", r"\\|", part) for inside, part in enumerate(parts))
 
 
 def skip_described_fields(app: Any, what: str, name: str, obj: Any, skip: bool, options: Any) -> bool | None:
-    """Fields of a NamedTuple stand in its docstring."""
+    """Leave out the fields of a NamedTuple, which its docstring describes."""
     return True if isinstance(obj, _tuplegetter) else None
 
 
 def setup(app: Any) -> None:
-    """Called by Sphinx."""
+    """Connect the functions above. Sphinx calls this."""
     app.connect("autodoc-skip-member", skip_described_fields)
-    app.connect("autodoc-process-docstring", escape_bars, priority=400)  # before napoleon makes reStructuredText of it
+    app.connect("autodoc-process-docstring", escape_bars, priority=400)  # before napoleon converts it to reStructuredText
