@@ -28,7 +28,7 @@ from gpe_pl.metrics import bootstrap_interval, energy_distance
 from gpe_pl.reports.finished_runs import Run
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.rollout.containment import Contained
-from gpe_pl.rollout.loop import SimulationError, Simulator
+from gpe_pl.rollout.loop import SimulationError, Simulator, steps
 from gpe_pl.schema import Split
 from gpe_pl.solvers.resolution import Resolved, coarser, finer
 from gpe_pl.training.budget import read_times
@@ -214,9 +214,9 @@ def _simulators(
             continue
         if solver is not None:
             yield f"solver, {SPACING}{factor:g}", "solver", solver, _Restricted(resolved, True)
-    for steps in settings.step_factors:
-        if (solver := _with_longer_steps(spec, steps)) is not None:
-            yield f"solver, {STEPS}{steps}", "solver", solver, _Restricted(same, True, steps)
+    for longer in settings.step_factors:
+        if (solver := _with_longer_steps(spec, longer)) is not None:
+            yield f"solver, {STEPS}{longer}", "solver", solver, _Restricted(same, True, longer)
     dt = spec.solver.frame_dt
     for label, (simulator, _) in models.items():
         at = _Restricted(Resolved(simulator.initial_state(data, history), lambda pos: pos), False)
@@ -285,30 +285,30 @@ def _timed(simulator: Any, at: _Restricted, data: Trajectory, history: int) -> t
     The first step runs twice and is timed once, so that compilation and first use of memory do not count. A failed rollout ends early. Frames within a step
     are interpolated.
     """
-    state: Any = at.resolved.state
+    start: Any = at.resolved.state
     dt = data.metadata.frame_dt
     first, every = 0 if at.from_start else history, at.frames_per_step
     wanted = data.num_frames - first
-    frames, seconds, steps = [_numpy(state)], 0.0, 0
+    frames, seconds, num_steps = [_numpy(start)], 0.0, 0
     try:
-        simulator.step(state)
-        for _ in range(-(-(wanted - 1) // every)):
-            begun = time.perf_counter()
-            state = simulator.step(state)
+        simulator.step(start)
+        begun = time.perf_counter()
+        for state in steps(simulator, start, -(-(wanted - 1) // every)):
             if isinstance(state.pos, torch.Tensor) and state.pos.is_cuda:
                 torch.cuda.synchronize()
             seconds += time.perf_counter() - begun
-            steps += 1
+            num_steps += 1
             pos, vel = _numpy(state)
             if not np.isfinite(pos).all():
                 break
             frames += [_between(frames[-1], (pos, vel), k / every) for k in range(1, every)] + [(pos, vel)]
+            begun = time.perf_counter()
     except SimulationError as error:
         log.info("%s stopped: %s", type(simulator).__name__, error)
     pos = np.stack([at.resolved.restrict(p) for p, _ in frames[:wanted]])
     vel = np.stack([(at.resolved.restrict(p + dt * v) - at.resolved.restrict(p)) / dt for p, v in frames[:wanted]])
     trajectory = replace(data, pos=pos, vel=vel, stress=None).frames(history - first)
-    return trajectory, seconds / max(1, steps) / (every * dt)
+    return trajectory, seconds / max(1, num_steps) / (every * dt)
 
 
 def _between(before: Frame, after: Frame, share: float) -> Frame:

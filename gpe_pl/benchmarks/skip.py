@@ -19,7 +19,7 @@ from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.momentum_conv import EdgeState
-from gpe_pl.rollout.loop import Simulator
+from gpe_pl.rollout.loop import Simulator, steps
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import param_names
 from gpe_pl.system.machine import synchronized
@@ -202,10 +202,8 @@ def _hold_time_ratio(settings: Settings, edge_state: EdgeState, builder: GraphBu
         runner = approximate(simulator(settings, edge_state, builder, skips))
 
         def call() -> State:
-            state = scene
-            for _ in range(hold):
-                state = runner.step(state)
-            return state
+            *_, last = steps(runner, scene, hold)
+            return last
 
         return synchronized(call, settings.device)
 

@@ -33,7 +33,7 @@ def approximate(simulator: LearnedSimulator) -> Simulator:
     return runner if skips.hold == 1 else Holding(runner, dt, skips.hold)
 
 
-class _Batched(ABC):
+class Batched(ABC):
     """``step`` from ``step_all``."""
 
     @abstractmethod
@@ -54,7 +54,7 @@ class _Rest:
     count: Tensor
 
 
-class Sleeping(_Batched):
+class Sleeping(Batched):
     """Islands at rest stand still and are not computed, until something that is not at rest, a wall included, comes within the graph's radius of them.
 
     An island (``graphs.islands``, by the radius of the graph) sleeps when the steps of all its nodes have been shorter and more even than
@@ -163,7 +163,7 @@ class _Held:
     inner: Any
 
 
-class Holding(_Batched):
+class Holding(Batched):
     """Asks a simulator once for every ``frames`` frames and holds its accelerations in between, in which contacts that begin or end go unnoticed.
 
     Args:

@@ -1,4 +1,5 @@
-"""``Simulator``, the protocol shared by solvers and learned models, and ``rollout``, the only time loop.
+"""``Simulator``, the protocol shared by solvers and learned models, and the time loop, ``step_scenes``: ``rollout`` collects
+its frames with a guard, ``steps`` yields its states without one.
 
 A guard looks at every new state. When it finds a state that cannot be trusted, the rollout stops there, keeps the good frames and says why.
 """
@@ -6,7 +7,7 @@ A guard looks at every new state. When it finds a state that cannot be trusted, 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol, cast, runtime_checkable
 
@@ -276,26 +277,54 @@ class Start:
 
 def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int, int, State | Termination]]:
     """Step all scenes side by side and yield (scene, frame, new state), or a ``Termination`` as a scene's last item. Holds one state per scene."""
-    live = {}
-    guards = [None if start.guard is None else start.guard.of(start.state) for start in starts]
-    for scene, (start, guard) in enumerate(zip(starts, guards, strict=True)):
+    live, num_steps, guards = dict[int, State](), dict[int, int](), dict[int, Guard]()
+    for scene, start in enumerate(starts):
+        guard = None if start.guard is None else start.guard.of(start.state)
         impossible = (
             unfit(simulator, start.metadata)
             or unsound(start.state, start.metadata)
             or (None if guard is None else guard.check(start.state, 0))
         )
-        if impossible is None:
-            live[scene] = start.state
-        else:
+        if impossible is not None:
             yield scene, 0, impossible
-    frame = 0
+            continue
+        live[scene], num_steps[scene] = start.state, start.num_steps
+        if guard is not None:
+            guards[scene] = guard
+    yield from step_scenes(simulator, live, num_steps, guards)
+
+
+def steps(simulator: Simulator, state: State, num_steps: int) -> Iterator[State]:
+    """Yield the states after each step of one scene, without a guard.
+
+    Raises:
+        SimulationError: a step failed; names the frame.
+    """
+    for _, _, item in step_scenes(simulator, {0: state}, {0: num_steps}):
+        if isinstance(item, Termination):
+            raise SimulationError(item.message, reason=item.reason, node=item.node)
+        yield item
+
+
+def step_scenes(
+    simulator: Simulator, states: Mapping[int, State], num_steps: Mapping[int, int], guards: Mapping[int, Guard] | None = None
+) -> Iterator[tuple[int, int, State | Termination]]:
+    """Yield what ``frames`` yields, for scenes that need no check of their start. This is the time loop: everything that advances a scene calls it.
+
+    Args:
+        simulator: steps all scenes together if it can.
+        states: start of each scene, by its number.
+        num_steps: frames to add to each scene.
+        guards: of scenes that have one.
+    """
+    live, frame = dict(states), 0
     while True:
         frame += 1
-        live = {scene: state for scene, state in live.items() if frame <= starts[scene].num_steps}
+        live = {scene: state for scene, state in live.items() if frame <= num_steps[scene]}
         if not live:
             return
         for scene, item in zip(list(live), step_all(simulator, list(live.values())), strict=True):
-            stop = _termination(item, frame, guards[scene], live[scene])
+            stop = _termination(item, frame, (guards or {}).get(scene), live[scene])
             if stop is None:
                 live[scene] = cast(State, item)
             else:

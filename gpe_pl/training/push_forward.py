@@ -16,8 +16,9 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.data.dataset import Start
 from gpe_pl.graphs.batching import batched
+from gpe_pl.learned.approximate import Batched
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
-from gpe_pl.rollout.loop import SimulationError
+from gpe_pl.rollout.loop import SimulationError, step_scenes
 from gpe_pl.system import ranks
 from gpe_pl.trajectory.state import State
 
@@ -131,22 +132,27 @@ def _moved(start: State, scene: dict[str, Any]) -> State:
     return replace(start, **values)
 
 
+@dataclass(frozen=True)
+class _Trainable(Batched):
+    """A learned simulator whose states can be trained on; those of ``LearnedSimulator.step_all`` are for inference only."""
+
+    simulator: LearnedSimulator
+
+    def step_all(self, states: list[State]) -> list[State | SimulationError]:
+        return self.simulator.next_states(states)
+
+
 @torch.no_grad()
 def walked(simulator: LearnedSimulator, starts: Sequence[Start]) -> tuple[list[State], list[int]]:
     """States after each start's own steps, all starts at once, and how many steps they made: fewer where a scene has no graph any more."""
     states, steps = [start.state for start in starts], [0] * len(starts)
-    going = [k for k, start in enumerate(starts) if start.own_steps]
+    num_steps = {k: start.own_steps for k, start in enumerate(starts)}
     was_training = simulator.training
     simulator.eval()
     try:
-        while going:
-            new = simulator.next_states([states[k] for k in going])
-            for k, state in zip(going, new, strict=True):
-                if not isinstance(state, SimulationError):
-                    states[k], steps[k] = state, steps[k] + 1
-            going = [
-                k for k, state in zip(going, new, strict=True) if not isinstance(state, SimulationError) and steps[k] < starts[k].own_steps
-            ]
+        for k, step, item in step_scenes(_Trainable(simulator), dict(enumerate(states)), num_steps):
+            if isinstance(item, State):
+                states[k], steps[k] = item, step
     finally:
         simulator.train(was_training)
     return states, steps

@@ -11,7 +11,7 @@ from torch import Tensor
 from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, in_double, inapplicable, stress_test
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gns import GNS
-from gpe_pl.rollout.loop import Guard, rollout
+from gpe_pl.rollout.loop import Guard, rollout, steps
 from gpe_pl.trajectory.state import State
 
 NUM_STEPS = 300
@@ -51,8 +51,7 @@ def linear_momentum(subject: Subject) -> Outcome:
     limit = 50 * torch.finfo(torch.float32).eps * state.num_nodes**0.5
     impulse, start = 0.0, (state.mass[:, None] * state.vel).sum(dim=0)
     now = state
-    for _ in range(NUM_STEPS):
-        new = subject.simulator.step(now)
+    for new in steps(subject.simulator, state, NUM_STEPS):
         impulse += float((state.mass[:, None] * (new.vel - now.vel)).norm(dim=1).sum())
         now = new
     drift = float(((state.mass[:, None] * now.vel).sum(dim=0) - start).norm()) / impulse

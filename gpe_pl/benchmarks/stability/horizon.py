@@ -19,7 +19,7 @@ from gpe_pl.graphs.features import history_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import displacement
 from gpe_pl.rollout.containment import Contained
-from gpe_pl.rollout.loop import Simulator, Start, rollout, rollouts
+from gpe_pl.rollout.loop import Simulator, Start, rollout, rollouts, steps
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -153,9 +153,8 @@ def settle(subject: Subject) -> State | str:
     length = max(subject.horizon_factors) * subject.spec.num_frames
     fastest = math.inf
     for index in range(len(subject.scenes)):
-        state = initial_state(subject.spec, "test", index)
-        for frame in range(round(min(length, 5 * subject.spec.num_frames))):
-            state = subject.spec.solver.step(state)
+        start, num_steps = initial_state(subject.spec, "test", index), round(min(length, 5 * subject.spec.num_frames))
+        for frame, state in enumerate(steps(subject.spec.solver, start, num_steps)):
             speed = float(np.linalg.norm(state.vel, axis=-1).max()) * subject.dt / subject.spacing
             fastest = min(fastest, speed)
             if speed < AT_REST and frame > subject.spec.num_frames // 2:
@@ -184,10 +183,9 @@ def separation(simulator: Simulator, state: State, num_steps: int, spacing: floa
     noise: Any = np.random.default_rng(seed).normal(size=tuple(state.pos.shape))
     noise *= PERTURBATION * size / np.sqrt(np.square(noise).sum(axis=-1).mean())
     is_torch = isinstance(state.pos, torch.Tensor)
-    a, b = state, replace(state, pos=state.pos + (torch.from_numpy(noise) if is_torch else noise))
+    twin = replace(state, pos=state.pos + (torch.from_numpy(noise) if is_torch else noise))
     found = [PERTURBATION * size / spacing]
-    for _ in range(num_steps):
-        a, b = simulator.step(a), simulator.step(b)
+    for a, b in zip(steps(simulator, state, num_steps), steps(simulator, twin, num_steps), strict=True):
         distance = np.asarray(a.pos) - np.asarray(b.pos)
         found.append(float(np.sqrt(np.square(distance).sum(axis=-1).mean())) / spacing)
         if not math.isfinite(found[-1]):
@@ -210,25 +208,26 @@ def growth_rate(separations: np.ndarray, spacing: float, saturated: float = 0.1)
 def resuming(subject: Subject) -> Outcome:
     start = subject.state(0, 0.0)
     simulator = Contained(subject.simulator, subject.dt)
-    whole = _advanced(simulator, start, 200)
-    again = _advanced(simulator, start, 200)
-    half = _advanced(simulator, start, 100)
+    whole = advanced(simulator, start, 200)
+    again = advanced(simulator, start, 200)
+    half = advanced(simulator, start, 100)
     with tempfile.TemporaryDirectory() as folder:
         subject.simulator.save(Path(folder) / "model.ckpt")
         np.savez(Path(folder) / "state.npz", pos=half.pos, vel=half.vel, history=history_of(half))
         loaded = np.load(Path(folder) / "state.npz")
         pos, vel, history = (torch.from_numpy(loaded[name]) for name in ("pos", "vel", "history"))
         resumed = Contained(LearnedSimulator.from_checkpoint(Path(folder) / "model.ckpt"), subject.dt)
-    rest = _advanced(resumed, replace(half, pos=pos, vel=vel, velocity_history=history), 100)
+    rest = advanced(resumed, replace(half, pos=pos, vel=vel, velocity_history=history), 100)
     equal = {"resumed": torch.equal(rest.pos, whole.pos), "repeated": torch.equal(again.pos, whole.pos)}
     finite = bool(torch.isfinite(whole.pos).all())
     text = ", ".join(f"{name} {'equal' if is_equal else 'different'}" for name, is_equal in equal.items())
     return Outcome(all(equal.values()) and finite, text)
 
 
-def _advanced(simulator: Simulator, state: State, num_steps: int) -> State:
-    for _ in range(num_steps):
-        state = simulator.step(state)
+def advanced(simulator: Simulator, state: State, num_steps: int) -> State:
+    """Return the state after some steps without a guard."""
+    for after in steps(simulator, state, num_steps):
+        state = after
     return state
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch_geometric.data import HeteroData
 
-from gpe_pl.benchmarks.stability.horizon import PERTURBATION, separation
+from gpe_pl.benchmarks.stability.horizon import PERTURBATION, advanced, separation
 from gpe_pl.benchmarks.stability.inputs import Spoiled
 from gpe_pl.benchmarks.stability.subject import (
     Outcome,
@@ -31,7 +31,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.testing.changes import in_order, permuted, to_dtype
 from gpe_pl.metrics import per_frame_mse
 from gpe_pl.rollout.containment import Contained
-from gpe_pl.rollout.loop import Guard, rollout
+from gpe_pl.rollout.loop import Guard, rollout, steps
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.system.machine import resident_bytes
 from gpe_pl.training.module import TrainingModule
@@ -44,9 +44,7 @@ NUM_STEPS = 100
 def single_precision(subject: Subject) -> Outcome:
     start = subject.state(0, 0.0)
     single, double = Contained(subject.simulator, subject.dt), Contained(in_double(subject.simulator), subject.dt)
-    a = b = start
-    for _ in range(NUM_STEPS):
-        a, b = single.step(a), double.step(b)
+    a, b = (advanced(simulator, start, NUM_STEPS) for simulator in (single, double))
     difference = float((a.pos - b.pos).square().sum(dim=1).mean().sqrt()) / subject.spacing
     twin = float(separation(single, start, NUM_STEPS, subject.spacing, subject.simulator.builder.metadata.longest_side)[-1])
     text = f"{difference:.2g} spacings, twins {PERTURBATION:g} of the domain apart {twin:.2g}"
@@ -69,10 +67,8 @@ def implementations(subject: Subject) -> Outcome:
 
 @stress_test(27, "memory and recompilation", "200 steps with changing edges: resident memory grows by < 1 % after 50; ≤ 3 recompilations")
 def memory(subject: Subject) -> Outcome:
-    simulator, state = Contained(subject.simulator, subject.dt), subject.state(0, 0.0)
     used, edges, num_compiled = [], set(), compilations()
-    for _ in range(200):
-        state = simulator.step(state)
+    for state in steps(Contained(subject.simulator, subject.dt), subject.state(0, 0.0), 200):
         used.append(resident_bytes())
         graph = subject.simulator.builder(state)
         edges.add(sum(graph[r].edge_index.shape[1] for r in subject.simulator.builder.spec.relations))
