@@ -1,6 +1,7 @@
-"""Equal time for every model: a budget of minutes becomes a number of steps, from a step time that is measured once and then written down.
+"""Time budgets: convert ``budget_minutes`` into a number of training steps, so that all models train for the same time.
 
-Runs count steps only, so a resumed run ends where an uninterrupted one does; all seeds of a sweep share the measurement.
+The time of one step is measured once and stored in a file, which all seeds of a sweep share. Runs count steps only, so a resumed run ends at the same step as
+an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -35,23 +36,24 @@ WARM_UP_STEPS = NUM_LANES
 MEASURED_STEPS = 25
 ROUNDS = 5
 SHARE_TO_MEASURE = 0.5
-"""Of a budget: no further round begins once measuring has taken as long."""
+"""Fraction of the budget after which no further round of measurements begins."""
 TIMES = TypeAdapter(dict[str, Annotated[float, Field(gt=0, strict=True)]])
 RATE = "FLOP/s in products"
-"""In a file of step times: what the machine did when the first of them was measured."""
+"""Key in a file of step times: the rate of matrix products [FLOP/s] on the machine that measured the first step time."""
 PRODUCTS = (4096, 128)
-"""Rows and channels of the products that are timed for it."""
+"""Rows and channels of the matrix products that are timed for ``RATE``."""
 SAME_MACHINE = 1.4
-"""Rates further apart than this factor are of different machines, or of a busy one."""
+"""Rates that differ by more than this factor come from different machines, or from a busy one."""
 
 
 def step_time_key(config: dict[str, Any], training: TrainingSettings, trainer: TrainerSettings, data: str | None = None) -> str:
-    """A name for what the time of a training step depends on.
+    """Key of a step time: a text that differs where the time of a training step can differ.
 
     Args:
-        config: of the run, resolved, without the tables of data and sizes (``run_folder.without_tables``), as offers to others must not change the name.
+        config: resolved configuration of the run without its lookup tables of data and sizes (``run_folder.without_tables``). Entries for other data must not
+            change the key.
         training, trainer: the same settings as objects.
-        data: checksum of imported data, of which the configuration says only the name; None: it says how the data are made.
+        data: checksum of imported data, which the configuration gives by name only. None for generated data, which the configuration describes in full.
     """
     parts = {key: config[key] for key in ("graph", "model", "data", "batching")} | {
         "batch_size": training.batch_size,
@@ -66,11 +68,11 @@ def step_time_key(config: dict[str, Any], training: TrainingSettings, trainer: T
 
 
 class BudgetError(GpeError, ValueError):
-    """The file of measured step times cannot be used; names it and what to do."""
+    """The file of measured step times cannot be used. The message names the file and says what to do."""
 
 
 def mean_step_time(module: TrainingModule, data: WindowDataset, size: BatchSize, settings: TrainingSettings) -> float:
-    """Seconds per optimiser step, over a run that begins without own steps of the model and may end with them."""
+    """Mean time per optimiser step [s] over a whole run: without push-forward at first, with it in the last ``push_share`` of the steps."""
     limit = math.inf if settings.budget_minutes is None else SHARE_TO_MEASURE * 60 * settings.budget_minutes
     if not settings.push_share:
         return step_time(module, data, size, settings.gradient_clip, limit=limit)
@@ -87,10 +89,10 @@ def step_time(
     push_forward: PushForward | None = None,
     limit: float = math.inf,
 ) -> float:
-    """Seconds per optimiser step, the building of its graphs included: processor time, or on a GPU wall time, in the fastest of several rounds.
+    """Time per optimiser step [s], including the building of its graphs: the fastest of several rounds.
 
-    No round but the first begins after ``limit`` seconds of them. Other processes can only lengthen a step, through shared caches and memory even where
-    processor time is counted.
+    The time is processor time on a CPU and wall time on a GPU. The fastest round counts because other processes can only lengthen a step: even processor time
+    grows when they share caches and memory. After ``limit`` seconds of rounds no further one begins; the first always runs.
     """
     on_gpu = next(module.parameters()).is_cuda
     clock = time.perf_counter if on_gpu else time.process_time
@@ -124,16 +126,16 @@ def _on(device: torch.device, samples: Samples) -> Samples:
 def within_budget(
     settings: TrainingSettings, path: Path, key: str, measure: Callable[[TrainingSettings], float], device: str = "cpu"
 ) -> TrainingSettings:
-    """Settings with the number of steps that ``settings.budget_minutes`` allow, and as many validations as before.
+    """Settings with the number of steps that fits into ``settings.budget_minutes``, and as many validations as before.
 
-    The time of compiling is not part of the budget.
+    The budget does not include the time of compilation.
 
     Args:
-        settings: with a budget.
-        path: JSON file of step times [s], shared by the runs of a sweep, whose trainings pause meanwhile (``PauseForMeasurements``).
-        key: in that file, what the step time depends on.
-        measure: step time [s] under given settings; called if the file does not have it yet.
-        device: what is used of the machine. If it is faster or slower than where the file's first time was measured, a warning says so.
+        settings: settings with a budget.
+        path: JSON file of step times [s]. The runs of a sweep share it, and their trainings pause during a measurement (``PauseForMeasurements``).
+        key: key of the step time in that file (``step_time_key``).
+        measure: measures the step time [s] under given settings; called if the file does not have it yet.
+        device: device to compute on. A warning says if it is faster or slower than the one on which the file's first time was measured.
 
     Raises:
         BudgetError: the file is damaged.
@@ -154,7 +156,7 @@ def within_budget(
 
 
 def _measured(settings: TrainingSettings, measure: Callable[[TrainingSettings], float]) -> float:
-    """Step time as the run will have it: ``compile: auto`` depends on the number of steps."""
+    """Step time [s] with or without compilation, as in the run itself: with ``compile: auto`` that depends on the number of steps."""
     assert settings.budget_minutes is not None
     if settings.compile != "auto":
         return measure(settings)
@@ -164,22 +166,22 @@ def _measured(settings: TrainingSettings, measure: Callable[[TrainingSettings], 
 
 
 def _check_machine(times: dict[str, float], path: Path, key: str, device: str) -> None:
-    """Warn if times so far are of another machine; equal budgets on both are not equal work. In an empty file, write down what this one does."""
+    """Warn if the stored times come from another machine, as equal budgets on both are not equal work. Into empty ``times``, add this machine's rate."""
     rate = gemm_rate(*PRODUCTS, device)
     before = times.get(RATE, rate) if times else times.setdefault(RATE, rate)
     if not 1 / SAME_MACHINE < rate / before < SAME_MACHINE:
         log.warning(
             "%s: its step times were measured where products ran at %.0f GFLOP/s, and here it is %.0f; %s gets a number of steps that does not compare "
-            "with the others'. To compare, delete the file and measure all here, on an idle machine",
+            "with those of the other runs. To compare, delete the file and measure all here, on an idle machine",
             *(path, 1e-9 * before, 1e-9 * rate, key),
         )
 
 
 class PauseForMeasurements(L.Callback):
-    """Holds a training while another run of its sweep measures a step time, which it would lengthen.
+    """Pauses a training while another run of its sweep measures a step time, which the training would lengthen.
 
     Args:
-        path: of the sweep's step times.
+        path: the sweep's file of step times.
     """
 
     def __init__(self, path: Path) -> None:
@@ -187,13 +189,13 @@ class PauseForMeasurements(L.Callback):
 
     def on_train_batch_start(self, *_: Any) -> None:
         if _announcement(self.path).exists():
-            with FileLock(_lock(self.path)):  # free once it is measured, or its process gone
+            with FileLock(_lock(self.path)):  # free once the measurement, or its process, has ended
                 _announcement(self.path).unlink(missing_ok=True)
 
 
 @contextmanager
 def _announced(path: Path) -> Iterator[None]:
-    """Inside, other trainings of the sweep pause before their next step."""
+    """Make other trainings of the sweep pause before their next step, for as long as the context lasts."""
     _announcement(path).touch()
     try:
         yield
@@ -210,7 +212,11 @@ def _announcement(path: Path) -> Path:
 
 
 def read_times(path: Path) -> dict[str, float]:
-    """Step times [s] by what they depend on, and the machine's rate; none where there is no file. Raises ``BudgetError`` where it is damaged."""
+    """Step times [s] by key, and the machine's rate under ``RATE``; empty if there is no file.
+
+    Raises:
+        BudgetError: the file is damaged.
+    """
     if not path.exists():
         return {}
     try:

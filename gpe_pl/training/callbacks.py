@@ -29,18 +29,18 @@ class WarmAverage(WeightAveraging):
     def __init__(self, decay: float = 0.999) -> None:
         def average(averaged: list[torch.Tensor], current: list[torch.Tensor], num_averaged: Any) -> None:
             n = int(num_averaged)
-            if averaged[0].is_floating_point():  # all of one call have one type
+            if averaged[0].is_floating_point():  # all tensors of one call have the same type
                 torch._foreach_lerp_(averaged, current, 1 - min(decay, (1 + n) / (10 + n)))
             else:
                 torch._foreach_copy_(averaged, current)
 
-        super().__init__(use_buffers=False, multi_avg_fn=average)  # copied: they do not learn, and may be infinite, which has no mean
+        super().__init__(use_buffers=False, multi_avg_fn=average)  # buffers are copied: they do not learn, and infinite values have no mean
 
 
 class RolloutValidation(Callback):
-    """Rolls the current (averaged) model out on validation trajectories and logs the position MSE as ``val/rollout_mse``.
+    """Rolls the current (averaged) model out on validation trajectories and logs the position MSE [m²] as ``val/rollout_mse``.
 
-    Stands before ``WarmAverage`` in the list of callbacks, so that it sees the averaged weights. Ranks share the trajectories.
+    Put it before ``WarmAverage`` in the list of callbacks, so that it sees the averaged weights. Each rank takes some of the trajectories.
 
     Args:
         trajectories: ground truth.
@@ -59,7 +59,7 @@ class RolloutValidation(Callback):
         simulator.eval()
         value = self._mse(simulator)
         simulator.train(was_training)
-        pl_module.log("val/rollout_mse", value, sync_dist=True)  # of all ranks already; Lightning advises it if not told
+        pl_module.log("val/rollout_mse", value, sync_dist=True)  # equal on all ranks already; without it Lightning warns
 
     def _mse(self, simulator: LearnedSimulator) -> float:
         history = simulator.builder.config.history
@@ -69,9 +69,9 @@ class RolloutValidation(Callback):
         for trajectory, truth in zip(trajectories, truths, strict=True):
             bounds = truth.metadata.bounds
             size = max(high - low for low, high in bounds)
-            guard = Guard(bounds=bounds, margin=size)  # what is so fast that it matters escapes within a frame
+            guard = Guard(bounds=bounds, margin=size)  # no max_speed: nodes that fast leave the domain within a frame
             starts.append(Start(simulator.initial_state(trajectory, history), truth.num_frames - 1, truth.metadata, guard))
-            worst.append(size**2)  # a rollout that stopped early counts as lost from there on
+            worst.append(size**2)  # error of the frames that a stopped rollout lacks
         contained = Contained(simulator, self.trajectories[0].metadata.frame_dt) if self.containment else simulator
         predictions = rollouts(contained, starts)
         errors = [per_frame_mse(p, t)[1:] for p, t in zip(predictions, truths, strict=True)]
@@ -83,7 +83,7 @@ class RolloutValidation(Callback):
 
 
 class StepProgress(Callback):
-    """Shows the steps of the whole training, also of a resumed one, in the terminal of the first process."""
+    """Shows a progress bar over all steps of a training in the terminal of the first process; a resumed training continues at its step."""
 
     def __init__(self) -> None:
         self._bar = ExitStack()

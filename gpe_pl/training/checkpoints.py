@@ -1,4 +1,4 @@
-"""Checkpoints of a run: when they are saved, what is remembered of them, and that they reach the disk whole or not at all."""
+"""Checkpoints of a run: decides when to save, keeps the best score, and writes each file whole or not at all."""
 
 from __future__ import annotations
 
@@ -22,23 +22,25 @@ from gpe_pl.system import ranks
 from gpe_pl.training.interruption import Interruption
 
 SCORE = "val/rollout_mse"
-"""The validation whose model has the lowest becomes the best checkpoint."""
+"""Metric of a validation; the model with its lowest value becomes the best checkpoint."""
 
 
 class Checkpoints(Checkpoint):
-    """Saves ``last.ckpt`` after every validation, every so many seconds between them, and when training is interrupted; ``best.ckpt`` after the best.
+    """Saves ``last.ckpt`` regularly, and ``best.ckpt`` after each validation that is better than all before it.
 
-    A checkpoint remembers the best score and its step, and no path: the files lie where this run's folder lies now. Ranks save and stop together.
+    ``last.ckpt`` is saved after every validation, every ``seconds`` between validations, and when training is interrupted. A checkpoint stores the best score
+    and its step but no path, so a run's folder can be moved. All ranks save and stop together.
 
     Args:
-        folder: of the two files.
-        seconds: between validations, from one ``last.ckpt`` to the next.
-        interruption: listened to from the first step on; ends training with ``KeyboardInterrupt`` when ``last.ckpt`` is saved.
+        folder: folder of the two files.
+        seconds: time from one ``last.ckpt`` to the next between validations [s].
+        interruption: notes signals from the first step on. After one, ``last.ckpt`` is saved and training ends with ``KeyboardInterrupt``.
 
     Attributes:
-        best_score, best_step: of ``best.ckpt``; None: there is none.
-        saved_step: of ``last.ckpt``; None: this training has neither loaded nor saved it.
-        has_begun: whether training steps are made, so that all of ``last.ckpt`` has been taken up.
+        best_score: validation score of ``best.ckpt`` [m²]; None if there is none.
+        best_step: training step of ``best.ckpt``; None if there is none.
+        saved_step: training step of ``last.ckpt``; None if this training has neither loaded nor saved it.
+        has_begun: whether training steps have begun, so that all of ``last.ckpt`` has been restored.
     """
 
     def __init__(self, folder: Path, seconds: float = math.inf, interruption: Interruption | None = None) -> None:
@@ -51,7 +53,7 @@ class Checkpoints(Checkpoint):
         self._saved_at = time.monotonic()
 
     def where_saved(self) -> str | None:
-        """Path and step of ``last.ckpt``, for messages; None: there is none."""
+        """Path and step of ``last.ckpt``, for messages; None if there is none."""
         if not self.last.exists():
             return None
         return str(self.last) if self.saved_step is None else f"{self.last}, step {self.saved_step}"
@@ -66,7 +68,7 @@ class Checkpoints(Checkpoint):
         interval = trainer.val_check_batch
         assert isinstance(interval, int)
         if trainer.global_step % interval == 0:
-            return  # the validation comes next, and saves; a run resumed from here would go on without it
+            return  # the validation comes next and saves; a run resumed from before it would skip it
         is_due = time.monotonic() - self._saved_at >= self.seconds
         stops, saves = self._agreed(pl_module, self.interruption.requested, is_due)
         if stops or saves:
@@ -89,21 +91,21 @@ class Checkpoints(Checkpoint):
 
     @staticmethod
     def _agreed(module: L.LightningModule, *wishes: bool) -> list[bool]:
-        """Which wishes any rank has; all ranks get the same answer."""
+        """For each wish, whether any rank has it; all ranks get the same answer."""
         if ranks.num_ranks() == 1:
             return list(wishes)
         return [bool(count) for count in ranks.summed(torch.tensor(wishes, dtype=torch.int64, device=module.device)).tolist()]
 
     @contextmanager
     def taken_up(self) -> Iterator[None]:
-        """Inside, whatever Lightning raises because ``last.ckpt`` holds something else than a training becomes a ``CheckpointError``."""
+        """Convert errors that Lightning raises inside this context, because ``last.ckpt`` is not a checkpoint of this training, to ``CheckpointError``."""
         try:
             yield
         except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
             if self.has_begun or not self.last.exists() or isinstance(error, GpeError | torch.OutOfMemoryError):
                 raise
             raise CheckpointError(
-                f"{self.last}: is none to resume from ({reason(error)}); delete the file, and the same command trains from the start"
+                f"{self.last}: training cannot resume from it ({reason(error)}); delete the file, and the same command trains from the start"
             ) from None
 
     # --- what is remembered ---------------------------------------------------------------------------------------------------------------
@@ -112,15 +114,15 @@ class Checkpoints(Checkpoint):
         return {"best_score": self.best_score, "best_step": self.best_step}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Take up what ``state_dict`` gave.
+        """Restore the best score and its step from the result of ``state_dict``.
 
         Raises:
-            CheckpointError: it is something else.
+            CheckpointError: ``state_dict`` holds something else.
         """
         score, step = (state_dict.get(key) for key in ("best_score", "best_step"))
         if (score, step) != (None, None) and not (type(score) is float and type(step) is int):
             raise CheckpointError(f"{self.last}: does not hold the score and step of the best checkpoint; delete the file")
-        if self.best.exists():  # else the next validation is the best one that there is
+        if self.best.exists():  # else the next validation is the best so far
             self.best_score, self.best_step = score, step
 
     def on_load_checkpoint(self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
@@ -128,9 +130,9 @@ class Checkpoints(Checkpoint):
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
-    """Checkpoints are written beside their place and renamed.
+    """Writes a checkpoint to a temporary file in the same folder and renames it.
 
-    Lightning writes them into the system's temporary folder, from where they are copied if that is another disk: a run that is killed meanwhile loses
+    Lightning's own class writes into the system's temporary folder and copies the file if that is another disk. A run that is killed during the copy loses
     both the old checkpoint and the new one.
     """
 
@@ -140,10 +142,10 @@ class AtomicCheckpoints(TorchCheckpointIO):
         replace_bytes(Path(path), content.getbuffer())
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = True) -> dict[str, Any]:
-        """Only tensors and plain values are unpickled, whatever the caller asks for.
+        """Content of a checkpoint. Unpickles only tensors and plain values, whatever ``weights_only`` says.
 
         Raises:
-            CheckpointError: not a readable checkpoint, or damaged.
+            CheckpointError: the file is damaged, or not a checkpoint.
         """
         try:
             return load_checkpoint(path, map_location)

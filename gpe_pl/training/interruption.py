@@ -1,4 +1,4 @@
-"""Signals that end a training: noted at once, obeyed at the next moment at which it can be saved."""
+"""Signals that end a training. They are noted at once; the training ends at the next step at which it can be saved."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from types import FrameType, TracebackType
 from typing import Any
 
 SIGNALS = ("SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2")
-"""Ctrl-C, the usual end of a process, and what clusters send before a job's time is over."""
+"""Signals of Ctrl-C (``SIGINT``), of ``kill`` (``SIGTERM``) and of clusters before a job's time is over (``SIGUSR1``, ``SIGUSR2``)."""
 
 NOTICE = (
     "interrupted: training saves a checkpoint after this step, or after the validation that is running; interrupt again to stop at once\n"
@@ -18,9 +18,12 @@ NOTICE = (
 
 
 class Interruption:
-    """Whether this process was asked to end. A second signal raises ``KeyboardInterrupt`` wherever the program is.
+    """Notes whether this process was asked to end. A second signal raises ``KeyboardInterrupt`` at once.
 
-    As a context manager it gives the signals back to whom they belonged before.
+    Use it as a context manager: on exit it restores the previous signal handlers.
+
+    Attributes:
+        requested: whether a signal has come since ``listen``.
     """
 
     def __init__(self) -> None:
@@ -28,14 +31,14 @@ class Interruption:
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Interruption:
-        if threading.current_thread() is threading.main_thread():  # Python lets no other thread change them
+        if threading.current_thread() is threading.main_thread():  # Python lets no other thread set handlers
             numbers = [getattr(signal, name) for name in SIGNALS if hasattr(signal, name)]
             self._before = {number: signal.getsignal(number) for number in numbers}
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         for number, handler in self._before.items():
-            if handler is not None:  # one that was not set from Python cannot be set from it
+            if handler is not None:  # None: not set from Python, so Python cannot restore it
                 signal.signal(number, handler)
 
     def listen(self) -> None:
@@ -48,4 +51,4 @@ class Interruption:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
-        os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, NOTICE.encode())  # print may be what was interrupted
+        os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, NOTICE.encode())  # print may be what the signal interrupted

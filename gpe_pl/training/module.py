@@ -1,4 +1,4 @@
-"""``LightningModule``: one-step loss, optimiser, learning-rate decay, and an early, clear stop when numbers go bad."""
+"""``LightningModule`` of a learned simulator: one-step loss, optimiser, learning-rate schedule, and a stop when losses are not finite."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ Schedule = Literal["cosine", "exponential"]
 Compile = Literal["auto", "on", "off"]
 
 MAX_SKIPPED, SKIP_WINDOW, MAX_IN_ROW = 10, 100, 3
-"""A run goes on without batches whose loss or gradient is not finite, unless there are so many of them within so many steps, or in a row."""
+"""Limits on skipped batches, whose loss or gradient is not finite. More than ``MAX_SKIPPED`` within ``SKIP_WINDOW`` steps, or ``MAX_IN_ROW`` in a row, stop the
+run."""
 
 COMPILE_PAYS_AFTER = 10_000
 """Steps from which ``compile: auto`` repays the time that compilation takes."""
@@ -37,41 +38,41 @@ RESUMED = {
     *("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers", "loops", "callbacks", "global_step"),
     *("skipped", "excursions"),
 }
-"""What a checkpoint holds from which a run goes on."""
+"""Keys that a checkpoint needs for a run to resume from it."""
 
 log = logging.getLogger(__name__)
 
 
 def clipped_norm(gradient_clip: float | None) -> float:
-    """The largest norm of a gradient; infinite without clipping: then the norm is only looked at."""
+    """Largest allowed norm of a gradient. Without clipping it is infinite, so that clipping still computes the norm and changes nothing."""
     return math.inf if gradient_clip is None else gradient_clip
 
 
 def _rows(tensor: Tensor) -> int:
-    """Nodes or edges in a tensor of a graph; ``edge_index`` has its edges in columns."""
+    """Number of nodes or edges in a tensor of a graph; ``edge_index`` has its edges in columns."""
     return tensor.shape[1] if tensor.dtype == torch.int64 and tensor.dim() == 2 else tensor.shape[0]
 
 
 class TrainingError(GpeError, RuntimeError):
-    """Training cannot go on; the message names step, trajectories and frames."""
+    """Training cannot continue; the message names step, trajectories and frames."""
 
 
 class TrainingModule(L.LightningModule):
     """Trains a ``LearnedSimulator`` on one-step accelerations.
 
-    The loss is the mean squared error of the normalised acceleration over all dynamic nodes and axes, which for a fixed frame interval is the paper's MSE of
-    the next position up to a constant.
+    The loss is the mean squared error of the normalised acceleration over all dynamic nodes and axes. For a fixed frame interval this is, up to a constant, the
+    paper's MSE of the next position.
 
     Args:
-        simulator: with statistics set.
+        simulator: simulator with its statistics set.
         num_steps: optimiser steps of the whole run; the schedule ends there.
-        learning_rate: at the start, in Adam.
-        final_learning_rate: at the end.
+        learning_rate: learning rate of Adam at the start.
+        final_learning_rate: learning rate at the end.
         schedule: ``exponential`` decays geometrically (paper: 5e-5 to 1e-6); ``cosine`` warms up and follows a half cosine (short budgets).
-        warmup_steps: linear warm-up of the ``cosine`` schedule.
-        stress_weight: of the mean squared error of the normalised stress, where the model decodes one, beside that of the acceleration.
-        compile: ``torch.compile`` the model: ``auto`` does so when the run is long enough, the model has no faster code of its own (``is_fused``, on a CPU)
-            and a C++ compiler is found.
+        warmup_steps: steps of linear warm-up in the ``cosine`` schedule.
+        stress_weight: weight of the mean squared error of the normalised stress, relative to that of the acceleration; used if the model decodes a stress.
+        compile: whether to apply ``torch.compile`` to the model. ``auto`` compiles if the run is long enough, the model has no fused passes for the device
+            (``is_fused``, on a CPU) and a C++ compiler is found.
     """
 
     def __init__(
@@ -99,12 +100,12 @@ class TrainingModule(L.LightningModule):
 
     def configure_optimizers(self) -> Any:
         optimizer = torch.optim.Adam(self.simulator.parameters(), lr=self.learning_rate, fused=True)
-        # a plain function: of anything else the scheduler stores the attributes in checkpoints
+        # a plain function: the scheduler would store the attributes of any other callable in checkpoints
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self.learning_rate_factor(step))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def learning_rate_factor(self, step: int) -> float:
-        """Learning rate at a step over ``learning_rate``."""
+        """Learning rate at a step divided by ``learning_rate``."""
         ratio = self.final_learning_rate / self.learning_rate
         if self.schedule == "exponential":
             return ratio ** (min(step, self.num_steps) / self.num_steps)
@@ -121,13 +122,13 @@ class TrainingModule(L.LightningModule):
 
     @contextmanager
     def compiled(self) -> Iterator[None]:
-        """Inside, training steps run the model's ``compute`` through ``torch.compile``, if that is wanted and works here."""
+        """Run the model's ``compute`` through ``torch.compile`` in training steps inside this context, if ``compile`` asks for it and it works here."""
         model = self.simulator.model
         is_long = self.num_steps - self.global_step >= COMPILE_PAYS_AFTER
         is_fast_already = self.device.type == "cpu" and model.is_fused
         wanted = self.compile_mode == "on" or (self.compile_mode == "auto" and is_long and not is_fast_already)
         if wanted and self.compile_mode == "auto" and not has_cpp_compiler():
-            log.warning("compile: auto found no C++ compiler, training runs without torch.compile")
+            log.warning("compile: auto found no C++ compiler; training runs without torch.compile")
             wanted = False
         if not wanted:
             yield
@@ -136,15 +137,15 @@ class TrainingModule(L.LightningModule):
         compiler_works = True
 
         def compute(*args: Any) -> Any:
-            # only training steps, and no sizes of one, which the compiler would specialise on: else it recompiles until it gives up
+            # only training steps, and no sizes of one: the compiler would specialise on them and recompile until it gives up
             nonlocal compiler_works
             if compiler_works and torch.is_grad_enabled() and all(_rows(t) > 1 for t in tree_leaves(args)):
                 try:
                     return fast(*args)
-                except Exception as error:  # whatever the machine's tool chain lacks
+                except Exception as error:  # depends on what the machine's tool chain lacks
                     if self.compile_mode == "on":
                         raise
-                    log.warning("compile: auto does without torch.compile (%s)", type(error).__name__)
+                    log.warning("compile: auto continues without torch.compile, which fails here (%s)", type(error).__name__)
                     compiler_works = False
             return plain(*args)
 
@@ -152,12 +153,13 @@ class TrainingModule(L.LightningModule):
         try:
             yield
         finally:
-            del model.compute  # back to the class's own
+            del model.compute  # restores the method of the class
 
     def loss(self, samples: Samples) -> Tensor:
-        """Mean squared error of the normalised accelerations, and of the normalised stress where there is one; of several ranks, the part of this one.
+        """Mean squared error of the normalised accelerations, plus that of the normalised stress if the model decodes one.
 
-        Starts are taken where the simulator has come to from them, and what it predicts there moves them on.
+        With several ranks, it is this rank's part of the sum. For push-forward samples, the graphs show the states that the unrolls have reached, and the
+        predictions advance these unrolls by one step.
         """
         batch = self._excursions.graphs(self.simulator, samples) if isinstance(samples, list) else samples
         predicted = self.simulator(batch)
@@ -179,44 +181,44 @@ class TrainingModule(L.LightningModule):
 
     @staticmethod
     def _weighted(batch: HeteroData, materials: Iterable[str], errors: list[Tensor]) -> list[Tensor]:
-        """Errors [node, …] of each material, times the weights of their graphs."""
+        """Errors [node, …] of each material, multiplied by the weights of their graphs."""
         weight = batch.weight.float()
         return [weight[batch[m].batch][:, None] * error for m, error in zip(materials, errors, strict=True)]
 
     def _shares(self, *errors: list[Tensor]) -> list[float]:
-        """How many of all ranks' errors of each kind are on this one. The ranks exchange it also where this one has none of a kind."""
+        """Fraction of all ranks' errors that is on this rank, for each kind. A rank without errors of a kind takes part in the exchange, too."""
         if ranks.num_ranks() == 1:
             return [1.0] * len(errors)
         here = torch.tensor([sum(e.numel() for e in kind) for kind in errors], device=self.device)
         return [n / max(1, total) for n, total in zip(here.tolist(), ranks.summed(here).tolist(), strict=True)]
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor | None:
-        """The loss, or None where it is not finite: then this step changes nothing."""
+        """Loss of a batch. Without a finite loss the step changes nothing; one process then returns None."""
         loss = self.loss(batch)
-        if not loss.requires_grad:  # all nodes are alone, and fall freely by design: this batch teaches nothing
+        if not loss.requires_grad:  # no node has an edge, so all fall freely by design: nothing to learn from this batch
             loss = loss + 0.0 * torch.stack([p.sum() for p in self.simulator.parameters() if p.requires_grad]).sum()
         total = ranks.summed(loss.detach())
         if not torch.isfinite(total):
             self._skip("loss", total)
-            return None if ranks.num_ranks() == 1 else loss  # ranks wait for each other's gradients, which are dropped afterwards
+            return None if ranks.num_ranks() == 1 else loss  # ranks wait for each other's gradients; clipping drops them
         self.log("train/loss", total, batch_size=1)
         return loss
 
     def configure_gradient_clipping(
         self, optimizer: torch.optim.Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
-        """Clip by norm, if that is wanted; a gradient that is not finite is dropped before it spoils the weights."""
+        """Clip the gradient by its norm if a clip value is set. A gradient that is not finite is dropped and leaves the weights unchanged."""
         norm = torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), clipped_norm(gradient_clip_val))
         if not torch.isfinite(norm):
             if not self._skipped or self._skipped[-1] != self.global_step:  # else its loss was not finite either
                 self._skip("gradient norm", norm)
-            optimizer.zero_grad(set_to_none=True)  # without gradients Adam leaves weights and moments as they are
+            optimizer.zero_grad(set_to_none=True)  # without gradients Adam changes neither weights nor moments
 
     def _skip(self, name: str, value: Tensor) -> None:
-        """Go on without a batch, unless too many of the last ones were like it; on all ranks, as the value is a sum over them.
+        """Count and report a skipped batch. All ranks do so together, as ``value`` is a sum over ranks.
 
         Raises:
-            TrainingError: names step, trajectories and frames.
+            TrainingError: too many of the last batches were skipped; names step, trajectories and frames.
         """
         windows = [window for part in ranks.gathered(self._windows) for window in part]
         what = f"step {self.global_step}: the {name} is {value.item()} for (trajectory, frame) = {', '.join(map(str, windows))}"
@@ -229,7 +231,7 @@ class TrainingModule(L.LightningModule):
                 "Lower training.learning_rate, or validate the data with `python -m gpe_pl.data.validate`"
             )
         self._skipped.append(self.global_step)
-        log.warning("%s; training goes on without this batch", what)
+        log.warning("%s; training continues without this batch", what)
 
     def validation_step(self, batch: HeteroData, batch_idx: int) -> None:
         predicted = self.simulator(batch).acceleration
@@ -237,10 +239,10 @@ class TrainingModule(L.LightningModule):
             self.val_nmse.update(value, self._normalized(batch[material].target))
 
     def on_validation_start(self) -> None:
-        self._excursions.clear()  # they have drifted from the weights, and the checkpoints that follow stay small
+        self._excursions.clear()  # they were made with older weights; and the checkpoints that follow stay small
 
     def on_validation_epoch_end(self) -> None:
-        self.log("val/one_step_nmse", self.val_nmse.compute(), sync_dist=True)  # of all ranks already; Lightning advises it if not told
+        self.log("val/one_step_nmse", self.val_nmse.compute(), sync_dist=True)  # equal on all ranks already; without it Lightning warns
         self.val_nmse.reset()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -251,7 +253,7 @@ class TrainingModule(L.LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         missing = RESUMED - checkpoint.keys()
         if missing:
-            raise CheckpointError(f"last.ckpt: has no {min(missing)}, and is none to resume from; delete the file to train from the start")
+            raise CheckpointError(f"last.ckpt: has no {min(missing)}, which resuming needs; delete the file to train from the start")
         self._skipped.extend(checkpoint["skipped"])
         self._excursions.load_state_dict(checkpoint["excursions"])
 

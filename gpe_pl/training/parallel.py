@@ -1,9 +1,9 @@
-"""Data parallelism: every process computes its part of each batch, and the parts of the gradient are summed::
+"""Data parallelism: every process computes its part of each batch, and the processes sum their gradients::
 
     L = Σ_r L_r,   L_r = Σ_{i on rank r} ‖a_i − â_i‖² / (D Σ_r N_r),   ∇L = Σ_r ∇L_r
 
-with the number N_r of nodes on rank r, so that L is the mean over all nodes of the batch, however they are spread. Averaging the gradients of per-process
-means instead, which is what ``DistributedDataParallel`` does, weighs a node by how few others its process has.
+N_r is the number of nodes on rank r. L is therefore the mean over all nodes of the batch, however they are distributed over the ranks.
+``DistributedDataParallel`` averages the gradients of per-process means instead, which gives more weight to the nodes of processes that have few.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from torch import Tensor, nn
 def sum_gradients(parameters: Iterable[nn.Parameter]) -> None:
     """Replace every gradient by its sum over ranks, in one message.
 
-    A gradient that a rank lacks, because none of its graphs has nodes of that type, counts as zero. One that all ranks lack stays absent, as in one process,
-    where the optimiser leaves such a parameter and its moments alone.
+    A rank lacks a gradient if none of its graphs has nodes of that type; it then counts as zero. A gradient that all ranks lack stays None, as in a single
+    process: the optimiser then changes neither the parameter nor its moments.
     """
     parameters = list(parameters)
     is_there = torch.tensor([float(p.grad is not None) for p in parameters], device=parameters[0].device)
@@ -35,7 +35,7 @@ def sum_gradients(parameters: Iterable[nn.Parameter]) -> None:
 
 
 def end_later_processes() -> None:
-    """End all processes of a run but the first, which alone does what follows the training."""
+    """End all processes of a run except the first, which alone continues after the training."""
     if rank_zero_only.rank > 0:  # type: ignore[attr-defined]
         sys.exit()
     if dist.is_available() and dist.is_initialized():
@@ -43,9 +43,9 @@ def end_later_processes() -> None:
 
 
 class SummedGradients(DDPStrategy):
-    """Lightning's processes and devices of DDP, with ``sum_gradients`` in place of its wrapper around the module.
+    """Lightning's DDP strategy with ``sum_gradients`` instead of its wrapper around the module.
 
-    All ranks start from the weights and statistics of rank 0, and add the same numbers ever after, so that their weights stay equal bit for bit.
+    All ranks start from the weights and statistics of rank 0 and then apply the same updates, so their weights stay equal bit for bit.
     """
 
     def setup_environment(self) -> None:
@@ -55,13 +55,13 @@ class SummedGradients(DDPStrategy):
         module.load_state_dict(self.broadcast(module.state_dict()))
 
     def configure_ddp(self) -> None:
-        """Leaves the module as it is."""
+        """Do nothing: the module needs no wrapper."""
 
     def post_backward(self, closure_loss: Tensor) -> None:
         assert self.lightning_module is not None
         sum_gradients(p for p in self.lightning_module.parameters() if p.requires_grad)
 
     def on_exception(self, exception: BaseException) -> None:
-        """End the processes that this one has started: they would wait for it for ever."""
+        """End the processes that this one has started, which would otherwise wait for it forever."""
         for process in getattr(self.launcher, "procs", []):
             process.kill()

@@ -1,7 +1,7 @@
-"""Training states that a simulator has come to by itself.
+"""Push-forward: trains a simulator on states that its own unrolls reach.
 
-A step of training predicts what the simulator needs for a step of its own, so the way on is free: every batch of states is trained on, moved on by that
-prediction, and waits until its turn comes again.
+A training step predicts the accelerations that the unroll needs for its next step, so the unroll costs no extra pass of the model. Each batch of states is
+trained on, advanced by this prediction, and kept until its lane comes up again.
 """
 
 from __future__ import annotations
@@ -23,12 +23,19 @@ from gpe_pl.system import ranks
 from gpe_pl.trajectory.state import State
 
 MOVED = ("pos", "vel", "velocity_history", "time")
-"""Of a state: what a step changes, apart from a moving boundary, which follows from the number of steps."""
+"""Fields of a state that a step changes. A moving boundary changes, too, but follows from the number of steps."""
 
 
 @dataclass
 class Excursion:
-    """A batch under way: its samples, where each of them is, and after how many steps of its own."""
+    """A batch of scenes in the middle of their unrolls.
+
+    Attributes:
+        samples: number of each scene's sample in the data set.
+        states: state that each unroll has reached.
+        steps: steps of each unroll.
+        graphs: graphs of ``states``; empty between ``move_on`` and the next call of ``graphs``.
+    """
 
     samples: list[int]
     states: list[State]
@@ -37,13 +44,13 @@ class Excursion:
 
 
 Stored = dict[int, dict[int, dict[str, Any]]]
-"""Of each lane, and each sample in it: what a scene has come to, other than by its start; see ``Excursions.state_dict``."""
+"""Unrolls by lane and sample as a checkpoint stores them: ``steps`` and the fields in ``MOVED`` (see ``Excursions.state_dict``)."""
 
 
 class Excursions:
-    """All batches that a simulator is under way with, one per lane (see ``PushForward``).
+    """All batches that a simulator is unrolling, one per lane (see ``PushForward``).
 
-    After ``clear`` they are walked again from their starts, with the weights of the day.
+    After ``clear``, the unrolls are repeated from their starts with the current weights.
     """
 
     def __init__(self) -> None:
@@ -55,8 +62,8 @@ class Excursions:
         self._loaded.clear()
 
     def state_dict(self) -> Stored:
-        """Where all scenes of all ranks are: ``steps``, ``time`` and the tensors ``pos``, ``vel``, ``velocity_history``. All ranks have to call it."""
-        own: Stored = {lane: dict(scenes) for lane, scenes in self._loaded.items()}  # loaded, and not asked for since
+        """Unrolls of all ranks: ``steps``, ``time`` and the tensors ``pos``, ``vel``, ``velocity_history`` of each scene. All ranks have to call it."""
+        own: Stored = {lane: dict(scenes) for lane, scenes in self._loaded.items()}  # loaded from a checkpoint and not used since
         for lane, way in self._lanes.items():
             scenes = zip(way.samples, way.states, way.steps, strict=True)
             own[lane] = {sample: {"steps": steps, **{name: getattr(state, name) for name in MOVED}} for sample, state, steps in scenes}
@@ -67,19 +74,22 @@ class Excursions:
         return together
 
     def load_state_dict(self, stored: Stored) -> None:
-        """Go on from where ``state_dict`` was; with any number of ranks, each of which takes up the samples that it is given."""
+        """Continue from the result of ``state_dict``. The number of ranks may differ; each rank takes the samples of its own batches."""
         self.clear()
         self._loaded = {lane: dict(scenes) for lane, scenes in stored.items()}
 
     def graphs(self, simulator: LearnedSimulator, starts: Sequence[Start]) -> HeteroData:
-        """Graphs of the states after each start's own steps. A scene that has come to nothing, or to the end of the truth, is at its start again."""
+        """Batch of graphs of the states that the unrolls have reached.
+
+        Scenes whose unroll failed or passed the last ground-truth frame restart.
+        """
         samples, lane = [start.sample for start in starts], starts[0].lane
         under_way = self._lanes.get(lane)
         if under_way is None or under_way.samples != samples:
             under_way = self._taken_up(lane, starts) or Excursion(samples, *walked(simulator, starts), [])
         under_way.graphs = []
         for k, start in enumerate(starts):
-            if start.state.boundary.motion is not None:  # known as far as this start goes, which may be farther than the one before
+            if start.state.boundary.motion is not None:  # this start's stretch of the motion may reach further than the last
                 boundary = start.state.boundary.at(under_way.steps[k])
                 under_way.states[k] = replace(under_way.states[k], boundary=boundary)
             graph = _graph(simulator, start, under_way.states[k], under_way.steps[k])
@@ -91,7 +101,7 @@ class Excursions:
         return batched(under_way.graphs)
 
     def _taken_up(self, lane: int, starts: Sequence[Start]) -> Excursion | None:
-        """What a checkpoint holds of these samples; None if it is about others."""
+        """Batch of these samples as a checkpoint stored it; None if the checkpoint does not have all of them."""
         stored = self._loaded.pop(lane, {})
         if not all(start.sample in stored for start in starts):
             return None
@@ -101,7 +111,13 @@ class Excursions:
 
     @torch.no_grad()
     def move_on(self, simulator: LearnedSimulator, lane: int, acceleration: dict[str, Tensor]) -> None:
-        """One step further, with what was predicted for the graphs."""
+        """Advance a lane's unrolls by one step.
+
+        Args:
+            simulator: integrates the accelerations.
+            lane: lane of the graphs.
+            acceleration: prediction for the lane's last ``graphs``, by material [node, axis], as the model returns it.
+        """
         under_way = self._lanes[lane]
         under_way.states = simulator.moved(under_way.states, under_way.graphs, acceleration)
         under_way.steps = [step + 1 for step in under_way.steps]
@@ -118,7 +134,11 @@ def _graph(simulator: LearnedSimulator, start: Start, state: State, step: int) -
 
 
 def _moved(start: State, scene: dict[str, Any]) -> State:
-    """A start with what a checkpoint says of its scene."""
+    """State of a start with the fields in ``MOVED`` replaced by those of a checkpoint.
+
+    Raises:
+        CheckpointError: a field has another shape or type.
+    """
     values = {}
     for name in MOVED:
         there, here = scene[name], getattr(start, name)
@@ -144,7 +164,10 @@ class _Trainable(Batched):
 
 @torch.no_grad()
 def walked(simulator: LearnedSimulator, starts: Sequence[Start]) -> tuple[list[State], list[int]]:
-    """States after each start's own steps, all starts at once, and how many steps they made: fewer where a scene has no graph any more."""
+    """States after unrolling each start for ``own_steps`` steps, all starts together, and the number of steps of each.
+
+    An unroll whose scene has no graph any more ends earlier.
+    """
     states, steps = [start.state for start in starts], [0] * len(starts)
     num_steps = {k: start.own_steps for k, start in enumerate(starts)}
     was_training = simulator.training

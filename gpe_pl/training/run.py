@@ -1,4 +1,4 @@
-"""One training run in a folder: start, resume, or recognise that it is finished."""
+"""One training run in a folder: settings, start or resume, and reuse of a finished run."""
 
 from __future__ import annotations
 
@@ -37,12 +37,16 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """Everything about the optimisation; see ``TrainingModule``, ``TrajectoryDataModule``, ``data.noise`` and ``data.sampling`` for the meaning of each value.
+    """Settings of the optimisation. ``TrainingModule``, ``TrajectoryDataModule``, ``data.noise`` and ``data.sampling`` describe those not listed here.
 
-    ``budget_minutes``, of one core or GPU, replaces ``num_steps`` (see ``training.budget``). The last ``push_share`` of the steps start where the model
-    has come to in up to ``push_steps`` steps of its own; ``push_correction`` of the way that its velocity has gone astray is to be taken back within a step.
-    ``gradient_clip`` and ``ema_decay`` are switched off by None. ``val_containment`` puts particles that cross a wall back in the rollouts of the validation,
-    which choose the best checkpoint.
+    Attributes:
+        budget_minutes: training time on one core or GPU [min]; replaces ``num_steps`` (see ``training.budget``).
+        gradient_clip: largest norm of the gradient; None switches clipping off.
+        ema_decay: decay of the moving average of the weights; None switches averaging off.
+        push_share: fraction of the steps, at the end of training, that use push-forward.
+        push_steps: maximum number of steps of an unroll.
+        push_correction: fraction of the velocity's deviation after an unroll that the target removes within one step.
+        val_containment: put particles that cross a wall back on its surface in the validation rollouts, which choose the best checkpoint.
     """
 
     num_steps: Annotated[int, Field(ge=1)]
@@ -76,12 +80,12 @@ class TrainingSettings:
 
     @property
     def noise(self) -> Noise:
-        """On the inputs."""
+        """Noise on the inputs."""
         return Noise(self.position_noise_of_domain, self.velocity_noise_of_change, self.noise_correction)
 
     @property
     def push_forward(self) -> PushForward | None:
-        """When samples begin with own steps of the model."""
+        """Push-forward settings; None without push-forward."""
         return (
             PushForward(round((1 - self.push_share) * self.num_steps), self.push_steps, self.push_correction) if self.push_share else None
         )
@@ -89,10 +93,13 @@ class TrainingSettings:
 
 @dataclass(frozen=True)
 class TrainerSettings:
-    """Where the training runs: in one process per device, each of which takes a part of every batch (see ``training.parallel``).
+    """Where and how the training runs: one process per device, each with a part of every batch (see ``training.parallel``).
 
-    ``devices`` are those of one of ``num_nodes`` machines. ``matmul_precision`` is PyTorch's for products of single precision: ``high`` and ``medium`` may use
-    TensorFloat-32 or bfloat16 inside, where the processor or GPU is faster with them. Between validations a checkpoint is saved every ``checkpoint_minutes``.
+    Attributes:
+        devices: number of devices on each of the ``num_nodes`` machines.
+        matmul_precision: PyTorch's precision of matrix products in float32. ``high`` and ``medium`` may use TensorFloat-32 or bfloat16 inside where the
+            processor or GPU is faster with them.
+        checkpoint_minutes: time between checkpoints, apart from those of validations [min].
     """
 
     accelerator: Literal["cpu", "gpu", "auto"] = "cpu"
@@ -106,7 +113,7 @@ class TrainerSettings:
 
     @property
     def device(self) -> str:
-        """Where tensors go."""
+        """Type of the device of all tensors: ``cpu`` or ``cuda``."""
         return "cuda" if self.accelerator == "gpu" or (self.accelerator == "auto" and torch.cuda.is_available()) else "cpu"
 
     @property
@@ -115,9 +122,15 @@ class TrainerSettings:
 
 
 def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
-    """Copy the checkpoint of a finished run below ``folder`` that was trained with the configuration ``config``; None if there is no such run.
+    """Copy the best checkpoint of a finished run that was trained with the same configuration. With several processes, the first one copies.
 
-    Of several processes the first copies.
+    Args:
+        folder: folder to search for runs.
+        config: configuration of the training, without the key ``evaluation``.
+        run_dir: folder of the new run.
+
+    Returns:
+        Path of the copy; None if there is no such run.
     """
     for path in sorted(folder.rglob(CONFIG)):
         trained = path.parent / "checkpoints" / "best.ckpt"
@@ -126,7 +139,7 @@ def adopt(folder: Path, config: dict[str, Any], run_dir: Path) -> Path | None:
             if not differences({key: value for key, value in there.items() if key != "evaluation"}, config):
                 own = run_dir / "checkpoints" / "best.ckpt"
                 if rank_zero_only.rank == 0:  # type: ignore[attr-defined]
-                    log.info("taking the model that was trained in %s", path.parent)
+                    log.info("using the model that was trained in %s", path.parent)
                     with replacing(own) as part:
                         shutil.copy(trained, part)
                 return own
@@ -142,11 +155,19 @@ def train(
     run_dir: Path,
     callbacks: Sequence[Callback] = (),
 ) -> Path:
-    """Train to ``num_steps``, resuming from ``checkpoints/last.ckpt`` if there is one; returns the checkpoint with the best validation rollout.
+    """Train to ``num_steps``. Resumes from ``checkpoints/last.ckpt`` if there is one.
 
-    Several processes return; ``end_later_processes`` leaves the first. Unless ``torchrun`` or Slurm starts them, each runs the same command.
+    With several processes, each of them returns; call ``end_later_processes`` to continue with the first alone. Unless ``torchrun`` or Slurm starts the
+    processes, each runs the same command.
+
+    Returns:
+        Path of the checkpoint with the best validation rollout.
+
+    Raises:
+        RunError: the accelerator or devices are not available, or training was interrupted; says how to resume.
+        TrainingError: losses are not finite; names the last checkpoint.
     """
-    datamodule.push_forward = training.push_forward  # known only now, as a budget of time has become a number of steps
+    datamodule.push_forward = training.push_forward  # known only now, as it depends on the number of steps within a time budget
     interruption = Interruption()
     checkpoints = Checkpoints(run_dir / "checkpoints", 60 * trainer_settings.checkpoint_minutes, interruption)
     steps = min(training.val_rollout_steps, datamodule.val_trajectories(1)[0].num_frames - datamodule.builder.config.history - 1)
@@ -161,7 +182,7 @@ def train(
         own.append(StepProgress())
     is_parallel = trainer_settings.num_processes > 1
     if is_parallel:
-        os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # else Lightning shares out all cores
+        os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # else Lightning divides all cores between the processes
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     try:
         trainer = L.Trainer(
@@ -190,7 +211,7 @@ def train(
     if last is not None:
         log.info("resuming from %s", last)
     for known in (r"`isinstance\(treespec, LeafSpec\)` is deprecated", r"Checkpoint directory .* exists and is not empty"):
-        warnings.filterwarnings("ignore", known)  # the first is between Lightning and PyTorch, the second what resuming is
+        warnings.filterwarnings("ignore", known)  # the first concerns Lightning and PyTorch; the second is normal when resuming
     try:
         with interruption, checkpoints.taken_up():
             trainer.fit(module, datamodule, ckpt_path=last, weights_only=True)
@@ -213,12 +234,15 @@ def train(
 
 
 def seed(number: int) -> None:
-    """Seed the random numbers of Python, NumPy and PyTorch."""
+    """Seed the random number generators of Python, NumPy and PyTorch."""
     L.seed_everything(number, verbose=False)
 
 
 def set_up(settings: TrainerSettings) -> str:
-    """Threads, memory and precision of PyTorch in this process; the device to compute on.
+    """Set PyTorch's threads, memory use and precision in this process.
+
+    Returns:
+        The device to compute on.
 
     Raises:
         RunError: there is no such device.

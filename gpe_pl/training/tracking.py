@@ -1,4 +1,4 @@
-"""Where the numbers of a run go: CSV files in its folder always, Weights & Biases if asked for."""
+"""Loggers of a run: CSV files in its folder always, and Weights & Biases (W&B) if configured."""
 
 from __future__ import annotations
 
@@ -24,24 +24,33 @@ log = logging.getLogger(__name__)
 WANDB_URL = "https://api.wandb.ai"
 FILMS: tuple[Literal["gif", "mp4"], ...] = ("gif", "mp4")
 RUN_ID = "run_id"
-"""File in a run's folder: the identifier under which W&B knows the run."""
+"""Name of the file in a run's folder that holds the identifier of the run in W&B."""
 
 
 @dataclass(frozen=True)
 class LoggerSettings:
-    """Where the metrics go; files in the run's folder are always written."""
+    """Where to log metrics. CSV files in the run's folder are always written.
+
+    Attributes:
+        kind: ``wandb`` also logs to W&B.
+        project: project in W&B.
+        mode: mode of W&B. None takes ``WANDB_MODE``, or else ``online`` if there is an API key and ``offline`` if not.
+    """
 
     kind: Literal["csv", "wandb"] = "csv"
     project: str = "gpe_pl"
     mode: Literal["online", "offline", "disabled"] | None = None
 
     def loggers(self, run_dir: Path, name: str, config: Mapping[str, Any]) -> list[Logger]:
-        """CSV under ``run_dir/log``, one version per start of the run, and W&B if asked for, offline without an API key.
+        """Loggers of a run: CSV under ``run_dir/log``, one version per start of the run, and W&B if configured.
 
         Args:
-            run_dir: folder of the run; it keeps the identifier by which a resumed run goes on in W&B.
-            name: of the experiment or sweep that the run belongs to, the group in W&B.
-            config: of the run, shown in W&B.
+            run_dir: folder of the run; it keeps the identifier under which a resumed run continues in W&B.
+            name: name of the experiment or sweep that the run belongs to; the group in W&B.
+            config: configuration of the run, shown in W&B.
+
+        Raises:
+            TrackingError: W&B refuses the run.
         """
         loggers: list[Logger] = [Log(run_dir, name="log", flush_logs_every_n_steps=1)]
         if self.kind == "wandb":
@@ -53,7 +62,7 @@ class LoggerSettings:
         import wandb
         from lightning.pytorch.loggers import WandbLogger
 
-        own = run_dir.parts[run_dir.parts.index(name) + 1 :] if name in run_dir.parts else ()  # of a sweep: what is special about this run
+        own = run_dir.parts[run_dir.parts.index(name) + 1 :] if name in run_dir.parts else ()  # within a sweep, this run's own part
         options: dict[str, Any] = {"group": name, "mode": mode, "resume": "allow"}
         logger = WandbLogger("/".join(own) or name, save_dir=run_dir, project=self.project, id=run_id(run_dir), **options)
         try:
@@ -61,18 +70,22 @@ class LoggerSettings:
         except wandb.errors.Error as error:
             if isinstance(error, wandb.errors.CommError) and mode != "offline":  # no network, or a key that is not accepted
                 log.warning("W&B: %s; this run is kept offline", error)
-                wandb.teardown()  # what it began under this identifier
+                wandb.teardown()  # ends what it began under this identifier
                 return self._wandb(run_dir, name, config, "offline")
             raise TrackingError(f"W&B: {error}; logger.mode=offline keeps the run here") from None
         return logger
 
 
 class Log(CSVLogger):
-    """A CSV file that is whole at any time: the end of a number that is cut off would not be missed."""
+    """CSV logger that replaces its file as a whole. A reader could not tell a number that is cut off from a complete one."""
 
     @rank_zero_only
     def save(self) -> None:
-        """Write what has been logged since the last time. Raises ``FullDiskError``."""
+        """Write the metrics logged since the last call.
+
+        Raises:
+            FullDiskError: the disk is full.
+        """
         writer: Any = self.experiment
         path = Path(writer.metrics_file_path)
         if not writer.metrics:
@@ -92,7 +105,7 @@ class TrackingError(GpeError):
 
 
 def has_key() -> bool:
-    """Whether this user has an API key for W&B: in ``WANDB_API_KEY``, or in ``~/.netrc``, where ``wandb login`` puts it."""
+    """Whether this user has an API key for W&B, in ``WANDB_API_KEY`` or in ``~/.netrc``, where ``wandb login`` stores it."""
     if os.environ.get("WANDB_API_KEY"):
         return True
     host = urlparse(os.environ.get("WANDB_BASE_URL", WANDB_URL)).hostname or ""
@@ -104,18 +117,22 @@ def has_key() -> bool:
 
 
 def run_id(run_dir: Path) -> str:
-    """An identifier that a resumed run finds again; written once. Raises ``TrackingError`` for another text: W&B makes paths of it."""
+    """Identifier of a run in W&B. It is written to ``RUN_ID`` once, so that a resumed run finds it again.
+
+    Raises:
+        TrackingError: the file holds something else, which W&B would use in paths.
+    """
     path = run_dir / RUN_ID
     if not path.exists():
         replace_text(path, os.urandom(6).hex())
     text = path.read_bytes()[:100].decode(errors="replace").strip()
     if not re.fullmatch("[0-9a-z]{1,32}", text):
-        raise TrackingError(f"{path}: holds {text!r}, which is no identifier of a run; delete the file, then W&B begins a new run")
+        raise TrackingError(f"{path}: holds {text!r}, which is not the identifier of a run; delete the file, and W&B begins a new run")
     return text
 
 
 def publish(loggers: Iterable[Logger], run_dir: Path, results: Mapping[str, float]) -> None:
-    """Give W&B, where it is among the loggers, the results of the evaluation with its figures and animations, and close the run."""
+    """Send results, figures and animations of the evaluation to W&B and close the run, if W&B is among the loggers."""
     from lightning.pytorch.loggers import WandbLogger
 
     for logger in loggers:

@@ -113,7 +113,7 @@ def test_a_loss_that_is_not_finite_names_step_trajectories_and_frames(value: flo
     named = rf"step 41: the loss is {value} for \(trajectory, frame\) = \(7, 30\), \(8, 31\)"
     for _ in range(2):
         assert m.training_step(data, 0) is None
-    assert all(re.search(rf"{named}; training goes on without this batch", r.message) for r in caplog.records)
+    assert all(re.search(rf"{named}; training continues without this batch", r.message) for r in caplog.records)
     assert len(caplog.records) == 2
     with pytest.raises(TrainingError, match=rf"{named}, as in 2 other batches since step 41\. Lower training.learning_rate"):
         m.training_step(data, 0)

@@ -86,7 +86,7 @@ def test_what_wandb_refuses_is_one_line(tmp_path: Path, recorder: type[Recorder]
 @pytest.mark.parametrize("content", [b"../../x", b"", b"\xff\xfe", b"a" * 10**6, b"a b", b"\x1b[2K"])
 def test_an_identifier_that_could_be_a_path_is_refused(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "run_id").write_bytes(content)
-    with pytest.raises(TrackingError, match=r"run_id: holds .*, which is no identifier of a run; delete the file"):
+    with pytest.raises(TrackingError, match=r"run_id: holds .*, which is not the identifier of a run; delete the file"):
         run_id(tmp_path)
 
 
