@@ -19,7 +19,8 @@ from pydantic.dataclasses import dataclass
 from gpe_pl.errors import GpeError
 from gpe_pl.files.names import DataName
 from gpe_pl.geometry.shapes import ON_SURFACE
-from gpe_pl.rollout.loop import Guard, Simulator, rollout
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import Simulator, rollout
 from gpe_pl.schema import SPLITS, ParameterGroup
 from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.solvers.scenes import Scene, describe

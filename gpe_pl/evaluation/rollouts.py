@@ -29,7 +29,8 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.rollout.containment import Contained
-from gpe_pl.rollout.loop import Guard, Simulator, Start, rollout, rollouts, share_outside
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import Simulator, Start, rollout, rollouts, share_outside
 from gpe_pl.schema import SPLITS, ParameterGroup, Split
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory

@@ -22,7 +22,8 @@ from gpe_pl.geometry.shapes import signed_distance, surface_tolerance
 from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.containment import Contained
-from gpe_pl.rollout.loop import Guard, Simulator, Start, frames, unsound
+from gpe_pl.rollout.guard import Guard, unsound
+from gpe_pl.rollout.loop import Simulator, Start, frames
 from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.system.machine import environment, peak_resident

@@ -9,7 +9,8 @@ from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
-from gpe_pl.rollout.loop import CROWDING_LIMIT, SimulationError, crowding
+from gpe_pl.rollout.guard import CROWDING_LIMIT, crowding
+from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.trajectory.boundary import search_tree
 
 MOST_PAIRS = 2**26

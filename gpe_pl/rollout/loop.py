@@ -12,16 +12,13 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
-from array_api_compat import array_namespace
 
 from gpe_pl.errors import GpeError
-from gpe_pl.geometry.shape_values import shapes_fault
 from gpe_pl.geometry.shapes import signed_distance
-from gpe_pl.schema import NODE_TYPES
-from gpe_pl.trajectory.boundary import Motion
+from gpe_pl.rollout.guard import Guard, unsound
+from gpe_pl.trajectory.boundary import Motion, as_numpy
 from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.trajectory import Metadata, Termination, Trajectory
-from gpe_pl.trajectory.values import faults, size_conflicts
 
 
 @runtime_checkable
@@ -55,164 +52,6 @@ class Replay:
     def step(self, state: State) -> State:
         frame = round((state.time - self.trajectory.start_time) / self.trajectory.metadata.frame_dt) + 1
         return self.trajectory.state(frame)
-
-
-CROWDING_LIMIT = 32
-"""Nodes in the space that one of them has at rest beyond which a cloud has collapsed, unless it was as dense at the start."""
-FINEST = 0.01
-"""Of a spacing: nodes that are closer at the start lie on top of each other."""
-TUNNEL_DEPTH = 0.25
-"""Of a spacing: a path between two frames that goes deeper through a wall or obstacle than this has not gone around it."""
-MAX_PATH_SAMPLES = 4096
-"""Of a path: those of ways longer than as many eighths of a spacing lie farther apart."""
-SUSPECTS_AT_ONCE = 1000
-"""Nodes whose paths are sampled as finely as that of the fastest of them."""
-
-
-@dataclass(frozen=True)
-class Guard:
-    """Limits beyond which a state is not trusted.
-
-    Attributes:
-        max_speed: m/s.
-        bounds: ``(low, high)`` per axis of the region that nodes may not leave by more than ``margin`` [m].
-        spacing: rest spacing [m] of nodes, for recognising clouds that collapse and nodes that went through an obstacle within one frame, or are deeper in
-            one than ``margin``; 0 does neither.
-        max_crowding: nodes in the space that one of them has at rest.
-    """
-
-    max_speed: float = math.inf
-    bounds: tuple[tuple[float, float], ...] = ()
-    margin: float = 0.0
-    spacing: float = 0.0
-    max_crowding: int = CROWDING_LIMIT
-
-    def __post_init__(self) -> None:
-        sound = self.max_speed > 0 and self.margin >= 0 and 0 <= self.spacing < math.inf  # what is not a number is neither
-        if not (sound and all(low < high for low, high in self.bounds)):
-            raise ValueError(f"guard limits must be positive, and bounds (low, high), got {self}")
-
-    def check(self, state: State, frame: int, before: State | None = None) -> Termination | None:
-        """The first violated limit of a state, or None; ``before`` is the state one frame earlier."""
-        if state.num_nodes == 0:
-            return None
-        found = self._not_finite(state, frame) or self._escape(state, frame) or self._explosion(state, frame)
-        if found is None and self.spacing > 0:
-            found = self._clustering(state, frame) or self._tunnelling(before, state, frame)
-        return found
-
-    def _not_finite(self, state: State, frame: int) -> Termination | None:
-        xp = array_namespace(state.pos)
-        finite = xp.all(xp.isfinite(state.pos) & xp.isfinite(state.vel), axis=-1)
-        if bool(xp.all(finite)):
-            return None
-        node = int(xp.argmax(xp.astype(~finite, xp.int8)))
-        return Termination("nan", frame, node, f"frame {frame}: node {node} has a position or velocity that is not finite")
-
-    def _escape(self, state: State, frame: int) -> Termination | None:
-        xp = array_namespace(state.pos)
-        for axis, (low, high) in enumerate(self.bounds):
-            outside = xp.maximum(low - state.pos[:, axis], state.pos[:, axis] - high)
-            if float(xp.max(outside)) > self.margin:
-                node = int(xp.argmax(outside))
-                return Termination("escape", frame, node, f"frame {frame}: node {node} is {float(outside[node]):.3g} m outside the domain")
-        return None
-
-    def _explosion(self, state: State, frame: int) -> Termination | None:
-        if not math.isfinite(self.max_speed):
-            return None
-        xp = array_namespace(state.pos)
-        speed = xp.sqrt(xp.sum(state.vel * state.vel, axis=-1))
-        if float(xp.max(speed)) <= self.max_speed:
-            return None
-        node = int(xp.argmax(speed))
-        text = f"frame {frame}: node {node} moves at {float(speed[node]):.3g} m/s, limit {self.max_speed:.3g} m/s"
-        return Termination("explosion", frame, node, text)
-
-    def _clustering(self, state: State, frame: int) -> Termination | None:
-        counts = crowding(_numpy(state.pos), self.spacing)
-        if counts.max() <= self.max_crowding:
-            return None
-        node = int(np.argmax(counts))
-        text = f"frame {frame}: node {node} shares a box as wide as the spacing with {counts.max() - 1} others, limit {self.max_crowding}"
-        return Termination("clustering", frame, node, text)
-
-    def _tunnelling(self, before: State | None, state: State, frame: int) -> Termination | None:
-        """Nodes deeper in a wall or obstacle than ``margin``, and those that were and are outside of all shapes, but not between the two frames."""
-        shapes, end = state.boundary.shapes, _numpy(state.pos)
-        if not shapes:
-            return None
-        depth = -signed_distance(shapes, end)
-        node = int(np.argmax(depth))
-        if 0 < self.margin < depth[node]:
-            return Termination("tunnelling", frame, node, f"frame {frame}: node {node} is {depth[node]:.3g} m deep in a wall or obstacle")
-        if before is None:
-            return None
-        start = _numpy(before.pos)
-        way = state.periodicity.shortest(end - start)
-        length, clearance = np.linalg.norm(way, axis=-1), signed_distance(shapes, start)
-        tolerance = TUNNEL_DEPTH * self.spacing
-        suspects = np.flatnonzero((length > clearance) & (length > 2 * tolerance) & (clearance > -tolerance) & (depth < tolerance))
-        suspects = suspects[np.argsort(length[suspects])]
-        deepest = np.zeros(len(end))
-        for some in np.array_split(suspects, max(1, len(suspects) // SUSPECTS_AT_ONCE)):
-            count = min(MAX_PATH_SAMPLES, math.ceil(float(length[some].max(initial=0.0)) / (0.5 * tolerance)))
-            for share in np.arange(1, count) / max(1, count):
-                deepest[some] = np.maximum(deepest[some], -signed_distance(shapes, start[some] + share * way[some]))
-        node = int(np.argmax(deepest))
-        if not deepest[node] > tolerance:
-            return None
-        text = f"frame {frame}: node {node} went {deepest[node]:.3g} m deep through a wall or obstacle within one frame"
-        return Termination("tunnelling", frame, node, text)
-
-    def of(self, start: State) -> Guard:
-        """The same for a rollout from a state, which may be finer in places: clouds collapse where twice as many are in one place as in the finest."""
-        if self.spacing == 0 or start.num_nodes == 0 or self._not_finite(start, 0) is not None:
-            return self
-        pos = _numpy(start.pos)
-        if crowding(pos, FINEST * self.spacing).max() > self.max_crowding:
-            return self
-        return replace(self, max_crowding=max(self.max_crowding, 2 * int(crowding(pos, self.spacing).max())))
-
-
-def crowding(pos: np.ndarray, width: float) -> np.ndarray:
-    """For every node [node], how many there are in its box of a grid of this width [m]; two boxes very rarely count as one."""
-    primes = np.array([73_856_093, 19_349_663, 83_492_791])[: pos.shape[1]]  # spatial hash [Teschner et al. 2003]; products may overflow
-    _, box, counts = np.unique(np.floor(pos / width).astype(np.int64) @ primes, return_inverse=True, return_counts=True)
-    return counts[box]
-
-
-def unsound(state: State, metadata: Metadata) -> Termination | None:
-    """The first array or shape of a state that breaks its rule (``schema.FIELDS``, ``shape_values.shapes_fault``), or None.
-
-    Nothing could be told from what follows it.
-    """
-    b, has_mesh = state.boundary, state.cells is not None and state.rest_pos is not None
-    nodes = {
-        "node_type": state.node_type,
-        "mass": state.mass,
-        "material_params": state.material_params,
-        "pos": state.pos[None],
-        "vel": state.vel[None],
-        **({"rest_pos": state.rest_pos, "cells": state.cells} if has_mesh else {}),
-    }
-    conditions = {"boundary_friction": b.friction, "boundary_restitution": b.restitution}
-    walls = {"boundary_pos": b.pos[None], "boundary_vel": b.vel[None], "boundary_normal": b.normal[None], **conditions}
-    m = b.motion
-    path = {} if m is None else {"boundary_pos": m.pos, "boundary_vel": m.vel, "boundary_normal": m.normal, **conditions}
-    for part in (nodes, walls, path):
-        arrays = {key: _numpy(value) for key, value in part.items()}
-        for conflict in size_conflicts(arrays, metadata.dim, len(metadata.param_names)):
-            return Termination("input", 0, -1, conflict)
-        for fault in faults(arrays, NODE_TYPES, metadata.materials, metadata.param_names):
-            reason = {"pos": "nan", "vel": "nan", "material_params": "material"}.get(fault.field, "input")
-            return Termination(reason, 0, fault.index("node"), str(fault))
-    for name, values in (("gravity", state.gravity), ("velocity_history", state.velocity_history)):
-        if values is not None and not np.isfinite(_numpy(values)).all():
-            return Termination("nan", 0, -1, f"{name} is not finite")
-    if (wrong := shapes_fault(b.shapes, metadata.periodicity)) is not None:
-        return Termination("input", 0, -1, wrong)
-    return None
 
 
 def step_all(simulator: Simulator, states: list[State]) -> list[State | SimulationError]:
@@ -438,4 +277,4 @@ def share_outside(trajectory: Trajectory, tolerance: float = 0.0) -> float:
 
 
 def _numpy(x: Any) -> np.ndarray:
-    return np.array(x) if isinstance(x, np.ndarray) else x.detach().cpu().numpy().copy()
+    return np.array(as_numpy(x))

@@ -14,7 +14,8 @@ from lightning.pytorch.callbacks import Callback, WeightAveraging
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import per_frame_mse
 from gpe_pl.rollout.containment import Contained
-from gpe_pl.rollout.loop import Guard, Start, rollouts
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import Start, rollouts
 from gpe_pl.system import ranks
 from gpe_pl.system.progress import progress_bar
 from gpe_pl.trajectory.trajectory import Trajectory

@@ -189,7 +189,7 @@ class Boundary:
 
     def to_numpy(self) -> Boundary:
         """The same with NumPy arrays of its own."""
-        values: dict[str, Any] = {name: np.array(_numpy(getattr(self, name))) for name in names_of(self, NODE)}
+        values: dict[str, Any] = {name: np.array(as_numpy(getattr(self, name))) for name in names_of(self, NODE)}
         return replace(self, **values)
 
     def at(self, frame: int, stop: int | None = None) -> Boundary:
@@ -219,7 +219,7 @@ def search_tree(pos: Array, periodicity: Periodicity = NOWHERE) -> Any:
     """A k-d tree of positions [node, dim] for neighbour search on the CPU: quick to build, so that moving nodes can have a new one in every step."""
     from scipy.spatial import cKDTree
 
-    points = np.ascontiguousarray(_numpy(pos))
+    points = np.ascontiguousarray(as_numpy(pos))
     if not periodicity:
         return cKDTree(points, balanced_tree=False, compact_nodes=False)
     return cKDTree(periodicity.from_corner(points), balanced_tree=False, compact_nodes=False, boxsize=periodicity.period)
@@ -250,5 +250,6 @@ def check_steps(boundary: Boundary, frame_dt: float, periodicity: Periodicity) -
             )
 
 
-def _numpy(x: Array) -> np.ndarray:
+def as_numpy(x: Array) -> np.ndarray:
+    """Return an array or tensor as a NumPy array, without a copy where that is possible."""
     return x if isinstance(x, np.ndarray) else x.detach().cpu().numpy()

@@ -22,7 +22,8 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import CHECKPOINT_FORMAT, CheckpointError, LearnedSimulator, SceneError
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.containment import Contained
-from gpe_pl.rollout.loop import Guard, SimulationError, rollout
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import SimulationError, rollout
 from gpe_pl.schema import param_names
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.state import State

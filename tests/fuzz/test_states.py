@@ -17,7 +17,8 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.testing.changes import in_order, permuted
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.containment import Contained
-from gpe_pl.rollout.loop import Guard, SimulationError, crowding, rollout
+from gpe_pl.rollout.guard import Guard, crowding
+from gpe_pl.rollout.loop import SimulationError, rollout
 from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.scenes import BodyScene
 from gpe_pl.trajectory.state import State

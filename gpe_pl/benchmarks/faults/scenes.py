@@ -19,7 +19,8 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.containment import Contained
-from gpe_pl.rollout.loop import Guard, rollout
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import rollout
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 

@@ -11,7 +11,8 @@ from torch import Tensor
 from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, in_double, inapplicable, stress_test
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gns import GNS
-from gpe_pl.rollout.loop import Guard, rollout, steps
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import rollout, steps
 from gpe_pl.trajectory.state import State
 
 NUM_STEPS = 300

@@ -12,7 +12,8 @@ import torch
 
 from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, no_boundary, relative_change, stress_test
 from gpe_pl.errors import GpeError
-from gpe_pl.rollout.loop import Guard, SimulationError, Simulator, Start, rollout, rollouts, step_all
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import SimulationError, Simulator, Start, rollout, rollouts, step_all
 from gpe_pl.schema import BOUNDARY, MATERIALS, node_code
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory

@@ -31,7 +31,8 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.testing.changes import in_order, permuted, to_dtype
 from gpe_pl.metrics import per_frame_mse
 from gpe_pl.rollout.containment import Contained
-from gpe_pl.rollout.loop import Guard, rollout, steps
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import rollout, steps
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.system.machine import resident_bytes
 from gpe_pl.training.module import TrainingModule

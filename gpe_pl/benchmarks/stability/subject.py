@@ -17,7 +17,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.testing.changes import in_order, to_dtype
 from gpe_pl.models.base import Prediction
-from gpe_pl.rollout.loop import Guard
+from gpe_pl.rollout.guard import Guard
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State

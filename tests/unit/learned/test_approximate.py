@@ -19,7 +19,8 @@ from gpe_pl.models.dpinet import DPINet
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.containment import Contained
-from gpe_pl.rollout.loop import Guard, Start, rollout, rollouts
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import Start, rollout, rollouts
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.trajectory.state import State
 from tests import scenes

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl.rollout.loop import Guard, Replay, SimulationError, Simulator, Start, frames, rollout, rollouts, share_outside
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import Replay, SimulationError, Simulator, Start, frames, rollout, rollouts, share_outside
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Termination, Trajectory
