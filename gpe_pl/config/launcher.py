@@ -99,7 +99,7 @@ class Job:
         return JobReturn(self.overrides, status=JobStatus.COMPLETED, _return_value=value)
 
     def failed(self, error: Exception) -> JobReturn:
-        """Return the result of a failed job, which holds the error."""
+        """Return the result of a failed job, which contains the error."""
         return JobReturn(self.overrides, status=JobStatus.FAILED, _return_value=error)
 
     def outcome(self, get: Callable[[], JobReturn]) -> JobReturn:

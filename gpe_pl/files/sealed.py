@@ -1,6 +1,6 @@
 """JSON files with a checksum, which the project writes and reads itself.
 
-A file holds a table. Its key ``sha256`` is the checksum of the other keys, so every changed digit is detected. Reading checks size, depth and numbers before
+A file contains a table. Its key ``sha256`` is the checksum of the other keys, so every changed digit is detected. Reading checks size, depth and numbers before
 any value is used. A damaged or hostile file raises ``SealError`` with a one-line message.
 """
 

@@ -49,7 +49,8 @@ class Repeated:
         xp, space = array_namespace(points), self.periodicity
         centre = xp.asarray(self._centre, dtype=points.dtype, device=device(points))
         near = centre + space.shortest(points - centre)
-        if not isinstance(self.shape, Polygon):  # the image with the nearest centre is the nearest image
+        # The image with the nearest centre counts if the shape is symmetric, or if each image has its own part of the inside.
+        if not isinstance(self.shape, Polygon):
             return self._whole.signed_distance(near)
         distance = self._whole.signed_distance(near)
         axes = [axis for axis in space.axes if axis != self._spanned]

@@ -258,7 +258,7 @@ def _require_simple(vertices: np.ndarray) -> None:
     for i in range(count):
         for j in range(i + 1, count):
             a, b, c, d = vertices[i], vertices[(i + 1) % count], vertices[j], vertices[(j + 1) % count]
-            if j == i + 1 or (i == 0 and j == count - 1):  # neighbours share a vertex; neither may hold the other's far end
+            if j == i + 1 or (i == 0 and j == count - 1):  # neighbours share a vertex; neither may contain the other's far end
                 far_i, far_j = (a, d) if j == i + 1 else (b, c)
                 crosses = holds(i, far_j) or holds(j, far_i)
             else:
