@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from gpe_pl.geometry.shapes import Bowl, Box, Sphere, domain_walls
 from gpe_pl.solvers.flip import FLIP
 from gpe_pl.solvers.fluid_scenes import FluidScene
-from tests.physics.test_flip import DAM_BREAK, OnGrid, clearance, fill, run, unit
+from tests.physics.test_flip import DAM_BREAK, DENSITY, GRAVITY, OnGrid, clearance, fill, run, unit
 
 
 def test_column_when_released(physics):
