@@ -241,3 +241,8 @@ class FeatureSpec:
     @property
     def node_types(self) -> tuple[str, ...]:
         return (*self.materials, BOUNDARY, *(grid(level) for level in range(1, self.num_levels + 1)))
+
+    @property
+    def meshes(self) -> tuple[str, ...]:
+        """Materials that are connected along their cells."""
+        return tuple(source for source, name, _ in self.relations if name == CELL)

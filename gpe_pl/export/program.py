@@ -22,21 +22,17 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.export import Dim
-from torch_geometric.data import HeteroData
 
 from gpe_pl.files.atomic import replace_bytes
-from gpe_pl.graphs.builder import GraphBuilder, from_centre
-from gpe_pl.graphs.features import boundary_features, edge_features, history_of, material_features, mesh_features, virtual_features
-from gpe_pl.graphs.islands import unwrapped
+from gpe_pl.graphs.features import history_of
+from gpe_pl.graphs.topology import IslandTopology, MeshTopology, Topology, descent_of
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.nn.static_friction import is_held
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, RADIUS, EdgeType, FeatureSpec, grid, level_of
-from gpe_pl.trajectory import integrators
+from gpe_pl.schema import BOUNDARY, DOWN, MATERIALS, EdgeType, grid, node_code
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 
@@ -67,7 +63,7 @@ class Input:
 
 
 class PortableStep(nn.Module):
-    """Step of a learned simulator on plain tensors.
+    """Step of a learned simulator on plain tensors: the simulator's own graph features, model and integration, with the topology as an input.
 
     Args:
         simulator: simulator with any model of this package.
@@ -75,120 +71,86 @@ class PortableStep(nn.Module):
 
     def __init__(self, simulator: LearnedSimulator) -> None:
         super().__init__()
-        metadata = simulator.builder.metadata
-        self.simulator, self.spec, self.scales = simulator, simulator.builder.spec, simulator.builder.scales
-        self.meshes = _meshes(self.spec)
-        self.frame_dt, self.periodicity, self.config = metadata.frame_dt, metadata.periodicity, simulator.builder.config
+        self.simulator = simulator
 
     def forward(self, scene: Scene) -> tuple[Scene, Scene]:
         """Return next positions and velocity history; and acceleration with gravity [m/s²] and stress [Pa] at nodes for which the model predicts one."""
-        graph = self.graph(scene)
-        predicted = self.simulator(graph)
-        is_supported = self.simulator.supported(graph) if self.simulator.static_friction else None
+        simulator, state, topology = self.simulator, self.state(scene), self.topology(scene)
+        graph = simulator.builder.graph(topology, state)
+        predicted = simulator(graph)
+        (acc,) = simulator.accelerations([state], [graph], predicted.acceleration)
+        new = simulator.integrated(state, graph, acc)
         moved: Scene = {}
         further: Scene = {}
-        for material, values in predicted.acceleration.items():
-            history = scene[f"velocity_history.{material}"]
-            acc = scene["gravity"].expand_as(history[:, -1]) + values.double() * self.simulator.acceleration_std
-            before = scene[f"pos.{material}"]
-            pos, vel = integrators.advance(before, history[:, -1], acc, self.frame_dt)
-            if is_supported is not None:
-                speed = self.simulator.slowest(scene["gravity"])
-                held = is_held(history[:, -1], vel, graph[material].island, is_supported, speed)[:, None]
-                pos, vel = torch.where(held, before, pos), torch.where(held, 0.0, vel)
-            moved[f"pos.{material}"] = pos
-            moved[f"velocity_history.{material}"] = torch.cat([history[:, 1:], vel[:, None]], dim=1)
-            further[f"acceleration.{material}"] = acc
+        for material, r in topology.rows.items():
+            moved |= {f"pos.{material}": new.pos[r], f"velocity_history.{material}": history_of(new)[r]}
+            further[f"acceleration.{material}"] = acc[r]
         for material, values in predicted.stress.items():
-            further[f"stress.{material}"] = values.double() * self.simulator.stress_std
+            further[f"stress.{material}"] = values.double() * simulator.stress_std
         return moved, further
 
-    def graph(self, scene: Scene) -> HeteroData:
-        """Return the graph that the builder makes of the same state."""
-        data = HeteroData()
-        for material in self.spec.materials:
-            store = data[material]
-            store.x = material_features(scene[f"velocity_history.{material}"], scene["gravity"], self.scales).float()
-            store.material_params, store.mass = scene[f"material_params.{material}"].float(), scene[f"mass.{material}"].float()
-        if self.spec.islands:
-            for material, arm in self._arms(scene).items():
-                data[material].pos, data[material].island = arm.float(), scene[f"island.{material}"]
-            data.island_is_free = scene["island_is_free"]
-            data.num_islands = torch.full((1,), scene["island_is_free"].shape[0])
-            for m in self.meshes:
-                data[m].body = scene[f"body.{m}"]
-            data.num_bodies = torch.full((1,), sum(scene[f"body.{m}"].shape[0] for m in self.meshes))  # upper bound
+    def state(self, scene: Scene) -> State:
+        """Return the state of a scene, whose nodes are in the order of their materials.
+
+        The state does not repeat: positions are not folded into a periodic domain.
+        """
+        materials, names = self.simulator.builder.spec.materials, self.simulator.builder.metadata.param_names
+
+        def joined(name: str) -> Tensor:
+            return torch.cat([scene[f"{name}.{m}"] for m in materials])
+
+        columns = {m: names.index(MATERIALS[m].name) for m in materials}
+        history = joined("velocity_history")
         pos, vel, normal, friction, restitution = (scene[f"boundary.{name}"] for name in BOUNDARY_FIELDS)
-        boundary = Boundary(pos, vel, normal, friction, restitution)
-        data[BOUNDARY].x = boundary_features(self.config, boundary, self.scales).float()
-        self._add_radius_edges(data, scene, boundary)
-        self._add_mesh(data, scene)
-        return data
+        return State(
+            pos=joined("pos"),
+            vel=history[:, -1],
+            node_type=torch.cat([torch.full(scene[f"mass.{m}"].shape, node_code(m)) for m in materials]),
+            mass=joined("mass"),
+            material_params=torch.cat(
+                [F.pad(scene[f"material_params.{m}"], (k, len(names) - k - 1), value=torch.nan) for m, k in columns.items()]
+            ),
+            boundary=Boundary(pos, vel, normal, friction, restitution),
+            gravity=scene["gravity"],
+            velocity_history=history,
+        )
 
-    def _arms(self, scene: Scene) -> Scene:
-        """Return positions relative to the mean of the island, by material."""
-        if self.periodicity:
-            return {m: scene[f"arm.{m}"] for m in self.spec.materials}
-        pos, island = (torch.cat([scene[f"{name}.{m}"] for m in self.spec.materials]) for name in ("pos", "island"))
-        arms = from_centre(pos, island, scene["island_is_free"].shape[0])
-        return dict(zip(self.spec.materials, arms.split([scene[f"pos.{m}"].shape[0] for m in self.spec.materials]), strict=True))
+    def topology(self, scene: Scene) -> Topology:
+        """Return the topology of a scene."""
+        builder, spec = self.simulator.builder, self.simulator.builder.spec
+        rows: Scene = {}
+        num_nodes = 0
+        for m in spec.materials:
+            first, num_nodes = num_nodes, num_nodes + scene[f"pos.{m}"].shape[0]
+            rows[m] = torch.arange(first, num_nodes)
+        edges = {relation: scene[f"edges.{'.'.join(relation)}"] for relation in spec.relations}
+        mesh = self._mesh(scene, rows, edges) if spec.meshes else None
+        islands = self._islands(scene) if spec.islands else None
+        return Topology(rows, edges, None, mesh, islands, builder.metadata.periodicity)
 
-    def _edges(self, scene: Scene, relation: EdgeType) -> Tensor:
-        return scene[f"edges.{'.'.join(relation)}"]
+    def _mesh(self, scene: Scene, rows: dict[str, Tensor], edges: dict[EdgeType, Tensor]) -> MeshTopology:
+        """Return the virtual nodes of a scene; which nodes of meshes lie below each follows from the edges to children."""
+        spec = self.simulator.builder.spec
+        sizes = tuple(scene[f"num_nodes.{grid(level)}"].shape[0] for level in range(1, spec.num_levels + 1))
+        descent = []
+        for m in spec.meshes:
+            parents, below, num_below = list[Tensor](), m, rows[m].shape[0]
+            for level, size in enumerate(sizes, start=1):
+                j, i = edges[grid(level), DOWN, below]
+                parents.append(torch.full((num_below,), size).scatter(0, i, j))
+                below, num_below = grid(level), size
+            above, node = descent_of(parents, sizes)
+            descent.append(torch.stack([above, rows[m][node]]))
+        rest_pos = [scene[f"{'rest_pos' if m in spec.meshes else 'pos'}.{m}"] for m in spec.materials]
+        return MeshTopology(sizes, torch.cat(descent, dim=1), torch.cat(rest_pos))
 
-    def _add_radius_edges(self, data: HeteroData, scene: Scene, boundary: Boundary) -> None:
-        pos = {m: scene[f"pos.{m}"] for m in self.spec.materials} | {BOUNDARY: boundary.pos}
-        vel = {m: scene[f"velocity_history.{m}"][:, -1] for m in self.spec.materials} | {BOUNDARY: boundary.vel}
-        for relation in self.spec.relations:
-            source, name, target = relation
-            if name != RADIUS:
-                continue
-            store = data[relation]
-            j, i = store.edge_index = self._edges(scene, relation)
-            displacement = self.periodicity.shortest(pos[target][i] - pos[source][j])
-            relative_velocity = vel[target][i] - vel[source][j]
-            normal = boundary.normal[j] if source == BOUNDARY else None
-            odd, even = edge_features(self.config.features, displacement, relative_velocity, normal, self.scales)
-            store.odd, store.even = odd.float(), even.float()
-            store.offset = store.odd[:, : self.spec.dim]
-
-    def _add_mesh(self, data: HeteroData, scene: Scene) -> None:
-        """Add virtual nodes, which move as the mean of their children, and the edges of meshes."""
-        relations = [r for r in self.spec.relations if r[1] != RADIUS]
-        if not relations:
-            return
-        dim, values, mass = self.spec.dim, dict[str, Tensor](), dict[str, Tensor]()
-        for m in self.meshes:
-            values[m] = torch.cat([scene[f"pos.{m}"], scene[f"rest_pos.{m}"], scene[f"velocity_history.{m}"].flatten(1)], dim=1)
-            mass[m] = scene[f"mass.{m}"][:, None]
-        width = next(iter(values.values())).shape[1]
-        for level in range(1, self.spec.num_levels + 1):
-            name = grid(level)
-            size = scene[f"num_nodes.{name}"]
-            total, weighted = size.new_zeros(size.shape[0], 1), size.new_zeros(size.shape[0], width)
-            for relation in relations:
-                if relation[:2] == (name, DOWN):
-                    (j, i), child = self._edges(scene, relation), relation[2]
-                    total = total.index_add(0, j, mass[child][i])
-                    weighted = weighted.index_add(0, j, mass[child][i] * values[child][i])
-            mass[name], values[name] = total, weighted / total
-            motion = values[name][:, 2 * dim :].unflatten(1, (-1, dim))
-            data[name].x = virtual_features(motion, torch.full((size.shape[0],), level), scene["gravity"], self.scales).float()
-        for relation in relations:
-            source, name, target = relation
-            store = data[relation]
-            j, i = store.edge_index = self._edges(scene, relation)
-            difference = values[target][i] - values[source][j]
-            level_of_source = None if name == CELL else torch.full((j.shape[0],), level_of(source))
-            odd, even = mesh_features(
-                self.config.features, difference[:, :dim], difference[:, dim : 2 * dim], difference[:, -dim:], level_of_source, self.scales
-            )
-            store.odd, store.even = odd.float(), even.float()
-
-
-def _meshes(spec: FeatureSpec) -> tuple[str, ...]:
-    """Return the materials that are connected along their cells."""
-    return tuple(target for _, name, target in spec.relations if name == CELL)
+    def _islands(self, scene: Scene) -> IslandTopology:
+        spec = self.simulator.builder.spec
+        body = {m: scene[f"body.{m}"] for m in spec.meshes}
+        num_bodies = sum(b.shape[0] for b in body.values())
+        label = torch.cat([scene[f"island.{m}"] for m in spec.materials])
+        arm = torch.cat([scene[f"arm.{m}"] for m in spec.materials]) if self.simulator.builder.metadata.periodicity else None
+        return IslandTopology(label, scene["island_is_free"], body, num_bodies, arm)
 
 
 def describe(simulator: LearnedSimulator) -> dict[str, Input]:
@@ -196,7 +158,6 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
     builder, spec, dim = simulator.builder, simulator.builder.spec, simulator.builder.spec.dim
     history = builder.config.history
     inputs = {"gravity": Input((dim,), "float64", "m/s^2", "external acceleration")}
-    meshes = _meshes(spec)
     is_periodic = bool(builder.metadata.periodicity)
     positions = "positions, not wrapped into the domain, so that the nodes of a mesh stay together" if is_periodic else "positions"
     for m in spec.materials:
@@ -209,12 +170,12 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
             f"material_params.{m}": Input((m, 1), "float64", parameter.unit, parameter.name),
             f"mass.{m}": Input((m,), "float64", "kg", "mass (per metre of depth in 2D)"),
         }
-        if m in meshes:
+        if m in spec.meshes:
             inputs[f"rest_pos.{m}"] = Input((m, dim), "float64", "m", "undeformed positions")
         if spec.islands:
             doc = "number of the node's group; edges between materials connect a group"
             inputs[f"island.{m}"] = Input((m,), "int64", "1", doc)
-        if spec.islands and m in meshes:
+        if spec.islands and m in spec.meshes:
             doc = "number of the node's body, below the number of nodes of meshes; -1 for all nodes if there are no cells"
             inputs[f"body.{m}"] = Input((m,), "int64", "1", doc)
         if spec.islands and is_periodic:
@@ -246,11 +207,15 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
 def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
     """Return the tensors that a program of this simulator takes, for a state with velocity history."""
     builder, spec = simulator.builder, simulator.builder.spec
-    graph = GraphBuilder(replace(builder.config, trim_boundary=False), builder.metadata)(state)
-    pos, rest_pos = (_kept_together(x, state, graph, spec) for x in (state.pos, state.pos if state.rest_pos is None else state.rest_pos))
+    topology = replace(builder, config=replace(builder.config, trim_boundary=False)).topology(state)
+    mesh, islands = topology.mesh, topology.islands
+    pos, rest_pos = state.pos, state.pos if state.rest_pos is None else state.rest_pos
+    sizes = [0] * spec.num_levels
+    if mesh is not None:
+        pos, rest_pos, sizes = pos if mesh.shift is None else pos + mesh.shift, mesh.rest_pos, [*mesh.num_virtual]
     scene: Scene = {"gravity": state.gravity} | {f"boundary.{name}": getattr(state.boundary, name) for name in BOUNDARY_FIELDS}
-    for m in spec.materials:
-        rows, column = graph[m].node_id, builder.metadata.param_names.index(MATERIALS[m].name)
+    for m, rows in topology.rows.items():
+        column = builder.metadata.param_names.index(MATERIALS[m].name)
         values = {
             "pos": pos[rows],
             "velocity_history": history_of(state)[rows],
@@ -258,26 +223,19 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
             "mass": state.mass[rows],
             "rest_pos": rest_pos[rows],
         }
-        if spec.islands:
-            values |= {"island": graph[m].island, "arm": graph[m].pos.double()}
-        if spec.islands and m in _meshes(spec):
-            values["body"] = graph[m].body
+        if islands is not None:
+            values["island"] = islands.label[rows]
+            if islands.arm is not None:
+                values["arm"] = islands.arm[rows]
+            if m in islands.body:
+                values["body"] = islands.body[m]
         scene |= {f"{name}.{m}": value for name, value in values.items()}
-    if spec.islands:
-        scene["island_is_free"] = graph.island_is_free
-    scene |= {f"num_nodes.{t}": state.pos.new_empty(graph[t].num_nodes, 0) for t in spec.node_types if t.startswith("grid_")}
-    scene |= {f"edges.{'.'.join(r)}": graph[r].edge_index for r in spec.relations}
+    if islands is not None:
+        scene["island_is_free"] = islands.is_free
+    scene |= {f"num_nodes.{grid(level)}": state.pos.new_empty(size, 0) for level, size in enumerate(sizes, start=1)}
+    none = torch.empty(2, 0, dtype=torch.int64, device=state.pos.device)
+    scene |= {f"edges.{'.'.join(relation)}": topology.edges.get(relation, none) for relation in spec.relations}
     return {name: scene[name] for name in describe(simulator)}
-
-
-def _kept_together(pos: Tensor, state: State, graph: HeteroData, spec: FeatureSpec) -> Tensor:
-    """Return periodic images of positions that do not tear meshes apart at the seams of the domain."""
-    if not state.periodicity:
-        return pos
-    along_cells = [graph[r[2]].node_id[graph[r].edge_index] for r in spec.relations if r[1] == CELL]
-    edges = torch.cat([torch.empty(2, 0, dtype=torch.int64, device=pos.device), *along_cells], dim=1)
-    images, _ = unwrapped(np.ascontiguousarray(pos.cpu().numpy()), edges.cpu().numpy(), state.periodicity)
-    return torch.from_numpy(images).to(pos.device)
 
 
 def export_model(simulator: LearnedSimulator, path: Path | str) -> None:

@@ -1,4 +1,7 @@
-"""``State`` → ``HeteroData``: the same function in training and in rollout.
+"""``State`` → ``HeteroData``, the same in training, in rollouts and in exported programs: graph = features ∘ topology.
+
+``GraphBuilder.topology`` searches with NumPy. ``GraphBuilder.graph`` computes features from the indices found and the state, with tensor operations alone, so
+that ``torch.export`` can trace it.
 
 Every graph of a data set carries all its node and edge stores, empty where a frame has none, because PyG's ``Batch`` numbers edges wrongly when a store
 is missing from some graphs. Each undirected edge is stored once. There are no edges between boundary nodes.
@@ -6,45 +9,43 @@ is missing from some graphs. Each undirected edge is stored once. There are no e
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
-from gpe_pl.errors import GpeError
 from gpe_pl.graphs.features import (
     GraphConfig,
     Scales,
     boundary_features,
     edge_features,
     feature_spec,
+    from_centre,
     history_of,
     material_features,
     mesh_features,
     scales_of,
     virtual_features,
 )
-from gpe_pl.graphs.islands import find_islands, unwrapped
-from gpe_pl.graphs.multiscale import MultiscaleGraph, multiscale_graph
-from gpe_pl.graphs.neighbors import check_crowding, radius_between, radius_pairs
+from gpe_pl.graphs.neighbors import check_crowding
+from gpe_pl.graphs.search import as_array, find_topology, rows_of
+from gpe_pl.graphs.topology import GraphError as GraphError
+from gpe_pl.graphs.topology import MeshTopology, Topology
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of, node_code
+from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata
 
-
-class GraphError(GpeError, ValueError):
-    """A state does not fit the data set whose graphs are built; the message says how."""
-
+EdgeFeatures = tuple[Tensor, Tensor]
+"""Odd [edge, odd channel] and even [edge, even channel] features of the edges of a relation."""
 
 LARGEST = 1e100
-"""Of coordinates [m] and velocities [m/s]: squares of larger ones overflow."""
+"""Largest coordinate [m] and velocity [m/s]: squares of larger ones overflow."""
 
 
 @dataclass(frozen=True)
@@ -56,14 +57,14 @@ class GraphBuilder:
     ``offset``: the displacement over the radius, which standardisation leaves as it is.
 
     With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph ``island_is_free`` [island] and ``num_islands`` [1].
-    ``pos`` counts from the mean of the node's island, and in periodic domains keeps it together; an island that goes around the period has no lever arms, and
-    ``pos`` is zero there. Nodes of meshes then have ``body``, which they move with, and the graph ``num_bodies`` [1]: what cells connect, with the nodes of no
-    cell beside it. Where there are no cells at all, ``body`` is -1.
+    ``pos`` counts from the mean of the node's island. In periodic domains the island is kept together; ``pos`` is zero in an island that goes around the
+    period, because it has no lever arms. Nodes of meshes also have ``body``, and the graph ``num_bodies`` [1]: a body is what cells connect, with the nodes of
+    no cell beside it. ``body`` is -1 in a scene without cells.
 
     Attributes:
-        config: what the graphs are like.
-        metadata: of the data set.
-        skips: what is left out in building them, which changes no graph.
+        config: settings of the graph.
+        metadata: metadata of the data set.
+        skips: what to leave out while building, which changes no graph.
 
     Raises:
         PeriodicityError: the neighbour radius is half a period or more.
@@ -89,10 +90,28 @@ class GraphBuilder:
         """Build the graph of a state of float64 tensors.
 
         Raises:
+            GraphError: as ``topology``.
+            SimulationError: as ``topology``.
+        """
+        return self.graph(self.topology(state), state)
+
+    def topology(self, state: State) -> Topology:
+        """Search for the nodes and edges of the graph of a state of float64 tensors.
+
+        Raises:
             GraphError: the state holds a node type that the data set does not have, lacks velocity history, repeats along other axes, or has cells that
                 do not fit its nodes.
             SimulationError: a position or velocity is not finite, or so many nodes lie within each other's radius that the material has collapsed.
         """
+        self._check(state)
+        rows = rows_of(state, self.spec.materials)
+        if sum(len(r) for r in rows.values()) != state.num_nodes:
+            present = {NODE_TYPES[code] for code in state.node_type.unique().tolist()}
+            unknown, known = ", ".join(sorted(present - {*self.spec.materials})), ", ".join(self.spec.materials)
+            raise GraphError(f"state has nodes of {unknown}; the data set {self.metadata.dataset!r} has {known}")
+        return find_topology(state, rows, self.config, self.spec, self.scales, self.skips)
+
+    def _check(self, state: State) -> None:
         if state.pos.dtype != torch.float64:
             raise GraphError(f"positions are {state.pos.dtype}; convert the state with State.to_torch, which makes them float64")
         if state.periodicity.axes != self.metadata.periodicity.axes:
@@ -107,254 +126,129 @@ class GraphBuilder:
             is_finite = bool(torch.isfinite(torch.cat([state.pos[node], history[node].flatten()])).all())
             what, reason = ("beyond all measure", "explosion") if is_finite else ("not finite", "nan")
             raise SimulationError(f"node {node} has a position or velocity that is {what}", reason=reason, node=node)
-        check_crowding(_array(state.pos), self.scales.radius, self.scales.spacing, state.periodicity)
-        rows = {m: self._rows(state, m) for m in self.spec.materials}
-        if sum(len(r) for r in rows.values()) != state.num_nodes:
-            present = {NODE_TYPES[code] for code in state.node_type.unique().tolist()}
-            unknown, known = ", ".join(sorted(present - {*self.spec.materials})), ", ".join(self.spec.materials)
-            raise GraphError(f"state has nodes of {unknown}; the data set {self.metadata.dataset!r} has {known}")
-        mesh = self._mesh(state) if self._meshes else None
+        check_crowding(as_array(state.pos), self.scales.radius, self.scales.spacing, state.periodicity)
 
-        data = HeteroData()
-        for material, r in rows.items():
+    # --- features of indices and state; torch.export traces what follows, so lengths are symbols and no branch depends on values ---------------
+
+    def graph(self, topology: Topology, state: State) -> HeteroData:
+        """Return the graph of a state whose topology is known."""
+        data, history, boundary = HeteroData(), history_of(state), state.boundary
+        for material, r in topology.rows.items():
             store = data[material]
             store.x = self._rounded(material_features(history[r], state.gravity, self.scales))
             column = self.metadata.param_names.index(MATERIALS[material].name)
             store.material_params = state.material_params[r, column : column + 1].float()
             store.mass = self._rounded(state.mass[r])
             store.node_id = r
-        self._add_radius_edges(data, state, rows, mesh)
-        if mesh is not None:
-            self._add_mesh(data, state, rows, mesh)
-        elif self._meshes:
-            self._add_empty_mesh(data, state)
-        if self.config.islands:
-            self._add_islands(data, state, rows)
-            self._add_bodies(data, state, rows, mesh)
+        if topology.boundary_rows is not None:
+            boundary = _part(boundary, topology.boundary_rows)
+        data[BOUNDARY].x = self._rounded(boundary_features(self.config, boundary, self.scales))
+        features = self._radius_features(topology, state, boundary)
+        levels = [grid(level) for level in range(1, self.spec.num_levels + 1)]
+        virtual = [torch.empty(0, self.spec.node_channels[name], device=state.pos.device) for name in levels]
+        if topology.mesh is not None:
+            virtual, of_mesh = self._mesh_features(topology, topology.mesh, state)
+            features |= of_mesh
+        for name, x in zip(levels, virtual, strict=True):
+            data[name].x = x
+        for relation in self.spec.relations:
+            self._add_edges(data, relation, topology.edges.get(relation), features.get(relation), state.pos.device)
+        if topology.islands is not None:
+            islands, num_islands = topology.islands, topology.islands.is_free.shape[0]
+            arm = from_centre(state.pos, islands.label, num_islands) if islands.arm is None else islands.arm
+            arm = self._rounded(arm)  # single precision has no room for where the island is
+            for material, r in topology.rows.items():
+                data[material].pos, data[material].island = arm[r], islands.label[r]
+            data.island_is_free, data.num_islands = islands.is_free, torch.full((1,), num_islands, device=arm.device)
+            for material, body in islands.body.items():
+                data[material].body = body
+            if self.spec.meshes:
+                data.num_bodies = torch.full((1,), islands.num_bodies, device=arm.device)
         return data
 
-    @cached_property
-    def _meshes(self) -> tuple[str, ...]:
-        """Materials that are connected along their cells."""
-        return tuple(source for source, name, _ in self.spec.relations if name == CELL)
+    def _rounded(self, values: Tensor) -> Tensor:
+        """Return values in the network's precision."""
+        return values.float()
 
-    def _rows(self, state: State, material: str) -> Tensor:
-        if len(self.metadata.materials) == 1 and bool((state.node_type == node_code(material)).all()):
-            return torch.arange(state.num_nodes, device=state.pos.device)
-        return torch.nonzero(state.node_type == node_code(material)).flatten()
-
-    # --- edges within a radius ------------------------------------------------------------------------------------------------------------
-
-    def _add_radius_edges(self, data: HeteroData, state: State, rows: dict[str, Tensor], mesh: MultiscaleGraph | None) -> None:
-        """Boundary nodes, and the edges that the radius decides."""
-        device = state.pos.device
-        pos, vel = {m: state.pos[r] for m, r in rows.items()}, {m: state.vel[r] for m, r in rows.items()}
-        points = {m: _array(p) for m, p in pos.items()} | {BOUNDARY: self._points(state)}
-        present = {m for m, r in rows.items() if len(r)} | ({BOUNDARY} if len(state.boundary.pos) else set())
-        relations = [r for r in self.spec.relations if r[1] == RADIUS]
-        edges: dict[EdgeType, Tensor] = {}
-        for relation in relations:
-            source, _, target = relation
-            if self.skips.absent_types and not {source, target} <= present:
-                continue
-            if source != target:
-                pairs = radius_between(points[source], points[target], self.scales.radius, state.periodicity)
-            else:
-                pairs = radius_pairs(points[source], self.scales.radius, state.periodicity)
-                if mesh is not None and source in self._meshes:
-                    pairs = pairs[:, mesh.are_in_contact(rows[source].cpu().numpy()[pairs], self.scales.radius)]
-            edges[relation] = torch.from_numpy(pairs).to(device)
-
-        boundary = _trim(state.boundary, edges) if self.config.trim_boundary else state.boundary
-        data[BOUNDARY].x = self._rounded(boundary_features(self.config, boundary, self.scales))
-        pos[BOUNDARY], vel[BOUNDARY] = boundary.pos, boundary.vel
-        for relation in relations:
-            if relation not in edges:
-                self._add_no_edges(data, relation, device)
-                continue
-            source, _, target = relation
-            edge_index = edges[relation]
-            chunk = max(1, edge_index.shape[1]) if self.skips.edges_at_once is None else self.skips.edges_at_once
-            parts = []
-            for j, i in edge_index.split(chunk, dim=1):
-                displacement, velocity = state.periodicity.shortest(pos[target][i] - pos[source][j]), vel[target][i] - vel[source][j]
-                normal = boundary.normal[j] if source == BOUNDARY else None
-                odd, even = edge_features(self.config.features, displacement, velocity, normal, self.scales)
-                parts.append((self._rounded(odd), self._rounded(even)))
-            store = data[relation]
-            store.edge_index = edge_index
-            store.odd, store.even = (part[0] if len(part) == 1 else torch.cat(part) for part in zip(*parts, strict=True))
-            store.offset = store.odd[:, : self.spec.dim]
-
-    def _points(self, state: State) -> Any:
-        """Where the boundary nodes are, as ``radius_between`` takes it."""
-        return state.boundary.tree(state.periodicity) if self.skips.static_boundary else _array(state.boundary.pos)
-
-    def _add_no_edges(self, data: HeteroData, relation: EdgeType, device: torch.device) -> None:
+    def _add_edges(
+        self, data: HeteroData, relation: EdgeType, edge_index: Tensor | None, features: EdgeFeatures | None, device: torch.device
+    ) -> None:
+        """Add the store of a relation, empty where there are no edges."""
+        if edge_index is None or features is None:
+            edge_index = torch.empty(2, 0, dtype=torch.int64, device=device)
+            channels = self.spec.odd_channels[relation], self.spec.even_channels[relation]
+            features = torch.empty(0, channels[0], device=device), torch.empty(0, channels[1], device=device)
         store = data[relation]
-        store.edge_index = torch.empty(2, 0, dtype=torch.int64, device=device)
-        store.odd = torch.empty(0, self.spec.odd_channels[relation], device=device)
-        store.even = torch.empty(0, self.spec.even_channels[relation], device=device)
+        store.edge_index, (store.odd, store.even) = edge_index, features
         if relation[1] == RADIUS:
             store.offset = store.odd[:, : self.spec.dim]
 
-    def _add_islands(self, data: HeteroData, state: State, rows: dict[str, Tensor]) -> None:
-        """Groups of nodes that the graph connects, and which of them no edge ties to the boundary.
+    def _radius_features(self, topology: Topology, state: State, boundary: Boundary) -> dict[EdgeType, EdgeFeatures]:
+        pos = {m: state.pos[r] for m, r in topology.rows.items()} | {BOUNDARY: boundary.pos}
+        vel = {m: state.vel[r] for m, r in topology.rows.items()} | {BOUNDARY: boundary.vel}
+        features = {}
+        for relation, edge_index in topology.edges.items():
+            source, name, target = relation
+            if name != RADIUS:
+                continue
+            at_once = self.skips.edges_at_once
+            parts = []
+            for j, i in (edge_index,) if at_once is None else edge_index.split(at_once, dim=1):
+                displacement, velocity = topology.periodicity.shortest(pos[target][i] - pos[source][j]), vel[target][i] - vel[source][j]
+                normal = boundary.normal[j] if source == BOUNDARY else None
+                odd, even = edge_features(self.config.features, displacement, velocity, normal, self.scales)
+                parts.append((self._rounded(odd), self._rounded(even)))
+            odd, even = (part[0] if len(part) == 1 else torch.cat(part) for part in zip(*parts, strict=True))
+            features[relation] = odd, even
+        return features
 
-        What pushes a body from beyond the radius no model can see; held to free fall, it stays stable (docs/results/trials).
-        """
-        between, touches = [], torch.zeros(state.num_nodes, dtype=torch.bool, device=state.pos.device)
-        for source, name, target in self.spec.relations:
-            if source == BOUNDARY:
-                touches[rows[target][data[source, name, target].edge_index[1]]] = True
-            elif source in rows and target in rows:
-                j, i = data[source, name, target].edge_index
-                between.append(torch.stack([rows[source][j], rows[target][i]]))
-        edges = torch.cat(between, dim=1).cpu().numpy()
-        islands = find_islands(state.num_nodes, edges, touches.cpu().numpy())
-        label = torch.from_numpy(islands.label).to(state.pos.device)
-        pos = self._kept_together(state, edges) if state.periodicity else state.pos
-        arms = self._rounded(from_centre(pos, label, len(islands.is_free)))  # single precision has no room for where the island is
-        for material, r in rows.items():
-            data[material].pos = arms[r]
-            data[material].island = label[r]
-        data.island_is_free = torch.from_numpy(islands.is_free).to(state.pos.device)
-        data.num_islands = torch.tensor([len(islands.is_free)], device=state.pos.device)
-
-    def _add_bodies(self, data: HeteroData, state: State, rows: dict[str, Tensor], mesh: MultiscaleGraph | None) -> None:
-        """Groups of mesh nodes that move together."""
-        if not self._meshes:
-            return
-        device = state.pos.device
-        nodes = torch.cat([rows[m] for m in self._meshes]).cpu().numpy()
-        body, num_bodies = np.full(len(nodes), -1), 0
-        if mesh is not None:
-            names, body = np.unique(
-                mesh.moving_bodies(state.node_type.cpu().numpy().astype(np.int64), self.scales.spacing)[nodes], return_inverse=True
-            )
-            num_bodies = len(names)
-        parts = torch.from_numpy(body).to(device).split([len(rows[m]) for m in self._meshes])
-        for material, part in zip(self._meshes, parts, strict=True):
-            data[material].body = part
-        data.num_bodies = torch.tensor([num_bodies], device=device)
-
-    def _rounded(self, values: Tensor) -> Tensor:
-        """Values in the network's precision."""
-        return values.float()
-
-    @staticmethod
-    def _kept_together(state: State, edges: np.ndarray) -> Tensor:
-        """Positions that do not tear islands apart at the seams of a periodic domain; all zero where an island goes around it."""
-        images, goes_around = unwrapped(_array(state.pos), edges, state.periodicity)
-        return torch.from_numpy(np.where(goes_around[:, None], 0.0, images)).to(state.pos.device)
-
-    # --- meshes ---------------------------------------------------------------------------------------------------------------------------
-
-    def _mesh(self, state: State) -> MultiscaleGraph | None:
-        """The multi-scale graph of a state's cells, or None where it has none."""
-        if state.cells is None or state.cells.shape[0] == 0:
-            return None
-        if state.rest_pos is None:
-            raise GraphError("state has cells but no rest_pos; a mesh needs both, or graph.mesh=false takes its nodes as particles")
-        rest_pos, cells = state.rest_pos.cpu().numpy(), state.cells.cpu().numpy()
-        mesh = multiscale_graph(rest_pos, cells, self.scales.spacing, self.spec.num_levels, state.periodicity)
-        kinds = state.node_type[state.cells]
-        codes = torch.tensor([node_code(m) for m in self._meshes], device=kinds.device)
-        wrong = (kinds != kinds[:, :1]).any(dim=1) | ~torch.isin(kinds[:, 0], codes)
-        if wrong.any():
-            cell = int(wrong.nonzero()[0])
-            found = ", ".join(sorted({NODE_TYPES[code] for code in kinds[cell].tolist()}))
-            raise GraphError(f"cell {cell} has nodes of {found}; a cell is of one material, and meshes are of {', '.join(self._meshes)}")
-        return mesh
-
-    def _add_mesh(self, data: HeteroData, state: State, rows: dict[str, Tensor], mesh: MultiscaleGraph) -> None:
-        """Cell edges, virtual nodes and the edges between levels.
+    def _mesh_features(self, topology: Topology, mesh: MeshTopology, state: State) -> tuple[list[Tensor], dict[EdgeType, EdgeFeatures]]:
+        """Return the features of virtual nodes, by level, and those of the edges of meshes.
 
         A virtual node moves as the mass-weighted mean of the mesh nodes below it, which is that of its children.
         """
-        spec, scales, dim, n = self.spec, self.scales, self.spec.dim, mesh.num_nodes
-        device = state.pos.device
-        level = torch.tensor(mesh.level, device=device)
-        sizes = np.bincount(mesh.level, minlength=spec.num_levels + 1)[1:].tolist()
-        row = torch.empty_like(level)  # of each point in its store
-        for r in rows.values():
-            row[r] = torch.arange(len(r), device=device)
-        row[n:] = torch.cat([torch.arange(size, device=device) for size in sizes]) if sizes else row[n:]
+        dim, sizes = self.spec.dim, mesh.num_virtual
+        pos = state.pos if mesh.shift is None else state.pos + mesh.shift
+        values = torch.cat([pos, mesh.rest_pos, history_of(state).flatten(1)], dim=1)
+        mean = _means_below(mesh, values, state.mass)
+        level = _levels(range(1, len(sizes) + 1), sizes, mean.device)
+        motion = mean[:, 2 * dim :].unflatten(1, (-1, dim))
+        x = self._rounded(virtual_features(motion, level, state.gravity, self.scales))
 
-        values = torch.cat([self._kept_whole(state, mesh), torch.tensor(mesh.rest_pos, device=device), history_of(state).flatten(1)], dim=1)
-        above, below = torch.tensor(mesh.descent, device=device)
-        above, mass = above - n, state.mass[below][:, None]
-        total = mass.new_zeros(sum(sizes), 1).index_add_(0, above, mass)
-        mean = values.new_zeros(sum(sizes), values.shape[1]).index_add_(0, above, mass * values[below]) / total
-        pos, rest, motion = torch.cat([values, mean]).split([dim, dim, values.shape[1] - 2 * dim], dim=1)
-        x = self._rounded(virtual_features(motion[n:].unflatten(1, (-1, dim)), level[n:], state.gravity, scales))
-        for k, part in enumerate(x.split(sizes), start=1):
-            data[grid(k)].x = part
-
-        for name, pairs in ((CELL, mesh.cell_edges), (DOWN, mesh.down_edges), (SAME, mesh.same_edges)):
-            edge_level = mesh.level[pairs[0]]
-            j, i = edges = torch.tensor(pairs, device=device)
-            odd, even = mesh_features(
-                self.config.features,
-                pos[i] - pos[j],
-                rest[i] - rest[j],
-                motion[i, -dim:] - motion[j, -dim:],
-                None if name == CELL else level[j],
-                scales,
-            )
-            for relation in spec.relations:
-                source, relation_name, target = relation
-                if relation_name != name:
-                    continue
-                chosen: Any = slice(None)
-                if name != CELL:
-                    chosen = slice(*np.searchsorted(edge_level, [level_of(source), level_of(source) + 1]))
-                if target in self._meshes and len(self._meshes) > 1:
-                    is_target = state.node_type[i[chosen]] == node_code(target)
-                    chosen = torch.arange(len(i), device=device)[chosen][is_target]
-                store = data[relation]
-                store.edge_index, store.odd, store.even = row[edges[:, chosen]], self._rounded(odd[chosen]), self._rounded(even[chosen])
-
-    def _kept_whole(self, state: State, mesh: MultiscaleGraph) -> Tensor:
-        """Positions that do not tear meshes apart at the seams of a periodic domain."""
-        if not state.periodicity:
-            return state.pos
-        pos, goes_around = unwrapped(np.ascontiguousarray(state.pos.cpu().numpy()), mesh.cell_edges, state.periodicity)
-        if goes_around.any():
-            raise GraphError(f"the mesh of node {int(goes_around.argmax())} goes around the periodic domain, so it has no rest shape")
-        return torch.from_numpy(pos).to(state.pos.device)
-
-    def _add_empty_mesh(self, data: HeteroData, state: State) -> None:
-        """The stores of a mesh for a state without one."""
-        device = state.pos.device
-        for k in range(1, self.spec.num_levels + 1):
-            data[grid(k)].x = torch.empty(0, self.spec.node_channels[grid(k)], device=device)
-        for relation in self.spec.relations:
-            if relation[1] != RADIUS:
-                self._add_no_edges(data, relation, device)
+        now, above = (torch.cat([v[:, : 2 * dim], v[:, -dim:]], dim=1) for v in (values, mean))  # position, rest position, velocity
+        points = {m: now[topology.rows[m]] for m in self.spec.meshes}
+        points |= {grid(k): part for k, part in enumerate(above.split(sizes), start=1)}
+        features: dict[EdgeType, EdgeFeatures] = {}
+        for name in (CELL, DOWN, SAME):
+            relations = [relation for relation in topology.edges if relation[1] == name]
+            if not relations:
+                continue
+            difference = torch.cat([points[r[2]][topology.edges[r][1]] - points[r[0]][topology.edges[r][0]] for r in relations])
+            counts = [topology.edges[r].shape[1] for r in relations]
+            level_of_source = None if name == CELL else _levels([level_of(r[0]) for r in relations], counts, mean.device)
+            displacement, rest, velocity = difference.split(dim, dim=1)
+            odd, even = mesh_features(self.config.features, displacement, rest, velocity, level_of_source, self.scales)
+            parts = zip(self._rounded(odd).split(counts), self._rounded(even).split(counts), strict=True)
+            features |= dict(zip(relations, parts, strict=True))
+        return [*x.split(sizes)], features
 
 
-def _array(x: Tensor) -> np.ndarray:
-    return np.ascontiguousarray(x.detach().cpu().numpy())
+def _means_below(mesh: MeshTopology, values: Tensor, mass: Tensor) -> Tensor:
+    """Return the mass-weighted means of values [node, channel] over the nodes below each virtual node."""
+    (above, below), num_virtual = mesh.descent, sum(mesh.num_virtual)
+    weight = mass[below][:, None]
+    total = mass.new_zeros(num_virtual + 1, 1).index_add_(0, above, weight)  # the last row is for nodes without a virtual node
+    mean = values.new_zeros(num_virtual + 1, values.shape[1]).index_add_(0, above, weight * values[below]) / total
+    return mean[:num_virtual]
 
 
-def from_centre(pos: Tensor, island: Tensor, num_islands: int) -> Tensor:
-    """Positions counted from the mean of their island."""
-    count = pos.new_zeros(num_islands, 1).index_add_(0, island, torch.ones_like(pos[:, :1]))
-    centre = pos.new_zeros(num_islands, pos.shape[1]).index_add_(0, island, pos) / count
-    return pos - centre[island]
+def _levels(levels: Iterable[int], counts: Iterable[int], device: torch.device) -> Tensor:
+    """Return each level as often as its count says."""
+    parts = [torch.full((n,), level, device=device) for level, n in zip(levels, counts, strict=True)]
+    return torch.cat([torch.empty(0, dtype=torch.int64, device=device), *parts])
 
 
-def _trim(boundary: Boundary, edges: dict[EdgeType, Tensor]) -> Boundary:
-    """The boundary nodes that have an edge, in order; renumbers the edges in place."""
-    used = torch.zeros(len(boundary.pos), dtype=torch.bool, device=boundary.pos.device)
-    for (source, _, _), edge_index in edges.items():
-        if source == BOUNDARY:
-            used[edge_index[0]] = True
-    kept = torch.nonzero(used).flatten()
-    new_row = torch.cumsum(used, dim=0) - 1
-    for relation, edge_index in edges.items():
-        if relation[0] == BOUNDARY:
-            edges[relation] = torch.stack([new_row[edge_index[0]], edge_index[1]])
-    rows = {name: getattr(boundary, name)[kept] for name in ("pos", "vel", "normal", "friction", "restitution")}
-    return Boundary(**rows, shapes=boundary.shapes)
+def _part(boundary: Boundary, rows: Tensor) -> Boundary:
+    """Return some of the boundary nodes."""
+    kept = {name: getattr(boundary, name)[rows] for name in ("pos", "vel", "normal", "friction", "restitution")}
+    return Boundary(**kept, shapes=boundary.shapes)

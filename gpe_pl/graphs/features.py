@@ -234,6 +234,13 @@ def _without_rounding(displacement: Tensor) -> Tensor:
     return torch.where(displacement.abs() < 1e-9, 0.0, displacement)
 
 
+def from_centre(pos: Float64[Tensor, "node dim"], island: Int64[Tensor, " node"], num_islands: int) -> Float64[Tensor, "node dim"]:
+    """Return positions relative to the mean of their island [m]."""
+    count = pos.new_zeros(num_islands, 1).index_add_(0, island, torch.ones_like(pos[:, :1]))
+    centre = pos.new_zeros(num_islands, pos.shape[1]).index_add_(0, island, pos) / count
+    return pos - centre[island]
+
+
 def history_of(state: State) -> Float64[Tensor, "node history dim"]:
     """Velocity history of a state, or its velocity alone."""
     return state.vel[:, None] if state.velocity_history is None else state.velocity_history

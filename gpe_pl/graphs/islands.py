@@ -91,20 +91,30 @@ def islands_within(
 def unwrapped(
     pos: Float64[np.ndarray, "node dim"], edge_index: Int64[np.ndarray, "2 edge"], periodicity: Periodicity
 ) -> tuple[Float64[np.ndarray, "node dim"], Bool[np.ndarray, "node"]]:
-    """Images of nodes that lie beside their neighbours, and whether a node's component goes around the period, so that no such images exist.
+    """Return images of nodes that lie beside their neighbours, and the nodes for which no such images exist; see ``image_shifts``."""
+    if not periodicity:
+        return pos, np.zeros(len(pos), dtype=bool)
+    shift, goes_around = image_shifts(pos, edge_index, periodicity)
+    return pos + shift, goes_around
+
+
+def image_shifts(
+    pos: Float64[np.ndarray, "node dim"], edge_index: Int64[np.ndarray, "2 edge"], periodicity: Periodicity
+) -> tuple[Float64[np.ndarray, "node dim"], Bool[np.ndarray, "node"]]:
+    """Return whole periods [m] that move each node beside its neighbours, and a mask of the nodes whose component goes around the period.
+
+    A component that goes around the period has no images that lie side by side.
 
     Args:
         pos: positions [m].
         edge_index: edges that are shorter than half the period.
-        periodicity: where space repeats.
+        periodicity: axes along which space repeats.
     """
-    if not periodicity:
-        return pos, np.zeros(len(pos), dtype=bool)
     j, i = edge_index
     difference = pos[i] - pos[j]
     turns = np.round((periodicity.shortest(difference) - difference) / np.where(periodicity.period > 0, periodicity.period, 1.0))
     image, goes_around = _images(len(pos), edge_index, turns.astype(np.int64))
-    return pos + image * periodicity.period, goes_around
+    return image * periodicity.period, goes_around
 
 
 @njit(cache=True)

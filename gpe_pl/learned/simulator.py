@@ -399,18 +399,31 @@ class LearnedSimulator(nn.Module):
         new = self.moved(states, graphs, predicted.acceleration)
         return self._with_stress(new, predicted.stress, graphs) if predicted.stress else new
 
-    def moved(self, states: list[State], graphs: list[HeteroData], acceleration: dict[str, Tensor]) -> list[State]:
-        """The next states under what the model predicts for a batch of their graphs: accelerations without gravity per material, in units of
-        ``acceleration_std``.
+    def moved(self, states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor]) -> list[State]:
+        """Return the next states from the accelerations that the model predicts for a batch of their graphs, see ``accelerations``."""
+        acc = self.accelerations(states, graphs, predicted)
+        return [self.integrated(*parts) for parts in zip(states, graphs, acc, strict=True)]
+
+    def accelerations(self, states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor]) -> list[Tensor]:
+        """Return the accelerations [node, dim] of each state in m/s², gravity included.
+
+        Args:
+            states: states of the scenes of a batch.
+            graphs: their graphs.
+            predicted: accelerations without gravity that the model predicts for the batch, per material, in units of ``acceleration_std``.
         """
         acc = [state.gravity.expand_as(state.pos).clone() for state in states]
-        for scene, rows, part in _per_scene(acceleration, graphs):
+        for scene, rows, part in _per_scene(predicted, graphs):
             acc[scene][rows] += part.double() * self.acceleration_std
-        new = [self.advance(state, a) for state, a in zip(states, acc, strict=True)]
-        return [self._held(*parts) for parts in zip(states, new, graphs, strict=True)] if self.static_friction else new
+        return acc
+
+    def integrated(self, state: State, graph: HeteroData, acc: Tensor) -> State:
+        """Return the next state under an acceleration [node, dim] in m/s², gravity included; static friction keeps slow nodes in place."""
+        new = self.advance(state, acc)
+        return self._held(state, new, graph) if self.static_friction else new
 
     def _held(self, state: State, new: State, graph: HeteroData) -> State:
-        """The new state, with those nodes where they were that static friction holds."""
+        """Return the new state with the old positions of the nodes that static friction keeps in place."""
         island = torch.empty(state.num_nodes, dtype=torch.int64, device=state.pos.device)
         for material in self.builder.spec.materials:
             island[graph[material].node_id] = graph[material].island
@@ -562,10 +575,10 @@ def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:
 
 
 def _per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """What was predicted for a batch, as (number of the scene, rows of its state, values)."""
+    """Yield the predictions for a batch as (number of the scene, rows of its state, values)."""
     for material, values in predicted.items():
         rows = [graph[material].node_id for graph in graphs]
-        for scene, part in enumerate(values.split([len(r) for r in rows])):
+        for scene, part in enumerate(values.split([r.shape[0] for r in rows])):
             yield scene, rows[scene], part
 
 

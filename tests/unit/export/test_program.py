@@ -94,6 +94,37 @@ def test_meshes(model: Any, kind: Any) -> None:
     assert_same_step(PortableStep(learned), learned, scenes.mesh_state(kind, materials, num_bodies=3).to_torch())
 
 
+@pytest.mark.parametrize("kind", ["particles", "triangles", "lattice", "tetrahedra"])
+def test_graphs_of_programs_are_those_of_the_builder(kind: str) -> None:
+    """Bit for bit, if the state has its nodes in the order of their materials, as programs have them."""
+    materials, dim = ("sand", "elastomer", "solid"), 3 if kind == "tetrahedra" else 2
+    learned = simulator(GPE, materials, dim, {"mesh": True, "num_levels": 3, "islands": True, "trim_boundary": False, "history": 2})
+    shuffled = scenes.state(materials=materials, history=2) if kind == "particles" else scenes.mesh_state(kind, materials, 3, history=2)
+    state = scenes.permuted(shuffled, np.argsort(shuffled.node_type, kind="stable")).to_torch()
+    step, scene, expected = PortableStep(learned), scene_of(learned, state), learned.builder(state)
+    graph = learned.builder.graph(step.topology(scene), step.state(scene))
+    assert int(graph.num_bodies) >= int(expected.num_bodies)
+    graph.num_bodies = expected.num_bodies  # an upper bound in programs
+    scenes.assert_equal_graphs(graph, expected)
+
+
+@pytest.mark.parametrize("loose", [False, True])
+def test_descent_follows_from_parents(loose: bool) -> None:
+    """Also where a mesh has nodes of no cell, and bodies whose root lies below the highest level."""
+    state = scenes.mesh_state("lattice", ("elastomer",), num_bodies=3)
+    assert state.cells is not None
+    cells = state.cells[::3] if loose else state.cells
+    learned = simulator(GPE, ("elastomer",), 2, {"mesh": True, "num_levels": 4})
+    changed = replace(state, cells=cells).to_torch()
+    expected = learned.builder.topology(changed).mesh
+    found = PortableStep(learned).topology(scene_of(learned, changed)).mesh
+    assert expected is not None and found is not None and found.num_virtual == expected.num_virtual
+    pairs = {*zip(*found.descent.tolist(), strict=True)}
+    without = {(above, node) for above, node in pairs if above == sum(found.num_virtual)}
+    assert pairs - without == {*zip(*expected.descent.tolist(), strict=True)}
+    assert bool(without)
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_islands_keep_their_momentum(dim: int) -> None:
     learned = simulator(dim=dim, config={"islands": True}, island_momentum="angular")
