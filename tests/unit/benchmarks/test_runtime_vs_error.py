@@ -165,7 +165,8 @@ def test_every_model_also_holds_its_predictions(monkeypatch: pytest.MonkeyPatch)
         "GNS, held predictions × 2": (2, 120.0),
         "GNS, held predictions × 4": (4, 120.0),
     }
-    assert all(s.model is simulator.model for s, _ in models.values())
+    weights = [*simulator.model.parameters()]
+    assert all(own is shared for s, _ in models.values() for own, shared in zip(s.model.parameters(), weights, strict=True))
 
 
 def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
