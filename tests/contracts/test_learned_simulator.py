@@ -679,7 +679,7 @@ UNBOUNDED = {
     "wide": (list(range(10**5)), "more than 20000 values"),
     "long": ("x" * 10**7, "a text of 10000000 characters"),
     "large": (2**1000, "an integer beyond 64 bits"),
-    "tensor": (torch.zeros(10), "a Tensor, where only"),
+    "tensor": (torch.zeros(10), "a Tensor, only text"),
 }
 
 
