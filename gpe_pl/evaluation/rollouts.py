@@ -1,4 +1,4 @@
-"""Rollouts of a learned simulator and of the trivial baselines over whole splits: one table of numbers, figures and animations."""
+"""Evaluation: rolls a learned simulator and the trivial baselines out over whole splits, and writes a table of metrics, figures and animations."""
 
 from __future__ import annotations
 
@@ -40,36 +40,40 @@ log = logging.getLogger(__name__)
 
 LEARNED = "learned"
 EXACT = "learned, exact"
-"""The same model without the approximate levels of ``Skips``, where a rollout has some."""
+"""Label of the same model without the approximate levels of ``Skips``; used if the rollout has any."""
 Export = Literal["vtk", "npz", "mp4", "model"]
 MAX_SPEED_FACTOR = 20.0
-"""A learned rollout has exploded when it is so many times faster than the fastest particle of the ground truth and than what crosses the domain in its time."""
+"""A learned rollout has exploded if a particle's speed exceeds this factor times a reference speed. The reference is the speed of the fastest particle of the
+ground truth, or the speed that crosses the domain within the trajectory if that is larger."""
 ONE_STEP_WINDOWS = 256
 VIEWER_BYTES = 2**26
-"""A viewer's arrays before compression; longer rollouts show every so many frames."""
+"""Maximum size of a viewer's arrays before compression [bytes]; the viewer of a longer rollout skips frames."""
 SCENES_AT_ONCE = 16
-"""Scenes, or windows, that one pass of the model takes together."""
+"""Number of scenes, or windows, in one pass of the model."""
 
 
 class StartError(GpeError, ValueError):
-    """Rollouts were asked to start before a model has seen enough frames."""
+    """The start frame of rollouts leaves a model too few frames before it."""
 
 
 @dataclass(frozen=True)
 class EvaluationSettings:
-    """What is evaluated.
+    """Settings of an evaluation.
 
     Attributes:
-        splits: of the data set.
-        horizons: in frames; the full length is always added.
-        num_trajectories: per split, from its start; None takes all.
+        splits: splits of the data set.
+        horizons: horizons [frames]; the full length is always added.
+        num_trajectories: number of trajectories per split, from its start; None takes all.
+        start_frame: frame at which rollouts start. Set it to evaluate models with different histories on the same frames. None takes the first frame with
+            enough history.
         containment: put particles that cross a wall back on its surface.
-        start_frame: that rollouts start at, so that models with different histories are judged on the same frames; None takes the first with enough history.
-        num_uncontained: trajectories per split that are also rolled out without containment, to see what it corrects; None takes all.
-        hold_parameters: takes material parameters outside the trained range for the nearest trained value.
-        static_friction: share of gravity within a frame below which what lies on a wall stays where it is; None takes the model's own.
-        num_pictures: trajectories per split that get a figure, an animation and a viewer.
-        export: what to write for other programs: those trajectories as ``vtk`` series, ``npz`` and ``mp4``, and the ``model`` (see ``portable``).
+        num_uncontained: number of trajectories per split that are also rolled out without containment, which shows what it corrects; None takes all.
+        hold_parameters: clamp material parameters outside the trained range to the nearest trained value.
+        static_friction: nodes on a wall stay in place if they are slower than this fraction of the speed that gravity gives in one frame (see
+            ``nn.static_friction``); None takes the model's own value.
+        num_pictures: number of trajectories per split that get a figure, an animation and a viewer.
+        export: what to write for other programs: the trajectories with pictures as ``vtk`` series, ``npz`` and ``mp4``, and the ``model`` (see
+            ``export.program``).
     """
 
     splits: Annotated[list[Split], Field(min_length=1)] = field(default_factory=lambda: ["test", "test_unseen"])
@@ -84,7 +88,7 @@ class EvaluationSettings:
     export: list[Export] = field(default_factory=list)
 
     def first_frame(self, history: int) -> int:
-        """The frame that rollouts of a model with so much history start at.
+        """Frame at which rollouts of a model with this history [frames] start.
 
         Raises:
             StartError: ``start_frame`` leaves too little history.
@@ -95,7 +99,7 @@ class EvaluationSettings:
 
 
 class ExportError(GpeError):
-    """Something that was asked for cannot be written; the message says what is missing."""
+    """A requested export cannot be written; the message says what is missing."""
 
 
 @dataclass(frozen=True)
@@ -113,16 +117,30 @@ class Row:
 
 
 def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettings, run_dir: Path, label: str = LEARNED) -> list[Row]:
-    """Roll out every trajectory of the splits; writes ``metrics.csv``, ``error_curve_*.png``, ``rollout_*.png``, ``rollout_*.gif``
-    and ``rollout_*.html`` (a viewer) of some, and their ``stress_*.png`` where the model decodes a stress.
+    """Roll out every trajectory of the splits, and write metrics and pictures to ``run_dir``.
 
-    All rollouts start at ``settings.start_frame`` and run to the end of the ground truth. ``share_outside_uncontained`` is the fraction of particle-frames
-    outside when containment is off, for as many rollouts as ``settings.num_uncontained``. ``share_corrected`` is the fraction of particle-steps that
-    containment corrects. Neither is reported where a boundary is known by its nodes only.
+    All rollouts start at ``settings.start_frame`` and run to the end of the ground truth. The files are ``metrics.csv`` and ``error_curve_*.png``. The first
+    ``settings.num_pictures`` trajectories of each split also get ``rollout_*.png``, ``rollout_*.gif`` and ``rollout_*.html`` (a viewer), and ``stress_*.png``
+    if the model decodes a stress.
 
-    Where ``simulator.skips`` has approximate levels, the rollout without them is evaluated beside, and what they cost is reported: ``skipping_mse`` [m²] is
-    the distance between the two rollouts, as far as the exact one came, ``share_asleep`` that of particle-steps that were not computed, ``lost_impulse``
-    [kg m/s] the momentum that falling asleep took away.
+    These metrics are computed here:
+
+    - ``share_outside_uncontained``: fraction of particle-frames outside with containment off, for the first ``settings.num_uncontained`` rollouts of a split.
+    - ``share_corrected``: fraction of particle-steps that containment corrects. Neither is reported for a boundary that consists of nodes only.
+    - ``skipping_mse`` [m²]: position MSE between the rollouts with and without the approximate levels of ``simulator.skips``, over the frames of both.
+    - ``share_asleep``: fraction of particle-steps that the approximate levels did not compute.
+    - ``lost_impulse`` [kg m/s]: momentum that was lost when nodes fell asleep. The last three are reported if there are approximate levels; the rollout without
+      them is then evaluated, too.
+
+    Args:
+        simulator: trained simulator.
+        root: folder of the data set.
+        settings: what to evaluate.
+        run_dir: folder for the files.
+        label: name of the model in the rows.
+
+    Returns:
+        The rows of ``metrics.csv``.
 
     Raises:
         StartError: ``settings.start_frame`` leaves too little history.
@@ -171,7 +189,7 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
 def _predict(
     simulator: LearnedSimulator, trajectories: list[Trajectory], start_frame: int, containment: bool, num_uncontained: int, label: str
 ) -> Iterator[tuple[dict[str, Trajectory], dict[str, float]]]:
-    """Predictions of all models, and further numbers of the learned one, for each trajectory."""
+    """Yield for each trajectory the predictions by model, and further metrics of the learned model by name."""
     truths = [trajectory.frames(start_frame) for trajectory in trajectories]
     starts = [_start(simulator, start_frame, *pair) for pair in zip(trajectories, truths, strict=True)]
     totals = [{"num_corrected": 0.0, "num_asleep": 0.0, "lost_impulse": 0.0} for _ in starts]
@@ -196,7 +214,7 @@ def _predict(
             predictions[name] = rollout(baseline(dt), trajectory.state(start_frame, start_frame), steps, truth.metadata)
         num_steps = truth.num_nodes * max(1, prediction.num_frames - 1)
         extra = {"num_good_frames": float(prediction.num_frames - 1)}
-        if truth.boundary.shapes:  # nodes alone have no inside
+        if truth.boundary.shapes:  # a boundary of nodes alone has no inside
             extra["share_outside_at_end"] = _share_outside(prediction, steps, steps, tolerance=surface_tolerance(truth.boundary.shapes))
             extra["share_corrected"] = totals[scene]["num_corrected"] / num_steps
             if scene < len(free):
@@ -209,30 +227,36 @@ def _predict(
 
 
 def _parameter(trajectory: Trajectory) -> float:
-    """The material parameter of a scene, or NaN where it has several or none."""
+    """Material parameter of a scene; NaN if it has several or none."""
     values = np.unique(np.asarray(trajectory.material_params, dtype=np.float64))
     values = values[np.isfinite(values)]
     return float(values[0]) if len(values) == 1 else float("nan")
 
 
 def _start(simulator: LearnedSimulator, start_frame: int, trajectory: Trajectory, truth: Trajectory) -> Start:
-    """Where a rollout begins, and limits far beyond what the ground truth does."""
+    """Start of a rollout, with a guard whose limits are far beyond the ground truth."""
     bounds = truth.metadata.bounds
     size = max(high - low for low, high in bounds)
-    across = size / (trajectory.num_frames * truth.metadata.frame_dt)  # where everything rests
+    across = size / (trajectory.num_frames * truth.metadata.frame_dt)  # the reference where everything rests
     speed = float(np.linalg.norm(trajectory.vel, axis=-1).max(initial=0.0))
     guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, across), bounds=bounds, margin=size, spacing=truth.metadata.spacing)
     return Start(simulator.initial_state(trajectory, start_frame), truth.num_frames - 1, truth.metadata, guard)
 
 
 def _share_outside(prediction: Trajectory, first: int, last: int, tolerance: float) -> float:
-    """Share of particle-frames inside a wall or obstacle in frames ``first … last``; those that a stopped rollout lacks count as outside."""
+    """Fraction of particle-frames that are inside a wall or obstacle in frames ``first … last``. Frames that a stopped rollout lacks count in full.
+
+    Args:
+        prediction: rollout; frame 0 is its start.
+        first, last: frames.
+        tolerance: depth [m] up to which a particle is not counted.
+    """
     wanted, good = last - first + 1, prediction.frames(first, last + 1)
     return (share_outside(good, tolerance) * good.num_frames + wanted - good.num_frames) / wanted
 
 
 def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windows: int = ONE_STEP_WINDOWS) -> float:
-    """Noise-free one-step error over windows spread evenly over a split, relative to predicting free fall."""
+    """One-step nMSE without noise, over windows spread evenly over a split: the error relative to predicting free fall."""
     dataset = WindowDataset(usable(open_split(root, split)), simulator.builder)
     windows = np.unique(np.linspace(0, len(dataset) - 1, min(len(dataset), num_windows)).round().astype(int))
     metric = OneStepNMSE()
@@ -245,7 +269,7 @@ def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windo
 
 
 def write_rows(path: Path, rows: list[Row]) -> None:
-    """Write rows as CSV, atomically, with their SHA-256 digest in a file beside it, as ``sha256sum`` writes it."""
+    """Write rows as CSV, atomically, and their SHA-256 digest to ``{name}.sha256`` in the format of ``sha256sum``."""
     table = io.StringIO(newline="")
     writer = csv.DictWriter(table, fieldnames=list(Row.__dataclass_fields__))
     writer.writeheader()
@@ -253,24 +277,24 @@ def write_rows(path: Path, rows: list[Row]) -> None:
     content = table.getvalue().encode()
     replace_text(
         _digest_file(path), f"{hashlib.sha256(content).hexdigest()}  {path.name}\n"
-    )  # first: a table without one is taken as it is
+    )  # first, as ``read_rows`` does not check a table without digest
     with replacing(path) as part:
         part.write_bytes(content)
 
 
 GROUPS = ("", *get_args(ParameterGroup))
-"""Of the material parameter; none where a value is of a whole split."""
+"""Groups of the material parameter; empty for the metrics of a whole split."""
 
 
 class MetricsError(GpeError, ValueError):
-    """A ``metrics.csv`` is damaged; the message names the file, and the line if it is one that cannot be read."""
+    """A ``metrics.csv`` is damaged; the message names the file, and the line if one cannot be read."""
 
 
 def read_rows(path: Path) -> Iterator[Row]:
-    """Rows of a ``metrics.csv``.
+    """Yield the rows of a ``metrics.csv``.
 
     Raises:
-        MetricsError: it is not what ``write_rows`` has written.
+        MetricsError: the file is not as ``write_rows`` wrote it.
     """
     digest = _digest_file(path)
     try:
@@ -281,7 +305,7 @@ def read_rows(path: Path) -> Iterator[Row]:
     content = path.read_bytes()
     if digest.exists() and digest.read_bytes().split()[:1] != [hashlib.sha256(content).hexdigest().encode()]:
         raise MetricsError(
-            f"{path}: damaged or changed (checksum mismatch); delete the file to evaluate again, or {digest.name} to take it as it is"
+            f"{path}: damaged or changed (checksum mismatch); delete the file to evaluate again, or {digest.name} to use it unchecked"
         )
     reader = csv.DictReader(io.TextIOWrapper(io.BytesIO(content), "utf-8", newline=""), strict=True)
     try:
@@ -297,9 +321,9 @@ def read_rows(path: Path) -> Iterator[Row]:
             if r["split"] not in SPLITS or r["parameter_group"] not in GROUPS or not (r["horizon"] == "full" or r["horizon"].isdecimal()):
                 raise ValueError(f"split, parameter group or horizon is {r['split']}, {r['parameter_group']}, {r['horizon']}")
             if not (r["model"].isprintable() and r["metric"].isprintable()):
-                raise ValueError("model or metric holds characters that are not shown")
+                raise ValueError("model or metric contains characters that are not printable")
             yield Row(**known)
-    except (ValueError, csv.Error) as error:  # also what is not text
+    except (ValueError, csv.Error) as error:  # also a file that is not text
         raise MetricsError(f"{path}, line {reader.line_num}: damaged ({error}); delete the file to evaluate again") from None
 
 
@@ -308,7 +332,7 @@ def _digest_file(path: Path) -> Path:
 
 
 def means(rows: list[Row], label: str = LEARNED) -> dict[str, float]:
-    """Means over trajectories of what was evaluated of a model, as ``split/metric@horizon``."""
+    """Means of a model's metrics over trajectories, by ``split/metric@horizon``."""
     values: dict[str, list[float]] = {}
     for row in rows:
         if row.model == label:

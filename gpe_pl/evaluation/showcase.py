@@ -1,6 +1,6 @@
-"""A rollout in a scene far larger than those in training, for which there is no ground truth: what it takes, whether it stays sound, and what it looks like.
+"""Showcase: a rollout in a scene far larger than those in training, without ground truth. Measures its cost and its plausibility, and draws it.
 
-Memory stays flat, however long the rollout: only the frames of the animation are kept.
+Memory does not grow with the length of the rollout, as only the frames of the animation are kept.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from gpe_pl.trajectory.trajectory import Metadata, Termination, Trajectory
 from gpe_pl.viz.saving import save_figure
 
 MAX_PICTURES = 60
-"""Frames of the animation at most."""
+"""Maximum number of frames of the animation."""
 MAX_SPEED_FACTOR = 2.0
-"""A node faster than this many times what free fall through the whole domain gives is counted as too fast."""
+"""A node is too fast if its speed exceeds this factor times that after a free fall through the whole domain."""
 DEPTH = 1e-3
-"""Depth in a solid, in rest spacings, from which a node counts as through the wall where nothing holds it back."""
+"""Depth in a solid [rest spacings] from which a node counts as outside in a rollout without containment."""
 
 
 @dataclass(frozen=True)
 class ShowcaseSettings:
-    """What is rolled out.
+    """Settings of a showcase.
 
     Attributes:
-        num_steps: frames to add.
-        num_uncontained_steps: frames of a second rollout without containment, to see what it corrects.
-        values: of each material's parameter.
-        seed: of the scene.
+        num_steps: length of the rollout [frames].
+        num_uncontained_steps: length [frames] of a second rollout without containment, which shows what it corrects.
+        values: value of each material's parameter, in the unit of ``schema.MATERIALS``.
+        seed: seed of the scene.
     """
 
     num_steps: Annotated[int, Field(ge=1)] = 50
@@ -58,7 +58,7 @@ class ShowcaseSettings:
 
 @dataclass(frozen=True)
 class Record:
-    """One number: what was measured, and its unit."""
+    """One measured value with its unit."""
 
     metric: str
     value: float
@@ -66,11 +66,11 @@ class Record:
 
 
 def start(simulator: LearnedSimulator, scene: Scene, settings: ShowcaseSettings) -> tuple[State, Metadata]:
-    """The scene at rest, as the simulator takes it.
+    """Initial state of the scene, at rest, for the simulator, and the scene's metadata.
 
     Raises:
         SceneError: the scene does not fit the simulator.
-        ValueError: there is no such scene, no such material in it, or a value outside the limits of the solvers.
+        ValueError: there is no such scene, it lacks a material in ``settings.values``, or a value is outside the limits of the solvers.
     """
     metadata = replace(describe(scene, simulator.builder.metadata.frame_dt, seed=settings.seed), dataset="showcase")
     unknown = settings.values.keys() - set(metadata.materials)
@@ -94,19 +94,23 @@ def run(
     folder: Path,
     on_progress: Callable[[int, int], Any] | None = None,
 ) -> list[Record]:
-    """Roll the simulator out from a ``start``; writes ``showcase.json`` and ``.md``, ``showcase.png`` and ``showcase.gif`` (``.mp4`` where that can be made).
+    """Roll the simulator out from a ``start``; writes ``showcase.json``, ``.md``, ``.png`` and ``.gif`` (``.mp4`` if ``imageio_ffmpeg`` is installed).
 
     Args:
-        simulator: a trained one, of the scene's spacing and materials.
-        state, metadata: where.
-        settings: how long.
-        folder: for the files.
-        on_progress: called with the frames done and their total.
+        simulator: trained simulator for the scene's spacing and materials.
+        state, metadata: result of ``start``.
+        settings: length of the rollouts.
+        folder: folder for the files.
+        on_progress: called with the number of frames done and their total.
 
     Returns:
-        Numbers of nodes, steps done and seconds per step; peak memory of the process; shares of particle-steps that containment corrected, and
-        of those faster than gravity can explain, of particles in a wall at the end, and of particle-frames in one without containment, from the same start;
-        largest speed. Where the simulator skips approximately, also the share of particle-steps that were not computed and the momentum [kg m/s] that was lost.
+        Numbers of nodes, boundary nodes and steps done; time per step [s] and peak memory of the process [B]; largest speed [m/s]; and these fractions:
+
+        - ``share_corrected``: particle-steps that containment corrected.
+        - ``share_too_fast``: particle-steps faster than gravity can explain.
+        - ``share_outside_at_end``: particles in a wall at the end.
+        - ``share_outside_uncontained``: particle-frames in a wall without containment, from the same start.
+        - ``share_asleep``: particle-steps that approximate skipping did not compute; with it, ``lost_impulse`` is the momentum that it lost [kg m/s].
     """
     folder.mkdir(parents=True, exist_ok=True)
     runner, total = approximate(simulator), settings.num_steps + settings.num_uncontained_steps
@@ -130,7 +134,7 @@ def run(
     if outside:
         records.append(Record("num_uncontained_steps", float(len(outside)), "1"))
         records.append(Record("share_outside_uncontained", float(np.mean(outside)), "1"))
-    finite = [vars(r) | {"value": r.value if math.isfinite(r.value) else None} for r in records]  # of no step there is no mean
+    finite = [vars(r) | {"value": r.value if math.isfinite(r.value) else None} for r in records]  # nan after no step; JSON has none
     written = {"environment": environment(), "records": finite, "stopped": stop}
     replace_text(folder / "showcase.json", json.dumps(written, indent=1, allow_nan=False))
     replace_text(folder / "showcase.md", table(records, stop))
@@ -139,7 +143,7 @@ def run(
 
 
 class _Tally:
-    """What happens in a rollout, counted."""
+    """Counts the events and times of a rollout."""
 
     def __init__(self, state: State, metadata: Metadata) -> None:
         self.end, self.limit = state, MAX_SPEED_FACTOR * _fall_speed(state, metadata)
@@ -149,11 +153,11 @@ class _Tally:
         self.resume()
 
     def resume(self) -> None:
-        """The next step begins."""
+        """Start the clock of the next step."""
         self.started = time.perf_counter()
 
     def add(self, state: State) -> None:
-        """A step ends."""
+        """Stop the clock, and count the step's new state."""
         self.seconds.append(time.perf_counter() - self.started)
         speed = state.vel.norm(dim=1)
         self.end, self.top_speed = state, max(self.top_speed, float(speed.max()))
@@ -184,26 +188,26 @@ class _Tally:
 
 
 def _frames(simulator: Simulator, state: State, num_steps: int, metadata: Metadata) -> Any:
-    """Frame number and new state, or why there is none, of one scene: a node that is not finite, or far outside the domain."""
+    """Yield frame number and new state of one scene, or a ``Termination`` if a node is not finite or far outside the domain."""
     guard = Guard(bounds=metadata.bounds, margin=max(high - low for low, high in metadata.bounds))
     for _, frame, item in frames(simulator, [Start(state, num_steps, metadata, guard)]):
         yield frame, item
 
 
 def _fall_speed(state: State, metadata: Metadata) -> float:
-    """Of the fastest node [m/s] after a free fall through the domain."""
+    """Speed of the fastest node after a free fall through the domain [m/s]."""
     height = sum((high - low) * abs(g) for (low, high), g in zip(metadata.bounds, metadata.gravity, strict=True))
     return math.sqrt(2 * height + float(state.vel.norm(dim=1).max()) ** 2)
 
 
 def _share_deeper(state: State, depth: float) -> float:
-    """Share of nodes more than a depth [m] inside a solid."""
+    """Fraction of nodes deeper than ``depth`` [m] inside a solid."""
     distance = signed_distance(state.boundary.shapes, state.pos)
     return float(cast(Any, distance < -depth).double().mean())
 
 
 class _Film:
-    """Evenly spaced frames of a rollout in single precision."""
+    """Keeps evenly spaced frames of a rollout in single precision, and draws them."""
 
     def __init__(self, state: State, metadata: Metadata, num_steps: int) -> None:
         self.state, self.stride = state, max(1, -(-num_steps // MAX_PICTURES))
@@ -238,11 +242,11 @@ class _Film:
 
 
 def table(records: list[Record], stopped: str | None) -> str:
-    """Markdown: a row per number, and why the rollout stopped early if it did."""
+    """Table in Markdown with one row per record, and the reason if the rollout stopped early."""
     lines = ["| | value | unit |", "|---|---|---|", *(f"| {r.metric.replace('_', ' ')} | {r.value:.6g} | {r.unit} |" for r in records)]
     return "\n".join([*lines, *(["", f"Stopped: {stopped}"] if stopped else []), ""])
 
 
 def summary(records: list[Record]) -> str:
-    """A line per number."""
+    """Plain text with one line per record."""
     return "\n".join(f"showcase  {r.metric:28} {r.value:12.6g} {r.unit}" for r in records)
