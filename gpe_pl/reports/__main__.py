@@ -1,4 +1,4 @@
-"""``python -m gpe_pl.reports FOLDER``."""
+"""Command ``python -m gpe_pl.reports FOLDER``: writes the tables of finished runs again."""
 
 import sys
 

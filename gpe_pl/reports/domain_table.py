@@ -1,8 +1,8 @@
-"""Table 1 of the paper from a sweep over domains, models and seeds: one table of numbers for machines, one for people, and two figures.
+"""Table 1 of the paper from a sweep over domains, models and seeds, as CSV and Markdown, and two figures.
 
-The number judged is the rollout MSE over all frames, mean over the trajectories of a domain's unseen material parameters, median over seeds. A failed rollout
-counts as ballistic flight in the same scene (``finished_runs.rollout_errors``). One rule holds for all domains; a column of its own has the ratio by the other
-one, in which a failed rollout is infinitely wrong.
+Models are compared by the rollout MSE over all frames: the mean over a domain's trajectories with unseen material parameters, the median over seeds. A failed
+rollout counts as ballistic flight in the same scene (``finished_runs.rollout_errors``), in all domains. A separate column has the ratio if the error of a
+failed rollout is infinite instead.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ TABLE_CSV, TABLE_MD, RATIOS_MD, FIGURE = "table1.csv", "table1.md", "table1_rati
 TABLES = (TABLE_CSV, TABLE_MD, RATIOS_MD, FIGURE, PARAMETER_FIGURE)
 OWN = "GPE"
 NOT_LEARNED = 2.0
-"""A model that is not this many times better than the best trivial baseline has learned nothing worth comparing."""
+"""A model has learned only if its error is at least this many times lower than that of the best trivial baseline."""
 
 PAPER = {
     "sand": {"DPINet": 5.15, "GNS": 3.80, "ContinuousConvNet": 3.51, "GPE": 2.37},
@@ -53,32 +53,32 @@ PAPER = {
     "fem": {"DPINet": 1.76, "GNS": 5.03, "ContinuousConvNet": 4.96, "GPE": 1.27},
     "fluid": {"DPINet": 3.31, "GNS": 3.78, "ContinuousConvNet": 2.75, "GPE": 3.22},
 }
-"""Yang et al. 2022, table 1: average MSE ×1e-3 in the paper's own units, which are not ours; only ratios compare."""
+"""Average MSE ×1e-3 of Yang et al. 2022, table 1. The units of the paper are not ours, so only ratios can be compared."""
 
 JUDGED = "test_unseen"
-"""Judged are all scenes with material parameters that training did not have, between the trained values and outside, in every domain. The paper says what it
-tests on for solids alone, and does so (trained on 1–4 MPa, tested on 0.5–10 MPa)."""
+"""Split that is evaluated in every domain: all scenes with material parameters that training did not have, between the trained values and outside. The paper
+names its test parameters for solids only, and does the same there (trained on 1–4 MPa, tested on 0.5–10 MPa)."""
 
 PAPER_COLUMN = "paper"
 
 TRIVIAL_SHOWN = ("ballistic", "stops_at_walls")
-"""Trivial baselines with a column and a line in the figure; runs of earlier versions lack the second."""
+"""Trivial baselines with a column in the table and a line in the figure, if they were evaluated."""
 
 SAME_IN_A_ROW = ("data.", "evaluation.data.", "evaluation.containment", "evaluation.hold_parameters", "evaluation.static_friction")
-"""Configuration keys, by how they begin, that all models of a domain need alike to be compared."""
+"""Prefixes of the configuration keys that must be equal for all models of a domain."""
 
 
 class TableError(GpeError, ValueError):
-    """Runs that do not belong into one table; names them, and what to do."""
+    """Runs do not belong into one table. The message names them and says what to do."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A model in a domain.
+    """Results of one model in one domain.
 
     Attributes:
-        errors: of single rollouts [seed, trajectory] in m²; failed ones as the rule has it.
-        num_failed: rollouts that had to be stopped.
+        errors: rollout MSE [seed, trajectory] in m². Failed rollouts have the error of ballistic flight or infinity, as the column requires.
+        num_failed: number of rollouts that had to be stopped.
         trivial: mean error of each trivial baseline that was evaluated [m²].
     """
 
@@ -88,12 +88,12 @@ class Cell:
 
     @cached_property
     def interval(self) -> Interval:
-        """Mean over trajectories, median over seeds [m²]."""
+        """Mean error over trajectories, median over seeds, with its bootstrap interval [m²]."""
         return bootstrap_interval(self.errors, statistic=median_of_means)
 
     @property
     def median(self) -> float:
-        """Of the single rollouts, of all seeds [m²]."""
+        """Median error over the rollouts of all seeds [m²]."""
         return float(np.median(self.errors))
 
     @property
@@ -102,15 +102,15 @@ class Cell:
 
 
 def compares_models(runs: list[Run]) -> bool:
-    """Whether runs are of several models or domains."""
+    """Whether there are runs of several models or domains."""
     return len({(domain_of(run), model_of(run)) for run in runs}) > 1
 
 
 def report_domains(folder: Path, runs: list[Run]) -> None:
-    """Write table and figures of finished runs into a folder.
+    """Write tables and figures of finished runs into a folder.
 
     Raises:
-        TableError: runs of one model and domain differ in more than their seeds, or those of a domain were judged on different scenes.
+        TableError: runs of one model and domain differ in more than their seeds, or runs of a domain were evaluated on different scenes.
     """
     runs = distinct_runs(runs)
     if not runs:
@@ -148,21 +148,21 @@ def model_of(run: Run) -> str:
 
 
 def _check(folder: Path, domains: list[str], by_cell: dict[tuple[str, str], list[Run]]) -> None:
-    """Refuse to average, or to compare, what was not done in the same way."""
+    """Raise ``TableError`` for runs that cannot be averaged or compared because their settings differ."""
     for (domain, model), runs in by_cell.items():
         keys = [key for key in axes_of(runs) if key != "seed"]
         if keys:
             raise TableError(
                 f"{folder}: runs of {model} on {domain} differ in {', '.join(keys[:3])}, not in the seed alone; "
-                "give what is no part of the table a name=… of its own"
+                "give runs that do not belong to the table another name=…"
             )
     for domain in domains:
         runs = [run for (d, _), members in by_cell.items() if d == domain for run in members]
         keys = [key for key in axes_of(runs) if key.startswith(SAME_IN_A_ROW)] + replaced_data(runs)
         if keys:
             raise TableError(
-                f"{folder}: models on {domain} were trained or judged on different data ({', '.join(keys[:3])}) and do not compare; "
-                "give these runs a name=… of their own"
+                f"{folder}: models on {domain} were trained or evaluated on different data ({', '.join(keys[:3])}) and do not compare; "
+                "give these runs another name=…"
             )
         frames = {frame for frame in map(_first_frame, runs) if frame is not None}
         if len(frames) > 1:
@@ -173,13 +173,16 @@ def _check(folder: Path, domains: list[str], by_cell: dict[tuple[str, str], list
 
 
 def _first_frame(run: Run) -> int | None:
-    """Where rollouts of a run start, if its configuration says so."""
+    """Start frame of a run's rollouts; None if its configuration does not have it."""
     frame = run.config.get("evaluation.start_frame")
     return run.config.get("graph.history") if frame is None else frame
 
 
 def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, Cell]]:
-    """The cells of a domain by model, on the trajectories that all its runs have evaluated: as it is judged, and with failed rollouts infinitely wrong."""
+    """Two cells for each model of a domain: failed rollouts count as ballistic flight in the first, and as infinite errors in the second.
+
+    Both use the trajectories that all runs of the domain have evaluated.
+    """
     found = {}
     for model, runs in by_model.items():
         values = {name: values_by_seed(runs, name, JUDGED, "rollout_mse", "full") for name in (LEARNED, *BASELINES)}
@@ -190,7 +193,7 @@ def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, C
         return {}
     num_evaluated = max(len(seed) for values in found.values() for seed in values[LEARNED])
     if len(trajectories) < num_evaluated:
-        log.warning("%s: judged on the %d of %d trajectories that all runs have evaluated", domain, len(trajectories), num_evaluated)
+        log.warning("%s: compared on the %d of %d trajectories that all runs have evaluated", domain, len(trajectories), num_evaluated)
     row = {}
     for model, values in found.items():
         errors = shared_table(values.pop(LEARNED), trajectories)
@@ -202,7 +205,7 @@ def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, C
 
 
 def _write_csv(path: Path, runs: Sequence[Run]) -> None:
-    """A line per domain, model, seed, split and metric, a column per horizon: the mean over trajectories. Trivial models have no seed."""
+    """Write means over trajectories: one line per domain, model, seed, split and metric, one column per horizon. Trivial models have no seed."""
     keys = ["domain", "model", "seed", "split", "metric"]
     tables = []
     for run in runs:
@@ -254,7 +257,7 @@ def _markdown(
 def _ratios(
     domains: list[str], cells: dict[tuple[str, str], Cell], strict: dict[tuple[str, str], Cell], by_cell: dict[tuple[str, str], list[Run]]
 ) -> list[dict[str, str]]:
-    """For each domain the ratios by their columns: as it is judged, by the other rule, and the paper's where its scenes are meant."""
+    """Ratios of each domain by column: with failed rollouts as ballistic flight, with infinite errors, and the paper's ratio if its scenes were evaluated."""
     other_scenes = any(key.startswith("evaluation.data.scene") for runs in by_cell.values() for run in runs for key in run.config)
     rows = []
     for domain in domains:
@@ -269,7 +272,7 @@ def _lines(header: list[str], rows: list[list[str]]) -> list[str]:
 
 
 def _medians(domains: list[str], models: list[str], cells: dict[tuple[str, str], Cell]) -> list[str]:
-    """A second table: of the typical scene rather than of their mean, which a few scenes carry that can go either way."""
+    """Table of median errors. They describe the typical scene; the mean depends on a few scenes with large errors."""
     header = ["domain", *models, f"{OWN} / best baseline"]
     lines = [table_row(header), "|" + "---|" * len(header)]
     for domain in domains:
@@ -291,7 +294,7 @@ def _text(cell: Cell | None) -> str:
 
 
 def _ratio(cells: dict[str, Cell]) -> str:
-    """GPE's error over that of the best baseline that has learned something, with the interval; bold where that excludes 1."""
+    """Ratio of GPE's error to that of the best baseline that has learned, with its interval; bold if the interval excludes 1."""
     own, others = cells.get(OWN), [c for m, c in cells.items() if m != OWN]
     baselines = [c for c in others if c.is_learned]
     if own is None or not others:

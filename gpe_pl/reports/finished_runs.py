@@ -1,4 +1,4 @@
-"""Training runs that have ended: their configuration, what they were evaluated to, and the values that several of them share."""
+"""Finished training runs: their configuration and metrics, and selections of values across several runs."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from gpe_pl.reports import run_archive
 log = logging.getLogger(__name__)
 
 UNSEEN_GROUPS = ("interpolated", "extrapolated")
-"""Where material parameters that training did not have can lie."""
+"""Groups of material parameters that training did not have."""
 
 
 Curve = tuple[np.ndarray, np.ndarray]
-"""Steps, and the one-step validation loss at each."""
+"""Training steps [point], and the one-step validation loss at each [point]."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,11 @@ class Run:
     """A finished run.
 
     Attributes:
-        folder: where it lies, or lay before it was archived.
-        config: flattened: values by keys such as ``training.num_steps``.
-        rows: what it was evaluated to: a table with the fields of ``evaluation.Row`` as columns.
-        data: checksums of its data, by key of the configuration.
-        curve: of an archived run; others have theirs in their folder (``validation_curve``).
+        folder: folder of the run; for an archived run, the folder before archiving.
+        config: flat configuration: values by keys such as ``training.num_steps``.
+        rows: metrics: a table with the fields of ``evaluation.rollouts.Row`` as columns.
+        data: checksums of the data, by key of the configuration.
+        curve: validation curve of an archived run; None if it is in the run's folder (see ``validation_curve``).
     """
 
     folder: Path
@@ -48,19 +48,19 @@ class Run:
 
 
 WITHOUT_CONSEQUENCE = {"evaluation.num_pictures", "evaluation.export"}
-"""What runs may differ in without having been done otherwise."""
+"""Keys ignored when comparing runs."""
 
 TRAINED = {"data.name": str, "model._target_": str, "training.num_steps": int}
-"""What the configuration of every training run says, by type."""
+"""Keys that the configuration of every training run has, with the types of their values."""
 
 
 def table_of(rows: Iterable[Row]) -> pd.DataFrame:
-    """Rows of ``metrics.csv`` as a table."""
+    """Table with one line per row of ``metrics.csv``."""
     return pd.DataFrame([[*vars(row).values()] for row in rows], columns=run_archive.COLUMNS)
 
 
 def archive(runs: list[Run], root: Path, folder: Path) -> None:
-    """Keep runs below ``root`` in the two files of ``run_archive`` in a folder."""
+    """Write the runs below ``root`` to the two files of ``run_archive`` in a folder."""
     about = {}
     for run in runs:
         settings = {f"{CONFIG}{key}": value for key, value in run.config.items()} | {
@@ -71,7 +71,7 @@ def archive(runs: list[Run], root: Path, folder: Path) -> None:
 
 
 CONFIG, DATA = "config:", "data:"
-"""Begin the keys under which an archive has the configuration of a run and the checksums of its data."""
+"""Prefixes of an archive's keys for the configuration of a run and for the checksums of its data."""
 CURVE = ("validation_steps", "validation_losses")
 
 
@@ -91,7 +91,13 @@ def _archived(folder: Path) -> list[Run]:
 
 
 def finished_runs(folder: Path) -> list[Run]:
-    """All finished training runs below a folder, in order of their paths, or those that are archived in it; evaluations beside them are none."""
+    """All finished training runs below a folder, in order of their paths, or those of an archive in it.
+
+    Folders that ``evaluate`` has written are not training runs.
+
+    Raises:
+        RunError: a configuration has values of other types than ``TRAINED``.
+    """
     if (folder / run_archive.RUNS).exists():
         return _archived(folder)
     runs = []
@@ -104,12 +110,12 @@ def finished_runs(folder: Path) -> list[Run]:
                 for key, kind in TRAINED.items():
                     if type(said[key]) is not kind:
                         raise RunError(
-                            f"{config}: {key} is {said[key]!r}; delete the folder {path.parent}, which this package has not written"
+                            f"{config}: {key} is {said[key]!r}, which this package did not write; delete the folder {path.parent}"
                         )
                 runs.append(Run(path.parent, said, table_of(read_rows(path)), data))
             else:
                 log.warning(
-                    "%s is not of a training run (%s) and is left out of the report",
+                    "%s is not a training run (its configuration lacks %s) and is left out of the report",
                     path.parent,
                     ", ".join(sorted(TRAINED.keys() - said.keys())),
                 )
@@ -118,7 +124,7 @@ def finished_runs(folder: Path) -> list[Run]:
 
 
 def _warn_of_replaced_data(runs: list[Run]) -> None:
-    """Say where two runs used data of one description that hold different things, as when data are imported again under the same name."""
+    """Warn if two runs used different data with the same description, for example data that were imported again under the same name."""
     first: dict[str, Run] = {}
     for run in runs:
         description = {
@@ -130,13 +136,13 @@ def _warn_of_replaced_data(runs: list[Run]) -> None:
 
 
 def replaced_data(runs: list[Run]) -> list[str]:
-    """Keys of the data of which runs have different checksums. Runs of earlier versions have none, and differ in nothing."""
+    """Keys of data for which runs have different checksums. A run without a checksum is not compared."""
     keys = sorted({key for run in runs for key in run.data})
     return [key for key in keys if len({run.data[key] for run in runs if key in run.data}) > 1]
 
 
 def distinct_runs(runs: list[Run]) -> list[Run]:
-    """Runs of the same configuration count once."""
+    """Runs with different configurations; of equal ones, the first."""
     first: dict[str, Run] = {}
     for run in runs:
         kept = first.setdefault(json.dumps(run.config, sort_keys=True), run)
@@ -161,18 +167,22 @@ def axes_of(runs: list[Run]) -> list[str]:
 
 
 def with_groups(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows, and those of unseen parameters a second time, under ``split/group`` by where these lie."""
+    """Rows with those of unseen parameters repeated under the split ``split/group``, where the group is in ``UNSEEN_GROUPS``."""
     unseen = rows[rows["parameter_group"].isin(UNSEEN_GROUPS)]
     return pd.concat([rows, unseen.assign(split=unseen["split"] + "/" + unseen["parameter_group"])], ignore_index=True)
 
 
 def splits_of(run: Run) -> list[str]:
-    """Splits that a run was evaluated on; unseen parameters also apart by where they lie."""
+    """Splits on which a run was evaluated, including ``split/group`` for groups of unseen parameters."""
     return sorted(with_groups(run.rows)["split"].unique())
 
 
 def validation_curve(run: Run) -> Curve:
-    """Of a run over all its starts; raises ``MetricsError`` where a log is damaged."""
+    """Validation curve of a run, over all its starts.
+
+    Raises:
+        MetricsError: a log is damaged.
+    """
     if run.curve is not None:
         return run.curve
     points: dict[int, float] = {}
@@ -184,7 +194,7 @@ def validation_curve(run: Run) -> Curve:
                 for line in reader:
                     if line.get("val/one_step_nmse"):
                         points[int(line["step"]) + 1] = float(line["val/one_step_nmse"])
-            except (ValueError, KeyError, TypeError, csv.Error) as error:  # also what is not text
+            except (ValueError, KeyError, TypeError, csv.Error) as error:  # also a file that is not text
                 raise MetricsError(
                     f"{path}, line {reader.line_num}: damaged ({error}); delete the file, which only the curve of the validation loss needs"
                 ) from None
@@ -193,11 +203,18 @@ def validation_curve(run: Run) -> Curve:
 
 
 Values = list[dict[int, float]]
-"""Of one metric: for each seed that has any, a value by number of the trajectory."""
+"""Values of one metric: for each seed that has any, the values by number of the trajectory."""
 
 
 def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon: str) -> Values:
-    """What runs have of a metric, in order of trajectories."""
+    """Values of a metric for each run, in order of trajectories.
+
+    Args:
+        runs: runs that differ in their seeds only.
+        model: label of the model in the rows.
+        split: a split, or ``split/group`` for one group of parameters.
+        metric, horizon: as in the rows.
+    """
     parent, _, group = split.partition("/")
     table = []
     for run in runs:
@@ -211,13 +228,13 @@ def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon
 
 
 STAND_IN = "ballistic"
-"""Trivial model whose error a failed rollout gets."""
+"""Trivial model whose error counts for a failed rollout."""
 
 
 def rollout_errors(runs: list[Run], split: str, horizon: str) -> Values:
-    """Rollout MSE [m²] of learned models as tables judge it: a failed rollout gets the error of ballistic flight in the same scene over the same frames.
+    """Rollout MSE [m²] of learned models, as in tables: a failed rollout gets the error of ballistic flight in the same scene over the same frames.
 
-    It stays infinite where ballistic flight was not evaluated. ``values_by_seed`` has the errors as they are.
+    The error stays infinite if ballistic flight was not evaluated. ``values_by_seed`` returns the errors without this replacement.
     """
     errors = []
     for run in runs:
@@ -228,12 +245,12 @@ def rollout_errors(runs: list[Run], split: str, horizon: str) -> Values:
 
 
 def shared_trajectories(*values: Values) -> list[int]:
-    """Numbers of the trajectories that all seeds, of several models if given, have evaluated."""
+    """Numbers of the trajectories that all seeds in all of ``values`` have evaluated."""
     seeds = [set(seed) for table in values for seed in table]
     return sorted(set.intersection(*seeds)) if seeds else []
 
 
 def shared_table(values: Values, trajectories: list[int] | None = None) -> np.ndarray:
-    """Values as a table [seed, trajectory], of the given trajectories or of those that all seeds have."""
+    """Values as an array [seed, trajectory]. Without ``trajectories``, it has those that all seeds have evaluated."""
     chosen = shared_trajectories(values) if trajectories is None else trajectories
     return np.array([[seed[k] for k in chosen] for seed in values]).reshape(len(values), len(chosen))

@@ -1,4 +1,4 @@
-"""How errors depend on the material parameter, trained values and others."""
+"""Figure of errors against the material parameter, for trained and unseen values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,11 @@ PARAMETER_FIGURE = "error_by_parameter.png"
 
 
 def parameter_curves(by_domain: dict[str, dict[str, list[Run]]]) -> Figure:
-    """Rollout MSE over all frames against the material parameter, of runs by domain and label; failed rollouts as in ``rollout_errors``."""
+    """Figure of the rollout MSE over all frames against the material parameter. Failed rollouts count as in ``rollout_errors``.
+
+    Args:
+        by_domain: runs by domain and label of the curve.
+    """
     from gpe_pl.viz.comparison import parameter_figure
 
     curves: dict[str, dict[str, dict[float, list[float]]]] = {}

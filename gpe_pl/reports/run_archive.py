@@ -1,7 +1,7 @@
-"""What many runs were evaluated to, in two small files from which tables are made again without the runs.
+"""Archive of many runs: two small files from which tables can be made again without the runs.
 
-``runs.json`` has their configurations and validation curves. ``rollouts.csv.xz`` has a line per run, model, split and trajectory, and a column per metric and
-horizon, such as ``rollout_mse@full``, with nine significant digits.
+``runs.json`` has the configurations and validation curves. ``rollouts.csv.xz`` has one line per run, model, split and trajectory, and one column per metric and
+horizon, such as ``rollout_mse@full``. Values have nine significant digits.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ RUNS, ROLLOUTS = "runs.json", "rollouts.csv.xz"
 NUMBER = "{:.9g}"
 KEYS = ["model", "split", "trajectory", "parameter_group", "parameter"]
 COLUMNS = [*KEYS, "metric", "horizon", "value"]
-"""Of the rows of a run, as ``metrics.csv`` has them."""
+"""Columns of a run's rows, as in ``metrics.csv``."""
 MOST_BYTES = 2**28
-"""Of ``rollouts.csv.xz`` when it is unpacked."""
+"""Maximum size of the unpacked ``rollouts.csv.xz`` [bytes]."""
 MOST_MEMORY = 2**28
-"""Of the unpacker itself."""
+"""Maximum memory of the unpacker [bytes]."""
 CONTENT = "rollouts_sha256"
 
 
@@ -38,13 +38,13 @@ def write_archive(folder: Path, runs: dict[str, dict[str, Any]], rows: dict[str,
     """Write both files.
 
     Args:
-        folder: which exists.
-        runs: what is known of each run by its name: tables of plain values.
-        rows: of each run, with ``COLUMNS``.
+        folder: existing folder.
+        runs: plain values about each run, by name of the run and key.
+        rows: rows of each run, with ``COLUMNS``.
     """
     together = pd.concat([table.assign(run=name) for name, table in rows.items()], ignore_index=True)
     together["column"] = together["metric"] + "@" + together["horizon"]
-    together["value"] = together["value"].map(NUMBER.format)  # a value that is not a number is "nan", a missing one is empty
+    together["value"] = together["value"].map(NUMBER.format)  # "nan" is a value that is not a number; empty is a missing value
     wide = together.pivot(index=["run", *KEYS], columns="column", values="value").reset_index()
     content = lzma.compress(wide.to_csv(index=False, lineterminator="\n").encode())
     with replacing(folder / ROLLOUTS) as part:
@@ -55,7 +55,7 @@ def write_archive(folder: Path, runs: dict[str, dict[str, Any]], rows: dict[str,
 
 
 def read_archive(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, pd.DataFrame]]:
-    """What ``write_archive`` was given, with values to nine digits.
+    """Arguments ``runs`` and ``rows`` of ``write_archive``, with values to nine digits.
 
     Raises:
         ArchiveError: a file is damaged or does not belong to the other.
@@ -80,7 +80,7 @@ def read_archive(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, pd.
 
 
 def _long(wide: pd.DataFrame) -> pd.DataFrame:
-    """Rows of one run with ``COLUMNS``; what a line lacks has no row."""
+    """Rows of one run with ``COLUMNS``, made from its lines of the archive; empty cells become no row."""
     long = wide.melt(id_vars=KEYS, value_vars=[name for name in wide.columns if "@" in name], var_name="column")
     long = long[long["value"] != ""]
     long[["metric", "horizon"]] = long.pop("column").str.rsplit("@", n=1, expand=True)

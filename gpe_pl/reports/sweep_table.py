@@ -1,4 +1,4 @@
-"""From the runs of a sweep to one table and one figure: what differs between the runs becomes the axes."""
+"""Table and figure of a sweep. The settings in which its runs differ are the axes."""
 
 from __future__ import annotations
 
@@ -43,24 +43,24 @@ STRESS_METRICS = ("von_mises_error", "stress_error")
 SWEEP_MD = "table.md"
 FORWARD_TIMES = "forward_times.json"
 Variant = tuple[str, ...]
-"""Values of the keys in which runs of a sweep differ."""
+"""Values of the configuration keys in which runs of a sweep differ."""
 
 TABLE_HORIZONS = 4
-"""The longest horizons, shown in the Markdown table; ``table.csv`` has all."""
+"""Number of horizons in the Markdown table, which shows the longest ones; ``table.csv`` has all."""
 
 
 def report_sweep(folder: Path, runs: list[Run]) -> None:
-    """Compare finished runs; writes into a folder."""
+    """Write table and figures that compare finished runs into a folder."""
     _report(folder, distinct_runs(runs))
 
 
 def report(folder: Path) -> None:
-    """Report on the one run in a folder."""
+    """Write table and figures of the one run in a folder."""
     _report(folder, [run for run in finished_runs(folder) if run.folder == folder])
 
 
 def variants_of(runs: list[Run]) -> tuple[list[str], dict[Variant, list[Run]]]:
-    """Keys in which runs differ besides their seeds, and the runs by their values of these keys."""
+    """Configuration keys, other than the seed, in which runs differ, and the runs by their values of these keys."""
     axes = [axis for axis in axes_of(runs) if axis != "seed"]
     variants: dict[Variant, list[Run]] = defaultdict(list)
     for run in runs:
@@ -69,7 +69,7 @@ def variants_of(runs: list[Run]) -> tuple[list[str], dict[Variant, list[Run]]]:
 
 
 def _report(folder: Path, runs: list[Run]) -> None:
-    """Write ``table.csv``, ``table.md``, ``validation_loss.png`` and, of unseen material parameters, ``error_by_parameter.png``."""
+    """Write ``table.csv``, ``table.md`` and ``validation_loss.png``, and ``error_by_parameter.png`` if unseen material parameters were evaluated."""
     if not runs:
         return
     axes, variants = variants_of(runs)
@@ -89,13 +89,13 @@ def _report(folder: Path, runs: list[Run]) -> None:
 
 
 def conclusion(folder: Path) -> str:
-    """What a command ends with: the numbers of the run or evaluation in a folder, and what to look at next."""
+    """Last output of a command: the metrics of the run or evaluation in a folder, and the viewers to open."""
     viewers = sorted(folder.glob("rollout_*_00.html"))
     return "\n".join([summary(table_of(read_rows(folder / "metrics.csv"))), *(printable(f"look at {viewer}") for viewer in viewers)])
 
 
 def summary(rows: pd.DataFrame) -> str:
-    """Means over trajectories as plain text: a line per split, metric and model, a column per horizon. Trivial models have their rollout MSE only."""
+    """Means over trajectories as plain text: one line per split, metric and model, one column per horizon. Trivial models show their rollout MSE only."""
     shown = with_groups(rows[~rows["model"].isin(BASELINES) | (rows["metric"] == "rollout_mse")])
     groups: dict[tuple[str, str, str], dict[str, float]] = defaultdict(dict)
     for (split, metric, model, horizon), value in shown.groupby(["split", "metric", "model", "horizon"])["value"].mean().items():
@@ -103,7 +103,7 @@ def summary(rows: pd.DataFrame) -> str:
     horizons = sorted({*rows["horizon"]} - {"1", "full"}, key=int)
     lines = [(("split", "metric", "model"), "".join(f"{h:>11}" for h in (*horizons, "full")))]
     for key, values in sorted(groups.items()):
-        if "1" in values:  # of one step, or of a rollout as a whole
+        if "1" in values:  # a metric of one step, shown in the last column
             values["full"] = values["1"]
         lines.append((key, "".join(f"{values[h]:11.4g}" if h in values else " " * 11 for h in (*horizons, "full"))))
     widths = [max(len(key[column]) for key, _ in lines) for column in range(3)]
@@ -115,7 +115,7 @@ def _column(axis: str) -> str:
 
 
 def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
-    """One line per variant, seed, split, metric and horizon: the mean over trajectories."""
+    """Write means over trajectories: one line per variant, seed, split, metric and horizon."""
     lines: list[list[Any]] = []
     for run in runs:
         key = [run.config.get(a) for a in axes]
@@ -233,7 +233,7 @@ def _horizons(run: Run) -> list[str]:
 
 
 def _stress_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[str]:
-    """Errors of displacement, velocity and stress beside each other, of models that decode a stress."""
+    """Table of the errors of displacement, velocity and stress for models that decode a stress; empty if none does."""
     stressed = {key: runs for key, runs in variants.items() if runs[0].rows["metric"].isin(STRESS_METRICS).any()}
     if not stressed:
         return []
@@ -253,7 +253,7 @@ def _stress_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[
 
 
 def _factor(ratio: float) -> str:
-    if ratio == 0:  # of a mean that failed rollouts make infinite
+    if ratio == 0:  # failed rollouts make the mean infinite
         return ""
     return f" **{ratio:.1f}×**" if ratio > 1 else f" {ratio:.2g}×" if ratio >= 0.01 else " < 0.01×"
 
@@ -263,7 +263,7 @@ def _mean(values: Values) -> float:
 
 
 def _failed(values: Values) -> str:
-    """How many rollouts failed, if any did."""
+    """Number of failed rollouts as text; empty if none failed."""
     numbers = [value for seed in values for value in seed.values()]
     failed = sum(not np.isfinite(value) for value in numbers)
     return f", {failed} of {len(numbers)} failed" if failed else ""

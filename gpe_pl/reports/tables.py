@@ -1,4 +1,4 @@
-"""Tables and figures of the finished runs in a folder; also ``python -m gpe_pl.reports FOLDER``, which trains and evaluates nothing."""
+"""Writes tables and figures of the finished runs in a folder. The command ``python -m gpe_pl.reports FOLDER`` does so from stored results alone."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from gpe_pl.system.locks import held
 
 
 def write_tables(folder: Path, runs: list[Run]) -> Path:
-    """Write the tables that suit what runs differ in into the folder of their sweep.
+    """Write tables and figures into the folder of a sweep. Which ones depends on the settings in which its runs differ.
 
     Returns:
-        The one to read, which is not there where no run has finished.
+        Path of the table in Markdown. It does not exist if no run has finished.
     """
     if compares_settings(runs):
         report_trials(folder, runs)
@@ -33,15 +33,15 @@ def write_tables(folder: Path, runs: list[Run]) -> Path:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Command line; returns the exit status."""
+    """Run the command line; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m gpe_pl.reports", description="Write tables and figures of finished runs again.")
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="of a sweep, such as runs/table1")
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder of a sweep, such as runs/table1")
     folder = parser.parse_args(arguments).folder
     speak_utf8()
     try:
         runs = finished_runs(folder)
         if not runs:
-            raise RunError(f"{folder}: has no finished run, which would have a config.json and a metrics.csv")
+            raise RunError(f"{folder}: contains no finished run (a folder with config.json and metrics.csv)")
         with held(folder):
             print(write_tables(folder, runs).read_text(encoding="utf-8"))
     except GpeError as error:

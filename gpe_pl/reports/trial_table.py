@@ -1,6 +1,6 @@
-"""Trials of settings for several models or domains: within each, which setting did best.
+"""Table of trials: for each model and domain, compares several settings and marks the best.
 
-The number compared is the rollout MSE over all frames, mean over the trajectories of a split, median over seeds; failed rollouts count as in
+Settings are compared by the rollout MSE over all frames: the mean over the trajectories of a split, the median over seeds. Failed rollouts count as in
 ``finished_runs.rollout_errors``.
 """
 
@@ -25,21 +25,22 @@ log = logging.getLogger(__name__)
 
 TRIALS_CSV, TRIALS_MD = "trials.csv", "trials.md"
 CONSEQUENCES = ("training.val_interval", "seed")
-"""What differs between trials without having been tried: it follows from the number of steps, or is chance."""
+"""Keys that may differ between trials but are no settings on trial. The validation interval follows from the number of steps; the seed is chance."""
 NUM_STEPS = "training.num_steps"
-"""Follows from a budget of time and the other settings; where these and the seed are equal, it was tried."""
+"""Key of the number of steps. It is a setting on trial only if it differs between runs with equal other settings and seed; else it follows from a time
+budget."""
 
 
 def compares_settings(runs: list[Run]) -> bool:
-    """Whether runs are of several models or domains, and one of these with several settings."""
+    """Whether there are runs of several models or domains, and several settings of at least one of them."""
     groups = _by_model(runs)
     return len(groups) > 1 and any(_settings(runs) for runs in groups.values())
 
 
 def report_trials(folder: Path, runs: list[Run]) -> None:
-    """Write ``trials.csv``, a line per run and split, and ``trials.md``, a line per setting with the best of each domain and model in bold.
+    """Write ``trials.csv``, with one line per run and split, and ``trials.md``, with one line per setting and the best of each domain and model in bold.
 
-    A table of models in domains that is there goes: it would not be of all runs.
+    An existing table of models in domains is deleted, as it would not show all runs.
     """
     groups = _by_model(runs)
     settings = sorted({key for members in groups.values() for key in _settings(members)})
@@ -69,7 +70,7 @@ def report_trials(folder: Path, runs: list[Run]) -> None:
         for name in TABLES:
             (folder / name).unlink(missing_ok=True)
         log.warning(
-            "%s: compares settings now (%s), and its table of models is gone; move the runs that are no part of it to another name=… to have it back",
+            "%s: now compares settings (%s), and its table of models is deleted; to restore it, move the runs that do not belong to it to another name=…",
             folder,
             ", ".join(settings),
         )
@@ -83,7 +84,7 @@ def _by_model(runs: list[Run]) -> dict[tuple[str, str], list[Run]]:
 
 
 def _settings(runs: list[Run]) -> list[str]:
-    """Configuration keys that were tried."""
+    """Configuration keys of the settings on trial."""
     keys = [key for key in axes_of(runs) if key not in (*CONSEQUENCES, NUM_STEPS)]
     steps: dict[tuple[str, ...], set[Any]] = defaultdict(set)
     for run in runs:
@@ -99,7 +100,7 @@ def _error(runs: list[Run], split: str) -> float:
 def _cell(runs: list[Run], split: str, error: float, *, is_best: bool) -> str:
     as_they_are = shared_table(values_by_seed(runs, LEARNED, split, "rollout_mse", "full"))
     failed = f"{int((~np.isfinite(as_they_are)).sum())} of {as_they_are.size} failed"
-    if not np.isfinite(error):  # without ballistic flight beside it
+    if not np.isfinite(error):  # ballistic flight was not evaluated
         return failed
     i = bootstrap_interval(shared_table(rollout_errors(runs, split, "full")), statistic=median_of_means)
     text = f"{1e3 * error:.3g}"

@@ -191,7 +191,8 @@ def test_what_is_no_training_run_and_what_is_there_twice_is_left_out(sweep: Path
     sealed.write(evaluation / "config.json", {"checkpoint": "best.ckpt"})
     report_domains(sweep, finished_runs(sweep))
     assert (sweep / "table1.md").read_text() == before
-    assert "0 copy repeats" in caplog.text and "evaluated is not of a training run (data.name, model._target_" in caplog.text
+    assert "0 copy repeats" in caplog.text
+    assert "evaluated is not a training run (its configuration lacks data.name, model._target_" in caplog.text
 
 
 def test_trajectories_that_a_seed_lacks_are_left_out(tmp_path: Path) -> None:
@@ -270,7 +271,7 @@ def test_models_are_compared_on_the_same_trajectories(tmp_path: Path, caplog: py
     report_domains(tmp_path, finished_runs(tmp_path))
     row = cells((tmp_path / "table1.md").read_text(), "sand")
     assert row["GPE"].startswith("3 [") and row["GNS"].startswith("7 [") and row["GPE / best baseline"].startswith("**0.43** ")
-    assert "sand: judged on the 2 of 3 trajectories" in caplog.text
+    assert "sand: compared on the 2 of 3 trajectories" in caplog.text
 
 
 def test_a_failed_rollout_is_counted(tmp_path: Path) -> None:

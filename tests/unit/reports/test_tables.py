@@ -36,7 +36,7 @@ def test_tables_follow_the_runs_that_are_there(sweep: Path, capsys: pytest.Captu
 def test_a_folder_without_runs_is_refused_and_left_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "table1.md").write_text("of runs that are gone")
     assert main([str(tmp_path)]) == 2
-    assert capsys.readouterr().err == f"error: {tmp_path}: has no finished run, which would have a config.json and a metrics.csv\n"
+    assert capsys.readouterr().err == f"error: {tmp_path}: contains no finished run (a folder with config.json and metrics.csv)\n"
     assert [path.name for path in tmp_path.iterdir()] == ["table1.md"]
 
 
@@ -44,7 +44,7 @@ def test_models_on_different_data_of_one_name_do_not_compare(sweep: Path, capsys
     write_run(sweep / "c", "sand", "DPINet", 0, [1e-3, 1e-3], checksum="2")
     write_run(sweep / "d", "sand", "ContinuousConvNet", 0, [1e-3, 1e-3], checksum="3")
     assert main([str(sweep)]) == 2
-    assert "models on sand were trained or judged on different data (data_sha256.train) and do not compare" in capsys.readouterr().err
+    assert "models on sand were trained or evaluated on different data (data_sha256.train) and do not compare" in capsys.readouterr().err
     assert not (sweep / "table1.md").exists()
 
 

@@ -95,4 +95,4 @@ def test_a_table_of_models_does_not_outlive_a_comparison_of_settings(tmp_path: P
     write_run(tmp_path / "trial", "sand", "GPE", 1.0, 0, [1e-3])
     report_trials(tmp_path, finished_runs(tmp_path))
     assert not (tmp_path / "table1.md").exists()
-    assert "compares settings now (training.velocity_noise_of_change)" in caplog.text
+    assert "now compares settings (training.velocity_noise_of_change)" in caplog.text
