@@ -1,15 +1,15 @@
 """Learned simulators of particles and meshes: the Graph-based Physics Engine and its baselines.
 
-What most programs need can be imported from here: a trained model on a scene with a parameter that it never saw, beside the ground truth::
+Import the most common names from here. This example compares a trained model with the ground truth in a scene with a parameter that training did not have::
 
     from gpe_pl import LearnedSimulator, dataset, generate_trajectory, roll_out, rollout_figure
-    simulator = LearnedSimulator.from_checkpoint("sand")  # comes with the package; or a checkpoint's path
+    simulator = LearnedSimulator.from_checkpoint("sand")  # a shipped model, or the path of a checkpoint
     truth = generate_trajectory(dataset("data=sand", "size=small"), split="test", index=0, values={"sand": 27.5})
     prediction = roll_out(simulator, simulator.initial_state(truth, frame=5), num_steps=100, metadata=truth.metadata)
     rollout_figure(truth.frames(5, 106), {"GPE": prediction}).savefig("rollout.png")
 
-A name is looked up when it is first used, so that nothing is imported that a program does not need. (``roll_out`` is ``rollout.rollout``: the module has
-its name already.)
+A name is imported when it is first used, so a program imports only what it needs. ``roll_out`` is the function ``rollout.loop.rollout``; it has another name
+here because ``gpe_pl.rollout`` is a package.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``gpe_pl COMMAND …``: the console script, which is ``python -m gpe_pl.COMMAND …``."""
+"""Console script ``gpe_pl COMMAND …``. It does the same as ``python -m gpe_pl.COMMAND …``."""
 
 from __future__ import annotations
 

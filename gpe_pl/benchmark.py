@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 
 NAMED = 5
-"""Of failures, at the end."""
+"""Number of failures that the final error message names."""
 
 
 def without_folder(value: Any, runs: str) -> Any:
-    """Settings as they can be shown to others, whose results lie elsewhere: ``paths.runs`` in place of that folder."""
+    """Settings with ``paths.runs`` in place of the results folder ``runs``, so that they can be published."""
     if isinstance(value, dict):
         return {key: without_folder(item, runs) for key, item in value.items()}
     if isinstance(value, list):
@@ -32,13 +32,13 @@ def without_folder(value: Any, runs: str) -> Any:
 
 
 def _suite(name: str) -> Any:
-    """The module of a suite, which lies in a folder of its own where it has several."""
+    """Module of a suite: ``benchmarks.{name}``, or ``benchmarks.{name}.suite`` if that is a package."""
     package = importlib.import_module(f"gpe_pl.benchmarks.{name}")
     return importlib.import_module(f"{package.__name__}.suite") if hasattr(package, "__path__") else package
 
 
 def benchmark(cfg: DictConfig) -> None:
-    """Run one suite and write ``results.json``, ``table.md`` and its figures; a suite of criteria ends with exit status 1 if one that counts is not met."""
+    """Run one suite and write ``results.json``, ``table.md`` and its figures. The exit status is 1 if the suite's ``failures`` names any."""
     import torch
     from omegaconf import OmegaConf
 
@@ -55,11 +55,11 @@ def benchmark(cfg: DictConfig) -> None:
     suite = _suite(cfg.suite.name)
     values: Any = OmegaConf.to_container(cfg.suite, resolve=True)
     settings = construct(suite.Settings, {k: v for k, v in values.items() if k != "name"}, "suite")
-    construct(TrainerSettings, cfg.trainer, "trainer")  # suites take single values of it
+    construct(TrainerSettings, cfg.trainer, "trainer")  # checks all keys, as suites use single values only
     if getattr(settings, "accelerator", "cpu") == "gpu" and not torch.cuda.is_available():
         raise ConfigError("trainer.accelerator=gpu: PyTorch finds no GPU here; choose trainer=cpu")
     keep_freed_memory()  # as trainings and evaluations do
-    cases = getattr(settings, "cases", None)  # of a suite about data sets
+    cases = getattr(settings, "cases", None)  # data sets by name, in suites that need some
     folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name
     with held(folder), recorded(folder, "benchmark", sys.argv[1:], cfg.paths.runs):
         records, table = suite.run(settings) if cases is None else suite.run(settings, {k: dataset(*c.overrides) for k, c in cases.items()})

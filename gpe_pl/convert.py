@@ -1,8 +1,8 @@
 """Import data of other projects, or your own arrays: ``python -m gpe_pl.convert format=lagrangebench source=FOLDER name=NAME``.
 
-What comes out is a data set of the project's own store, which ``python -m gpe_pl.fit data=imported data.name=NAME`` trains on. The modules of
-``gpe_pl.data.importers`` describe the formats; ``--help`` lists the settings. Trajectories that cannot be used are refused one by one, with the reason and
-the frame, and the others imported: read the report.
+The command writes a data set in this package's store. Train on it with ``python -m gpe_pl.fit data=imported data.name=NAME``. The modules of
+``gpe_pl.data.importers`` describe the formats; ``--help`` lists the settings. Read the report: trajectories that cannot be used are left out, each with the
+reason and the frame.
 """
 
 from __future__ import annotations

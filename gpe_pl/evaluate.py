@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def evaluate_checkpoint(cfg: DictConfig) -> None:
-    """Roll a trained model out on one split of a data set, and in the scene's showcase if it has one; numbers and pictures go to ``{paths.runs}/{name}``."""
+    """Roll a trained model out on one split of a data set, and in the data set's showcase if it has one. Results go to ``{paths.runs}/{name}``."""
     from gpe_pl.config.datasets import ensure_split, evaluated_config, scene_metadata
     from gpe_pl.evaluation.rollouts import EvaluationSettings, evaluate
     from gpe_pl.files.names import run_name
@@ -63,7 +63,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
 
 
 def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
-    """What the numbers of an evaluation depend on, and what they are about."""
+    """Settings and checksums on which the metrics of an evaluation depend. An evaluation with others needs another folder."""
     from omegaconf import OmegaConf
 
     from gpe_pl.data.checksum import split_checksum
@@ -71,7 +71,7 @@ def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
     from gpe_pl.learned.pretrained import fingerprint
 
     values: Any = OmegaConf.to_container(cfg, resolve=True)
-    without = ("splits", "data", "num_pictures", "export")  # more pictures may be asked for later
+    without = ("splits", "data", "num_pictures", "export")  # do not change the metrics
     evaluation = {key: value for key, value in values["evaluation"].items() if key not in without}
     return {
         "checkpoint": fingerprint(cfg.checkpoint),
@@ -83,7 +83,7 @@ def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
 
 
 def _own_data(simulator: LearnedSimulator) -> str:
-    """Overrides that choose data like those of the training; empty where none do."""
+    """Overrides that choose data like those of the training; empty if there are none."""
     from gpe_pl.config.datasets import IMPORTED, dataset
     from gpe_pl.data.ground_truth import trajectory_metadata
 
@@ -99,7 +99,13 @@ def _own_data(simulator: LearnedSimulator) -> str:
 
 
 def _showcase(cfg: DictConfig, simulator: LearnedSimulator) -> Callable[[Path], None]:
-    """Rolls the simulator out in the showcase's scene, which is made first: what is wrong with it is said before the evaluation, not after it."""
+    """Build the showcase's scene, and return a function that rolls the simulator out in it and writes results into a folder.
+
+    The scene is built first so that errors in its settings are reported before the evaluation.
+
+    Raises:
+        ConfigError: a setting of ``data.showcase`` is wrong.
+    """
     from gpe_pl.evaluation import showcase
     from gpe_pl.system.progress import progress_bar
 

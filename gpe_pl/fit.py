@@ -14,7 +14,7 @@ def fit(cfg: DictConfig) -> float:
     """Generate missing data, train or resume, and evaluate.
 
     Returns:
-        The mean full-length rollout MSE [m²] on the first evaluated split. Failed rollouts count as in tables (``finished_runs.rollout_errors``).
+        Mean full-length rollout MSE [m²] on the first evaluated split. Failed rollouts count as in tables (``finished_runs.rollout_errors``).
     """
     from gpe_pl.config.fit_run import FitRun
     from gpe_pl.files.names import data_name, run_name

@@ -1,6 +1,6 @@
 """Generate ground truth: ``python -m gpe_pl.simulate data=sand size=tiny``.
 
-The same command resumes a run that was killed. It reads every byte that is there, and generates shards again whose checksums disagree.
+The same command resumes a run that was killed. It reads all existing shards, and generates those again whose checksums do not match.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def simulate(cfg: DictConfig) -> None:
-    """Generate a data set, or what is missing of it or damaged, and say beforehand what a large one takes."""
+    """Generate the missing and damaged shards of a data set. For a large one, print first how much disk space and time it takes."""
     from gpe_pl.data.generation import CONTACT_SHEET_FILE, is_complete, written
 
     if not (cfg.num_workers is None or (isinstance(cfg.num_workers, int) and cfg.num_workers >= 1)):
@@ -42,7 +42,7 @@ def _simulate(root: str, spec: DatasetSpec, part: tuple[int, int], num_workers: 
 
     there = sum(path.stat().st_size for path in (Path(root) / spec.name / spec.size).glob("*/shard-*.h5"))
     if there > AUTOMATIC_BYTES:
-        print(f"{spec.name} {spec.size}: checking {there / 2**30:.1f} GiB that are there", flush=True)
+        print(f"{spec.name} {spec.size}: checking {there / 2**30:.1f} GiB of existing shards", flush=True)
     discard_damaged(root, spec, num_workers, part)
     missing = plan(root, spec, part)
     if missing.bytes_needed > AUTOMATIC_BYTES:
