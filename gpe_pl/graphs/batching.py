@@ -1,4 +1,4 @@
-"""Several graphs as one, which a model computes in one pass."""
+"""Batches: several graphs joined into one, which a model computes in one pass."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from torch_geometric.data import HeteroData
 
 
 def batched(graphs: Sequence[HeteroData]) -> HeteroData:
-    """The disjoint union of graphs with the same types and attributes; node stores say in ``batch`` which graph a row is of.
+    """Return the disjoint union of graphs with the same types and attributes; ``batch`` of node stores gives the graph of each row.
 
-    The same values as ``torch_geometric.data.Batch.from_data_list``, whose collation for any kind of data takes longer than a small graph's edges.
+    The values equal those of ``torch_geometric.data.Batch.from_data_list``, whose general collation takes longer than building a small graph's edges.
     """
     out, first = HeteroData(), graphs[0]
     offsets: dict[str, list[int]] = {}
@@ -38,5 +38,5 @@ def batched(graphs: Sequence[HeteroData]) -> HeteroData:
 
 
 def _shifted(edge_index: Tensor, source: int, target: int) -> Tensor:
-    """Edges of a graph whose nodes begin at these rows."""
+    """Return the edges of a graph whose source and target nodes start at these rows."""
     return edge_index + torch.tensor([[source], [target]], device=edge_index.device)

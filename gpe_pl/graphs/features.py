@@ -37,12 +37,12 @@ GAP_SCALE = 0.2
 GAP_LIMIT = 6.0
 """… and clipped here, so that the channel resolves contact and saturates beyond it."""
 TINY = 1e-12
-"""Length of an edge between coincident nodes, in rest spacings or widths of a level."""
+"""Length given to an edge between coincident nodes, in rest spacings or widths of a level."""
 
 
 @dataclass(frozen=True)
 class GraphConfig:
-    """How states become graphs.
+    """Settings of the graphs of a data set.
 
     Attributes:
         features: edge features, ``paper`` or ``contact``.
@@ -51,8 +51,8 @@ class GraphConfig:
         connectivity_spacings: neighbour radius in rest spacings; None takes the data set's radius.
         trim_boundary: leave out boundary nodes without an edge, which cannot influence anything.
         mesh: connect ``schema.MESH_MATERIALS`` along their cells and put levels of virtual nodes above them; without it they are particles like the others.
-        num_levels: of virtual nodes; None takes as many as lead to one root in any body of the domain.
-        islands: find the connected groups of nodes and which of them nothing touches; see ``nn.island_momentum``.
+        num_levels: number of levels of virtual nodes; None takes as many as lead to one root in any body of the domain.
+        islands: find the connected groups of nodes, and those without an edge to the boundary; see ``nn.island_momentum``.
     """
 
     features: Features = "contact"
@@ -85,13 +85,13 @@ class Scales:
 
 
 def scales_of(config: GraphConfig, metadata: Metadata) -> Scales:
-    """Scales from the metadata, with the radius of the graph configuration if it names one."""
+    """Return the scales of a data set, with the radius of the graph configuration if it names one."""
     own = config.connectivity_spacings
     return Scales(metadata.connectivity_radius if own is None else own * metadata.spacing, metadata.spacing, metadata.frame_dt)
 
 
 def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
-    """Channel counts of the graphs that ``config`` makes of a data set."""
+    """Return the channel counts of a data set's graphs."""
     dim, materials = metadata.dim, metadata.materials
     meshes = set(materials) & set(MESH_MATERIALS) if config.mesh else set()
     if not meshes:
@@ -119,7 +119,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
 
 
 def _edge_channels(features: Features, relation: EdgeType, dim: int) -> tuple[int, int]:
-    """Odd and even channels of ``edge_features`` (``radius``) and ``mesh_features`` (all other relations)."""
+    """Return the numbers of odd and even channels of ``edge_features`` (``radius``) and ``mesh_features`` (all other relations)."""
     if features == "paper":
         return dim, 0
     if relation[1] == RADIUS:
@@ -128,10 +128,10 @@ def _edge_channels(features: Features, relation: EdgeType, dim: int) -> tuple[in
 
 
 def material_features(velocity_history: Float64[Tensor, "node history dim"], gravity: Float64[Tensor, " dim"], scales: Scales) -> Tensor:
-    """Motion and external acceleration of dynamic nodes [node, (history + 1) · dim].
+    """Return motion and external acceleration of dynamic nodes [node, (history + 1) · dim].
 
-    The history enters as the last velocity and the velocity changes before it: the same content as the velocities, but a change is a tenth of a velocity
-    and would drown in its scale.
+    The history enters as the last velocity and the velocity changes before it. A change is about a tenth of a velocity; on the scale of velocities it would
+    be lost.
     """
     n = velocity_history.shape[0]
     changes = velocity_history[:, 1:] - velocity_history[:, :-1]
@@ -140,9 +140,9 @@ def material_features(velocity_history: Float64[Tensor, "node history dim"], gra
 
 
 def boundary_features(config: GraphConfig, boundary: Boundary, scales: Scales) -> Tensor:
-    """Velocity of boundary nodes [boundary_node, dim], or with ``boundary_condition`` also normal, friction and restitution [boundary_node, 2 dim + 2].
+    """Return features of boundary nodes: velocity [node, dim], with ``boundary_condition`` also normal, friction and restitution [node, 2 dim + 2].
 
-    Friction μ enters as μ/(1+μ), so no-slip is 1.
+    Friction μ enters as μ/(1+μ), which is 1 for no-slip.
     """
     velocity = boundary.vel / scales.velocity
     if not config.boundary_condition:
@@ -158,10 +158,10 @@ def edge_features(
     normal: Float[Tensor, "edge dim"] | None,
     scales: Scales,
 ) -> tuple[Float[Tensor, "edge odd"], Float[Tensor, "edge even"]]:
-    """Odd and even edge channels.
+    """Return odd and even channels of edges within the radius.
 
     Args:
-        features: which set.
+        features: ``paper`` or ``contact``.
         displacement: x_target − x_source [m].
         relative_velocity: v_target − v_source [m/s].
         normal: wall normal at the source for ``boundary`` edges, None between dynamic nodes.
@@ -189,7 +189,7 @@ def edge_features(
 def virtual_features(
     velocity_history: Float64[Tensor, "node history dim"], level: Int64[Tensor, " node"], gravity: Float64[Tensor, " dim"], scales: Scales
 ) -> Tensor:
-    """Features of virtual nodes [node, (history + 1) · dim + 1]: those of material nodes, and the level, which is log₂ of width over rest spacing."""
+    """Return features of virtual nodes [node, (history + 1) · dim + 1]: those of material nodes, and the level, log₂ of width over rest spacing."""
     return torch.cat([material_features(velocity_history, gravity, scales), level[:, None].double()], dim=1)
 
 
@@ -201,17 +201,17 @@ def mesh_features(
     level: Int64[Tensor, " edge"] | None,
     scales: Scales,
 ) -> tuple[Float[Tensor, "edge odd"], Float[Tensor, "edge even"]]:
-    """Odd and even channels of the edges of meshes, in units of the level's width, so that all levels of a uniformly strained body look alike.
+    """Return odd and even channels of the edges of meshes, in units of the level's width, so that all levels of a uniformly strained body look alike.
 
     With x the displacement, X that at rest and x̂ = x/|x|: odd are x, the relative velocity, X and (|x| − |X|) x̂, along which a spring pulls; even are
     |x| − |X|, the velocity along x̂ and |X|, and between virtual nodes the level.
 
     Args:
-        features: which set.
+        features: ``paper`` or ``contact``.
         displacement: x_target − x_source [m].
-        rest_displacement: the same at rest [m].
+        rest_displacement: displacement at rest [m].
         relative_velocity: v_target − v_source [m/s].
-        level: of the source; None for cell edges, which have width one spacing.
+        level: level of the source; None for cell edges, whose width is one spacing.
         scales: units.
     """
     width = scales.spacing if level is None else scales.spacing * torch.exp2(level.double())[:, None]
@@ -230,7 +230,7 @@ def mesh_features(
 
 
 def _without_rounding(displacement: Tensor) -> Tensor:
-    """Zero where it is not above the rounding of a mean of positions: rows of virtual nodes above a lattice stay exactly in line, as its own rows do."""
+    """Return displacements with zeros in place of rounding errors of mean positions, so that rows of virtual nodes above a lattice are exactly in line."""
     return torch.where(displacement.abs() < 1e-9, 0.0, displacement)
 
 
@@ -242,5 +242,5 @@ def from_centre(pos: Float64[Tensor, "node dim"], island: Int64[Tensor, " node"]
 
 
 def history_of(state: State) -> Float64[Tensor, "node history dim"]:
-    """Velocity history of a state, or its velocity alone."""
+    """Return the velocity history of a state, or its velocity alone."""
     return state.vel[:, None] if state.velocity_history is None else state.velocity_history

@@ -1,4 +1,4 @@
-"""Islands: connected components of the dynamic nodes. What no edge reaches from outside can only fall freely."""
+"""Islands: connected components of the dynamic nodes. An island without an edge to the boundary can only fall freely."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ class Islands:
     is_free: Bool[np.ndarray, "island"]
 
     def mean(self, values: Float64[np.ndarray, "node dim"], mass: Float64[np.ndarray, "node"]) -> Float64[np.ndarray, "island dim"]:
-        """Mass-weighted mean over each island."""
+        """Return the mass-weighted mean over each island."""
         count = len(self.is_free)
         total = np.stack([np.bincount(self.label, mass * column, count) for column in values.T], axis=-1)
         return total / np.bincount(self.label, mass, count)[:, None]
 
 
 def find_islands(num_nodes: int, edge_index: Int64[np.ndarray, "2 edge"], touches_boundary: Bool[np.ndarray, "node"]) -> Islands:
-    """Islands of a graph.
+    """Return the islands of a graph.
 
     Args:
         num_nodes: dynamic nodes.
@@ -50,7 +50,7 @@ def find_islands(num_nodes: int, edge_index: Int64[np.ndarray, "2 edge"], touche
 @njit(cache=True)
 @no_type_check
 def _components(num_nodes, edge_index):
-    """Component of each node, numbered in order of their first nodes, and their number: union–find with path halving [Tarjan & van Leeuwen 1984]."""
+    """Return the component of each node, numbered by first node, and the number of components (union–find with path halving, Tarjan & van Leeuwen 1984)."""
     parent = np.arange(num_nodes)
     for k in range(edge_index.shape[1]):
         a, b = edge_index[0, k], edge_index[1, k]
@@ -82,7 +82,7 @@ def islands_within(
     mesh_edges: Int64[np.ndarray, "2 edge"],
     periodicity: Periodicity = NOWHERE,
 ) -> Islands:
-    """Islands of nodes that a radius [m] or a mesh connects; free where no boundary node, given by position or search tree, lies within the radius."""
+    """Return the islands that a radius [m] or a mesh connects; free ones have no boundary node, given by position or search tree, within the radius."""
     touches = np.zeros(len(pos), dtype=bool)
     touches[radius_between(boundary, pos, radius, periodicity)[1]] = True
     return find_islands(len(pos), np.concatenate([radius_pairs(pos, radius, periodicity), mesh_edges], axis=1), touches)
@@ -120,7 +120,7 @@ def image_shifts(
 @njit(cache=True)
 @no_type_check
 def _images(num_nodes, edge_index, turns):
-    """Periods by which to move each node, so that edge k, moved by ``turns[k]`` at its target, is short; and whether its component contradicts that."""
+    """Return the periods that move each node so that edge k, shifted by ``turns[k]`` at its target, is short; and a mask of nodes for which none exist."""
     num_edges, dim = turns.shape
     first = np.zeros(num_nodes + 1, np.int64)  # of a node's entries in ``edge``
     for k in range(num_edges):
@@ -165,9 +165,9 @@ def _images(num_nodes, edge_index, turns):
 
 
 def free_since(before: Islands, now: Islands) -> Bool[np.ndarray, "island"]:
-    """Islands that are free and already were so in the frame before, as one or several.
+    """Return a mask of the islands that are free now and whose nodes were free in the frame before, in one or several islands.
 
-    One that lost a part since then, or that then touched something, still carries that push in its last velocity.
+    An island that touched something or lost a part since then still carries that push in its last velocity.
     """
     together = np.zeros((len(before.is_free), len(now.is_free)), dtype=bool)
     together[before.label, now.label] = True

@@ -17,9 +17,9 @@ from gpe_pl.trajectory.trajectory import Metadata
 
 
 def lattice_scene(num_nodes: int, num_edges: int, config: GraphConfig, dim: int = 2, seed: int = 0) -> tuple[GraphBuilder, State]:
-    """About ``num_edges`` undirected edges between ``num_nodes`` nodes in a unit square or cube.
+    """Return a builder and a state with about ``num_edges`` undirected edges between ``num_nodes`` nodes in a unit square or cube.
 
-    Nodes are in random order, as a simulation leaves them.
+    Nodes are in random order, as after a long simulation.
     """
     rng = np.random.default_rng(seed)
     side = int(np.ceil(num_nodes ** (1 / dim)))
@@ -50,13 +50,13 @@ def lattice_scene(num_nodes: int, num_edges: int, config: GraphConfig, dim: int 
 
 
 def lattice_graph(num_nodes: int, num_edges: int, config: GraphConfig, dim: int = 2, seed: int = 0) -> tuple[GraphBuilder, HeteroData]:
-    """The graph of ``lattice_scene``."""
+    """Return the builder and the graph of ``lattice_scene``."""
     builder, state = lattice_scene(num_nodes, num_edges, config, dim, seed)
     return builder, builder(state)
 
 
 def _radius(pos: np.ndarray, num_edges: int) -> float:
-    """The distance within which about so many pairs lie [m]: by bisection in a part of the scene, whose share of the pairs is that of its nodes."""
+    """Return the radius [m] within which about ``num_edges`` pairs lie, by bisection on a sample of the nodes."""
     tree = cKDTree(pos)
     some = cKDTree(pos[:: max(1, len(pos) // 20_000)])
     wanted = 2 * num_edges * some.n / tree.n
@@ -68,7 +68,7 @@ def _radius(pos: np.ndarray, num_edges: int) -> float:
 
 
 def _count(some: cKDTree, tree: cKDTree, radius: float, enough: float) -> float:
-    """Ordered pairs of distinct nodes within a radius; not counted where there must be many times more than enough."""
+    """Return the number of ordered pairs of distinct nodes within a radius; ``enough`` if there must be many times more."""
     volume = (2 * radius) ** tree.m
     if volume * tree.n > 1000 * enough / some.n:
         return enough

@@ -28,10 +28,10 @@ SNAP = 1e-3
 """Nodes this near (in rest spacings) below the face of a box count as on it, so that rounding does not tear the rows of a lattice apart."""
 
 MESHES_HELD = 1024
-"""Multi-scale graphs kept in memory; one of a thousand nodes takes about 0.2 MB."""
+"""Largest number of multi-scale graphs kept in memory; a graph of a thousand nodes takes about 0.2 MB."""
 
 REACH = 2.0
-"""Rest spacings within which a node of no cell is part of a body: further than the diagonal of a lattice's cell in space."""
+"""Distance within which a node of no cell is part of a body, in rest spacings; longer than the diagonal of a cubic cell."""
 
 
 class MeshError(GpeError, ValueError):
@@ -40,10 +40,10 @@ class MeshError(GpeError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class MultiscaleGraph:
-    """What stays the same about the mesh of a scene. Points are the nodes of the state, followed by the virtual nodes in the order of their levels.
+    """Part of a mesh's graph that does not change with time. Points are the nodes of the state, followed by the virtual nodes in the order of their levels.
 
     Attributes:
-        rest_pos: of the nodes of the state [m]; in a periodic domain the images that do not tear bodies apart.
+        rest_pos: undeformed positions of the nodes of the state [m]; in a periodic domain the images that keep bodies together.
         body: connected body of each point; a node of no cell is a body of its own.
         level: of each point, 0 for the nodes of the state.
         parent: virtual node one level up, or -1: roots, nodes of no cell, and the top of bodies that are deeper than the levels asked for.
@@ -64,11 +64,11 @@ class MultiscaleGraph:
 
     @property
     def num_nodes(self) -> int:
-        """Nodes of the state."""
+        """Number of nodes of the state."""
         return len(self.rest_pos)
 
     def moving_bodies(self, kind: Int64[np.ndarray, " node"], spacing: float) -> Int64[np.ndarray, " node"]:
-        """Body that each node of the state moves with.
+        """Return the body that each node of the state moves with.
 
         A node of no cell moves with the body of its kind that it lies beside at rest, within ``REACH`` spacings, directly or by other such nodes. Where
         there is none it is a body of its own.
@@ -80,7 +80,7 @@ class MultiscaleGraph:
         return _moving_bodies(self, kind.tobytes(), spacing)
 
     def are_in_contact(self, pairs: Int64[np.ndarray, "2 edge"], radius: float) -> Bool[np.ndarray, " edge"]:
-        """Which near pairs of nodes touch rather than belong together.
+        """Return a mask of the near pairs of nodes that are contacts.
 
         Two bodies touch where they are near. A body touches itself where nodes are near that are more than two radii [m] apart at rest and share no cell.
         """
@@ -94,7 +94,7 @@ class MultiscaleGraph:
 
 
 def levels_of(extent: float, spacing: float) -> int:
-    """Levels up to one root for any body that is at least ``spacing`` shorter than a domain whose longest side is ``extent`` [m]."""
+    """Return the number of levels up to one root for any body that is at least ``spacing`` shorter than a domain whose longest side is ``extent`` [m]."""
     return max(1, math.ceil(math.log2(extent / spacing)))
 
 
@@ -105,14 +105,14 @@ def multiscale_graph(
     num_levels: int,
     periodicity: Periodicity = NOWHERE,
 ) -> MultiscaleGraph:
-    """The multi-scale graph of a mesh, built once for equal arguments; its arrays are read-only.
+    """Return the multi-scale graph of a mesh, built once for equal arguments; its arrays are read-only.
 
     Args:
         rest_pos: undeformed positions [m].
         cells: nodes of each cell.
         spacing: rest spacing [m].
-        num_levels: the most levels of virtual nodes; a body ends at its root or here.
-        periodicity: where space repeats.
+        num_levels: largest number of levels of virtual nodes; a body ends at its root or here.
+        periodicity: axes along which space repeats.
 
     Raises:
         MeshError: a cell has a node that does not exist, or a rest position is not finite.
@@ -157,7 +157,7 @@ def _moving_bodies(graph: MultiscaleGraph, kind: bytes, spacing: float) -> Int64
 
 
 def build(rest_pos: np.ndarray, cells: np.ndarray, spacing: float, num_levels: int, periodicity: Periodicity = NOWHERE) -> MultiscaleGraph:
-    """``multiscale_graph`` without memory."""
+    """Return ``multiscale_graph`` without looking for an earlier result."""
     num_nodes = len(rest_pos)
     bad = np.flatnonzero(((cells < 0) | (cells >= num_nodes)).any(axis=1))
     if len(bad):
@@ -210,7 +210,7 @@ def build(rest_pos: np.ndarray, cells: np.ndarray, spacing: float, num_levels: i
 def _smallest_boxes(
     rest_pos: np.ndarray, nodes: np.ndarray, body: np.ndarray, num_bodies: int, spacing: float
 ) -> tuple[Int64[np.ndarray, "node dim"], Int64[np.ndarray, "body dim"]]:
-    """Integer coordinates of each node in its body, in rest spacings, and how often they must be halved along each axis until all are zero."""
+    """Return the integer coordinates of each node in its body, in rest spacings, and the halvings along each axis until all are zero."""
     box, low = np.zeros(rest_pos.shape, dtype=np.int64), np.full((num_bodies, rest_pos.shape[1]), np.inf)
     np.minimum.at(low, body[nodes], rest_pos[nodes])
     box[nodes] = np.floor((rest_pos[nodes] - low[body[nodes]]) / spacing + SNAP)
@@ -223,14 +223,14 @@ def _smallest_boxes(
 
 
 def cell_edges(cells: Int64[np.ndarray, "cell corner"], num_nodes: int) -> Int64[np.ndarray, "2 edge"]:
-    """Pairs of nodes that share a cell, each once, the lower node first."""
+    """Return the pairs of nodes that share a cell, each once, the lower node first."""
     pairs = [cells[:, [a, b]].T for a, b in itertools.combinations(range(cells.shape[1]), 2)]
     both = np.concatenate([np.empty((2, 0), dtype=np.int64), *pairs], axis=1)
     return _unique_pairs(both[:, both[0] != both[1]], num_nodes)  # a cell may name a node twice: a triangle among quadrilaterals
 
 
 def _keys(pairs: np.ndarray, count: int) -> Any:
-    """One number per unordered pair of two numbers below ``count``."""
+    """Return one number per unordered pair of two numbers below ``count``."""
     return pairs.min(axis=0) * count + pairs.max(axis=0)
 
 
@@ -240,7 +240,7 @@ def _unique_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
 
 
 def _box_keys(body: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """One number per body and box."""
+    """Return one number per body and box."""
     key = body
     for column in box.T:
         key = key * (column.max(initial=0) + 1) + column

@@ -14,20 +14,21 @@ from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.trajectory.boundary import search_tree
 
 MOST_PAIRS = 2**26
-"""That are listed; a gigabyte of indices."""
+"""Largest number of pairs that a search lists: a gigabyte of indices."""
 NUM_SAMPLED = 64
-"""Nodes from whose neighbours the number of all pairs is estimated."""
+"""Number of nodes whose neighbours serve to estimate the number of all pairs."""
 
 
 def pairs_at_rest(num_nodes: int, radius: float, spacing: float, dim: int) -> float:
-    """Pairs of a cloud with one node per spacing^dim: N/2 V_dim (R / spacing)^dim."""
+    """Return the number of pairs in a cloud with one node per spacing^dim: N/2 V_dim (R / spacing)^dim."""
     ball = {1: 2.0, 2: np.pi, 3: 4 / 3 * np.pi}[dim]
     return num_nodes / 2 * ball * (radius / spacing) ** dim
 
 
 def check_crowding(pos: Float64[np.ndarray, "node dim"], radius: float, spacing: float, periodicity: Periodicity = NOWHERE) -> None:
-    """Refuse a cloud that has collapsed: its pairs are counted before they are listed, which takes time but no memory,
-    and that only where a bound from the number of nodes in boxes does not say that there are few.
+    """Refuse a cloud that has collapsed.
+
+    Pairs are counted before they are listed, which takes time but no memory. Clouds whose nodes per box rule out a collapse are not counted.
 
     Raises:
         SimulationError: ``CROWDING_LIMIT`` times as many pairs within the radius [m] as at rest; names the most crowded node. Reason ``clustering``.
@@ -52,10 +53,10 @@ def check_crowding(pos: Float64[np.ndarray, "node dim"], radius: float, spacing:
 
 
 def radius_pairs(pos: Float64[np.ndarray, "node dim"], radius: float, periodicity: Periodicity = NOWHERE) -> Int64[np.ndarray, "2 edge"]:
-    """Unordered pairs of distinct nodes at most ``radius`` [m] apart; row 0 is the source, row 1 the target, each pair once.
+    """Return the unordered pairs of distinct nodes at most ``radius`` [m] apart, each once; row 0 is the source, row 1 the target.
 
     Raises:
-        SimulationError: more than can be listed.
+        SimulationError: there are more pairs than memory can hold.
     """
     if len(pos) < 2:
         return np.empty((2, 0), dtype=np.int64)
@@ -72,16 +73,16 @@ def radius_between(
     radius: float,
     periodicity: Periodicity = NOWHERE,
 ) -> Int64[np.ndarray, "2 edge"]:
-    """Pairs of a source node and a target node of two different sets at most ``radius`` [m] apart.
+    """Return the pairs of a source node and a target node of two different sets at most ``radius`` [m] apart.
 
     Args:
         source: positions [m], or ``search_tree`` of them with the same periodicity.
         target: positions [m].
         radius: [m].
-        periodicity: where space repeats; a tree given as ``source`` must have been built for it.
+        periodicity: axes along which space repeats; a tree given as ``source`` must have been built for it.
 
     Raises:
-        SimulationError: more than can be listed.
+        SimulationError: there are more pairs than memory can hold.
     """
     tree = source if isinstance(source, cKDTree) else search_tree(source, periodicity)
     if tree.n == 0 or len(target) == 0:
@@ -94,7 +95,7 @@ def radius_between(
 
 
 def _check_number(tree: cKDTree, other: cKDTree, radius: float) -> None:
-    """Raise ``SimulationError`` where the pairs of two sets, as estimated from some nodes, would fill the memory: a radius in another unit makes that many."""
+    """Raise ``SimulationError`` if the pairs of two sets, estimated from some nodes, would fill the memory, as with a radius in another unit."""
     if tree.n * other.n <= MOST_PAIRS:
         return
     sample = np.unique(np.linspace(0, other.n - 1, NUM_SAMPLED).astype(int))

@@ -26,13 +26,12 @@ def _as_they_are(relation: EdgeType, graphs: list[HeteroData]) -> list[HeteroDat
 
 @dataclass(frozen=True)
 class StatisticsSample:
-    """Training graphs that statistics are taken from.
+    """Training graphs from which statistics are computed.
 
     Attributes:
-        graphs: evenly spread over the split.
-        rare: gives graphs of trajectories that have nodes of all these roles (see ``schema.role``), where ``graphs`` has too few of them; none where it has
-            enough.
-        touching: takes a relation of contacts and these graphs, and gives others that have such contacts where too few of these have.
+        graphs: graphs evenly spread over the split.
+        rare: returns graphs of trajectories with nodes of all given roles (see ``schema.role``) if ``graphs`` has too few of them, else none.
+        touching: takes a relation of contacts and graphs; returns other graphs with such contacts if too few of the given ones have any.
     """
 
     graphs: list[HeteroData]
@@ -40,7 +39,7 @@ class StatisticsSample:
     touching: Callable[[EdgeType, list[HeteroData]], list[HeteroData]] = _as_they_are
 
     def of(self, *roles: str) -> list[HeteroData]:
-        """The graphs to look at for nodes of one role, or edges between two."""
+        """Return the graphs for statistics of nodes of one role, or of edges between two."""
         return self.rare(frozenset(roles)) or self.graphs
 
     def __iter__(self) -> Iterator[HeteroData]:
@@ -79,10 +78,10 @@ class GraphStandardizer(nn.Module):
         return params.to(cls._precision(material)).log() if MATERIALS[material].scale == "log" else params
 
     def fit(self, graphs: Iterable[HeteroData]) -> list[str]:
-        """Set all statistics from graphs of the training split, those of what is rare from further ones if it is a ``StatisticsSample``.
+        """Set all statistics from graphs of the training split; a ``StatisticsSample`` adds graphs of rare materials and contacts.
 
         Returns:
-            Materials, and contacts between what occurs, that no graph has: these are not standardised. Relations of meshes are missing where there is no mesh.
+            Materials, and contacts between materials that occur, that no graph has. These are not standardised. Relations of meshes are never named.
         """
 
         def fit(module: nn.Module, values: Iterable[Tensor]) -> bool:
@@ -113,14 +112,14 @@ class GraphStandardizer(nn.Module):
         return missing
 
     def unknown(self) -> list[str | EdgeType]:
-        """Materials and relations without statistics; nothing before any are set."""
+        """Return the materials and relations without statistics; empty before ``fit``."""
         materials = [m for m in self.spec.materials if cast(Standardize, self.node[m]).is_identity]
         if len(materials) == len(self.spec.materials):
             return []
         return [*materials, *(r for r in self.spec.relations if cast(Standardize, self.odd[self._key(r)]).is_identity)]
 
     def take_over(self, other: GraphStandardizer) -> None:
-        """The statistics of another one, but for what it has none of."""
+        """Take the statistics of another standardizer where it has any."""
         own = {name: module for name, module in self.named_modules() if isinstance(module, Standardize)}
         for name, module in other.named_modules():
             if isinstance(module, Standardize) and not module.is_identity:
@@ -128,12 +127,12 @@ class GraphStandardizer(nn.Module):
         self.mass.copy_(other.mass)
 
     def forward(self, data: HeteroData, skip_absent: bool = True, limits: dict[str, Tensor] | None = None) -> HeteroData:
-        """A graph with standardised features; the input is left as it is.
+        """Return a graph with standardised features; the input does not change.
 
         Args:
-            data: with features in SI units.
-            skip_absent: leaves out features that the graph has no rows of.
-            limits: lowest and highest value [2, param] of each material's parameters; values beyond are taken for these.
+            data: graph with features in SI units.
+            skip_absent: whether to leave out node types and relations without rows.
+            limits: lowest and highest value [2, param] of each material's parameters, to which values are clamped.
         """
 
         def wanted(values: Tensor) -> bool:
@@ -159,5 +158,5 @@ class GraphStandardizer(nn.Module):
 
 
 def named(kind: str | EdgeType) -> str:
-    """A material or relation in words."""
+    """Return a material or relation in words."""
     return kind if isinstance(kind, str) else "–".join((role(kind[0]), kind[1], role(kind[2])))

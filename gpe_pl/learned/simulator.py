@@ -48,9 +48,9 @@ log = logging.getLogger(__name__)
 CHECKPOINT_FORMAT = 3
 
 RANGE_TOLERANCE = 1e-5
-"""Material parameters are stored in single precision; differences below this share of the value are none."""
+"""Relative difference of material parameters that counts as none, because they are stored in single precision."""
 MASS_FACTOR = 2.0
-"""By which masses of nodes may leave the range of training: those at corners of meshes differ between bodies of one kind."""
+"""Factor by which masses of nodes may leave the range of training: corners of meshes differ between bodies of one kind."""
 
 
 class CheckpointError(GpeError, ValueError):
@@ -119,7 +119,7 @@ class LearnedSimulator(nn.Module):
     def configured(
         self, *, skips: Skips | None = None, holds_parameters: bool | None = None, static_friction: float | None = None
     ) -> LearnedSimulator:
-        """A copy with other settings; None keeps a setting. The copy shares the weights and leaves this simulator unchanged."""
+        """Return a copy with other settings; None keeps a setting. The copy shares the weights and leaves this simulator unchanged."""
         other = copy.copy(self)
         other._modules = {**self._modules, "model": copy.copy(self.model)}
         if skips is not None:
@@ -144,7 +144,7 @@ class LearnedSimulator(nn.Module):
 
     @property
     def num_hops(self) -> int:
-        """How many edges away a node can still count."""
+        """Number of edges to the farthest node that can influence a prediction."""
         return self.model.num_hops
 
     @torch.no_grad()
@@ -233,7 +233,7 @@ class LearnedSimulator(nn.Module):
         }
 
     def trained_ranges(self) -> Iterator[tuple[str, Tensor]]:
-        """Lowest and highest value [2, param] of each material's parameters in training."""
+        """Yield each material with the lowest and highest value [2, param] of its parameters in training."""
         for material in self.builder.spec.param_channels:
             yield material, self.get_buffer(f"trained_{material}")
 
@@ -279,13 +279,14 @@ class LearnedSimulator(nn.Module):
                 yield kind, f"{kind} is {mass[is_outside][0].item():g} kg, in training it was {low:g} to {high:g} kg"
 
     def forward(self, data: HeteroData) -> Prediction:
-        """Accelerations without gravity per material, in units of ``acceleration_std``."""
+        """Return accelerations without gravity per material, in units of ``acceleration_std``."""
         limits = dict(self.trained_ranges()) if self.holds_parameters else None
         return self.model(self.standardizer(data, self.skips.absent_types, limits))
 
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
-        """The state at a frame with the velocity history that the graph needs, on this model's device. What training did not have of material
-        parameters, gravity and boundary nodes, and another version of the solver, is named in a warning, once per kind.
+        """Return the state at a frame with the velocity history that the graph needs, on this model's device.
+
+        A warning names material parameters, gravity and boundary nodes outside the range of training, and another version of the solver, once per kind.
 
         Raises:
             IndexError: too few frames before ``frame``.
@@ -300,7 +301,7 @@ class LearnedSimulator(nn.Module):
         return self._checked(state, f"frame {frame}")
 
     def standing(self, state: State, scene: Metadata) -> State:
-        """A scene's state as if it had never moved otherwise, on this model's device: what a rollout without frames before it starts from.
+        """Return the start of a rollout without earlier frames, on this model's device: all velocities of the history are the present one.
 
         Raises:
             SceneError: as ``initial_state``.
@@ -311,7 +312,7 @@ class LearnedSimulator(nn.Module):
         return self._checked(replace(state, velocity_history=history.clone()), "start")
 
     def fits(self, scene: Metadata) -> bool:
-        """Whether a scene has the frame interval, spacing, dimension and materials that the model was trained on."""
+        """Return whether a scene has the frame interval, spacing, dimension and materials of training."""
         own = self.builder.metadata
         same_scales = abs(scene.frame_dt / own.frame_dt - 1) < 1e-6 and abs(scene.spacing / own.spacing - 1) < 0.01
         return same_scales and scene.dim == own.dim and scene.param_names == own.param_names
@@ -364,11 +365,11 @@ class LearnedSimulator(nn.Module):
 
     @torch.inference_mode()
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        """``step`` of several scenes in one pass of the model; a scene that has no graph any more is answered with the reason."""
+        """Return ``step`` of several scenes from one pass of the model; a scene whose graph cannot be built gives the reason."""
         return self.next_states(states)
 
     def next_states(self, states: list[State]) -> list[State | SimulationError]:
-        """``step_all`` with tensors that may take part in training."""
+        """Return ``step_all`` with tensors that may take part in training."""
         graphs = [self._graph(state) for state in states]
         sound = [k for k, graph in enumerate(graphs) if not isinstance(graph, SimulationError)]
         new: list[Any] = list(graphs)
@@ -384,7 +385,7 @@ class LearnedSimulator(nn.Module):
             return error
 
     def _warn_of_unknown(self, graphs: list[HeteroData]) -> None:
-        """Name what a scene has and the statistics of the training lack, once each."""
+        """Warn once of each node type and relation of a scene that has no statistics of training."""
         if self._unknown is None:
             self._unknown = self.standardizer.unknown()
         for kind in [*self._unknown]:
@@ -431,11 +432,11 @@ class LearnedSimulator(nn.Module):
         return new.corrected(torch.where(held, state.pos, new.pos), torch.where(held, 0.0, new.vel))
 
     def slowest(self, gravity: Tensor) -> Tensor:
-        """Speed [m/s] below which static friction holds."""
+        """Return the speed [m/s] below which static friction keeps nodes in place."""
         return self.static_friction * self.builder.metadata.frame_dt * gravity.norm()
 
     def supported(self, graph: HeteroData) -> Tensor:
-        """Islands of a graph [island] that static friction may hold."""
+        """Return a mask [island] of the islands that static friction may keep in place."""
         spec = self.builder.spec
         moves = (graph[BOUNDARY].x[:, : spec.dim] != 0).any(dim=1)
         walls = [relation for relation in spec.relations if relation[0] == BOUNDARY]
@@ -453,7 +454,7 @@ class LearnedSimulator(nn.Module):
         ]
 
     def advance(self, state: State, acc: Tensor) -> State:
-        """The next state under a given acceleration [m/s²], gravity included."""
+        """Return the next state under an acceleration [node, dim] in m/s², gravity included."""
         dt = self.builder.metadata.frame_dt
         return state.later(dt, *integrators.advance(state.pos, state.vel, acc, dt))
 
@@ -583,5 +584,5 @@ def _per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterat
 
 
 def reason(error: Exception) -> str:
-    """What went wrong, in one line of bounded length."""
+    """Return the type and message of an error in one line of bounded length."""
     return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
