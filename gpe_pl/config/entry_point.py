@@ -43,19 +43,11 @@ from gpe_pl.printable import clean_messages, one_line, speak_utf8
 from gpe_pl.system import early_interrupts
 from gpe_pl.system.signatures import checked, parameters
 
-WITHOUT_KEY = {"comparison", "experiment", "recipe", "scene", "solver"}
+WITHOUT_KEY = {"comparison", "experiment", "recipe", "scene", "solver", "tuned"}
 """Config groups that set keys under other names than their own."""
 
 plugins.register()  # files in conf/ use the plugins
 OmegaConf.register_new_resolver("times", lambda a, b: a * b, replace=True)  # ${times:a,b} in conf/
-
-
-def _for_model(values: Mapping[str, Any], target: str) -> Any:
-    """Resolver ``${for_model:values,target}`` in conf/: the entry of a table for a model's class, or the entry ``default``."""
-    return values.get(target.rpartition(".")[2], values["default"])
-
-
-OmegaConf.register_new_resolver("for_model", _for_model, replace=True)
 OmegaConf.register_new_resolver("model_name", model_name, replace=True)  # ${model_name:checkpoint,runs}
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # ${run_name:name} in conf/ checks the name of a results folder

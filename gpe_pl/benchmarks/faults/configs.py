@@ -19,7 +19,6 @@ PLACES = (
     "paths",
     "hydra",
     "size",
-    "data.comparison",
     "data.dimensions",
     "data.sizes",
     "data.showcase",

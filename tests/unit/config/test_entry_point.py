@@ -367,13 +367,6 @@ def test_commands_fail_in_one_line(tmp_path: Path, command: str, arguments: list
     assert "Traceback" not in child.stdout + child.stderr
 
 
-def test_a_table_by_model_has_a_default() -> None:
-    table = ["data=mixed", "comparison=equal_steps", "data.comparison.velocity_noise_of_change.default=0.5"]
-    table += ["++data.comparison.velocity_noise_of_change.GNS=2.0"]
-    assert compose("fit", *table).training.velocity_noise_of_change == 0.5
-    assert compose("fit", *table, "model=gns").training.velocity_noise_of_change == 2.0
-
-
 def test_a_path_with_an_equals_sign_is_taken_as_typed(tmp_path: Path) -> None:
     run = tmp_path / "data=sand" / "seed=0"
     run.mkdir(parents=True)

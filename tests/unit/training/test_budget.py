@@ -162,7 +162,7 @@ def test_a_measurement_that_fails_writes_nothing(tmp_path: Path) -> None:
     ("overrides", "is_other"),
     [
         (["seed=3", "name=mine", "trainer.progress=false"], False),
-        (["data.larger.scene.max_bodies=7", "data.comparison.push_correction.default=0.5"], False),
+        (["data.larger.scene.max_bodies=7", "size.comparison.seeds='0'"], False),
         (["model.hidden_channels=8"], True),
         (["training.batch_size=3"], True),
         (["batching=by_nodes"], True),

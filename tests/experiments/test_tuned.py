@@ -1,0 +1,61 @@
+"""Tuned values stand as plain numbers in files named after the choices that they are for, and a run uses them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from gpe_pl.config.folder import CONF
+from tests.runs import compose
+
+ALWAYS = sorted(path for group in ("training", "model") for path in (CONF / group).glob("data*/*.yaml"))
+COMPARED = sorted((CONF / "tuned").glob("*/*.yaml"))
+USED = {"sand_gns", "fem_gns", "mixed_gpe_tuned"}
+"""Files of these choices are tested with the fast tests."""
+
+
+def choices(path: Path) -> dict[str, str]:
+    """The choices that a file is named after, by group."""
+    left, found = f"{path.stem.removeprefix('compared_')}_", {}
+    for group in ("size", "data", "model"):
+        names = sorted((p.stem for p in (CONF / group).glob("*.yaml")), key=len, reverse=True)
+        if name := next((n for n in names if left.startswith(f"{n}_")), None):
+            found[group], left = name, left.removeprefix(f"{name}_")
+    assert not left, f"{path}: {left} is no choice"
+    return found
+
+
+def leaves(values: dict[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", value
+
+
+@pytest.mark.parametrize("path", [*ALWAYS, *COMPARED], ids=lambda p: p.stem)
+def test_values_are_plain_and_files_are_named_after_choices(path: Path) -> None:
+    assert "${" not in path.read_text()
+    expected = {"size": {"size"}, "size_model": {"size", "model"}, "data": {"data"}, "data_model": {"data", "model"}}
+    groups = {"data", "model"} if path.parent.parent.name == "model" else expected[path.parent.name]
+    assert choices(path).keys() == groups
+
+
+def _param(path: Path) -> Any:
+    return pytest.param(path, marks=() if "_".join(choices(path).values()) in USED else pytest.mark.slow, id=path.stem)
+
+
+@pytest.mark.parametrize("path", [_param(path) for path in (*ALWAYS, *COMPARED)])
+def test_a_run_uses_the_values(path: Path) -> None:
+    chosen = choices(path)
+    others = {"data": "mixed", "model": "gpe" if path.parent.name == "size" else "dpinet", "size": "tiny"}  # without files of their own
+    more = ["comparison=equal_steps"] if path in COMPARED else []
+    if chosen.get("data") == "imported":
+        more.append("data.name=mine")
+    cfg = compose("fit", *more, *(f"{group}={name}" for group, name in {**others, **chosen}.items()))
+    for key, value in leaves(OmegaConf.to_container(OmegaConf.load(path))):  # type: ignore[arg-type]
+        assert OmegaConf.select(cfg, key) == value, key
