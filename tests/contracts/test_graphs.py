@@ -197,7 +197,7 @@ def test_boundary_nodes_tell_sticky_from_slip() -> None:
 
 
 def test_boundary_nodes_may_have_their_velocity_only() -> None:
-    """As in the paper: the other channels are those that normal, friction and restitution would have."""
+    """The paper does so. The other channels would hold normal, friction and restitution."""
     s = scenes.state(5)
     s = replace(s, boundary=replace(s.boundary, vel=np.ones_like(s.boundary.vel))).to_torch()
     plain, full = (builder(trim_boundary=False, boundary_condition=b) for b in (False, True))

@@ -453,7 +453,7 @@ def test_a_scene_without_a_graph_is_named_and_the_others_go_on(case: str, reason
 
 
 def test_pairs_are_counted_before_they_are_listed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What would take gigabytes is refused; what is dense but possible is not."""
+    """States whose pairs would take gigabytes are refused. Dense but feasible ones are not."""
     build = scenes.builder()
     dense = scenes.state(400, low=0.3, high=0.4).to_torch()  # 14 times the density at rest
     build(dense)

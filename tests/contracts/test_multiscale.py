@@ -399,7 +399,7 @@ def test_a_body_at_rest_is_unstretched_however_it_is_turned() -> None:
 
 
 def test_levels_of_a_uniformly_strained_lattice_look_alike() -> None:
-    """What lets all levels share weights: in units of its own width, a level of a stretched and turning body has the features of any other."""
+    """All levels can share weights: in units of its width, each level of a stretched and turning body has the same features."""
     size = 16
     points, number = np.argwhere(np.ones((size, size))) * scenes.SPACING, np.arange(size**2).reshape(size, size)
     cells = np.stack([number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], axis=-1).reshape(-1, 4)

@@ -205,7 +205,7 @@ def test_a_mesh_at_the_seam_is_the_mesh_inside(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["triangles", "tetrahedra"])
 def test_rest_positions_that_were_folded_are_those_of_the_whole_mesh(kind: str) -> None:
-    """As of data whose rest positions are those of a first frame in which a body lies across the seam; also for the exported program."""
+    """Rest positions are folded if they come from a first frame in which a body lies across the seam. Also tests the exported program."""
     dim = 3 if kind == "tetrahedra" else 2
     space = torus((True,) * dim)
     build = builder(space, ("elastomer",), mesh=True)

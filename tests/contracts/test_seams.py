@@ -283,7 +283,7 @@ def test_a_lid_whose_motion_does_not_know_the_seam_is_refused() -> None:
 
 @pytest.mark.parametrize("normals", [True, False])
 def test_a_lid_in_a_file_slides_on_across_the_seam_of_that_file(tmp_path: Path, normals: bool) -> None:
-    """What repeats is said in the file, not on the command line."""
+    """The file gives the periodic axes, not the command line."""
     num_frames, dt, x = 12, 0.01, np.arange(0.025, 1.0, SPACING)
     time = dt * np.arange(num_frames)[:, None]
     lid = np.stack([(x + 1.0 * time) % 1.0, np.full((num_frames, len(x)), 0.5)], axis=-1)

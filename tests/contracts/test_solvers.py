@@ -274,7 +274,7 @@ def test_free_fall(case):
 
 
 def test_free_flight_has_constant_acceleration(case):
-    """What a model learns from, second differences of positions, is g to rounding, though substeps change as the body gets faster."""
+    """Second differences of positions, from which models learn, equal g to rounding, though substeps change as the body gets faster."""
     solver, state = case
     start = isolated(state, (0.0,) * (state.dim - 1) + (-98.1,))
     start.vel[:, -1] = 5.0

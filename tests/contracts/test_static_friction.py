@@ -79,7 +79,7 @@ def test_at_rest_is_for_ever() -> None:
 
 @pytest.mark.parametrize("when", ["before", "after"])
 def test_what_moves_is_not_held(when: str) -> None:
-    """Before the step, or because of it, where more of gravity is left over than static friction resists."""
+    """A node moves before the step, or because the unbalanced part of gravity exceeds static friction."""
     state, lies = lying_and_flying()
     learned = simulator()
     velocity = 1.01 * ENOUGH * 9.81 * learned.builder.metadata.frame_dt

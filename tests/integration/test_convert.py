@@ -108,7 +108,7 @@ def test_a_periodic_data_set_is_imported_trained_on_and_evaluated(
 
 @pytest.mark.slow
 def test_trajectories_of_any_length(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Of those too short for the history nothing is used; the others differ in length."""
+    """Trajectories too short for the history are left out. The others differ in length."""
     lengths = {"train": (14, 3, 28), "val": (3, 14), "test": (20, 3, 14)}
 
     def scene(seed: int, num_frames: int) -> Trajectory:
@@ -145,7 +145,7 @@ def test_other_models_train_on_periodic_data(tmp_path: Path, lagrangebench: Path
 
 @pytest.mark.slow
 def test_own_arrays_are_trained_on(tmp_path: Path) -> None:
-    """What one does in a notebook."""
+    """A notebook can save arrays as a data set and train on it."""
     made = [
         Trajectory.from_numpy(crowd(k), DT, ["sand", "fluid"] * 30, {"sand": 20.0 + k, "fluid": 0.1}, gravity=[0, -1]) for k in range(4)
     ]

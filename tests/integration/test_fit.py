@@ -334,7 +334,7 @@ def test_one_corrupted_batch_does_not_end_a_run(
 
 
 def test_a_position_that_is_not_finite_stops_the_run_and_is_named(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a trajectory that is not held in memory, and went wrong after training had looked at all of them."""
+    """The trajectory is read from disk, and was spoiled after training had checked all trajectories."""
     plain, spoiled = TrajectoryDataModule.train_dataloader, tmp_path / "shard-00000.h5"
 
     def train_dataloader(self: TrajectoryDataModule) -> Any:

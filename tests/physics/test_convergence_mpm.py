@@ -43,7 +43,7 @@ CASES = [(data, size, dim) for data in ("elastomer", "mixed") for size, dim in (
 
 @pytest.mark.parametrize(("data", "size", "dim"), [*CASES, ("elastomer", "paper", 2)])
 def test_bounce(data, size, dim, physics):
-    """From the softest to the stiffest material of the data, with the time step of the data and with half of it."""
+    """Materials of the data, from the softest to the stiffest, bounce alike with the time step of the data and with half of it."""
     spec: Any = dataset(f"data={data}", f"size={size}", f"dimension={dim}")
     solver, tolerance = replace(spec.solver, materials=("elastomer",)), 0.1 if (data, size, dim) == FEW_PARTICLES else 0.03
     values = spec.parameters["elastomer"]
@@ -66,7 +66,7 @@ def settled_height(solver, hardening, spacing):
 
 @pytest.mark.parametrize(("size", "dim"), [("tiny", 2), ("small", 2), ("tiny", 3)])
 def test_settled_snow(size, dim, physics):
-    """Of the softest and the hardest snow of the data, with the time step of the data and with half of it."""
+    """The softest and the hardest snow of the data settle equally high with the time step of the data and with half of it."""
     spec: Any = dataset("data=snow", f"size={size}", f"dimension={dim}")
     solver, values = spec.solver, spec.parameters["snow"].extrapolated
     for hardening in (min(values), max(values)):
@@ -77,7 +77,7 @@ def test_settled_snow(size, dim, physics):
 
 @pytest.mark.parametrize(("size", "dim"), [("tiny", 2), ("small", 2), ("paper", 2), ("tiny", 3)])
 def test_effective_viscosity_of_liquid_under_snow(size, dim, physics):
-    """Of the thinnest liquid of the data: the nominal viscosity and the grid's own add up, and shorter steps do not raise it."""
+    """The effective viscosity of the data's thinnest liquid is the nominal one plus that of the grid. Shorter steps do not raise it."""
     spec: Any = dataset("data=snow_on_liquid", f"size={size}", f"dimension={dim}")
     solver = replace(spec.solver, materials=("fluid",))
     viscosity, own = min(spec.parameters["fluid"].extrapolated), solver.numerical_viscosity
@@ -90,7 +90,7 @@ def test_effective_viscosity_of_liquid_under_snow(size, dim, physics):
 
 @pytest.mark.parametrize("angle", [20.0, 40.0])
 def test_collapse_of_a_column(angle, physics):
-    """Of sand twice as high as wide: where its grains lie."""
+    """The grains of a sand column twice as high as wide end at the same distances with half the time step."""
     own, half = (np.sort(collapse(2.0, angle, duration=1.0, cfl=cfl).pos[:, 0]) / L0 for cfl in (0.5, 0.25))
     formula, source = "the same with half the time step", "10 cells per width, cfl = 0.5"
     for what, of in (("mean", np.mean), ("95 % quantile", lambda x: np.quantile(x, 0.95))):

@@ -203,7 +203,7 @@ TILTED = Polygon(((-1.0, -1.0), (2.0, -1.0), (2.0, 0.05), (0.45, 0.05), (-1.0, 0
     ],
 )
 def test_liquid_rests_on_curved_and_tilted_solids(physics, name, dim, shapes):
-    """On stairs of whole cells, or with holes in cut cells, the liquid would never come to rest; with a wrong room beside solids, not at its height."""
+    """The test fails for solids of whole cells or with holes in cut cells: the liquid would not come to rest. It also fails for wrong volumes beside solids."""
     cells = 24 if dim == 2 else 16
     solver = FLIP(bounds=unit(dim), grid_spacing=1 / cells, frame_dt=0.01)
     start = fill((0.0,) * dim, (1.0, 0.3125, 1.0)[:dim], 0.5 / cells, lambda x: clearance(shapes, x) > 0.005, shapes=shapes)
@@ -251,7 +251,7 @@ def test_projection_keeps_a_rotation_in_a_round_container(physics, dim):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_divergence_after_projection(physics, dim):
-    """Of a random velocity in a round container with a free surface, per substep."""
+    """A random velocity field in a round container with a free surface has no divergence after one projection."""
     h = 5e-3
     solver = FLIP(bounds=unit(dim), grid_spacing=1 / 16)
     bowl = Bowl((0.5,) * dim, 0.45, 0.0)
@@ -346,7 +346,7 @@ def implicit(dt, viscosity=0.1):
 
 @pytest.mark.parametrize("offset", [0.0, 0.5])
 def test_stokes_flow_decays(physics, offset):
-    """In a closed no-slip square, with walls on nodes and through the middle of cells."""
+    """The flow is in a closed no-slip square, with walls on nodes or through the middle of cells."""
     physics(
         f"decay of Stokes flow, walls {offset:g} cells from the nodes", stokes_rate(32, offset) / implicit(2e-3), 1.0, 0.02,
         formula="λ₁ = 52.3447 ν/a²", source="Leriche & Labrosse 2000",

@@ -91,7 +91,7 @@ SNOW_CONSTANTS = Snow(
 
 
 def test_collision_of_snow_blocks(reference, physics):
-    """In free fall, before they reach the floor: the same law, particle by particle; ours takes smaller substeps once the snow has hardened."""
+    """Both solvers agree particle by particle in free fall, before the floor. Ours takes smaller substeps once the snow has hardened."""
     pos = two_blocks()
     vel = np.where(pos[:, :1] < 0.5, [[1.0, 0.0]], [[-1.0, 0.0]])
     expected = reference(pos, vel, SNOW, 300)

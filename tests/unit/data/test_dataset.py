@@ -263,7 +263,7 @@ def test_a_start_without_own_steps_is_the_usual_sample(store: Path, noise: Noise
 
 @pytest.mark.parametrize("correction", [0.2, 1.0])
 def test_the_target_after_own_steps_leads_back(store: Path, correction: float) -> None:
-    """By the shares of the corrections to the true velocity of that frame, and to the true position."""
+    """The target removes the given fractions of the deviations from the true velocity and position of its frame."""
     data = dataset(store, noise=Noise(0.0, 0.5, 0.25))
     start, dt = data[StartKey(5, 0, 2, correction=correction)], data.builder.metadata.frame_dt
     assert start.own_steps == 2 == data[StartKey(5, 0, 9)].own_steps  # the trajectory ends there

@@ -248,7 +248,7 @@ def test_other_spec_is_refused_by_key(folder):
 
 
 def test_data_of_another_version_of_the_solver_are_refused(tmp_path):
-    """By the version, although settings differ too; the time step is part of what is compared."""
+    """The error names the version, although settings differ, too. The time step is compared as well."""
     few = replace(SPEC, num_train=1, num_val=0, num_test=0, num_test_unseen=0, num_frames=3)
     made = generate(tmp_path, few) / "dataset.json"
     values = json.loads(made.read_text())

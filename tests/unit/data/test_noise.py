@@ -74,7 +74,7 @@ def test_both_noises_add_up() -> None:
 
 
 def test_noise_beyond_half_a_spacing_is_refused() -> None:
-    """By key, value and spacing, with the largest that is allowed."""
+    """The error names key, value and spacing, and the largest value that is allowed."""
     space = replace(scenes.metadata(("sand",), 2), bounds=((0.0, 2.0), (0.0, 1.0)), spacing=0.01, connectivity_radius=0.03, frame_dt=0.1)
     Noise(0.0025, 0.5).check(space, velocity_unit=0.1)  # half a spacing each
     with pytest.raises(NoiseError) as caught:

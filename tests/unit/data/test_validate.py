@@ -291,7 +291,7 @@ def test_hostile_files_give_violations(shard: Path, edit: Callable[[h5py.File], 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_random_damage_never_raises(shard: Path, tmp_path: Path, seed: int) -> None:
-    """What the validator passes, the reader reads; in a child process, so that a crash of HDF5 fails the test."""
+    """Every file that the validator passes can be read. This runs in a child process, so that a crash of HDF5 fails the test."""
     script = """
 import sys
 from pathlib import Path
@@ -400,7 +400,7 @@ def report_of(tmp_path: Path, capsys: pytest.CaptureFixture[str], *trajectories:
 def test_free_flight_is_compared_with_gravity(
     tmp_path: Path, new_trajectory: Callable[..., Trajectory], capsys: pytest.CaptureFixture[str], gravity: tuple[float, float]
 ) -> None:
-    """What falls with another acceleration than the stored one does not ask for a larger radius."""
+    """If groups fall with another acceleration than the stored gravity, the report does not ask for a larger radius."""
     t = falling(new_trajectory, 0.0)
     report = report_of(tmp_path, capsys, replace(t, metadata=replace(t.metadata, gravity=gravity)))
     assert "free groups accelerate by (0, -9.8" in report

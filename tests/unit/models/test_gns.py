@@ -117,7 +117,7 @@ def test_number_of_parameters_is_that_of_the_paper() -> None:
 
 
 def test_steps_are_residual() -> None:
-    """With LayerNorms of the processor at zero nothing is added: what is decoded is what was encoded."""
+    """With the processor's LayerNorms at zero, the steps add nothing: the decoder gets the encoder's output."""
     build = scenes.builder()
     data = scenes.to_dtype(build(scenes.state().to_torch()), DOUBLE)
     torch.manual_seed(0)

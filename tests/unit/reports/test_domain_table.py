@@ -226,7 +226,7 @@ def test_runs_that_differ_in_more_than_the_seed_are_no_seeds(sweep: Path, part: 
 
 
 def test_seeds_trained_for_other_numbers_of_steps_are_refused_and_the_table_stays(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """As after another measurement of step times: a mistake to name, not a trial of settings that would replace the table."""
+    """Another measurement of step times can cause this. It is a mistake to report, not a trial of settings that replaces the table."""
     report_sweep_of(sweep)
     table = (sweep / "table1.md").read_text()
     change(sweep / "sand" / "GPE" / "1", "training", num_steps=7)

@@ -70,7 +70,7 @@ def test_restart_equals_run_through(case):
 
 
 def test_substeps_are_counted(case):
-    """At rest they are as long as ``substep`` allows; fewer, longer ones with less stiffness."""
+    """Substeps at rest are as long as ``substep`` allows. With less stiffness they are fewer and longer."""
     fem, state = case
     still = isolated(state)
     assert fem.step(still).num_substeps == math.ceil(fem.frame_dt / fem.substep(still))
@@ -175,7 +175,7 @@ def test_stiffness_may_vary_from_node_to_node(case):
 
 
 def test_no_kernel_is_compiled_twice(case):
-    """What ``compile_kernels`` compiles fits every dimension and kind of cell."""
+    """The kernels that ``compile_kernels`` compiles serve every dimension and kind of cell."""
     fem, state = case
     fem.compile_kernels()
     fem.step(state)

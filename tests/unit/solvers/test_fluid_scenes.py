@@ -113,7 +113,7 @@ def test_attributes_for_metadata() -> None:
 
 
 def test_values_of_a_file_give_the_same_scene() -> None:
-    """As Hydra passes them: lists, integers and nested dictionaries."""
+    """Hydra passes values as lists, integers and nested dictionaries."""
     values = dataclasses.asdict(SCENES["canyon"])  # type: ignore[call-overload]
     values["bounds"] = [[0, 2], [0, 1], [0, 1]]
     values["terrain_options"] = {"fit": "contain", "up": "z", "solid": "auto", "relief": None}

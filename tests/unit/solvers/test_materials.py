@@ -186,7 +186,7 @@ def test_return_mapping_realises_friction_angle(angle):
 
 @pytest.mark.parametrize("angle", [20.0, 30.0, 40.0])
 def test_return_mapping_realises_friction_angle_in_triaxial_compression(angle):
-    """In 3D, with two equal principal stresses larger than the third: τ_max - τ_min = sin φ |τ_max + τ_min|."""
+    """In 3D, with two equal principal stresses larger than the third, τ_max - τ_min = sin φ |τ_max + τ_min|."""
     _, _, stress, _ = respond(Sand(), angle, np.diag([0.8, 1.02, 1.02]))
     tau = np.linalg.eigvalsh(stress)
     realised = math.degrees(math.asin(abs(tau[2] - tau[0]) / abs(tau[2] + tau[0])))

@@ -110,7 +110,7 @@ def test_absurd_internal_state_or_boundary(dim, material, reason, change):
 @pytest.mark.parametrize("speed", [10.0, 100.0])
 @pytest.mark.parametrize(("material", "value"), [(m, v) for m in ALL for v in (LIMITS[m].low, VALUE[m], LIMITS[m].high)])
 def test_stable_for_every_parameter(dim, speed, material, value):
-    """At 10 m/s an impact ends within the domain and no faster than it began; at 100 m/s that, or a typed error."""
+    """After an impact at 10 m/s, the body is within the domain and no faster than before. At 100 m/s, a typed error is also allowed."""
     solver = MPM(bounds=bounds(dim), grid_spacing=CELL, materials=(material,), frame_dt=2e-3, max_substeps=2000)
     state, fastest = scene(dim, material, value, speed), 0.0
     try:
@@ -169,7 +169,7 @@ def meshed(dim):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_deformed_mesh_without_internal_state_is_refused(dim):
-    """What was moved or turned as a whole, by rounding or by less than a thousandth is undeformed."""
+    """A mesh that was moved or turned as a whole, or changed by rounding or less than a thousandth, counts as undeformed."""
     solver, state = meshed(dim)
     turn = np.eye(dim)
     turn[:2, :2] = [[0.6, -0.8], [0.8, 0.6]]
@@ -261,7 +261,7 @@ def with_obstacle(obstacle, dim):
 
 @pytest.mark.parametrize("name", ["flat box", "narrow box", "sphere", "turned slab", "triangle", "thin arm", "plate", "ball"])
 def test_obstacle_thinner_than_a_cell_is_refused(name):
-    """By shape and by the thickness that would do."""
+    """The error names the shape and the smallest thickness that the grid resolves."""
     dim = 3 if name in ("plate", "ball") else 2
     for cells in (0.02, 0.5, 0.95):
         with pytest.raises(SimulationError, match=rf"{type(thin(name, 0.1)).__name__}.*at least {CELL:g} m thick") as caught:

@@ -150,7 +150,7 @@ def test_what_others_have_prepared_is_not_run(tmp_path: Path) -> None:
 
 
 def test_compiled_functions_are_kept_in_the_fallback(tmp_path: Path) -> None:
-    """In a process whose package and home cannot be written."""
+    """The process cannot write to the folders of the package and home."""
     code = """
 import os
 from pathlib import Path
@@ -169,7 +169,7 @@ _crc32c(np.zeros(1, np.uint8), np.zeros(256, np.uint32))
 
 @pytest.mark.parametrize("given", [None, "/dev/null/cache"])
 def test_without_any_place_functions_compile_without_a_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, given: str | None) -> None:
-    """As in a container whose package, home and temporary folders are read-only."""
+    """For example, a container may have read-only package, home and temporary folders."""
     from numba.core.dispatcher import Dispatcher
 
     def refuse(_: object) -> None:

@@ -108,7 +108,7 @@ def test_processes_of_one_run_share_its_folder(tmp_path: Path, monkeypatch: pyte
 
 
 def test_hydra_lets_later_processes_of_a_training_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of one that has several; each of a command that ``srun -n 2`` starts twice is alone, and so is each sweep."""
+    """This holds for a training with several processes only. Copies of a command that ``srun -n 2`` starts twice, and sweeps, exclude each other."""
     monkeypatch.setenv("SLURM_PROCID", "1")
     folders = {"run": {"dir": str(tmp_path / "a")}, "sweep": {"dir": str(tmp_path / "a")}}
     settings = {"devices": 2, "num_nodes": 1}
@@ -122,7 +122,7 @@ def test_hydra_lets_later_processes_of_a_training_in(tmp_path: Path, monkeypatch
 
 
 def test_disks_without_locks_have_lock_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a process that has ended on this machine it counts as gone; of another machine nobody can tell."""
+    """The lock file of a process that has ended on this machine is ignored. On another machine nobody can tell whether the process has ended."""
 
     def has_none(_: UnixFileLock) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
@@ -155,7 +155,7 @@ def test_a_folder_that_was_deleted_meanwhile_is_an_error(tmp_path: Path, ends_wi
 
 @pytest.mark.parametrize("ends_with", [None, FileNotFoundError])
 def test_a_deleted_folder_is_an_error_also_where_the_process_holds_it_already(tmp_path: Path, ends_with: type[OSError] | None) -> None:
-    """As in a training, whose folder Hydra's callback holds: the inner block ends with it, and the callback's end says nothing more."""
+    """In a training, Hydra's callback holds the folder, too. The inner block raises the error, and the end of the callback raises no other."""
     lost = "a: was deleted or replaced while this command wrote to it"
     with pytest.raises(FolderError, match=lost), held(tmp_path / "a"), pytest.raises(FolderError, match=lost), held(tmp_path / "a"):
         shutil.rmtree(tmp_path / "a")
@@ -164,7 +164,7 @@ def test_a_deleted_folder_is_an_error_also_where_the_process_holds_it_already(tm
 
 
 def test_a_command_that_removes_its_empty_folder_keeps_its_own_error(tmp_path: Path) -> None:
-    """As ``evaluate`` does where the disk of the compile cache is full."""
+    """For example, ``evaluate`` does so if the disk of the compile cache is full."""
     with pytest.raises(OSError, match="No space left on device"), held(tmp_path / "a"):
         (tmp_path / "a").rmdir()
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -255,7 +255,7 @@ def test_hydra_starts_nothing_in_a_folder_that_another_writes_to(tmp_path: Path,
 def test_hydra_starts_nothing_in_a_folder_that_cannot_be_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], kind: str
 ) -> None:
-    """In one line: an exception of a callback would be a warning, and the command would go on."""
+    """The error is one line. Hydra would turn an exception of a callback into a warning and continue the command."""
     config = OmegaConf.create({"hydra": {kind: {"dir": str(tmp_path / "a")}}})
     start = Report().on_run_start if kind == "run" else Report().on_multirun_start
     (tmp_path / "a").mkdir()

@@ -58,7 +58,7 @@ def test_a_function_that_fails_says_so() -> None:
 
 
 def test_memory_is_known_where_there_is_no_proc_and_no_resource(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """As on Windows, where psutil tells the peak."""
+    """On Windows, for example, psutil knows the peak."""
     resident = machine.resident_bytes()
     assert 0.5 * resident < machine.peak_resident() < 100 * resident
     monkeypatch.setattr(machine, "CLEAR_REFS", tmp_path / "none")
@@ -86,7 +86,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) * resource.g
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="its allocator is not glibc's")
 def test_memory_of_freed_arrays_is_not_cleared_again() -> None:
-    """In units of one array: how much new memory twenty of them needed, one after the other. Huge pages make fewer of them."""
+    """Counts the new memory of twenty arrays, one after the other, in units of one array. Huge pages reduce the number of pages."""
     cleared = {
         how: float(subprocess.run([sys.executable, "-c", PAGES_OF_NEW_ARRAYS, how], capture_output=True, text=True, check=True).stdout)
         for how in ("kept", "given back")

@@ -190,7 +190,7 @@ def test_checkpoints_between_validations_come_when_their_time_has_passed(data: P
     ],
 )
 def test_an_interrupted_training_is_saved_where_it_is(data: Path, tmp_path: Path, number: int, step: int, saved: int) -> None:
-    """After a step that a validation follows: after that."""
+    """If a validation follows the step, training saves after the validation."""
     last = tmp_path / "run" / "checkpoints" / "last.ckpt"
     with pytest.raises(RunError, match=rf"^interrupted; run the same command again to resume from {last}, step {saved}$"):
         trained(data, tmp_path / "run", at={step: send(number)})
@@ -231,7 +231,7 @@ def test_a_second_signal_while_a_checkpoint_is_written_leaves_the_one_before(
 
 
 def test_signals_that_are_ignored_stay_ignored() -> None:
-    """As Ctrl-C is for jobs that a shell runs in the background."""
+    """A shell makes its background jobs ignore Ctrl-C, for example."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with Interruption() as interruption:

@@ -120,7 +120,7 @@ def test_a_loss_that_is_not_finite_names_step_trajectories_and_frames(value: flo
 
 
 def test_a_batch_of_nodes_without_neighbours_teaches_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With forces between pairs they fall freely, whatever the weights are."""
+    """With forces between pairs, such nodes fall freely for any weights."""
     build = scenes.builder(MATERIALS, history=1)
     simulator = LearnedSimulator(GPE(build.spec, decoder="pair", num_message_passing_steps=1, hidden_channels=8), build)
     m = TrainingModule(simulator, 10)

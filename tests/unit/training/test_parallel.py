@@ -234,7 +234,7 @@ def test_two_processes_resume_where_they_stopped(mixed: Path, tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_two_processes_stop_and_save_together_when_one_is_interrupted(mixed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the middle of excursions, of which each process has some."""
+    """The interruption comes in the middle of unrolls, of which each process has some."""
     monkeypatch.setattr(sampling, "NUM_LANES", 2)
     whole = trained_on_ranks(mixed, tmp_path / "whole", BatchSize(3), late=True)
     plain = Recorded.training_step

@@ -72,7 +72,7 @@ def visits(data: WindowDataset, samples: list[tuple[int, int]], lane: int, num_v
 
 
 def test_steps_of_training_move_the_states_on(data: WindowDataset, simulator: LearnedSimulator) -> None:
-    """With weights that stay, they are where the simulator's rollout is; other lanes have no part in it."""
+    """With constant weights, unrolls equal the simulator's rollout. Other lanes have no influence."""
     module = TrainingModule(simulator, num_steps=10)
     lanes = [visits(data, [(0, 0), (1, 3)], 0, 3), visits(data, [(2, 3), (3, 0)], 1, 3)]
     for step in range(3):

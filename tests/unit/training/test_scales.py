@@ -220,7 +220,7 @@ def test_limits_of_evaluated_rollouts_follow_the_scene(still: bool, tmp_path: Pa
 
 @pytest.mark.parametrize("pressure", [1e-3, 1e6])
 def test_small_stresses_are_learned_in_their_own_scale(pressure: float) -> None:
-    """Not in Pa: 1 Pa is much where stresses are of 1 mPa."""
+    """An error of 1 Pa is large if stresses are about 1 mPa, so the loss cannot be in Pa."""
     graph = scenes.graph(("solid",))
     nodes = graph["solid"]
     nodes.target = torch.ones(nodes.num_nodes, 2)

@@ -299,7 +299,7 @@ def test_trajectories_are_made_when_they_are_asked_for(tmp_path: Path) -> None:
 
 
 def test_a_trajectory_that_cannot_be_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is wrong in the second pass costs no other trajectory either, unless it was the last of its split."""
+    """A trajectory that fails in the second pass does not affect the others, unless it is the last of its split."""
     decided: list[None] = []
     decide = assemble._Conversion._decide
 

@@ -1,4 +1,4 @@
-"""What states derive from the kinds of their fields: some nodes, several states in one, and the state one frame later."""
+"""``take``, ``joined`` and ``later`` of states, which follow from the kinds of their fields."""
 
 from __future__ import annotations
 

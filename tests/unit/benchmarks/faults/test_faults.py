@@ -335,7 +335,7 @@ def test_a_command_that_is_killed_at_once_has_printed_nothing(tmp_path: Path, mo
 
 
 def test_an_early_interrupt_is_one_line_in_a_forked_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in one that ``python -m`` starts."""
+    """A forked command behaves like one that ``python -m`` starts."""
     before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(os, "dup2", lambda *_: None)
     caught: list[object] = []

@@ -318,7 +318,7 @@ def test_a_cloth_of_quadrilaterals(tmp_path: Path, axes: int) -> None:
 
 
 def test_a_plate_that_an_actuator_deforms(tmp_path: Path) -> None:
-    """As in deforming_plate: an obstacle moves in a prescribed way, handles stand still."""
+    """An obstacle moves in a prescribed way and handles stand still, as in deforming_plate."""
     points = np.argwhere(np.ones((4, 4, 2))).astype(float)
     cells, press = Delaunay(points + np.random.default_rng(0).uniform(-0.1, 0.1, points.shape)).simplices, np.linspace(0, 0.3, 8)
     kind = np.where(points[:, 0] == 0, 3, 0)

@@ -118,7 +118,7 @@ def test_bounds_of_other_axes_are_refused_trajectory_by_trajectory(tmp_path: Pat
 
 
 def test_a_file_that_blows_up_is_not_unpacked(tmp_path: Path) -> None:
-    """Of a gigabyte of zeros in 30 kB no more is unpacked than 1032 times the file's size."""
+    """At most 1032 times the size of a file is unpacked; this one has a gigabyte of zeros in 30 kB."""
     import tracemalloc
 
     import zstandard
@@ -192,7 +192,7 @@ def test_meshes_of_another_number_of_frames_than_described(tmp_path: Path, conta
 
 @pytest.mark.parametrize("stated", ["float32", "float64"])
 def test_bytes_of_another_type_than_described(tmp_path: Path, stated: str) -> None:
-    """Not read as other numbers in half or twice as many frames."""
+    """The bytes are not read as other numbers in half or twice as many frames."""
     cloths = [sources.sheet(seed=k, num_frames=12) for k in range(3)]
     sources.mgn_meta(tmp_path / "raw", cloths[0])
     meta = json.loads((tmp_path / "raw" / "meta.json").read_text())

@@ -89,7 +89,7 @@ def test_everything_moves_with_the_origin(tmp_path: Path) -> None:
 
 
 def test_nodes_at_one_place_are_named(tmp_path: Path) -> None:
-    """As where two bodies overlap; a spacing that was given says nothing of it."""
+    """Overlapping bodies have such nodes. A given spacing does not reveal them."""
     made = []
     for seed in range(3):
         pos = swinging(seed)
@@ -206,7 +206,7 @@ def test_crossing_the_seam_is_no_jump(tmp_path: Path) -> None:
 @pytest.mark.parametrize("precision", [np.float32, np.float64])
 @pytest.mark.parametrize("step", [1e-3, 1 / 640], ids=["three decimals", "pixels"])
 def test_positions_with_few_digits_are_named(tmp_path: Path, step: float, precision: type) -> None:
-    """What is rounded before it is stored, as in text files and videos, is rounding all the same, and looks like acceleration."""
+    """Positions from text files or videos may be rounded before they are stored. This rounding, too, looks like acceleration."""
     error = step / (np.sqrt(2) * DT**2)
     true = [motion_of(Trajectory.from_numpy(swinging(seed), DT, "sand", {"sand": 30.0}).metadata, swinging(seed)) for seed in range(4)]
     assert error > 0.2 * true[0].acceleration
