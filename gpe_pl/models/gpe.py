@@ -7,8 +7,7 @@ The model is an encoder, processor and decoder over typed nodes and relations, w
     h_i  += f_v(Σ_j m_ij)                                e_ij += m_ij
     a_i   = f_d(h_i)                                     or a sum of antisymmetric pair forces over the true mass, or both (``contact``)
 
-Virtual nodes above meshes are nodes of separate types and carry hidden messages only. With ``simultaneous``, as in Algorithm 1, a message climbs one level per
-step. ``sweep`` climbs all levels, passes messages within each, and descends again, so that every step couples the whole body.
+Virtual nodes above meshes are nodes of separate types and carry hidden messages only. A message climbs one level per step.
 """
 
 from collections.abc import Iterable
@@ -27,11 +26,10 @@ from gpe_pl.nn.blocks import MLP
 from gpe_pl.nn.connected import Edges, order_of_edges, renumbered, reordered, touched
 from gpe_pl.nn.island_momentum import IslandMomentum, conserve, rigid_part
 from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction, MomentumConv, orient
-from gpe_pl.schema import CELL, DOWN, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
+from gpe_pl.schema import CELL, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
 
 Decoder = Literal["node", "pair", "contact"]
 LevelWeights = Literal["shared", "separate"]
-Schedule = Literal["simultaneous", "sweep"]
 MaterialEmbeddingKind = Literal["affine", "mlp"]
 NodeNorm = Literal["none", "layer"]
 
@@ -169,7 +167,6 @@ class GPE(Model):
         hidden_channels: width of all hidden states and layers; 128 in the paper.
         implementation: ``factored`` or ``plain``; both compute the same function of the same parameters.
         level_weights: one set of weights for all levels of virtual nodes, which then serves any number of levels, or one set per level (paper).
-        schedule: order of messages between levels; ``simultaneous`` (paper) or ``sweep``.
         stress: also decode the stress of materials that have one.
         node_norm: ``layer`` normalises the encoded state of every node, and the update of each step, as GNS does. Accelerations then stay bounded however far
             a rollout deviates. ``none`` follows the paper.
@@ -193,7 +190,6 @@ class GPE(Model):
         hidden_channels: Annotated[int, Field(ge=1, le=4096)] = 128,
         implementation: Implementation = "factored",
         level_weights: LevelWeights = "shared",
-        schedule: Schedule = "simultaneous",
         stress: bool = False,
         node_norm: NodeNorm = "none",
         island_momentum: IslandMomentum = "ignored",
@@ -208,7 +204,6 @@ class GPE(Model):
             hidden_channels=hidden_channels,
             implementation=implementation,
             level_weights=level_weights,
-            schedule=schedule,
             stress=stress,
             node_norm=node_norm,
             island_momentum=island_momentum,
@@ -229,7 +224,7 @@ class GPE(Model):
                 f"model.stress=true, but the data set stores no stress of {', '.join(spec.materials)}; choose model.stress=false or data=fem"
             )
         self.interaction, self.decoder, self.edge_state = interaction, decoder, edge_state
-        self.level_weights, self.schedule = level_weights, schedule
+        self.level_weights = level_weights
         self.num_message_passing_steps = num_message_passing_steps
         hidden, norm = hidden_channels, node_norm == "layer"
         is_fused = implementation == "factored"
@@ -295,9 +290,6 @@ class GPE(Model):
 
     def _readable(self) -> list[set[str]]:
         """Return for every step the node types whose state after it can still influence a material."""
-        if self.schedule == "sweep":  # messages reach everything within a step; only the last state of the boundary is unused
-            virtual = {grid(level) for level in range(1, self.spec.num_levels + 1)}
-            return [{*self.spec.node_types}] * (self.num_message_passing_steps - 1) + [{*self.spec.materials} | virtual]
         readable = [{*self.spec.materials}]
         while len(readable) < self.num_message_passing_steps:
             readers = readable[-1]
@@ -316,7 +308,7 @@ class GPE(Model):
         convs = cast(nn.ModuleDict, self.convs[0])
         relations = [r for r in self.spec.relations if self.key(r) in convs and (keep_absent or data[r].edge_index.shape[1])]
         edges = {r: (data[r].edge_index, data[r].odd, data[r].even) for r in relations}
-        if grid(1) in x and self.level_weights == "shared" and self.schedule == "simultaneous":
+        if grid(1) in x and self.level_weights == "shared":
             x, edges = _merge_levels(x, edges)
         apart = self.skips.isolated_nodes and not self.training
         body = {m: data[m].body for m in self.bodies if m in x}
@@ -418,50 +410,32 @@ class GPE(Model):
         h = {t: self._encode_node(t, x[t], params.get(t)) for t in x}
         e = {r: self._encode_edges(r, odd, even, chunk) for r, (_, odd, even) in edges.items()}
 
-        phases = self._phases([*x], edges)
         for step in range(self.num_message_passing_steps):
             update_edges = self.edge_state == "latent" and step < self.num_message_passing_steps - 1
             convs, updates = cast(nn.ModuleDict, self.convs[step]), cast(nn.ModuleDict, self.updates[step])
-            for relations, receivers in phases:
-                total: dict[str, Tensor] = {}
-                for relation in relations:
-                    if self.key(relation) not in convs:
-                        continue
-                    source, _, target = relation
-                    edge_index, _, even = edges[relation]
-                    conv = convs[self.key(relation)]
-                    at_target, at_source, state = conv(
-                        h[source], h[target], edge_index, e[relation], even, update_edges, chunk, is_inference
-                    )
-                    for node_type, arriving in ((target, at_target), (source, at_source)):
-                        if arriving is not None and node_type in receivers and self.type_key(node_type) in updates:
-                            total[node_type] = total[node_type] + arriving if node_type in total else arriving
-                    if update_edges:
-                        e[relation] = state
-                for node_type, rows in receivers.items():
-                    if self.type_key(node_type) not in updates:
-                        continue
-                    update, state = updates[self.type_key(node_type)], h[node_type]
-                    incoming = total[node_type] if node_type in total else torch.zeros_like(state)
-                    h[node_type] = update(incoming, state) if rows is None else state.index_add(0, rows, update(incoming[rows]))
+            total: dict[str, Tensor] = {}
+            for relation, (edge_index, _, even) in edges.items():
+                if self.key(relation) not in convs:
+                    continue
+                source, _, target = relation
+                conv = convs[self.key(relation)]
+                at_target, at_source, state = conv(h[source], h[target], edge_index, e[relation], even, update_edges, chunk, is_inference)
+                for node_type, arriving in ((target, at_target), (source, at_source)):
+                    if arriving is not None and self.type_key(node_type) in updates:
+                        total[node_type] = total[node_type] + arriving if node_type in total else arriving
+                if update_edges:
+                    e[relation] = state
+            for node_type in x:
+                if self.type_key(node_type) not in updates:
+                    continue
+                incoming = total[node_type] if node_type in total else torch.zeros_like(h[node_type])
+                h[node_type] = updates[self.type_key(node_type)](incoming, h[node_type])
 
         stress = {m: self.stress_decoder[m](h[m]) for m in mass if self._decodes_stress(m)}
         if self.decoder == "pair":
             return Decoded(self._pair_accelerations(h, mass, body, edges, chunk), stress, {})
         contact = self._pair_accelerations(h, {m: mass[m] for m in body}, body, edges, chunk) if body else {}
         return Decoded({m: self.node_decoder[m](h[m]) for m in mass}, stress, contact)
-
-    def _phases(self, types: list[str], edges: Edges) -> list[tuple[list[EdgeType], dict[str, Tensor | None]]]:
-        """Return the phases of a step in order: relations that compute messages, and node types that receive them, with the rows to update or None for all."""
-        if self.schedule == "simultaneous":
-            return [([*edges], dict.fromkeys(types))]
-        levels = [grid(level) for level in range(1, self.spec.num_levels + 1) if grid(level) in types]
-        below = {level: [r for r in edges if r[1] == DOWN and r[0] == level] for level in levels}
-        phases: list[tuple[list[EdgeType], dict[str, Tensor | None]]] = [(below[level], {level: None}) for level in levels]
-        phases.append(([r for r in edges if r[1] != DOWN], dict.fromkeys(types)))
-        for level in reversed(levels):
-            phases.append((below[level], {r[2]: edges[r][0][1] for r in below[level]}))  # not every node has a parent
-        return phases
 
     def _encode_node(self, node_type: str, x: Tensor, params: Tensor | None) -> Tensor:
         if params is not None:

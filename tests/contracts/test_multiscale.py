@@ -423,12 +423,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "contact": {"decoder": "contact", "island_momentum": "linear"},
     "geometry": {"edge_state": "geometry"},
     "separate": {"level_weights": "separate"},
-    "sweep": {"schedule": "sweep"},
-    "sweep-separate-odd": {"schedule": "sweep", "level_weights": "separate", "interaction": "odd"},
+    "separate-odd": {"level_weights": "separate", "interaction": "odd"},
 }
 
 
-USUAL = {"negated", "pair", "contact", "geometry", "sweep-separate-odd"}
+USUAL = {"negated", "pair", "contact", "geometry", "separate-odd"}
 """Variants of the fast tests; the others run with the slow tests."""
 
 
@@ -525,9 +524,8 @@ def test_trained_with_four_levels_runs_with_six() -> None:
         two.load_state_dict(one.state_dict())
 
 
-@pytest.mark.parametrize("schedule", ["simultaneous", "sweep"])
-def test_reach_of_a_step(schedule: str) -> None:
-    """Pulling one end of a strip is felt at the other after one sweep, or after as many simultaneous steps as it takes to climb and come down."""
+def test_reach_of_a_step() -> None:
+    """Pulling one end of a strip is felt at the other after as many steps as it takes to climb and come down."""
     count = 32
     x = np.arange(count) * scenes.SPACING
     line = np.stack([x, 0 * x], 1)
@@ -541,9 +539,9 @@ def test_reach_of_a_step(schedule: str) -> None:
     data = double(build, s)
     pulled = data.clone()
     pulled["elastomer"].x[0] += 1.0
-    needed = 1 if schedule == "sweep" else 9  # four levels up, one edge across, four levels down: the root is not needed
-    for steps in {1, needed - 1, needed} - {0}:
-        model = model_of(build, schedule=schedule, num_message_passing_steps=steps)
+    needed = 9  # four levels up, one edge across, four levels down: the root is not needed
+    for steps in (1, needed - 1, needed):
+        model = model_of(build, num_message_passing_steps=steps)
         change = accelerations(model, pulled, count) - accelerations(model, data, count)
         assert bool(change[-1].abs().max() > 0) == (steps == needed)
 

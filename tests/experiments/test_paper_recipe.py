@@ -40,7 +40,7 @@ def assert_is_the_papers(cfg: DictConfig) -> None:
     assert model.get("num_message_passing_steps", 12) == 12
     if cfg.model._target_ == "gpe_pl.models.gpe.GPE":
         assert (model["interaction"], model["decoder"], model["edge_state"]) == ("negated", "node", "latent")
-        assert (model["level_weights"], model["schedule"], model["node_norm"]) == ("separate", "simultaneous", "none")
+        assert (model["level_weights"], model["node_norm"]) == ("separate", "none")
         assert (model["material_embedding"], model["island_momentum"]) == ("affine", "ignored")
 
 
