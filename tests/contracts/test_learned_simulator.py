@@ -457,7 +457,7 @@ def test_pairs_are_counted_before_they_are_listed(monkeypatch: pytest.MonkeyPatc
     build = scenes.builder()
     dense = scenes.state(400, low=0.3, high=0.4).to_torch()  # 14 times the density at rest
     build(dense)
-    monkeypatch.setattr("gpe_pl.graphs.builder.radius_pairs", lambda *_: pytest.fail("listed"))
+    monkeypatch.setattr("gpe_pl.graphs.search.radius_pairs", lambda *_: pytest.fail("listed"))
     with pytest.raises(SimulationError, match="31996000 pairs of nodes within the radius of 0.12 m, most at node 0; .* would have 72382"):
         build(scenes.state(8000, low=0.3, high=0.31).to_torch())
 
