@@ -346,7 +346,7 @@ def output_dir(cfg: DictConfig) -> Path:
 
 
 def num_processes(cfg: DictConfig) -> int:
-    """Return the number of processes of a training, which Lightning starts or finds; 1 if ``fit`` does not accept the setting."""
+    """Return ``trainer.devices`` × ``trainer.num_nodes``, the number of processes of a training. A setting that is not an integer counts as 1."""
     counts = [OmegaConf.select(cfg, f"trainer.{key}") for key in ("devices", "num_nodes")]
     return math.prod(count if type(count) is int else 1 for count in counts)
 

@@ -95,7 +95,10 @@ def radius_between(
 
 
 def _check_number(tree: cKDTree, other: cKDTree, radius: float) -> None:
-    """Raise ``SimulationError`` if the pairs of two sets, estimated from some nodes, would fill the memory, as with a radius in another unit."""
+    """Raise ``SimulationError`` if there would be too many pairs of neighbours for the memory.
+
+    The number of pairs is estimated from a sample of nodes. A radius in the wrong unit is a likely cause.
+    """
     if tree.n * other.n <= MOST_PAIRS:
         return
     sample = np.unique(np.linspace(0, other.n - 1, NUM_SAMPLED).astype(int))

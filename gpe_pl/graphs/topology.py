@@ -45,10 +45,10 @@ class IslandTopology:
     Attributes:
         label: island of each node of the state.
         is_free: whether no edge ties an island to the boundary.
-        body: for each material of meshes, the body that each of its nodes moves with; -1 where the scene has no cells.
+        body: for each material of meshes, the index of the body of each node. It is -1 in scenes without cells.
         num_bodies: number of bodies, or an upper bound of it.
-        arm: positions relative to the mean of the island [m], where the domain repeats; zero in an island that goes around it. None: to compute from
-            positions.
+        arm: positions relative to the centre of the island [m], for periodic domains. It is zero in an island that wraps around the domain. With None,
+            it is computed from positions.
     """
 
     label: Int64[Tensor, " node"]

@@ -421,7 +421,7 @@ def _body(count: int, spacing: float, material: str, dim: int, rng: np.random.Ge
 
     Every shape is a level set of a gauge, so the ``count`` points of smallest gauge fill the shape at the right size.
     """
-    gauge = _gauge(rng, dim)
+    gauge = _random_convex_shape(rng, dim)
     reach = math.ceil(2.0 * count ** (1 / dim)) + 2
     lattice = integer_lattice(np.full(dim, -reach), np.full(dim, reach))
     is_meshed = material in MESHED
@@ -466,7 +466,7 @@ def _lattice_cells(sites: np.ndarray) -> np.ndarray:
     return np.array(simplices, dtype=np.int64).reshape(-1, dim + 1)
 
 
-def _gauge(rng: np.random.Generator, dim: int) -> Callable[[np.ndarray], np.ndarray]:
+def _random_convex_shape(rng: np.random.Generator, dim: int) -> Callable[[np.ndarray], np.ndarray]:
     """Draw a convex shape, as the function that gives the factor [point] by which it must be scaled to reach each point [point, dim]."""
     kind = rng.integers(3)
     if kind == 0:

@@ -24,10 +24,10 @@ from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replacing
 from gpe_pl.files.hdf5_arrays import attribute, dataset_in, is_named, is_own, obstacle
 from gpe_pl.files.json_text import parsed
+from gpe_pl.files.late_failure import LateFailure
 from gpe_pl.geometry.shape_values import shape_from_dict, shape_to_dict, shapes_fault
 from gpe_pl.geometry.shapes import Shape
 from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, SCHEMA_VERSION, node_code
-from gpe_pl.system.late_failure import LateFailure
 from gpe_pl.trajectory.boundary import Boundary, Motion
 from gpe_pl.trajectory.state import Stress
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory

@@ -158,7 +158,7 @@ def _folder(path: Path) -> None:
 
 
 def rewrites(sound: Path) -> Iterator[tuple[str, Callable[[Path], None]]]:
-    """Yield name and function of every other content of a shard."""
+    """Yield each altered content of a shard: a name, and a function that alters the file."""
     trajectory = read_trajectory(sound, "00000")
     for key in stored_arrays(trajectory):
         if FIELDS[key].required:

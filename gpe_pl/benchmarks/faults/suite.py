@@ -197,7 +197,10 @@ def _faults(settings: Settings, specs: dict[str, DatasetSpec], commands: dict[st
 
 
 def _pairs(settings: Settings, name: str, commands: dict[str, Command], root: Path) -> Iterator[tuple[pairs.Leaving, pairs.Leaving]]:
-    """Yield pairs: a command and itself, a command and each of its others, and a training and the command that makes its data."""
+    """Yield pairs of commands to start at once in one folder.
+
+    Each command is paired with itself and with its variants (``Attacked.others``), a training also with the command that generates its data.
+    """
     command = commands[name]
     own = pairs.Leaving(command, runs.digests(root / name))
     yield own, own

@@ -62,7 +62,7 @@ def test_one_during_which_the_disk_fills(raw: Path, monkeypatch: pytest.MonkeyPa
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patched:
-        patched.setattr("gpe_pl.system.late_failure.os.write", full)
+        patched.setattr("gpe_pl.files.late_failure.os.write", full)
         with pytest.raises(FullDiskError, match=r"data/set/imported: cannot be written, there is no room"):
             converted(raw)
     assert left(raw) == []

@@ -16,8 +16,8 @@ import pytest
 
 from gpe_pl.export.trajectories import write_vtk
 from gpe_pl.files.atomic import FullDiskError, replace_bytes, replace_text, replacing, unnamed
+from gpe_pl.files.late_failure import LateFailure
 from gpe_pl.printable import clean_messages
-from gpe_pl.system.late_failure import LateFailure
 from gpe_pl.trajectory.store import read_trajectory, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -33,7 +33,7 @@ def limited(monkeypatch: pytest.MonkeyPatch, room: int) -> None:
         left[0] -= count
         return count
 
-    monkeypatch.setattr("gpe_pl.system.late_failure.os.write", limited_write)
+    monkeypatch.setattr("gpe_pl.files.late_failure.os.write", limited_write)
 
 
 @pytest.mark.parametrize("room", [0, 100, 5000, 12_000])
