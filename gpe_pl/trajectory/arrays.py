@@ -1,4 +1,4 @@
-"""Arrays that users bring: checks with errors that name argument, frame and node, and what can be told from positions alone."""
+"""Checks of users' arrays, with errors that name argument, frame and node, and properties derived from positions: velocities, spacing, normals."""
 
 from __future__ import annotations
 
@@ -15,16 +15,20 @@ from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.cells import fitting_kinds, stacked
 
 RADIUS_SPACINGS = 2.0
-"""Neighbour radius in rest spacings where none is given: about 12 neighbours in the plane and 32 in space."""
+"""Default neighbour radius in rest spacings: about 12 neighbours in the plane and 32 in space."""
 
 FRAMES_AT_ONCE = 256
 NEIGHBOURS = 16
 MAX_VISITED = 50_000
-"""Points that stand for free space when normals are estimated."""
+"""Maximum number of points of free space from which normals are estimated."""
 
 
 class ArrayError(GpeError, ValueError):
-    """An array or value that does not fit; the message names it, and frame and node where there is one. ``frame`` is -1 where there is none."""
+    """An array or value does not fit. The message names it, with frame and node if there is one.
+
+    Attributes:
+        frame: number of the frame, -1 if the fault is not in a single frame.
+    """
 
     def __init__(self, message: str, frame: int = -1) -> None:
         super().__init__(message)
@@ -32,12 +36,12 @@ class ArrayError(GpeError, ValueError):
 
 
 def numbers(name: str, values: Any, axes: Mapping[str, int | None]) -> np.ndarray:
-    """Finite real numbers of a given shape, of magnitudes up to ``LARGEST``.
+    """Return values as an array after checking its shape, and that all numbers are real, finite and at most ``LARGEST`` in magnitude.
 
     Args:
-        name: of the argument, for messages.
-        values: anything that NumPy takes for an array.
-        axes: name and size of each axis; None where any size will do.
+        name: name of the argument, for messages.
+        values: anything that NumPy converts to an array.
+        axes: name and size of each axis; a size of None allows any.
 
     Raises:
         ArrayError: other numbers or another shape; names the first place.
@@ -63,7 +67,11 @@ def numbers(name: str, values: Any, axes: Mapping[str, int | None]) -> np.ndarra
 
 
 def per_node(name: str, values: Any, shape: tuple[int, ...], axis: str = "node", low: float = -np.inf, high: float = np.inf) -> np.ndarray:
-    """One value for all nodes, or one per node, as float32 of ``shape``, from ``low`` to ``high``."""
+    """Return one value for all nodes, or one per node, as float32 of ``shape``.
+
+    Raises:
+        ArrayError: another shape, or a value outside ``low`` … ``high``; names the node.
+    """
     array = np.asarray(values)
     if array.dtype.kind in "fiu" and array.ndim < len(shape) and array.shape == shape[len(shape) - array.ndim :]:
         array = np.broadcast_to(array, shape)
@@ -77,14 +85,14 @@ def per_node(name: str, values: Any, shape: tuple[int, ...], axis: str = "node",
 
 
 def positive(name: str, value: Any, unit: str) -> float:
-    """A positive, finite number."""
+    """Return a number; raise ``ArrayError`` if it is not positive and finite."""
     if isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and 0 < value < np.inf:
         return float(value)
     raise ArrayError(f"{name}={value!r}: must be a positive number of {unit}")
 
 
 def flags(name: str, values: Any, count: int) -> tuple[bool, ...]:
-    """``count`` truth values, one per axis; None: none is true."""
+    """Return ``count`` truth values, one per axis; None stands for all false."""
     if values is None:
         return (False,) * count
     array = np.asarray(values)
@@ -94,7 +102,11 @@ def flags(name: str, values: Any, count: int) -> tuple[bool, ...]:
 
 
 def checked_bounds(bounds: Any, periodic: tuple[bool, ...], pos: np.ndarray, boundary_pos: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """Bounds that hold all positions [frame, node, dim] along axes that do not repeat; the extremes where none are given."""
+    """Return bounds ``(low, high)`` per axis [m]; without ``bounds``, the extremes of all positions.
+
+    Raises:
+        ArrayError: a position [frame, node, dim] is outside along an axis that is not periodic, or a periodic axis has no bounds.
+    """
     dim = pos.shape[2]
     if bounds is None:
         if any(periodic):
@@ -103,7 +115,7 @@ def checked_bounds(bounds: Any, periodic: tuple[bool, ...], pos: np.ndarray, bou
         if len(boundary_pos):
             points += [boundary_pos.min(axis=0), boundary_pos.max(axis=0)]
         low, high = np.min(points, axis=0).astype(np.float64), np.max(points, axis=0).astype(np.float64)
-        thin = np.where(high > low, 0.0, 0.5 * (float(np.max(high - low)) or 1.0))  # a row of nodes has no height
+        thin = np.where(high > low, 0.0, 0.5 * (float(np.max(high - low)) or 1.0))  # nodes in a row have no extent along an axis
         return tuple(zip((low - thin).tolist(), (high + thin).tolist(), strict=True))
     array = numbers("bounds", bounds, {"axis": dim, "low and high": 2}).astype(np.float64)
     checked = tuple((float(low), float(high)) for low, high in array)
@@ -112,7 +124,7 @@ def checked_bounds(bounds: Any, periodic: tuple[bool, ...], pos: np.ndarray, bou
     except ValueError as error:
         raise ArrayError(str(error)) from None
     for axis, (low, high) in enumerate(checked):
-        far = max(abs(low), abs(high)) if pos.dtype == np.float32 else 0.0  # where rounding can lead out
+        far = max(abs(low), abs(high)) if pos.dtype == np.float32 else 0.0  # rounding can move float32 positions out
         slack = 1e-5 * max(far, high - low)
         outside = (pos[..., axis] < low - slack) | (pos[..., axis] > high + slack)
         if not periodic[axis] and outside.any():
@@ -127,7 +139,7 @@ def checked_bounds(bounds: Any, periodic: tuple[bool, ...], pos: np.ndarray, bou
 def checked_materials(
     materials: str | Sequence[str], params: Mapping[str, Any], num_nodes: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Codes of ``node_type`` [node], ``material_params`` [node, param] and the names of the materials that occur."""
+    """Return codes of ``node_type`` [node], ``material_params`` [node, param] and the names of the materials that occur."""
     names = [materials] * num_nodes if isinstance(materials, str) else [str(name) for name in materials]
     if len(names) != num_nodes:
         raise ArrayError(f"materials: {len(names)} names for {num_nodes} nodes")
@@ -138,7 +150,7 @@ def checked_materials(
     if not isinstance(params, Mapping) or set(params) != set(present):
         wanted = ", ".join(f"{m}: {MATERIALS[m].name} [{MATERIALS[m].unit}]" for m in present)
         given = ", ".join(sorted(params)) if isinstance(params, Mapping) else "no names"
-        raise ArrayError(f"params: has {given or 'nothing'}, needs {wanted}; any constant will do where it never varies")
+        raise ArrayError(f"params: has {given or 'nothing'}, needs {wanted}; give any constant for a parameter that never varies")
     codes = np.array([node_code(name) for name in names], np.uint8)
     columns = np.full((num_nodes, len(param_names(present))), np.nan, np.float32)
     for material in present:
@@ -153,19 +165,22 @@ def checked_materials(
 
 
 def checked_cells(cells: Any, codes: np.ndarray, dim: int) -> tuple[np.ndarray, int]:
-    """Cells [cell, corner] whose nodes exist and are of one material that can have a mesh, and their dimension.
+    """Return all cells [cell, corner] and their dimension.
 
     Args:
-        cells: of one kind [cell, corner], or by kind.
+        cells: cells of one kind [cell, corner], or such arrays by kind.
         codes: types of the nodes [node].
-        dim: of space.
+        dim: dimension of space.
+
+    Raises:
+        ArrayError: a cell has a node that does not exist, nodes of several materials, or of a material that cannot have a mesh.
     """
     if not isinstance(cells, Mapping):
         array = _integers("cells", cells)
         kinds = fitting_kinds(array.shape[1], dim)
         if not kinds:
             known = ", ".join(f"{kind} {corners}" for kind, (own_dim, corners) in CELL_KINDS.items() if own_dim <= dim)
-            raise ArrayError(f"cells: has shape {list(array.shape)}, expected [cell, corner] with as many corners as a kind has: {known}")
+            raise ArrayError(f"cells: has shape {list(array.shape)}, expected [cell, corner] with the number of corners of a kind: {known}")
         if len(kinds) > 1:
             raise ArrayError(
                 f"cells: with {array.shape[1]} corners in 3D they are {' or '.join(kinds)}; say which: cells={{{kinds[0]!r}: …}}"
@@ -196,7 +211,7 @@ def _integers(name: str, cells: Any) -> np.ndarray:
 
 
 def _checked_kind(name: str, array: np.ndarray, kind: str, codes: np.ndarray) -> np.ndarray:
-    """Cells [cell, corner] of one kind."""
+    """Return cells [cell, corner] of one kind after checking them."""
     if array.shape[1] != CELL_KINDS[kind][1]:
         raise ArrayError(f"{name}: has shape {list(array.shape)}, expected [cell, {CELL_KINDS[kind][1]}]")
     wrong = ((array < 0) | (array >= len(codes))).any(axis=1) | (np.diff(np.sort(array, axis=1), axis=1) == 0).any(axis=1)
@@ -215,9 +230,9 @@ def _checked_kind(name: str, array: np.ndarray, kind: str, codes: np.ndarray) ->
 
 
 def velocities_of(pos: np.ndarray, frame_dt: float, periodicity: Periodicity) -> np.ndarray:
-    """Velocities [frame, node, dim] in m/s from the frame before; the first frame has those of the second."""
+    """Return velocities [frame, node, dim] in m/s as differences to the frame before; the first frame has those of the second."""
     vel = np.empty(pos.shape, np.float32)
-    for start in range(1, len(pos), FRAMES_AT_ONCE):  # in double precision, but not all of it at once
+    for start in range(1, len(pos), FRAMES_AT_ONCE):  # double precision of all frames at once would take too much memory
         window = pos[start - 1 : start + FRAMES_AT_ONCE].astype(np.float64)
         vel[start : start + FRAMES_AT_ONCE] = integrators.velocities(window, frame_dt, periodicity)
     vel[0] = vel[1]
@@ -225,7 +240,7 @@ def velocities_of(pos: np.ndarray, frame_dt: float, periodicity: Periodicity) ->
 
 
 def nearest_distances(pos: np.ndarray, periodicity: Periodicity = NOWHERE) -> np.ndarray:
-    """Distance [node] in m from each node [node, dim] to the nearest other one; infinite for a single node."""
+    """Return the distance [node] in m from each node [node, dim] to the nearest other one; infinite for a single node."""
     from scipy.spatial import cKDTree
 
     points, box = (periodicity.from_corner(pos), periodicity.period) if periodicity else (pos, None)
@@ -233,10 +248,10 @@ def nearest_distances(pos: np.ndarray, periodicity: Periodicity = NOWHERE) -> np
 
 
 def typical_spacing(pos: np.ndarray, periodicity: Periodicity = NOWHERE) -> float:
-    """Median distance [m] of nodes [node, dim] to their nearest neighbour.
+    """Return the median distance [m] of nodes [node, dim] to their nearest neighbour.
 
     Raises:
-        ArrayError: a single node, or nodes that coincide.
+        ArrayError: there is a single node, or half of the nodes coincide with others.
     """
     if len(pos) < 2:
         raise ArrayError("spacing: a single node has no neighbours; pass spacing")
@@ -247,12 +262,12 @@ def typical_spacing(pos: np.ndarray, periodicity: Periodicity = NOWHERE) -> floa
 
 
 def estimated_normals(boundary_pos: np.ndarray, visited: np.ndarray, periodicity: Periodicity = NOWHERE) -> np.ndarray:
-    """Unit normals [boundary_node, dim] of walls of which only points are known: the mean direction to the nearest places where nodes have been.
+    """Return estimated unit normals [boundary_node, dim] of walls given by points: the mean direction to the nearest positions of nodes.
 
     Args:
         boundary_pos: points on the walls [boundary_node, dim] in m.
-        visited: positions of nodes [..., dim] in m, of one frame or of many.
-        periodicity: where space repeats.
+        visited: positions of nodes [..., dim] in m, in one or several frames.
+        periodicity: axes along which space repeats.
     """
     from scipy.spatial import cKDTree
 
@@ -271,7 +286,7 @@ def estimated_normals(boundary_pos: np.ndarray, visited: np.ndarray, periodicity
     for fallback in (
         away[:, 0],
         np.broadcast_to(np.eye(walls.shape[1])[-1], walls.shape),
-    ):  # surrounded from all sides; coincident with a node
+    ):  # the first for points with nodes on all sides, the second for points that coincide with a node
         weak = np.linalg.norm(normal, axis=1) < 1e-3
         normal[weak] = fallback[weak]
     return normal / np.linalg.norm(normal, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""``Boundary``: walls and obstacles as nodes with a boundary condition, and the ``Motion`` that may be prescribed for them."""
+"""``Boundary``: walls and obstacles as nodes with a boundary condition, and their prescribed ``Motion``."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ Array = Any
 
 @dataclass(frozen=True)
 class Motion:
-    """Prescribed motion of boundary nodes, from the present frame on: NumPy arrays [frame, boundary_node, dim].
+    """Prescribed motion of boundary nodes from the current frame on, as NumPy arrays [frame, boundary_node, dim].
 
     Attributes:
         pos: positions in m.
-        vel: velocities in m/s with which the nodes go on to the next frame.
+        vel: velocities in m/s that take the nodes to the next frame.
         normal: unit normals into free space.
     """
 
@@ -39,11 +39,11 @@ class Motion:
         return len(self.pos)
 
     def frames(self, start: int, stop: int | None = None) -> Motion:
-        """That of the frames ``start:stop``."""
+        """Return the motion in the frames ``start:stop``."""
         return Motion(self.pos[start:stop], self.vel[start:stop], self.normal[start:stop])
 
     def take(self, nodes: np.ndarray) -> Motion:
-        """Return the motion of some boundary nodes: row numbers, or a mask."""
+        """Return the motion of some boundary nodes, given by row numbers or a mask."""
         return Motion(self.pos[:, nodes], self.vel[:, nodes], self.normal[:, nodes])
 
 
@@ -58,7 +58,7 @@ class Boundary:
         friction: Coulomb coefficient [boundary_node]; ``schema.STICKY`` or more is no-slip.
         restitution: fraction of the normal velocity that a bounce returns [boundary_node].
         shapes: analytic geometry, for signed distances.
-        motion: where the nodes go, if they move; its first frame is what ``pos``, ``vel`` and ``normal`` say.
+        motion: prescribed motion, None if no node moves; its first frame equals ``pos``, ``vel`` and ``normal``.
     """
 
     pos: Array = field(metadata=NODE)
@@ -71,7 +71,10 @@ class Boundary:
 
     @classmethod
     def sample(cls, shapes: tuple[Shape, ...], spacing: float, dim: int, periodicity: Periodicity = NOWHERE) -> Boundary:
-        """Sample shapes, and their images in periodic domains, into nodes at most ``spacing`` [m] apart; nodes that lie inside another shape are left out."""
+        """Return a boundary of nodes on the surfaces of shapes and of their periodic images, at most ``spacing`` [m] apart.
+
+        Nodes inside another shape are left out.
+        """
         shapes = repeated(tuple(shapes), periodicity)
         pos, normal, friction, restitution = [np.empty((0, dim))], [np.empty((0, dim))], [np.empty(0)], [np.empty(0)]
         rounding = 1e-3 * surface_tolerance(shapes)
@@ -91,7 +94,7 @@ class Boundary:
 
     @classmethod
     def empty(cls, dim: int) -> Boundary:
-        """No boundary at all."""
+        """Return a boundary without nodes."""
         return cls.sample((), 1.0, dim)
 
     @classmethod
@@ -105,18 +108,18 @@ class Boundary:
         restitution: Array = 0.0,
         shapes: tuple[Shape, ...] = (),
     ) -> Boundary:
-        """Walls and obstacles that are known by points on them; see ``arrays.estimated_normals`` where normals are not known.
+        """Return a boundary given by points on walls and obstacles. If normals are not known, see ``arrays.estimated_normals``.
 
         Args:
             pos: positions [boundary_node, dim] in m, about as far apart as particles.
-            normal: directions into free space [boundary_node, dim]; of any length.
-            vel: velocity in m/s, one for all [dim] or one per node, for walls that slide along themselves.
-            friction: Coulomb coefficient, one for all or one per node; ``schema.STICKY`` is no-slip.
-            restitution: fraction of the normal velocity that a bounce returns, one for all or one per node.
-            shapes: the geometry behind the points, if it is known; containment and pictures use it.
+            normal: directions into free space [boundary_node, dim], of any length.
+            vel: velocity in m/s of walls that slide along themselves: one for all nodes [dim] or one per node [boundary_node, dim].
+            friction: Coulomb coefficient, one for all nodes or one per node; ``schema.STICKY`` is no-slip.
+            restitution: fraction of the normal velocity that a bounce returns, one for all nodes or one per node.
+            shapes: geometry of the walls, if known; containment and pictures use it.
 
         Raises:
-            ArrayError: an array of another shape, a number that is not finite or out of range; names the node.
+            ArrayError: an array has the wrong shape, or a number is not finite or out of range; names the node.
         """
         pos = numbers("boundary pos", pos, {"boundary_node": None, "dim": None})
         normal = numbers("boundary normal", normal, dict(zip(("boundary_node", "dim"), pos.shape, strict=True)))
@@ -138,15 +141,15 @@ class Boundary:
         restitution: Array = 0.0,
         periodicity: Periodicity = NOWHERE,
     ) -> Boundary:
-        """Walls and obstacles that move in a prescribed way, as grippers, pistons and paddles do, in the first of their frames.
+        """Return a boundary with a prescribed motion, such as a gripper, piston or paddle, at its first frame.
 
         Args:
-            pos: positions [frame, boundary_node, dim] in m, of as many frames as the trajectory.
-            normal: directions into free space, of any length: in the first frame [boundary_node, dim], from where they turn as the rigid parts do that the
-                motion shows (``rigid_parts``), or in every frame [frame, boundary_node, dim].
-            frame_dt: seconds between frames.
+            pos: positions [frame, boundary_node, dim] in m, with as many frames as the trajectory.
+            normal: directions into free space, of any length. Give those of every frame [frame, boundary_node, dim], or those of the first frame
+                [boundary_node, dim]; these turn with the rigid parts found in the motion (``rigid_parts``).
+            frame_dt: time between frames [s].
             friction, restitution: as in ``from_numpy``.
-            periodicity: where space repeats.
+            periodicity: axes along which space repeats.
 
         Raises:
             ArrayError: as ``from_numpy``.
@@ -165,15 +168,17 @@ class Boundary:
         return replace(first, motion=Motion(inside, vel, normals)).at(0)
 
     def inside(self, periodicity: Periodicity) -> Boundary:
-        """The same, of NumPy arrays, in a periodic domain: nodes are inside, those that meet at a seam exist once and those within an image of a shape not at
-        all, and shapes know their images.
+        """Return this boundary of NumPy arrays as a periodic domain needs it.
+
+        Nodes are folded into the domain. Of nodes that coincide at a seam, one is kept. Nodes inside an image of a shape are left out. Images are added to the
+        shapes.
         """
         if not periodicity:
             return self
         pos, motion = periodicity.wrapped(self.pos), self.motion
         close = 1e-6 * float(periodicity.period[list(periodicity.axes)].min())
         j, i = search_tree(pos, periodicity).query_pairs(close, output_type="ndarray").reshape(-1, 2).T
-        same = (self.normal[i] * self.normal[j]).sum(axis=1) > 0.999  # two walls meet in a corner, where each has its node
+        same = (self.normal[i] * self.normal[j]).sum(axis=1) > 0.999  # two walls that meet in a corner both keep their node
         if motion is not None:
             same &= (np.abs(periodicity.shortest(motion.pos[:, i] - motion.pos[:, j])) <= close).all(axis=(0, 2))
             same &= ((motion.normal[:, i] * motion.normal[:, j]).sum(axis=2) > 0.999).all(axis=0)
@@ -183,19 +188,19 @@ class Boundary:
         return replace(replace(self, pos=pos).take(kept), shapes=shapes)
 
     def take(self, nodes: Array) -> Boundary:
-        """Return some of the boundary nodes, with their motion and all shapes: row numbers, or a mask [boundary_node]."""
+        """Return some of the boundary nodes, with their motion and all shapes; ``nodes`` are row numbers or a mask [boundary_node]."""
         values = {name: getattr(self, name)[nodes] for name in names_of(self, NODE)}
         return replace(self, **values, motion=None if self.motion is None else self.motion.take(nodes))
 
     def to_numpy(self) -> Boundary:
-        """The same with NumPy arrays of its own."""
+        """Return a copy with NumPy arrays."""
         values: dict[str, Any] = {name: np.array(as_numpy(getattr(self, name))) for name in names_of(self, NODE)}
         return replace(self, **values)
 
     def at(self, frame: int, stop: int | None = None) -> Boundary:
-        """The boundary so many frames later, with its motion up to the frame ``stop``; the same object if it does not move.
+        """Return the boundary ``frame`` frames later, with its motion up to the frame ``stop``; the same object if it does not move.
 
-        Where its motion ends it stays and is still.
+        After the last frame of its motion, the boundary stays in place with zero velocity.
         """
         if self.motion is None:
             return self
@@ -208,15 +213,15 @@ class Boundary:
         return now if frame < self.motion.num_frames else replace(now, vel=0.0 * now.vel, motion=None)
 
     def tree(self, periodicity: Periodicity) -> Any:
-        """``search_tree`` of the positions, built once: a boundary stays where it is, or becomes another one in the next frame."""
-        kept: dict[Periodicity, Any] = self.__dict__.setdefault("_trees", {})  # no field: no part of equality or of what is stored
+        """Return ``search_tree`` of the positions. It is built once, as the positions of a ``Boundary`` never change."""
+        kept: dict[Periodicity, Any] = self.__dict__.setdefault("_trees", {})  # not a field, so neither compared nor stored
         if periodicity not in kept:
             kept[periodicity] = search_tree(self.pos, periodicity)
         return kept[periodicity]
 
 
 def search_tree(pos: Array, periodicity: Periodicity = NOWHERE) -> Any:
-    """A k-d tree of positions [node, dim] for neighbour search on the CPU: quick to build, so that moving nodes can have a new one in every step."""
+    """Return a k-d tree of positions [node, dim] for neighbour search on the CPU. It is quick to build, as moving nodes need a new one in every step."""
     from scipy.spatial import cKDTree
 
     points = np.ascontiguousarray(as_numpy(pos))
@@ -226,7 +231,7 @@ def search_tree(pos: Array, periodicity: Periodicity = NOWHERE) -> Any:
 
 
 def _unit(normal: np.ndarray) -> np.ndarray:
-    """Directions [..., boundary_node, dim] of length 1."""
+    """Return directions [..., boundary_node, dim] scaled to length 1."""
     length = np.linalg.norm(normal.astype(np.float64), axis=-1, keepdims=True)
     if (length == 0).any():
         *frame, node, _ = np.argwhere(length == 0)[0].tolist()
@@ -236,7 +241,7 @@ def _unit(normal: np.ndarray) -> np.ndarray:
 
 
 def check_steps(boundary: Boundary, frame_dt: float, periodicity: Periodicity) -> None:
-    """Refuse nodes that move by more than half a period between frames: they cross a seam that their motion does not know."""
+    """Raise ``ArrayError`` if a node moves by more than half a period between frames: its motion was made without this periodicity."""
     if boundary.motion is None:
         return
     for axis in periodicity.axes:
@@ -251,5 +256,5 @@ def check_steps(boundary: Boundary, frame_dt: float, periodicity: Periodicity) -
 
 
 def as_numpy(x: Array) -> np.ndarray:
-    """Return an array or tensor as a NumPy array, without a copy where that is possible."""
+    """Return an array or tensor as a NumPy array, without a copy if possible."""
     return x if isinstance(x, np.ndarray) else x.detach().cpu().numpy()

@@ -1,6 +1,7 @@
-"""Kinds of mesh cells, told by their dimension and number of corners.
+"""Kinds of mesh cells, which follow from their dimension and number of corners.
 
-Cells are stored in one array [cell, corner]. A cell with fewer corners than others repeats its last one: a triangle among quadrilaterals is ``[a, b, c, c]``.
+Cells are stored in one array [cell, corner]. A cell with fewer corners than others repeats its last corner: a triangle among quadrilaterals is
+``[a, b, c, c]``.
 """
 
 from __future__ import annotations
@@ -16,21 +17,21 @@ Array = Any
 
 
 def fitting_kinds(num_corners: int, dim: int) -> list[str]:
-    """Kinds that have so many corners and exist in a space of this dimension."""
+    """Return the kinds with this number of corners that exist in a space of this dimension."""
     return [kind for kind, (own_dim, corners) in CELL_KINDS.items() if corners == num_corners and own_dim <= dim]
 
 
 def kinds_of(cells: np.ndarray, cell_dim: int | None, dim: int) -> np.ndarray:
-    """Kind of each cell [cell] as its place in ``schema.CELL_KINDS``, -1 where the number of corners is that of none, or a node is there twice.
+    """Return the kind of each cell [cell] as an index into ``schema.CELL_KINDS``; -1 if no kind has this number of corners, or a node occurs twice.
 
     Args:
         cells: nodes of each cell [cell, corner].
-        cell_dim: dimension of the cells; None: that of space, apart from triangles.
-        dim: of space.
+        cell_dim: dimension of the cells; None stands for the dimension of space, except for triangles.
+        dim: dimension of space.
     """
     ordered = np.sort(cells, axis=1)
     corners = 1 + (ordered[:, 1:] != ordered[:, :-1]).sum(axis=1)
-    repeated = (is_corner(cells) != (np.arange(cells.shape[1]) < corners[:, None])).any(axis=1)  # other than the last corner, at the end
+    repeated = (is_corner(cells) != (np.arange(cells.shape[1]) < corners[:, None])).any(axis=1)  # but for the last, at the end
     kinds = np.full(len(cells), -1)
     for code, (own_dim, number) in enumerate(CELL_KINDS.values()):
         kinds[(corners == number) & (own_dim == (cell_dim or dim) or number == 3)] = code
@@ -39,20 +40,20 @@ def kinds_of(cells: np.ndarray, cell_dim: int | None, dim: int) -> np.ndarray:
 
 
 def is_corner(cells: Array) -> Array:
-    """Which entries of cells [cell, corner], arrays or tensors, are corners, and not the last one again."""
-    own = cells >= 0  # all of them
+    """Return a mask [cell, corner] of the entries of ``cells``, arrays or tensors, that are corners and not repetitions of the last one."""
+    own = cells >= 0  # all true
     own[:, 1:] = cells[:, 1:] != cells[:, :-1]
     return own
 
 
 def mean_over_corners(values: Array, cells: Array) -> Array:
-    """Mean [cell, …] over the corners of each cell [cell, corner] of values [node, …], arrays or tensors."""
+    """Return the mean [cell, …] of values [node, …] over the corners of each cell [cell, corner]; arrays or tensors."""
     own = is_corner(cells).reshape(*cells.shape, *[1] * (values.ndim - 1))
     return (values[cells] * own).sum(axis=1) / own.sum(axis=1)
 
 
 def stacked(groups: Mapping[str, np.ndarray]) -> np.ndarray:
-    """One array of cells from those of each kind [cell, corner], in their order."""
+    """Return one array of cells from arrays [cell, corner] of each kind, in their order."""
     width = max((cells.shape[1] for cells in groups.values()), default=3)
     padded = [np.pad(cells, ((0, 0), (0, width - cells.shape[1])), mode="edge") for cells in groups.values()]
     return np.concatenate([np.empty((0, width), np.int32), *padded]).astype(np.int32)

@@ -9,13 +9,13 @@ from typing import Any
 Kind = Mapping[str, str]
 
 NODE: Kind = {"kind": "node"}
-"""A row per node."""
+"""The field has one row per node."""
 CELL: Kind = {"kind": "cell"}
-"""A row per mesh cell that holds numbers of nodes."""
+"""The field has one row per mesh cell, which holds numbers of nodes."""
 SCENE: Kind = {"kind": "scene"}
-"""One value for the whole scene."""
+"""The field has one value for the whole scene."""
 STEP: Kind = {"kind": "step"}
-"""What a simulator computed in the step that led to a state, and what it needs for the next one. Needs a default, which says that nothing is known."""
+"""The field describes the step that led to a state, or holds what a simulator needs for the next one. Its default, which it must have, means unknown."""
 
 
 def names_of(part: Any, kind: Kind) -> tuple[str, ...]:

@@ -1,11 +1,12 @@
-"""Rigid parts among nodes whose paths are known, recognised by how they move, and the normals that they carry along.
+"""Finds rigid parts among nodes with known paths, and turns the normals of the nodes with their parts.
 
-Nodes are of one rigid part where one motion describes them in every frame::
+Nodes belong to one rigid part if one motion describes them in every frame::
 
     x_n(t) = c(t) + R(t) (x_n(0) − c(0))
 
-with the rotation R(t) that brings the part of the first frame closest to where it is now [Kabsch 1976]. Nearness does not make a part: a piston that slides
-over a floor is another one than the floor. Places of a membrane that happen to move alike are none: most of what hangs together with them moves otherwise.
+R(t) is the rotation that brings the part from the first frame closest to its present position [Kabsch 1976]. Near nodes need not belong to one part: a piston
+that slides over a floor is another part than the floor. Nodes of a membrane that happen to move alike are no part, as most of the nodes connected to them move
+differently.
 """
 
 from __future__ import annotations
@@ -21,26 +22,26 @@ from scipy.spatial import cKDTree
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 
 TOLERANCE = 1e-5
-"""Share of the boundary's extent below which differences of positions are rounding."""
+"""Differences of positions below this fraction of the boundary's extent are rounding."""
 
 STRETCH = 0.25
-"""Relative change of their distance up to which near nodes of no rigid part hang together."""
+"""Relative change of their distance up to which near nodes outside rigid parts count as connected."""
 
 PARTNERS = 8
 NEIGHBOURS = 16
 FEW_FRAMES = 8
-"""Frames, evenly spread, that are looked at first: they exclude most of what does not move alike."""
+"""Number of evenly spread frames that are compared first. They exclude most of the nodes that move differently."""
 
 
 @dataclass(frozen=True)
 class _Paths:
-    """Nodes, and where they go.
+    """Paths of nodes.
 
     Attributes:
         first: positions in the first frame [node, dim] in m.
-        moved: displacements since then [frame, node, dim] in m.
-        periodicity: where space repeats.
-        tolerance: of positions [m].
+        moved: displacements since the first frame [frame, node, dim] in m.
+        periodicity: axes along which space repeats.
+        tolerance: tolerance of positions [m].
     """
 
     first: np.ndarray
@@ -49,21 +50,21 @@ class _Paths:
     tolerance: float
 
     def arms(self, nodes: np.ndarray, centre: np.ndarray) -> np.ndarray:
-        """From a place [dim] to the nearest images of nodes in the first frame [node, dim]."""
+        """Return vectors from ``centre`` [dim] to the nearest images of nodes in the first frame [node, dim] in m."""
         return np.asarray(self.periodicity.shortest(self.first[nodes] - centre))
 
     @cached_property
     def few(self) -> _Paths:
-        """The same nodes in few frames."""
+        """The paths in ``FEW_FRAMES`` frames."""
         return replace(self, moved=self.moved[self._stages[0]])
 
     @cached_property
     def _stages(self) -> tuple[np.ndarray, slice]:
-        """Frames in the order in which they are looked at."""
+        """Selections of frames in the order in which they are compared: few frames, then all."""
         return np.linspace(0, len(self.moved) - 1, FEW_FRAMES).astype(int), slice(None)
 
     def keep_distance(self, nodes: np.ndarray, node: int) -> np.ndarray:
-        """Those of ``nodes`` that are as far from ``node`` in every frame as in the first."""
+        """Return those of ``nodes`` whose distance from ``node`` is the same in every frame."""
         for frames in self._stages:
             arm = self.arms(nodes, self.first[node])
             length = np.linalg.norm(arm + self.moved[frames][:, nodes] - self.moved[frames][:, node, None], axis=-1)
@@ -71,7 +72,7 @@ class _Paths:
         return nodes
 
     def part_of(self, nodes: np.ndarray, reference: int) -> _Part:
-        """The motion that describes nodes best, whose images are those nearest to a reference node."""
+        """Return the rigid motion that describes nodes best. Their images are those nearest to a reference node."""
         arms = self.arms(nodes, self.first[reference])
         mean, path = arms.mean(axis=0), self.moved[:, nodes].mean(axis=1)
         change = self.moved[:, nodes] - path[:, None]
@@ -79,7 +80,7 @@ class _Paths:
         return _Part(self.first[reference] + mean, path, turn)
 
     def described(self, nodes: np.ndarray, part: _Part) -> np.ndarray:
-        """Which of ``nodes`` a motion describes in every frame [node]."""
+        """Return a mask [node] of those of ``nodes`` that a motion describes in every frame."""
         fits = np.ones(len(nodes), dtype=bool)
         for frames in self._stages:
             rows, predicted = nodes[fits], part.path[frames][:, None]
@@ -95,9 +96,9 @@ class _Part:
     """A rigid motion.
 
     Attributes:
-        centre: in the first frame [dim] in m.
+        centre: centre in the first frame [dim] in m.
         path: displacement of the centre [frame, dim] in m.
-        turn: rotation since the first frame [frame, dim, dim]; None where the part does not turn.
+        turn: rotation since the first frame [frame, dim, dim]; None if the part does not turn.
     """
 
     centre: np.ndarray
@@ -106,15 +107,15 @@ class _Part:
 
 
 def carried_along(pos: np.ndarray, normal: np.ndarray, periodicity: Periodicity = NOWHERE) -> np.ndarray:
-    """Unit normals [frame, boundary_node, dim] that turn as the rigid part of each node does; those of parts that do not turn stay bit for bit.
+    """Return unit normals [frame, boundary_node, dim] that turn with the rigid part of each node.
 
-    A node of no rigid part turns as near nodes of none do that stay about as far from it, which follows a membrane. A single node does not turn. In
-    space, parts whose nodes lie in a row do not turn about that row.
+    Normals of parts that do not turn stay equal bit for bit. A node outside rigid parts turns with the near nodes outside rigid parts that keep about the same
+    distance from it; this follows a membrane. A single node does not turn. In 3D, parts whose nodes lie in a row do not turn about this row.
 
     Args:
-        pos: positions [frame, boundary_node, dim] in m, continuous also across seams.
-        normal: those of the first frame [boundary_node, dim].
-        periodicity: where space repeats.
+        pos: positions [frame, boundary_node, dim] in m, continuous across seams.
+        normal: unit normals in the first frame [boundary_node, dim].
+        periodicity: axes along which space repeats.
     """
     turned = np.array(np.broadcast_to(normal, pos.shape))
     if pos.shape[1] < 2:
@@ -133,14 +134,14 @@ def carried_along(pos: np.ndarray, normal: np.ndarray, periodicity: Periodicity 
 
 
 def _tolerance(pos: np.ndarray) -> float:
-    """What differences of positions [m] owe to rounding: of the precision that holds them, which may be finer in memory."""
+    """Return the difference of positions [m] that rounding can cause. Positions in float64 may have been rounded to float32 before."""
     is_single = bool((pos.astype(np.float32) == pos).all())
     rounding = float(np.finfo(np.float32 if is_single else np.float64).eps) * float(np.abs(pos).max())
     return max(TOLERANCE * float(np.ptp(pos[0], axis=0).max()), 8 * rounding)
 
 
 def _parts(paths: _Paths) -> tuple[np.ndarray, list[_Part]]:
-    """Rigid part of each node [node], -1 for those of none, and the parts."""
+    """Return the number of each node's rigid part [node], -1 for none, and the parts."""
     label = np.full(len(paths.first), -1)
     parts: list[_Part] = []
     left = np.arange(len(paths.first))
@@ -166,7 +167,10 @@ def _parts(paths: _Paths) -> tuple[np.ndarray, list[_Part]]:
 
 
 def _hold_together(paths: _Paths, label: np.ndarray) -> np.ndarray:
-    """Which nodes are of a part to whose nodes most of what hangs together with them belongs [node]; what is known to be rigid hangs with nothing else."""
+    """Return a mask [node] of the nodes in accepted parts.
+
+    A part is accepted if at least half of the nodes that are connected to its nodes belong to it. Nodes of accepted parts are then no longer counted.
+    """
     is_rigid = np.zeros(len(label), dtype=bool)
     while True:
         nodes = np.flatnonzero(~is_rigid)
@@ -184,11 +188,11 @@ def _hold_together(paths: _Paths, label: np.ndarray) -> np.ndarray:
 
 
 def _hypotheses(paths: _Paths, nodes: np.ndarray, seed: int) -> Iterator[np.ndarray]:
-    """Few nodes whose common motion may be that of a part to which ``seed`` belongs; all of them keep their distance from it."""
+    """Yield small sets of nodes whose common motion may be that of the part of ``seed``. All of them keep their distance from it."""
     yield np.array([seed])  # no turn
     others = nodes[nodes != seed]
     distance = np.linalg.norm(paths.arms(others, paths.first[seed]), axis=1)
-    others = others[distance > 100 * paths.tolerance]  # the direction to nearer ones is rounding
+    others = others[distance > 100 * paths.tolerance]  # rounding dominates the direction to nearer nodes
     order = np.argsort(distance[distance > 100 * paths.tolerance], kind="stable")
     ends = np.unique(np.concatenate([np.arange(min(len(order), PARTNERS)), np.arange(max(0, len(order) - PARTNERS), len(order))]))
     for partner in others[order[ends]]:
@@ -205,7 +209,7 @@ def _hypotheses(paths: _Paths, nodes: np.ndarray, seed: int) -> Iterator[np.ndar
 
 
 def _grown(paths: _Paths, nodes: np.ndarray, some: np.ndarray, seed: int) -> tuple[np.ndarray, _Part]:
-    """Those of ``nodes`` that move as some of them do, and their motion: fitted again to all that were found, which is more exact."""
+    """Return those of ``nodes`` that move with ``some`` of them, and their motion. It is fitted again to all nodes found, which is more exact."""
     part = paths.part_of(some, seed)
     for _ in range(4):
         found = nodes[paths.described(nodes, part)]
@@ -216,9 +220,9 @@ def _grown(paths: _Paths, nodes: np.ndarray, some: np.ndarray, seed: int) -> tup
 
 
 def _settle(paths: _Paths, label: np.ndarray, parts: list[_Part]) -> None:
-    """Give nodes to the nearest part whose motion describes them where there are several, as on the axis of a wheel, or where the node has no part yet.
+    """Assign nodes to the nearest part whose motion describes them; changes ``label``.
 
-    Changes ``label``.
+    This concerns nodes that several motions describe, as on the axis of a wheel, and nodes without a part.
     """
     fits = np.stack([paths.described(np.arange(len(label)), part) for part in parts])
     open_ones = np.flatnonzero(fits.sum(axis=0) > (label >= 0))
@@ -229,12 +233,12 @@ def _settle(paths: _Paths, label: np.ndarray, parts: list[_Part]) -> None:
 
 
 def rotations(arms: np.ndarray, change: np.ndarray, tolerance: float) -> np.ndarray:
-    """Rotations [frame, dim, dim] that bring arms closest to what they are in each frame.
+    """Return rotations [frame, dim, dim] that bring the arms of the first frame closest to those of each frame.
 
     Args:
-        arms: from the centre to nodes in the first frame [node, dim] in m.
-        change: since then [frame, node, dim] in m.
-        tolerance: of positions [m]. Nodes in a row to 100 times of it do not say how they turn about the row: they do not.
+        arms: vectors from the centre to nodes in the first frame [node, dim] in m.
+        change: change of the arms since the first frame [frame, node, dim] in m.
+        tolerance: tolerance of positions [m]. Nodes that lie in a row, to 100 times this tolerance, do not turn about the row.
     """
     now = arms + change
     if arms.shape[1] == 2:
@@ -246,14 +250,14 @@ def rotations(arms: np.ndarray, change: np.ndarray, tolerance: float) -> np.ndar
 
 
 def _closest(covariance: np.ndarray) -> np.ndarray:
-    """The rotations R [..., dim, dim] that maximise tr(R C) for covariances C = Σ a bᵀ of arms a before and b after."""
+    """Return the rotations R [..., dim, dim] that maximise tr(R C) for covariances C = Σ a bᵀ of arms a before and b after."""
     u, _, vt = np.linalg.svd(covariance)
     u[..., -1] *= np.linalg.det(u @ vt)[..., None]  # a rotation, no reflection
     return np.asarray(np.swapaxes(u @ vt, -1, -2))
 
 
 def _transported(direction: np.ndarray) -> np.ndarray:
-    """Rotations [frame, 3, 3] since the first frame, each step by the shortest way that turns a direction [frame, 3]."""
+    """Return rotations [frame, 3, 3] since the first frame. Each step is the smallest rotation that turns a direction [frame, 3] to the next."""
     unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
     turn = [np.eye(3)]
     for before, after in itertools.pairwise(unit):
@@ -264,7 +268,7 @@ def _transported(direction: np.ndarray) -> np.ndarray:
 
 
 def _surroundings(paths: _Paths, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The nearest others of these nodes [node, neighbour], the arms to them [node, neighbour, dim] in m, and which of them hang together."""
+    """Return the nearest others among ``nodes`` [node, neighbour], the vectors to them [node, neighbour, dim] in m, and a mask of those that are connected."""
     points, box = paths.first[nodes], None
     if paths.periodicity:
         points, box = paths.periodicity.from_corner(points), paths.periodicity.period
@@ -281,11 +285,11 @@ def _surroundings(paths: _Paths, nodes: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _local_rotations(paths: _Paths, nodes: np.ndarray) -> Iterator[np.ndarray]:
-    """For every frame, how the surroundings of each of these nodes have turned [node, dim, dim]."""
+    """Yield for every frame the rotation of the surroundings of each of ``nodes`` [node, dim, dim]."""
     near, arms, hangs = _surroundings(paths, nodes)
     arms, dim = np.where(hangs[..., None], arms, 0.0), arms.shape[2]
     extent = np.linalg.svd(np.einsum("nkd,nke->nde", arms, arms), compute_uv=False)
-    unknown = extent[:, dim - 2] <= 1e-6 * extent[:, 0] if dim == 3 else extent[:, 0] == 0  # a row in space, or nothing
+    unknown = extent[:, dim - 2] <= 1e-6 * extent[:, 0] if dim == 3 else extent[:, 0] == 0  # neighbours in a row in 3D, or none
     for moved in paths.moved:
         turn = _closest(np.einsum("nkd,nke->nde", arms, arms + moved[near] - moved[nodes][:, None]))
         yield np.where(unknown[:, None, None], np.eye(dim), turn)

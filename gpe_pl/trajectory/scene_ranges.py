@@ -1,7 +1,7 @@
-"""What scenes have besides materials, as ranges: gravity, and the conditions and the spacing of boundary nodes.
+"""Ranges of gravity, boundary conditions and the spacing of boundary nodes in scenes.
 
-A model knows only what its training had of it, which is often one value. A range is an array [2, channel] of lowest and highest values; its channels are the
-components of gravity and then ``BOUNDARY_CHANNELS``. Where there are no boundary nodes, their lowest value is ∞ and their highest −∞.
+A model knows only the values of its training, often a single one. A range is an array [2, channel] of lowest and highest values. Its channels are the
+components of gravity, followed by ``BOUNDARY_CHANNELS``. Without boundary nodes, the lowest value is ∞ and the highest −∞.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from gpe_pl.trajectory.arrays import nearest_distances
 from gpe_pl.trajectory.boundary import Boundary
 
 BOUNDARY_CHANNELS = (("friction", ""), ("restitution", ""), ("speed", " m/s"), ("spacing", " m"))
-"""Names and units."""
+"""Names and units of the channels of boundary nodes."""
 
 TOLERANCE = 1e-5
-"""Boundary conditions are stored in single precision; differences below this share of the value are none."""
+"""Relative difference of boundary conditions that counts as none, as they are stored in single precision."""
 
 SPACING_TOLERANCE = 0.1
-"""Share by which the spacing of boundary nodes differs between scenes of one kind, as their obstacles do."""
+"""Relative difference in the spacing of boundary nodes that counts as none: it varies with the obstacles of similar scenes."""
 
 
 def scene_range(gravity: np.ndarray, boundary: Boundary, periodicity: Periodicity) -> Float64[np.ndarray, "2 channel"]:
-    """The range of one scene, with all of the boundary's motion.
+    """Return the range of one scene, including all of the boundary's motion.
 
     Args:
-        gravity: [dim] in m/s².
-        boundary: of NumPy arrays.
-        periodicity: where space repeats.
+        gravity: external acceleration [dim] in m/s².
+        boundary: boundary of NumPy arrays.
+        periodicity: axes along which space repeats.
     """
     columns = [np.asarray(gravity, np.float64)[:, None]]
     for name, _ in BOUNDARY_CHANNELS:
@@ -51,22 +51,22 @@ def _values(name: str, boundary: Boundary, periodicity: Periodicity) -> np.ndarr
     if len(boundary.pos) < 2:
         return np.empty(0)
     nearest = nearest_distances(np.asarray(boundary.pos, np.float64), periodicity)
-    return np.array([np.median(nearest), nearest.max()])  # the typical one, and the widest, as of a single coarse obstacle
+    return np.array([np.median(nearest), nearest.max()])  # typical and widest spacing; a single coarse obstacle shows in the latter
 
 
 def unlimited(dim: int) -> Float64[np.ndarray, "2 channel"]:
-    """The range that holds every scene."""
+    """Return the range that contains every scene."""
     return np.array([[-np.inf], [np.inf]]) * np.ones(dim + len(BOUNDARY_CHANNELS))
 
 
 def united(ranges: Iterable[Float64[np.ndarray, "2 channel"]]) -> Float64[np.ndarray, "2 channel"]:
-    """The smallest range that holds all of these."""
+    """Return the smallest range that contains all of ``ranges``."""
     low, high = zip(*ranges, strict=True)
     return np.stack([np.min(low, axis=0), np.max(high, axis=0)])
 
 
 def described(trained: Float64[np.ndarray, "2 channel"]) -> Iterator[tuple[str, str]]:
-    """What a range says of training: a name and its values with their unit, for each kind of value."""
+    """Yield a name, and the values of the training range with their unit, for each kind of value."""
     gravity, boundary = np.split(trained, [-len(BOUNDARY_CHANNELS)], axis=1)
     yield "gravity", _between(_vector(gravity[0]), _vector(gravity[1]), " m/s²")
     for (name, unit), (low, high) in zip(BOUNDARY_CHANNELS, boundary.T, strict=True):
@@ -74,12 +74,12 @@ def described(trained: Float64[np.ndarray, "2 channel"]) -> Iterator[tuple[str, 
 
 
 def outside(trained: Float64[np.ndarray, "2 channel"], scene: Float64[np.ndarray, "2 channel"], speed: float) -> Iterator[tuple[str, str]]:
-    """Kinds of values of a scene that training did not have, each with a line that names value and trained range.
+    """Yield the kinds of values in a scene that training did not have, each with a line that names the value and the trained range.
 
     Args:
         trained: range of training.
         scene: range of the scene.
-        speed: a speed of the scene's scale [m/s].
+        speed: typical speed of the scene [m/s], which scales the tolerance of speeds.
     """
     size = np.where(np.isfinite(trained), np.abs(trained), 0.0).max(axis=0)
     count = len(BOUNDARY_CHANNELS)

@@ -1,4 +1,4 @@
-"""``State``: everything that a ``Simulator`` needs to know at one instant."""
+"""``State``: everything that a ``Simulator`` needs at one instant."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from gpe_pl.trajectory.kinds import CELL, NODE, SCENE, STEP, names_of
 
 @dataclass(frozen=True)
 class Stress:
-    """Cauchy stress of a mesh in Pa; in a ``Trajectory`` with a leading axis of frames.
+    """Cauchy stress of a mesh in Pa. In a ``Trajectory`` the arrays have a leading axis of frames.
+
+    Components are xx, xy, yy, zz in plane strain and xx, xy, xz, yy, yz, zz in 3D.
 
     Attributes:
-        node: [node, component], averaged from the cells around each node; zero at nodes of no cell.
-        cell: [cell, component]. Components are xx, xy, yy, zz in plane strain and xx, xy, xz, yy, yz, zz in 3D.
+        node: stress at nodes [node, component], the mean over the cells around each node; zero at nodes without a cell.
+        cell: stress in cells [cell, component].
     """
 
     node: Array
@@ -38,7 +40,7 @@ class Stress:
 
 
 def von_mises(stress: Array) -> Array:
-    """Von Mises stress √(3/2 s:s) [...] in Pa, with s the deviator of stresses [..., component] ordered as in ``Stress``."""
+    """Return the von Mises stress √(3/2 s:s) [...] in Pa, where s is the deviator of stresses [..., component] in the order of ``Stress``."""
     xp = array_namespace(stress)
     zero = xp.zeros_like(stress[..., 0])
     if stress.shape[-1] == 4:
@@ -51,7 +53,7 @@ def von_mises(stress: Array) -> Array:
 
 @dataclass(frozen=True)
 class State:
-    """Everything a ``Simulator`` needs to know at one instant; arrays of one backend.
+    """Everything that a ``Simulator`` needs at one instant. All arrays are NumPy arrays, or all are tensors.
 
     Every field declares its kind (``kinds``). ``take``, ``joined`` and ``later`` follow from the kinds, so a new field is declared here only.
 
@@ -59,21 +61,21 @@ class State:
         pos: positions of the dynamic nodes [node, dim] in m.
         vel: velocities [node, dim] in m/s.
         node_type: codes of ``schema.NODE_TYPES`` [node].
-        mass: [node] in kg.
-        material_params: [node, param], columns named by ``Metadata.param_names``, NaN where not applicable.
+        mass: masses [node] in kg.
+        material_params: material parameters [node, param]; ``Metadata.param_names`` names the columns. NaN if the node's material lacks the parameter.
         boundary: boundary nodes and their conditions.
         gravity: external acceleration [dim] in m/s².
-        velocity_history: the last velocities [node, history, dim], oldest first, the last one equal to ``vel``; None for solvers.
-        time: seconds since the start.
-        rest_pos: undeformed positions [node, dim] in m, where there is a mesh; nodes of no cell have their initial position.
-        cells: nodes of each mesh cell [cell, corner]; one with fewer corners than others repeats its last.
-        cell_dim: dimension of the cells, 2 for surfaces in 3D; None: that of space. See ``cells.kinds_of``.
-        stress: of the mesh, where the solver computes it.
-        num_substeps: that a solver took to come here from the frame before.
-        num_corrected: nodes that containment put back in coming here from the frame before.
-        num_asleep: nodes that a simulator left alone in coming here from the frame before.
-        lost_impulse: momentum [kg m/s], in sum of magnitudes, that it took from them.
-        internal: opaque part of a solver (deformation gradient, …), carried so that a restart equals a run-through. Stored frames lack it.
+        velocity_history: the last velocities [node, history, dim] in m/s, oldest first; the last one equals ``vel``. None for solvers.
+        time: time since the start [s].
+        rest_pos: undeformed positions [node, dim] in m; None without a mesh. Nodes without a cell have their initial position.
+        cells: nodes of each mesh cell [cell, corner]; a cell with fewer corners than others repeats its last corner.
+        cell_dim: dimension of the cells, 2 for surfaces in 3D; None stands for the dimension of space. See ``cells.kinds_of``.
+        stress: stress of the mesh; None if the simulator does not compute it.
+        num_substeps: number of solver substeps in the last frame.
+        num_corrected: number of nodes that containment put back in the last frame.
+        num_asleep: number of sleeping nodes, which the simulator did not compute in the last frame.
+        lost_impulse: momentum [kg m/s] that these nodes lost, as the sum of magnitudes.
+        internal: private data of a solver or simulator (deformation gradient, …), kept so that a restart equals running through. It is not stored.
         periodicity: axes along which space repeats.
     """
 
@@ -174,7 +176,7 @@ class State:
         return replace(self, pos=pos, vel=vel, velocity_history=history)
 
     def to_torch(self, device: Any = "cpu") -> State:
-        """The same state as float64 tensors on a device (``internal`` is dropped: it belongs to a solver)."""
+        """Return the state as float64 tensors on a device. ``internal`` is dropped, as it belongs to a solver."""
         import torch
 
         def tensor(x: Array) -> Any:

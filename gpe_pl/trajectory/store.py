@@ -1,8 +1,8 @@
-"""Trajectories on disk.
+"""The store: writes and reads trajectories on disk.
 
-A shard is one HDF5 file with a group per trajectory. It is written under a temporary name and renamed, so a reader never sees half of one.
-Every array is chunked with a fletcher32 checksum, and each group carries a SHA-256 digest of all its arrays and attributes. Text is stored
-with a fixed length: HDF5 keeps text of variable length outside its checksums, where one flipped bit can hang the library.
+A shard is an HDF5 file with one group per trajectory. It is written under a temporary name and renamed, so a reader never sees an incomplete one. Every array
+is chunked with a fletcher32 checksum, and each group has a SHA-256 digest of all its arrays and attributes. Text is stored with a fixed length, because HDF5
+keeps text of variable length outside its checksums, where one flipped bit can hang the library.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ class StoreError(GpeError, ValueError):
 
 
 class UnsoundError(StoreError):
-    """A stored trajectory can be read, but holds what nothing can be learned from or compared with.
+    """A stored trajectory can be read, but has invalid values.
 
     Attributes:
-        fault: what is wrong, without file and trajectory.
+        fault: the fault, without file and trajectory.
     """
 
     def __init__(self, where: str, fault: str) -> None:
@@ -51,7 +51,7 @@ class UnsoundError(StoreError):
 
 
 def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
-    """The arrays of a trajectory by the names, and with the types, of ``schema.FIELDS``."""
+    """Return the arrays of a trajectory with the names and types of ``schema.FIELDS``."""
     b = trajectory.boundary
     arrays: dict[str, Any] = {
         "pos": trajectory.pos,
@@ -76,20 +76,21 @@ def stored_arrays(trajectory: Trajectory) -> dict[str, np.ndarray]:
 
 
 def array_bytes(trajectory: Trajectory) -> int:
-    """Bytes of what is stored of a trajectory, uncompressed."""
+    """Return the uncompressed size of a trajectory's stored arrays [bytes]."""
     return sum(array.nbytes for array in stored_arrays(trajectory).values())
 
 
 PREDICTION = "prediction"
-"""Attribute that only predictions have."""
+"""Name of an attribute that only predictions have."""
 START_TIME = "start_time"
-"""Attribute of trajectories that begin later than their scene, in s: solvers do not take their first frame for undeformed."""
+"""Name of the attribute with the time of the first frame [s]. Only trajectories that start later than their scene have it: solvers do not assume that their
+first frame is undeformed."""
 ATTRIBUTES = ("metadata", "shapes", "node_types")
-"""Of a trajectory's group, beside the digest."""
+"""Attributes of every trajectory's group, besides the digest."""
 
 
 def stored_attributes(trajectory: Trajectory) -> dict[str, str]:
-    """What else is stored of a trajectory, as JSON: metadata, shapes of its boundary, the names behind ``node_type``, and when it begins, if not at 0."""
+    """Return the attributes of a trajectory as JSON: metadata, shapes of its boundary, names of the ``node_type`` codes, and a start time other than 0."""
     m = trajectory.metadata
     meta = json.dumps(asdict(m), sort_keys=True)
     shapes = json.dumps([shape_to_dict(s) for s in trajectory.boundary.shapes], sort_keys=True)
@@ -98,7 +99,7 @@ def stored_attributes(trajectory: Trajectory) -> dict[str, str]:
 
 
 def digest(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
-    """SHA-256 over names, shapes, types and bytes of all arrays and attributes of a trajectory."""
+    """Return the SHA-256 digest of names, shapes, types and bytes of all arrays and attributes of a trajectory."""
     sha = hashlib.sha256()
     for name, text in sorted(attributes.items()):
         sha.update(f"{name}={text};".encode())
@@ -109,11 +110,11 @@ def digest(arrays: dict[str, np.ndarray], attributes: dict[str, str]) -> str:
 
 
 COMPRESSION = {"shuffle": True, "compression": "gzip", "compression_opts": 1}
-"""Lossless: a quarter less disk for particles, more for meshes; higher levels save a per cent."""
+"""Lossless compression. It saves a quarter of the disk space for particles, and more for meshes. Higher levels save one per cent."""
 
 
 def _chunks(array: np.ndarray, dims: tuple[str, ...]) -> tuple[int, ...]:
-    """Whole arrays in one chunk, except that frames are cut into chunks of about 256 kB."""
+    """Return the shape of chunks: arrays with frames are cut into chunks of about 256 kB, others are one chunk."""
     if dims[0] != "frame" and not (dims[0] == MOTION and len(array) > 1):
         return tuple(max(1, n) for n in array.shape)
     frame_bytes = max(1, array[:1].nbytes)
@@ -129,7 +130,7 @@ def write_shard(path: Path | str, trajectories: Iterable[Trajectory], names: Ite
         names: group names; by default ``00000, 00001, …``.
 
     Raises:
-        ValueError: ``names`` are fewer than the trajectories.
+        ValueError: there are fewer ``names`` than trajectories.
         FullDiskError: there is no room for the file.
     """
     path = Path(path)
@@ -171,7 +172,7 @@ def _write_text(owner: h5py.HLObject, key: str, text: str) -> None:
 
 @contextmanager
 def open_shard(path: Path | str) -> Iterator[h5py.File]:
-    """Open a shard of this schema version for reading; whatever HDF5 raises on a damaged file becomes a ``StoreError``."""
+    """Open a shard of this schema version for reading. Errors that HDF5 raises on a damaged file become ``StoreError``."""
     path = Path(path)
     if not path.is_file():
         raise StoreError(f"{path}: no such file; generate data with `python -m gpe_pl.simulate`")
@@ -185,7 +186,7 @@ def open_shard(path: Path | str) -> Iterator[h5py.File]:
             yield file
     except StoreError:
         raise
-    except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:  # all of these come out of HDF5 and h5py
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:  # HDF5 and h5py raise all of these
         raise StoreError(
             f"{path}: not a readable HDF5 file (damaged or truncated: {error}); delete it and generate or import the data again"
         ) from error
@@ -196,7 +197,7 @@ def _where(group: h5py.Group) -> str:
 
 
 def open_group(file: h5py.File, name: str) -> h5py.Group:
-    """The group of one trajectory."""
+    """Return the group of one trajectory."""
     if not is_named(file, name):
         raise StoreError(f"{file.filename}: no trajectory {name!r}; it has {len(file)} trajectories")
     if not is_own(file, name) or not isinstance(file[name], h5py.Group):
@@ -207,18 +208,18 @@ def open_group(file: h5py.File, name: str) -> h5py.Group:
 
 
 def read_text(group: h5py.Group, key: str) -> str:
-    """A text attribute of a trajectory."""
+    """Return a text attribute of a trajectory."""
     if key not in group.attrs:
         raise StoreError(f"{_where(group)}: attribute {key!r} is missing; delete the shard and generate or import the data again")
     text = attribute(group, key)
-    if not isinstance(text, bytes):  # text of variable length is not safe to read from a damaged file
+    if not isinstance(text, bytes):  # reading text of variable length from a damaged file is not safe
         stored = group.attrs.get_id(key)
         raise StoreError(f"{_where(group)}: attribute {key!r} is {stored.dtype}{list(stored.shape)}, expected text of fixed length")
     return text.decode()
 
 
 def open_field(group: h5py.Group, key: str) -> h5py.Dataset:
-    """One stored array, compared with ``schema.FIELDS`` before any of it is read."""
+    """Return a stored array after comparing its type and shape with ``schema.FIELDS``; none of its values is read yet."""
     spec, where = FIELDS[key], f"{_where(group)}: field {key!r}"
     if not is_named(group, key):
         raise StoreError(f"{where} is missing; delete the shard and generate or import the data again")
@@ -233,7 +234,7 @@ def open_field(group: h5py.Group, key: str) -> h5py.Dataset:
 
 
 def read_field(group: h5py.Group, key: str, frames: slice | None = None) -> np.ndarray:
-    """What a stored array holds; only ``frames`` of it where it has frames."""
+    """Return the values of a stored array; only those of ``frames`` if it has frames."""
     spec, dataset = FIELDS[key], open_field(group, key)
     try:
         has_frames = spec.dims[0] == "frame" or (spec.dims[0] == MOTION and dataset.shape[0] > 1)
@@ -244,19 +245,23 @@ def read_field(group: h5py.Group, key: str, frames: slice | None = None) -> np.n
 
 
 def trajectory_names(path: Path | str) -> list[str]:
-    """Group names of a shard, in order."""
+    """Return the group names of a shard, in order."""
     with open_shard(path) as file:
         return sorted(file)
 
 
 def read_metadata(path: Path | str, name: str) -> Metadata:
-    """Only the metadata of one trajectory."""
+    """Return the metadata of one trajectory, without reading its arrays."""
     with open_shard(path) as file:
         return metadata_of(open_group(file, name))
 
 
 def metadata_of(group: h5py.Group) -> Metadata:
-    """The metadata of a trajectory's group; every key must be there with the right type, and no other."""
+    """Return the metadata of a trajectory's group.
+
+    Raises:
+        StoreError: a key is missing, unknown or of another type.
+    """
     try:
         text = read_text(group, "metadata")
         values = parsed(text)
@@ -281,7 +286,7 @@ def _parsed_list(group: h5py.Group, key: str) -> list[Any]:
 
 
 def shapes_of(group: h5py.Group) -> tuple[Shape, ...]:
-    """The obstacle and wall geometry of a trajectory's group."""
+    """Return the shapes of walls and obstacles of a trajectory's group."""
     try:
         return tuple(shape_from_dict(values) for values in _parsed_list(group, "shapes"))
     except StoreError:
@@ -291,7 +296,7 @@ def shapes_of(group: h5py.Group) -> tuple[Shape, ...]:
 
 
 def start_time_of(group: h5py.Group) -> float:
-    """When the first frame of a trajectory's group is, in s since the start of its scene."""
+    """Return the time of the first frame of a trajectory's group since the start of its scene [s]."""
     if START_TIME not in group.attrs:
         return 0.0
     try:
@@ -306,7 +311,7 @@ def start_time_of(group: h5py.Group) -> float:
 
 
 def node_types_of(group: h5py.Group) -> tuple[str, ...]:
-    """The names behind the integers of ``node_type`` in a trajectory's group; all of them are in ``schema.NODE_TYPES``."""
+    """Return the names of the ``node_type`` codes in a trajectory's group; all of them are in ``schema.NODE_TYPES``."""
     try:
         names = tuple(_parsed_list(group, "node_types"))
     except StoreError:
@@ -325,12 +330,12 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
     Args:
         path: shard.
         name: group name.
-        frames: only these frames, without reading the others; not together with ``verify``.
-        verify: recompute the SHA-256 digest (HDF5's own checksums are always verified).
+        verify: recompute the SHA-256 digest. HDF5's checksums are always verified.
+        frames: read these frames only; not together with ``verify``.
 
     Raises:
-        StoreError: file, group or field missing, wrong shape or type, or a checksum that does not match.
-        UnsoundError: metadata, shapes or values that break their rules (``Metadata.violations``, ``shape_values.shapes_fault``, ``schema.FIELDS``);
+        StoreError: a file, group or field is missing, has the wrong shape or type, or does not match its checksum.
+        UnsoundError: metadata, shapes or values break their rules (``Metadata.violations``, ``shape_values.shapes_fault``, ``schema.FIELDS``);
             names field, frame and node.
     """
     if verify and frames is not None:
@@ -385,7 +390,11 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
 
 
 def shards(root: Path | str, split: str) -> list[Path]:
-    """Shard files of a split under a data set's folder, in order; raises ``StoreError`` when there is none."""
+    """Return the shard files of a split in a data set's folder, in order.
+
+    Raises:
+        StoreError: there is none.
+    """
     found = sorted((Path(root) / split).glob("shard-*.h5"))
     if not found:
         others = sorted({path.parent.name for path in Path(root).glob("*/shard-*.h5")})
@@ -397,7 +406,7 @@ def shards(root: Path | str, split: str) -> list[Path]:
 
 
 def iter_trajectories(root: Path | str, split: str) -> Iterator[Trajectory]:
-    """All trajectories of a split, one at a time."""
+    """Yield all trajectories of a split, one at a time."""
     for path in shards(root, split):
         for name in trajectory_names(path):
             yield read_trajectory(path, name)

@@ -1,4 +1,4 @@
-"""``Trajectory`` and its ``Metadata``: with ``State``, the only contract between solvers and learners."""
+"""``Trajectory`` and its ``Metadata``. Together with ``State`` they are the only interface between solvers and learned simulators."""
 
 from __future__ import annotations
 
@@ -33,20 +33,20 @@ from gpe_pl.trajectory.state import State, Stress
 
 @dataclass(frozen=True)
 class Metadata:
-    """What is known about a trajectory besides its arrays. Lengths in m, times in s.
+    """Properties of a trajectory other than its arrays. Lengths in m, times in s.
 
     Attributes:
         dataset: name of the data set.
         materials: every material that occurs anywhere in the data set (fixes the node types of all its graphs).
         param_names: column names of ``material_params``.
         frame_dt: time between stored frames.
-        solver_dt: largest solver substep, 0 where there is none.
+        solver_dt: largest solver substep, 0 if there is none.
         spacing: rest spacing of neighbouring nodes.
-        connectivity_radius: neighbour radius that sees what the solver's kernel sees.
+        connectivity_radius: neighbour radius; nodes that act on each other in the solver should be within it.
         bounds: ``(low, high)`` per axis of the domain.
-        periodic: per axis.
+        periodic: whether space repeats, per axis.
         gravity: external acceleration [m/s²].
-        seed: seed of the scene, -1 where unknown.
+        seed: seed of the scene, -1 if unknown.
         split: split that the trajectory belongs to.
         parameter_group: whether the material parameter is among the trained values (``seen``), between or outside them.
         solver, solver_version, config: provenance; ``config`` is JSON.
@@ -90,7 +90,7 @@ class Metadata:
         return Periodicity(self.bounds, self.periodic)
 
     def violations(self) -> Iterator[tuple[str, str]]:
-        """Fields that describe no scene, each with what is wrong with it. Files may hold anything, so whoever reads one asks."""
+        """Yield the invalid fields, each with its fault. Call it for metadata from files, which may hold any values."""
         unknown = [name for name in self.materials if name not in MATERIALS]
         if unknown or not self.materials:
             yield "materials", f"names {unknown or 'nothing'}; known: {', '.join(MATERIALS)}"
@@ -122,7 +122,14 @@ class Metadata:
 
 @dataclass(frozen=True)
 class Termination:
-    """Why a rollout stopped early: reason code, the first frame that is not good, and the node that shows it (-1: none in particular)."""
+    """Reason why a rollout stopped early.
+
+    Attributes:
+        reason: reason code, such as ``nan``.
+        frame: first frame that failed.
+        node: node that shows the failure, -1 if it is no single one.
+        message: explanation for a reader.
+    """
 
     reason: str
     frame: int
@@ -132,19 +139,20 @@ class Termination:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Frames of one scene; NumPy arrays.
+    """Frames of one scene, as NumPy arrays.
 
     Attributes:
         metadata: provenance and physical constants.
-        pos, vel: [frame, node, dim] in m and m/s.
-        node_type, mass: [node].
-        material_params: [node, param].
-        boundary: boundary nodes in the first frame; those that move have a motion of as many frames.
+        pos: positions [frame, node, dim] in m.
+        vel: velocities [frame, node, dim] in m/s.
+        node_type, mass: as in ``State`` [node].
+        material_params: as in ``State`` [node, param].
+        boundary: boundary in the first frame; if it moves, its motion has as many frames as the trajectory.
         rest_pos, cells, cell_dim: reference configuration of meshes, as in ``State``.
-        stress: of the mesh in every frame.
-        termination: set when a rollout stopped before its last frame.
-        start_time: of the first frame, in s since the start of the scene.
-        is_prediction: whether a rollout of anything but a ground-truth solver made it.
+        stress: stress of the mesh in every frame.
+        termination: reason if a rollout stopped before its last frame.
+        start_time: time of the first frame since the start of the scene [s].
+        is_prediction: whether the trajectory is a rollout of a simulator other than a ground-truth solver.
     """
 
     metadata: Metadata
@@ -183,33 +191,33 @@ class Trajectory:
         dataset: str = "arrays",
         split: str = "train",
     ) -> Trajectory:
-        """A trajectory of your own arrays, checked.
+        """Return a trajectory made from your own arrays, which are checked.
 
-        ``data.importers.save_dataset`` writes many of them as a data set that ``python -m gpe_pl.fit data=imported`` trains on.
+        ``data.importers.save_dataset`` writes several such trajectories as a data set, on which ``python -m gpe_pl.fit data=imported`` trains.
 
         Args:
-            pos: positions [frame, node, dim] in m of at least 3 frames. Along periodic axes they are folded into the domain. What is not float32 or
-                float16 stays in double precision until it is stored.
+            pos: positions [frame, node, dim] in m of at least 3 frames. Along periodic axes they are folded into the domain. Arrays of other types than float32
+                and float16 stay in double precision until they are stored.
             frame_dt: time between frames [s].
-            materials: material of all nodes, or of each; names of ``schema.MATERIALS``.
-            params: the parameter of each material that occurs, in the unit that ``schema.MATERIALS`` gives it: one value, or one per node of the trajectory.
+            materials: material of all nodes, or of each node; names of ``schema.MATERIALS``.
+            params: parameter of each material that occurs, in the unit of ``schema.MATERIALS``: one value, or one per node of the trajectory.
             vel: velocities [frame, node, dim] in m/s; None takes the differences of positions. Models learn from positions only.
-            mass: of all nodes or of each [kg]; only ratios matter to a model.
-            bounds: ``(low, high)`` of the domain per axis [m]; None takes the extremes of all positions. Periodic axes need them.
-            periodic: per axis whether space repeats; None: nowhere.
-            gravity: external acceleration [dim] in m/s²; None: zero, and models learn it as any other force.
+            mass: mass of all nodes, or of each node [kg]; only ratios matter to a model.
+            bounds: ``(low, high)`` of the domain per axis [m]; None takes the extremes of all positions. Periodic axes need bounds.
+            periodic: whether space repeats, per axis; None stands for no axis.
+            gravity: external acceleration [dim] in m/s²; None stands for zero. Models then learn gravity like any other force.
             spacing: rest spacing of neighbours [m]; None takes the median distance to the nearest node in the first frame.
-            connectivity_radius: neighbour radius [m] that sees what acts on a node; None takes ``arrays.RADIUS_SPACINGS`` spacings.
+            connectivity_radius: neighbour radius [m]; nodes that act on each other should be within it. None takes ``arrays.RADIUS_SPACINGS`` spacings.
             boundary: walls and obstacles, for example ``Boundary.sample(domain_walls(bounds, friction), spacing, dim)`` or ``Boundary.from_numpy(…)``.
-                In periodic domains its nodes are folded like others, those that meet at a seam become one, and shapes have images.
-            cells: nodes of each cell [cell, corner] of meshes of elastomers and solids, or such arrays by kind, ``{"quadrilateral": …, "triangle": …}``, where
-                there are several or, with four corners in 3D, the shape does not tell quadrilaterals from tetrahedra. Kinds are those of
+                In periodic domains its nodes are folded like others, those that coincide at a seam become one, and shapes get images.
+            cells: nodes of each cell [cell, corner] in meshes of elastomers and solids, or such arrays by kind, ``{"quadrilateral": …, "triangle": …}``. Give
+                them by kind if there are several kinds, and for four corners in 3D, which quadrilaterals and tetrahedra have. Kinds are those of
                 ``schema.CELL_KINDS``, corners in VTK's order.
             rest_pos: undeformed positions [node, dim] of meshes in m; None takes those of the first frame.
-            dataset, split: where the trajectory belongs; ``save_dataset`` overrides both.
+            dataset, split: names of data set and split; ``save_dataset`` overrides both.
 
         Raises:
-            ArrayError: an argument that does not fit; names it, and frame and node where there is one.
+            ArrayError: an argument does not fit; names it, with frame and node if there is one.
         """
         pos = numbers("pos", pos, {"frame": None, "node": None, "dim": None})
         pos = pos.astype(np.float32 if pos.dtype in (np.float16, np.float32) else np.float64, copy=False)
@@ -268,13 +276,13 @@ class Trajectory:
         return self.pos.shape[1]
 
     def state(self, frame: int, history: int = 0) -> State:
-        """The state at a frame.
+        """Return the state at a frame.
 
-        With ``history`` > 0 the velocities are those of a learned simulator: differences of the last ``history + 1`` stored positions in
-        float64. Without it they are the stored ones.
+        Without ``history``, the velocities are the stored ones. With ``history`` > 0, they are differences of the last ``history + 1`` stored positions in
+        float64, as a learned simulator needs them.
 
         Raises:
-            IndexError: ``frame`` is out of range, or lacks ``history`` frames before it.
+            IndexError: ``frame`` is out of range, or has fewer than ``history`` frames before it.
         """
         if not history <= frame < self.num_frames:
             raise IndexError(f"frame {frame} with history {history} is outside the {self.num_frames} frames of this trajectory")
@@ -292,10 +300,13 @@ class Trajectory:
         )  # fmt: skip
 
     def seen_from(self, origin: np.ndarray) -> Trajectory:
-        """The same in coordinates whose origin is at ``origin`` [dim] in m; stored positions should be near theirs, since float32 is fine near 0 only."""
+        """Return the trajectory in coordinates whose origin is at ``origin`` [dim] in m.
+
+        Choose an origin near the positions before you store them, as float32 is precise near 0 only.
+        """
         b, m = self.boundary, self.metadata
         rest_pos = self.rest_pos
-        if rest_pos is not None:  # only their differences matter, so they may have an origin of their own already
+        if rest_pos is not None:  # only their differences matter, so their origin may be another one
             rest_pos = np.where(np.abs(rest_pos - origin).max(axis=0) < np.abs(rest_pos).max(axis=0), rest_pos - origin, rest_pos)
         bounds = tuple((low - x, high - x) for (low, high), x in zip(m.bounds, origin.tolist(), strict=True))
         motion = None if b.motion is None else replace(b.motion, pos=b.motion.pos - origin)
@@ -303,7 +314,7 @@ class Trajectory:
         return replace(self, metadata=replace(m, bounds=bounds), pos=self.pos - origin, boundary=boundary, rest_pos=rest_pos)
 
     def frames(self, start: int, stop: int | None = None) -> Trajectory:
-        """The frames ``start:stop`` as a trajectory of their own."""
+        """Return the frames ``start:stop`` as a trajectory."""
         stress = None if self.stress is None else Stress(self.stress.node[start:stop], self.stress.cell[start:stop])
         first, _, _ = slice(start, stop).indices(self.num_frames)
         return replace(
@@ -316,9 +327,9 @@ class Trajectory:
         )
 
     def with_moving_boundary(self) -> Trajectory:
-        """For pictures and other programs: boundary nodes that move in a prescribed way as further nodes, of type ``boundary``, after the others.
+        """Return the trajectory with moving boundary nodes as additional nodes of type ``boundary``, for pictures and other programs.
 
-        The same object if none does.
+        The additional nodes follow the others. If no boundary node moves, the result is the same object.
         """
         motion = self.boundary.motion
         if motion is None:

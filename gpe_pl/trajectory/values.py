@@ -1,6 +1,6 @@
-"""Values of stored arrays, compared with the rules that ``schema.FIELDS`` declares.
+"""Checks the values of stored arrays by the rules that ``schema.FIELDS`` declares.
 
-The store compares what it reads, the importers what they are given, a rollout the state that it starts from, and the validator names everything that it finds.
+The store checks arrays that it reads, importers check their input, and rollouts check their initial state. The validator lists all faults.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from gpe_pl.schema import CELL_KINDS, FIELDS, LARGEST, MATERIALS, MOTION
 from gpe_pl.trajectory.cells import kinds_of
 
 UNIT_TOLERANCE = 1e-4
-"""Largest difference of a unit vector's length from 1."""
+"""Maximum difference of a unit vector's length from 1."""
 PADDED = ", but for the last one, which a cell with fewer corners than others repeats at the end"
 SMALLEST = float(np.finfo(np.float32).tiny)
 
@@ -25,9 +25,9 @@ class Fault:
     """A stored array that breaks its rule.
 
     Attributes:
-        field: its name in ``schema.FIELDS``.
-        place: index of the first offender, by axis.
-        message: the place, how many more there are, and what is wrong.
+        field: name of the array in ``schema.FIELDS``.
+        place: index of the first wrong element, by axis.
+        message: the place, the number of further wrong elements, and what is wrong.
     """
 
     field: str
@@ -38,12 +38,12 @@ class Fault:
         return f"field {self.field!r}: {self.message}"
 
     def index(self, axis: str) -> int:
-        """Index along an axis; -1 where the field has no such axis."""
+        """Return the index along an axis; -1 if the field has no such axis."""
         return dict(self.place).get(axis, -1)
 
 
 def size_conflicts(arrays: Mapping[str, np.ndarray], dim: int, num_params: int) -> list[str]:
-    """Fields whose shape contradicts the schema, the data set's numbers of dimensions and parameters, or an earlier field; one sentence each."""
+    """Return one sentence for each field whose shape contradicts the schema, the numbers of dimensions and parameters, or an earlier field."""
     sizes = {"dim": dim, "param": num_params}
     conflicts = []
     for key, array in arrays.items():
@@ -66,12 +66,12 @@ def size_conflicts(arrays: Mapping[str, np.ndarray], dim: int, num_params: int) 
 def faults(
     arrays: Mapping[str, np.ndarray], names: Sequence[str], materials: Sequence[str], param_names: Sequence[str], first_frame: int = 0
 ) -> Iterator[Fault]:
-    """Every field that breaks its rule; those that are the same in all frames come first.
+    """Yield a fault for every field that breaks its rule; fields without frames come first.
 
     Args:
-        arrays: by their names in ``schema.FIELDS``; their shapes agree with each other.
-        names: node types behind the codes of ``node_type``.
-        materials, param_names: of the data set.
+        arrays: arrays by their names in ``schema.FIELDS``, without conflicts of size (``size_conflicts``).
+        names: node types by the codes of ``node_type``.
+        materials, param_names: as in the metadata of the data set.
         first_frame: number of the first frame of ``arrays``, for messages.
     """
     scene = _Scene(arrays, [name if name in materials else "" for name in names], param_names, materials)
@@ -85,7 +85,7 @@ def faults(
 
 @dataclass(frozen=True)
 class _Scene:
-    """What rules need to know besides the array that they look at; ``names`` are empty where a node type is none of the materials."""
+    """Data that rules need besides the array that they check. A name is empty if its node type is not one of the materials."""
 
     arrays: Mapping[str, np.ndarray]
     names: Sequence[str]
@@ -93,14 +93,20 @@ class _Scene:
     materials: Sequence[str]
 
     def is_type(self, *wanted: str) -> np.ndarray:
-        """Whether each node [node] is of one of these types."""
+        """Return a mask [node] of the nodes of the wanted types."""
         codes = self.arrays["node_type"]
         return np.isin(codes, [k for k, name in enumerate(self.names) if name in wanted])
 
 
 @dataclass(frozen=True)
 class _Found:
-    """Which elements are wrong, at least one, and what is wrong with the one at an index; ``column`` begins the message."""
+    """Wrong elements of an array.
+
+    Attributes:
+        bad: mask of the wrong elements; at least one is true.
+        wrong: returns what is wrong with the element at an index.
+        column: beginning of the message.
+    """
 
     bad: np.ndarray
     wrong: Callable[[tuple[int, ...]], str]
@@ -111,7 +117,7 @@ _Rule = Callable[[_Scene, np.ndarray], Iterator[_Found]]
 
 
 def _place(key: str, bad: np.ndarray, first_frame: int) -> tuple[tuple[str, int], ...]:
-    """Index of the first offender, by axis; without the frame where something stands still."""
+    """Return the index of the first wrong element, by axis; without the frame if the boundary does not move."""
     place = []
     for axis, k, size in zip(FIELDS[key].dims, np.argwhere(bad)[0].tolist(), bad.shape, strict=False):
         if axis == "frame" or (axis == MOTION and size > 1):
@@ -131,10 +137,10 @@ def _finite(_: _Scene, array: np.ndarray) -> Iterator[_Found]:
 
 
 def _within(low: float, high: float, wrong: str) -> _Rule:
-    """A rule: numbers from ``low`` to ``high``."""
+    """Return the rule that numbers lie between ``low`` and ``high``."""
 
     def rule(_: _Scene, array: np.ndarray) -> Iterator[_Found]:
-        if array.size and not (array.min() >= low and array.max() <= high):  # also where one is NaN
+        if array.size and not (array.min() >= low and array.max() <= high):  # also catches NaN
             yield _Found(~((array >= low) & (array <= high)), lambda k: f"{wrong}, is {array[k]:.6g}")
 
     return rule
@@ -157,7 +163,7 @@ def _node_types(scene: _Scene, array: np.ndarray) -> Iterator[_Found]:
 
 
 def _parameters(scene: _Scene, array: np.ndarray) -> Iterator[_Found]:
-    """What ``MaterialParameter.rule`` says where a node's material has the parameter; anything elsewhere."""
+    """Check ``MaterialParameter.rule`` at nodes whose material has the parameter. Other nodes may have any value."""
     for material in scene.materials:
         spec = MATERIALS[material]
         if spec.name not in scene.param_names:

@@ -127,7 +127,7 @@ BAD[3, 5, 1] = np.nan
         ({"frame_dt": True}, "^frame_dt=True"),
         ({"materials": "mud"}, "^materials: node 0 is 'mud'; known: sand, snow, fluid, elastomer, solid$"),
         ({"materials": ["sand"] * 3}, "^materials: 3 names for 20 nodes$"),
-        ({"params": {}}, r"^params: has nothing, needs sand: friction_angle \[deg\]; any constant will do"),
+        ({"params": {}}, r"^params: has nothing, needs sand: friction_angle \[deg\]; give any constant"),
         ({"params": {"sand": 30, "snow": 5}}, "^params: has sand, snow, needs sand"),
         ({"params": {"sand": np.full(20, np.nan)}}, r"^params\['sand'\]: node 0 is nan$"),
         (
@@ -172,7 +172,7 @@ def test_what_does_not_fit_is_named(changes: dict[str, Any], message: str) -> No
             [[0, 1, 6, 5], [1, 2, 7]],
             "^cells: rows have different lengths; give cells by kind, such as {'triangle': …, 'quadrilateral': …}$",
         ),
-        ([[0, 1, 2, 3, 4]], r"^cells: has shape \[1, 5\], expected .* as a kind has: triangle 3, quadrilateral 4$"),
+        ([[0, 1, 2, 3, 4]], r"^cells: has shape \[1, 5\], expected .* of a kind: triangle 3, quadrilateral 4$"),
         ({"tetrahedron": [[0, 1, 2, 3]]}, "^cells: unknown kind 'tetrahedron'; in 2D there are triangle, quadrilateral$"),
         ({"triangle": [[0, 1, 2, 3]]}, r"^cells\['triangle'\]: has shape \[1, 4\], expected \[cell, 3\]$"),
         ({}, "^cells: has no kind"),
