@@ -1,4 +1,4 @@
-"""Trivial simulators that any learned model has to beat."""
+"""Trivial baselines: simulators without learning, which a learned model has to beat."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class ConstantVelocity:
 
 @dataclass(frozen=True)
 class StopsAtWalls:
-    """Every node keeps its velocity until it touches a wall or obstacle, where it sticks. Needs no gravity, so it is right where that is not known."""
+    """Every node keeps its velocity until it touches a wall or obstacle, where it sticks. This baseline also suits data whose gravity is unknown."""
 
     dt: float
 
@@ -36,7 +36,7 @@ class StopsAtWalls:
 
 @dataclass(frozen=True)
 class Ballistic:
-    """Free fall until a node touches a wall or obstacle, where it sticks."""
+    """Every node falls freely until it touches a wall or obstacle, where it sticks."""
 
     dt: float
 
@@ -49,11 +49,11 @@ BASELINES: dict[str, Callable[[float], Simulator]] = {
     "stops_at_walls": StopsAtWalls,
     "constant_velocity": ConstantVelocity,
 }
-"""What evaluations compare a model with, by the name in their tables; each takes the frame interval [s]."""
+"""Baselines of an evaluation by their names in tables; each takes the frame interval [s]."""
 
 
 def _sticking(state: State, dt: float, acceleration: Array) -> State:
-    """The state after a step with a constant acceleration [dim]; what touches a wall or obstacle on the way stays there."""
+    """Return the state after a step with a constant acceleration [dim] in m/s². Nodes that touch a wall or obstacle stay there."""
     xp = array_namespace(state.pos)
     shapes = state.boundary.shapes
     pos, vel = integrators.advance(state.pos, state.vel, acceleration, dt)
@@ -67,7 +67,7 @@ def _sticking(state: State, dt: float, acceleration: Array) -> State:
 
 
 def _touchdown(state: State, end: Array) -> Array:
-    """The last free points on the straight paths from the state's positions to ``end``, by bisection."""
+    """Return the last free points [node, dim] on the straight paths from the state's positions to ``end``, found by bisection."""
     xp = array_namespace(end)
     free, inside = state.pos, end
     for _ in range(NUM_BISECTIONS):

@@ -1,4 +1,4 @@
-"""Walls that a learned simulator cannot cross: particles that end a step inside a boundary are put back on its surface, and counted."""
+"""Containment: puts particles that end a step inside a wall or obstacle back on its surface, and counts them."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from gpe_pl.trajectory.state import State
 
 
 def contain(state: State, dt: float) -> tuple[State, Array]:
-    """Move nodes deeper than ``geometry.surface_tolerance`` along the surface normal back to the surface of the boundary's shapes.
+    """Move nodes that are deeper than ``geometry.shapes.surface_tolerance`` in a shape of the boundary along the normal back to its surface.
 
-    Where surfaces meet so narrowly that this does not lead out, a node returns to where the step began.
-    Velocities, and the last entry of the velocity history, change by displacement / ``dt``, so that they still are differences of positions.
+    If surfaces meet so narrowly that a node is still inside, it returns to its position before the step. Velocities, and the last entry of the velocity
+    history, change by displacement / ``dt``, so that they remain differences of positions.
 
     Args:
-        state: after a step.
+        state: state after a step.
         dt: frame interval [s].
 
     Returns:
-        The corrected state (the same object if nothing was inside) and a mask [node] of the corrected nodes.
+        Corrected state (the same object if no node was inside) and a mask [node] of the corrected nodes.
     """
     shapes = state.boundary.shapes
     pos = state.pos
@@ -38,7 +38,7 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
         before = moved
         for shape in shapes:
             depth = xp.clip(-shape.signed_distance(moved), 0.0, None)
-            if bool(xp.any(depth > 0)):  # finding normals of shapes that nothing is in would take most of the time
+            if bool(xp.any(depth > 0)):  # normals are expensive, and most shapes contain no node
                 moved = moved + depth[:, None] * outward_normal(shape, moved, step=tolerance)
         if moved is before:
             break
@@ -52,10 +52,10 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
 
 @dataclass(frozen=True)
 class Contained:
-    """A simulator with containment after every step; new states know how many nodes it corrected (``State.num_corrected``).
+    """A simulator with containment after every step. ``State.num_corrected`` of a new state is the number of corrected nodes.
 
     Attributes:
-        simulator: the simulator inside.
+        simulator: simulator that makes the steps.
         dt: frame interval [s].
     """
 

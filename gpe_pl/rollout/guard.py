@@ -1,4 +1,4 @@
-"""``Guard``: limits beyond which a state is not trusted, and the check of what a rollout starts from."""
+"""``Guard``: limits beyond which a rollout stops, and the check of its initial state."""
 
 from __future__ import annotations
 
@@ -17,27 +17,28 @@ from gpe_pl.trajectory.trajectory import Metadata, Termination
 from gpe_pl.trajectory.values import faults, size_conflicts
 
 CROWDING_LIMIT = 32
-"""Nodes in the space that one of them has at rest beyond which a cloud has collapsed, unless it was as dense at the start."""
+"""Stop with ``clustering`` when more nodes than this share a cell of side ``spacing``; raised for starts that are already denser."""
 FINEST = 0.01
-"""Of a spacing: nodes that are closer at the start lie on top of each other."""
+"""Nodes closer than this at the start coincide [rest spacings]; the limit on crowding then stays."""
 TUNNEL_DEPTH = 0.25
-"""Of a spacing: a path between two frames that goes deeper through a wall or obstacle than this has not gone around it."""
+"""A path between two frames that is deeper than this in a wall or obstacle went through it [rest spacings]."""
 MAX_PATH_SAMPLES = 4096
-"""Of a path: those of ways longer than as many eighths of a spacing lie farther apart."""
+"""Maximum number of samples of a path. Paths longer than this many eighths of a spacing are sampled more coarsely."""
 SUSPECTS_AT_ONCE = 1000
-"""Nodes whose paths are sampled as finely as that of the fastest of them."""
+"""Number of nodes whose paths are sampled together, as finely as the fastest of them needs."""
 
 
 @dataclass(frozen=True)
 class Guard:
-    """Limits beyond which a state is not trusted.
+    """Limits beyond which a rollout stops.
 
     Attributes:
-        max_speed: m/s.
-        bounds: ``(low, high)`` per axis of the region that nodes may not leave by more than ``margin`` [m].
-        spacing: rest spacing [m] of nodes, for recognising clouds that collapse and nodes that went through an obstacle within one frame, or are deeper in
-            one than ``margin``; 0 does neither.
-        max_crowding: nodes in the space that one of them has at rest.
+        max_speed: maximum speed of nodes [m/s].
+        bounds: ``(low, high)`` per axis of the domain [m].
+        margin: distance [m] by which nodes may leave the bounds, and depth [m] that they may have in a wall or obstacle; a depth limit of 0 is none.
+        spacing: rest spacing of nodes [m]. It is needed to detect clouds that collapse, nodes that pass through an obstacle within one frame, and nodes too
+            deep in one; 0 switches these checks off.
+        max_crowding: maximum number of nodes in a cell of side ``spacing``.
     """
 
     max_speed: float = math.inf
@@ -47,12 +48,12 @@ class Guard:
     max_crowding: int = CROWDING_LIMIT
 
     def __post_init__(self) -> None:
-        sound = self.max_speed > 0 and self.margin >= 0 and 0 <= self.spacing < math.inf  # what is not a number is neither
+        sound = self.max_speed > 0 and self.margin >= 0 and 0 <= self.spacing < math.inf  # NaN fails all comparisons
         if not (sound and all(low < high for low, high in self.bounds)):
             raise ValueError(f"guard limits must be positive, and bounds (low, high), got {self}")
 
     def check(self, state: State, frame: int, before: State | None = None) -> Termination | None:
-        """The first violated limit of a state, or None; ``before`` is the state one frame earlier."""
+        """Return the first violated limit of a state, or None; ``before`` is the state one frame earlier."""
         if state.num_nodes == 0:
             return None
         found = self._not_finite(state, frame) or self._escape(state, frame) or self._explosion(state, frame)
@@ -97,7 +98,7 @@ class Guard:
         return Termination("clustering", frame, node, text)
 
     def _tunnelling(self, before: State | None, state: State, frame: int) -> Termination | None:
-        """Nodes deeper in a wall or obstacle than ``margin``, and those that were and are outside of all shapes, but not between the two frames."""
+        """Find nodes deeper than ``margin`` in a wall or obstacle, and nodes that were outside all shapes in both frames but not in between."""
         shapes, end = state.boundary.shapes, as_numpy(state.pos)
         if not shapes:
             return None
@@ -125,7 +126,7 @@ class Guard:
         return Termination("tunnelling", frame, node, text)
 
     def of(self, start: State) -> Guard:
-        """The same for a rollout from a state, which may be finer in places: clouds collapse where twice as many are in one place as in the finest."""
+        """Return the guard for a rollout from a state. If the state is denser in places, ``max_crowding`` is twice the number of nodes in its densest cell."""
         if self.spacing == 0 or start.num_nodes == 0 or self._not_finite(start, 0) is not None:
             return self
         pos = as_numpy(start.pos)
@@ -135,16 +136,16 @@ class Guard:
 
 
 def crowding(pos: np.ndarray, width: float) -> np.ndarray:
-    """For every node [node], how many there are in its box of a grid of this width [m]; two boxes very rarely count as one."""
+    """Return for every node [node] the number of nodes in its cell of a grid of this width [m]. Very rarely, two cells count as one."""
     primes = np.array([73_856_093, 19_349_663, 83_492_791])[: pos.shape[1]]  # spatial hash [Teschner et al. 2003]; products may overflow
     _, box, counts = np.unique(np.floor(pos / width).astype(np.int64) @ primes, return_inverse=True, return_counts=True)
     return counts[box]
 
 
 def unsound(state: State, metadata: Metadata) -> Termination | None:
-    """The first array or shape of a state that breaks its rule (``schema.FIELDS``, ``shape_values.shapes_fault``), or None.
+    """Return a termination for the first array or shape of an initial state that breaks its rule, or None.
 
-    Nothing could be told from what follows it.
+    The rules are those of ``schema.FIELDS`` and ``shape_values.shapes_fault``.
     """
     b, has_mesh = state.boundary, state.cells is not None and state.rest_pos is not None
     nodes = {

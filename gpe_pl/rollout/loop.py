@@ -1,7 +1,7 @@
-"""``Simulator``, the protocol shared by solvers and learned models, and the time loop, ``step_scenes``: ``rollout`` collects
-its frames with a guard, ``steps`` yields its states without one.
+"""``Simulator``, the protocol of solvers and learned models, and ``step_scenes``, the time loop.
 
-A guard looks at every new state. When it finds a state that cannot be trusted, the rollout stops there, keeps the good frames and says why.
+``rollout`` collects the frames of the loop, with a guard. ``steps`` yields its states, without one. A guard checks every new state. If it rejects a state, the
+rollout stops, keeps the frames before and stores the reason.
 """
 
 from __future__ import annotations
@@ -30,13 +30,18 @@ class Simulator(Protocol):
 
 @runtime_checkable
 class BatchSimulator(Simulator, Protocol):
-    """A simulator that advances several scenes at once for less than the sum of their costs."""
+    """A simulator that advances several scenes together, which takes less time than one after the other."""
 
     def step_all(self, states: list[State]) -> list[State | SimulationError]: ...
 
 
 class SimulationError(GpeError, RuntimeError):
-    """A solver refused to go on; carries the particle that shows the failure (-1: none in particular) and a reason code."""
+    """A simulator cannot compute the next state.
+
+    Attributes:
+        reason: reason code.
+        node: node that shows the failure, -1 if it is no single one.
+    """
 
     def __init__(self, message: str, *, reason: str = "solver", node: int = -1) -> None:
         super().__init__(message)
@@ -45,7 +50,7 @@ class SimulationError(GpeError, RuntimeError):
 
 @dataclass(frozen=True)
 class Replay:
-    """The oracle: a simulator that steps through a stored trajectory."""
+    """A simulator that steps through a stored trajectory; the oracle."""
 
     trajectory: Trajectory
 
@@ -55,7 +60,7 @@ class Replay:
 
 
 def step_all(simulator: Simulator, states: list[State]) -> list[State | SimulationError]:
-    """One step of every state, together if the simulator can; errors of single scenes are returned, so that the others go on."""
+    """Return the next state of every scene, computed together if the simulator can. Errors of single scenes are returned, so that the others continue."""
     if not states:
         return []
     if isinstance(simulator, BatchSimulator):
@@ -72,7 +77,7 @@ def _step(simulator: Simulator, state: State) -> State | SimulationError:
 
 @runtime_checkable
 class GroundTruth(Protocol):
-    """What tells a ground-truth solver from other simulators: the name and version under which its results are stored, and which scenes it computes."""
+    """A ground-truth solver. Other simulators do not have the name and version under which results are stored, and the scenes that can be computed."""
 
     name: ClassVar[str]
     version: ClassVar[str]
@@ -85,7 +90,7 @@ class GroundTruth(Protocol):
 
 
 def unfit(simulator: Simulator, metadata: Metadata) -> Termination | None:
-    """Why the frames of a solver are not those that the metadata describe, or None: it would step by another time, or read the parameters of others."""
+    """Return the reason if a solver has another frame interval or other materials than the metadata describe; else None."""
     if not isinstance(simulator, GroundTruth):
         return None
     solver, wrong = f"the solver {simulator.name}", ""
@@ -98,14 +103,14 @@ def unfit(simulator: Simulator, metadata: Metadata) -> Termination | None:
 
 @dataclass(frozen=True)
 class Start:
-    """Where a rollout begins and ends.
+    """Start and length of a rollout.
 
     Attributes:
-        state: becomes frame 0.
-        num_steps: frames to add.
-        metadata: of the scene; describes the result.
-        guard: stops the rollout at the first state that cannot be trusted; if that is the first of all, the frame of the termination is 0. A start with
-            values that break the rules of ``schema.FIELDS`` is never trusted.
+        state: initial state, which becomes frame 0.
+        num_steps: number of frames to add.
+        metadata: metadata of the scene, which also describe the result.
+        guard: stops the rollout at the first state that it rejects; frame 0 of a termination is the initial state. Initial values that break the rules of
+            ``schema.FIELDS`` stop a rollout without a guard, too.
     """
 
     state: State
@@ -115,7 +120,7 @@ class Start:
 
 
 def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int, int, State | Termination]]:
-    """Step all scenes side by side and yield (scene, frame, new state), or a ``Termination`` as a scene's last item. Holds one state per scene."""
+    """Advance all scenes together. Yields (scene, frame, new state), or a ``Termination`` as a scene's last item. Keeps one state per scene in memory."""
     live, num_steps, guards = dict[int, State](), dict[int, int](), dict[int, Guard]()
     for scene, start in enumerate(starts):
         guard = None if start.guard is None else start.guard.of(start.state)
@@ -148,13 +153,13 @@ def steps(simulator: Simulator, state: State, num_steps: int) -> Iterator[State]
 def step_scenes(
     simulator: Simulator, states: Mapping[int, State], num_steps: Mapping[int, int], guards: Mapping[int, Guard] | None = None
 ) -> Iterator[tuple[int, int, State | Termination]]:
-    """Yield what ``frames`` yields, for scenes that need no check of their start. This is the time loop: everything that advances a scene calls it.
+    """Yield the items of ``frames`` for scenes whose start needs no check. This is the only time loop: everything that advances scenes calls it.
 
     Args:
-        simulator: steps all scenes together if it can.
-        states: start of each scene, by its number.
-        num_steps: frames to add to each scene.
-        guards: of scenes that have one.
+        simulator: simulator, which advances all scenes together if it can.
+        states: initial state of each scene, by its number.
+        num_steps: number of frames to add to each scene.
+        guards: guards of scenes that have one.
     """
     live, frame = dict(states), 0
     while True:
@@ -178,15 +183,15 @@ def _termination(item: State | SimulationError, frame: int, guard: Guard | None,
 
 
 def rollouts(simulator: Simulator, starts: Sequence[Start], on_frame: Callable[[int, int, State], Any] | None = None) -> list[Trajectory]:
-    """``rollout`` of several scenes side by side; a learned simulator advances them in one pass of its model.
+    """Roll several scenes out together. A learned simulator advances them in one pass of its model.
 
     Args:
         simulator: solver, learned model, baseline or ``Replay``.
-        starts: one per scene.
+        starts: one start per scene.
         on_frame: called with scene, frame number and state.
 
     Returns:
-        One trajectory per start.
+        One trajectory per start, as ``rollout`` returns it.
     """
     is_prediction = not isinstance(simulator, GroundTruth)
     recordings = [_Recording(start, is_prediction) for start in starts]
@@ -198,7 +203,7 @@ def rollouts(simulator: Simulator, starts: Sequence[Start], on_frame: Callable[[
 
 
 class _Recording:
-    """The frames of one scene so far, as arrays of its own."""
+    """Collects the frames of one scene as NumPy arrays."""
 
     def __init__(self, start: Start, is_prediction: bool) -> None:
         self.start, self.is_prediction = start, is_prediction
@@ -256,13 +261,13 @@ def rollout(
     Args:
         simulator: solver, learned model, baseline or ``Replay``.
         state: initial state, which becomes frame 0.
-        num_steps: frames to add.
-        metadata: of the scene; describes the result.
-        guard: stops the rollout at the first state that cannot be trusted.
-        on_frame: called with frame number and state (progress, sinks, watchers).
+        num_steps: number of frames to add.
+        metadata: metadata of the scene, which also describe the result.
+        guard: stops the rollout at the first state that it rejects.
+        on_frame: called with frame number and state.
 
     Returns:
-        Up to ``num_steps + 1`` frames; fewer if it stopped early, with the reason in ``termination``.
+        ``num_steps + 1`` frames; fewer if the rollout stopped early, with the reason in ``termination``.
     """
     see = None if on_frame is None else lambda _, frame, item: on_frame(frame, item)
     return rollouts(simulator, [Start(state, num_steps, metadata, guard)], see)[0]

@@ -1,7 +1,7 @@
-"""What a rollout leaves out because the scene does not need it. Each level is a switch, so that it can be compared with its absence.
+"""Levels of skipping: computations that a rollout can leave out. Each level is a switch, so that rollouts with and without it can be compared.
 
-Exact levels are on by default and change a rollout by rounding at most. Approximate levels (``learned.approximate``) are off by default; evaluation reports
-what they cost in accuracy.
+Exact levels are on by default and change a rollout by rounding at most. Approximate levels (``learned.approximate``) are off by default. Evaluation reports the
+error that they cause.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from pydantic import Field
 
 @dataclass(frozen=True)
 class Skips:
-    """Levels of a learned rollout.
+    """Levels of skipping in a learned rollout.
 
     Attributes:
-        absent_types: exact. Node types and relations that the scene has none of run no code.
-        static_boundary: exact. The boundary is sorted into a search tree once, not in every step.
-        isolated_nodes: exact. Nodes without an edge take no part in message passing.
-        edges_at_once: exact. Edge features and messages are computed for so many edges at a time, which bounds the memory; None: all together.
-        sorted_from: exact. Graphs of so many nodes and more are computed with neighbours near each other in memory; None: none.
-        stress: leaves out the stress that a model decodes beside the motion; the motion stays as it is.
-        sleep_after: approximate. Groups of connected nodes that have been at rest for so many frames stand still until something moves in their
-            reach; None: never.
-        rest_step_spacings, rest_step_change_spacings: a node is at rest when its step within a frame is shorter than the first, and differs from the step
-            before by less than the second [rest spacings]. Learned models tremble: what lies still in the ground truth makes steps of 0.01 to 0.03
-            spacings. What turns in flight is as slow for some frames, and ``sleep_after`` has to be longer.
-        hold: approximate. Frames for which one prediction is held.
+        absent_types: exact. Skip the code of node types and relations that the scene does not have.
+        static_boundary: exact. Build the search tree of the boundary once, not in every step.
+        isolated_nodes: exact. Leave nodes without an edge out of message passing.
+        edges_at_once: exact. Number of edges for which features and messages are computed at a time, which limits the memory; None takes all.
+        sorted_from: exact. Number of nodes from which graphs are sorted so that neighbours are near each other in memory; None never sorts.
+        stress: exact for the motion. Do not decode the stress.
+        sleep_after: approximate. Number of frames at rest after which a group of connected nodes stands still, until something moves within its reach; None
+            stands for never. Choose more frames than a body that turns in flight is this slow.
+        rest_step_spacings: a node at rest moves less than this distance in a frame [rest spacings]. Learned models make steps of 0.01 to 0.03 spacings where
+            the ground truth rests.
+        rest_step_change_spacings: the step of a node at rest differs from the step before by less than this distance [rest spacings].
+        hold: approximate. Number of frames for which one prediction is repeated.
     """
 
     absent_types: bool = True
@@ -44,5 +44,5 @@ class Skips:
 
     @property
     def is_exact(self) -> bool:
-        """Whether a rollout with these levels equals one without, up to rounding."""
+        """Whether a rollout with these levels equals a rollout without them, up to rounding."""
         return self.sleep_after is None and self.hold == 1
