@@ -230,7 +230,7 @@ def mesh_features(
 
 
 def _without_rounding(displacement: Tensor) -> Tensor:
-    """Return displacements with zeros in place of rounding errors of mean positions, so that rows of virtual nodes above a lattice are exactly in line."""
+    """Return displacements with rounding errors of mean positions set to zero, so that virtual nodes above a lattice lie exactly in rows."""
     return torch.where(displacement.abs() < 1e-9, 0.0, displacement)
 
 

@@ -1,4 +1,4 @@
-"""A scene for timing: a jittered lattice of sand without walls, of any size, whose radius is chosen to give a wanted number of edges."""
+"""A scene for timing: a jittered lattice of sand without walls. You choose its numbers of nodes and edges; the radius follows."""
 
 from __future__ import annotations
 

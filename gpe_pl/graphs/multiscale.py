@@ -45,7 +45,7 @@ class MultiscaleGraph:
     Attributes:
         rest_pos: undeformed positions of the nodes of the state [m]; in a periodic domain the images that keep bodies together.
         body: connected body of each point; a node of no cell is a body of its own.
-        level: of each point, 0 for the nodes of the state.
+        level: level of each point, 0 for the nodes of the state.
         parent: virtual node one level up, or -1: roots, nodes of no cell, and the top of bodies that are deeper than the levels asked for.
         cell_edges: pairs of nodes that share a cell, first node lower.
         same_edges: pairs of neighbouring virtual nodes of one level and body, by level.

@@ -29,7 +29,7 @@ class MeshTopology:
         descent: pairs of a virtual node (row 0, numbered through all levels) and a node of the state below it (row 1). The number after the last virtual node
             stands for none.
         rest_pos: undeformed positions of the nodes of the state [m]; in periodic domains the images that keep each body together.
-        shift: what to add to positions so that meshes keep together at the seams of a periodic domain [m]; None: nothing.
+        shift: vector to add to each position so that meshes stay in one piece at the seams of a periodic domain [m]; None stands for zero.
     """
 
     num_virtual: tuple[int, ...]
@@ -60,14 +60,14 @@ class IslandTopology:
 
 @dataclass(frozen=True)
 class Topology:
-    """Everything of a graph that a search decides.
+    """Indices of a graph, which a search finds.
 
     Attributes:
         rows: rows of each material's nodes in the state.
         edges: ``edge_index`` of each relation, as rows of the source's and the target's node store. A relation that is missing has no edges.
-        boundary_rows: boundary nodes of the state that the graph has; None: all.
+        boundary_rows: boundary nodes of the state that the graph has; None stands for all.
         mesh: virtual nodes; None in a scene without cells.
-        islands: connected groups of nodes; None where the graph does not tell them.
+        islands: connected groups of nodes; None without ``GraphConfig.islands``.
         periodicity: axes along which edges take the shortest way around.
     """
 
@@ -92,7 +92,7 @@ def descent_of(parents: list[Int64[Tensor, " _"]], num_virtual: tuple[int, ...])
     node = torch.arange(parents[0].shape[0])
     ancestor, above = node, []
     for parent, size in zip(parents, num_virtual, strict=True):
-        ancestor = torch.cat([parent, parent.new_full((1,), size)])[ancestor]  # what has no ancestor here has none above
+        ancestor = torch.cat([parent, parent.new_full((1,), size)])[ancestor]  # nodes without an ancestor here have none above
         above.append(torch.where(ancestor < size, first + ancestor, total))
         first += size
     return torch.stack([torch.cat(above), node.repeat(len(above))])
