@@ -1,6 +1,6 @@
-"""Learned simulators that skip more than is exact: what rests is left alone, and one prediction serves several frames.
+"""Approximate levels of skipping: nodes at rest are not computed, and one prediction is repeated for several frames.
 
-What a rollout has to remember for this travels in ``State.internal``, so it may stop anywhere and go on.
+The data that this needs between steps are in ``State.internal``, so a rollout can stop at any frame and continue.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from gpe_pl.trajectory.state import State, Stress
 
 
 def approximate(simulator: LearnedSimulator) -> Simulator:
-    """The simulator with the approximate levels that its ``skips`` ask for; itself if they ask for none."""
+    """Return the simulator with the approximate levels of its ``skips``; the same object if there are none."""
     skips, dt = simulator.skips, simulator.builder.metadata.frame_dt
     runner: Simulator = simulator
     if skips.sleep_after is not None:
@@ -34,11 +34,11 @@ def approximate(simulator: LearnedSimulator) -> Simulator:
 
 
 class Batched(ABC):
-    """``step`` from ``step_all``."""
+    """Base class that derives ``step`` from ``step_all``."""
 
     @abstractmethod
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        """The states one frame later, or why there is none."""
+        """Return the states one frame later, or the error of a scene that has none."""
 
     def step(self, state: State) -> State:
         (after,) = self.step_all([state])
@@ -49,21 +49,21 @@ class Batched(ABC):
 
 @dataclass(frozen=True)
 class _Rest:
-    """For how many predictions in a row each node has been at rest [node]."""
+    """Number of predictions in a row for which each node has been at rest [node]."""
 
     count: Tensor
 
 
 class Sleeping(Batched):
-    """Islands at rest stand still and are not computed, until something that is not at rest, a wall included, comes within the graph's radius of them.
+    """Simulator in which islands at rest sleep: they stand still and are not computed until a moving node or wall comes within the graph's radius of them.
 
-    An island (``graphs.islands``, by the radius of the graph) sleeps when the steps of all its nodes have been shorter and more even than
-    ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` in the last ``Skips.sleep_after`` predictions. No pair that pushes each other is
-    thus ever frozen at one end only, and what moves sees its surroundings as before: the model gets all that is within its reach. The momentum that an
-    island still has when it falls asleep is lost; new states report it (``State.lost_impulse``), and how many nodes sleep (``State.num_asleep``).
+    An island (``graphs.islands``, connected by the radius of the graph) sleeps if all its nodes have been at rest in the last ``Skips.sleep_after``
+    predictions, by ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings``. Islands sleep as a whole, so no edge has a sleeping and a moving end.
+    Moving nodes keep their surroundings: the model gets all nodes within its reach. The momentum of an island that falls asleep is lost. New states have the
+    lost momentum (``State.lost_impulse``) and the number of sleeping nodes (``State.num_asleep``).
 
     Args:
-        simulator: whose ``skips`` say when to sleep.
+        simulator: simulator, whose ``skips`` set when islands sleep.
     """
 
     def __init__(self, simulator: LearnedSimulator) -> None:
@@ -81,7 +81,7 @@ class Sleeping(Batched):
         return results
 
     def _awake_and_seen(self, state: State) -> tuple[Tensor, Tensor]:
-        """Nodes that move [node], and those that the model has to see for this, themselves included [node]."""
+        """Return masks [node] of the awake nodes, and of the nodes in the graph for their predictions, which include them."""
         after = self.simulator.skips.sleep_after
         assert after is not None
         is_calm = (_rest_of(state) >= after).cpu().numpy()
@@ -100,12 +100,12 @@ class Sleeping(Batched):
             others = space.from_corner(pos[~awake]) if space else pos[~awake]
             distance, _ = search_tree(pos[awake], space).query(others, distance_upper_bound=reach)
             seen[~awake] = np.isfinite(distance)
-            if len(cells):  # a mesh is seen as a whole
+            if len(cells):  # the graph of a mesh needs all of it
                 seen = _in_the_same_island(seen, islands.label)
         return torch.from_numpy(awake).to(state.pos.device), torch.from_numpy(seen).to(state.pos.device)
 
     def _are_near_a_moving_wall(self, state: State, pos: np.ndarray) -> np.ndarray:
-        """Nodes [node] that a wall which moves in a prescribed way may push."""
+        """Return a mask [node] of the nodes near a wall with a prescribed motion."""
         near = np.zeros(len(pos), dtype=bool)
         if state.boundary.motion is not None:
             moves = (state.boundary.vel != 0).any(dim=1)
@@ -114,7 +114,7 @@ class Sleeping(Batched):
         return near
 
     def _combined(self, state: State, after: State, awake: Tensor, seen: Tensor) -> State:
-        """The state with awake nodes as they are afterwards; the others stand where they are."""
+        """Return the next state: awake nodes are at their new positions, the others stay."""
         pos, vel = state.pos.clone(), torch.zeros_like(state.vel)
         moved = awake[seen]
         pos[awake], vel[awake] = after.pos[moved], after.vel[moved]
@@ -140,7 +140,7 @@ def _rest_of(state: State) -> Tensor:
 
 
 def _in_the_same_island(chosen: np.ndarray, label: np.ndarray) -> np.ndarray:
-    """All nodes of the islands [node] that hold a chosen node [node]."""
+    """Return a mask [node] of all nodes in islands with a chosen node; ``chosen`` is a mask [node]."""
     holds = np.zeros(label.max(initial=-1) + 1, dtype=bool)
     holds[label[chosen]] = True
     return holds[label]
@@ -156,7 +156,13 @@ def _combined_stress(state: State, after: State, awake: Tensor, moved: Tensor) -
 
 @dataclass(frozen=True)
 class _Held:
-    """The accelerations [node, dim] of a prediction, the frames that it still serves, and the internal part of the simulator that made it."""
+    """A prediction that is repeated.
+
+    Attributes:
+        acceleration: accelerations [node, dim] in m/s².
+        frames: number of frames for which it is still to be repeated.
+        inner: ``State.internal`` of the simulator that made it.
+    """
 
     acceleration: Tensor
     frames: int
@@ -164,12 +170,12 @@ class _Held:
 
 
 class Holding(Batched):
-    """Asks a simulator once for every ``frames`` frames and holds its accelerations in between, in which contacts that begin or end go unnoticed.
+    """Simulator that predicts once in ``frames`` frames and repeats the accelerations in between. Contacts that begin or end in between have no effect.
 
     Args:
-        simulator: that predicts.
+        simulator: simulator that predicts.
         dt: frame interval [s].
-        frames: that one prediction serves.
+        frames: number of frames for which one prediction is used.
     """
 
     def __init__(self, simulator: Simulator, dt: float, frames: int) -> None:
@@ -190,7 +196,7 @@ class Holding(Batched):
 
     def _hold(self, state: State, after: State) -> State:
         acceleration = integrators.acceleration(after.vel, state.vel, self.dt)
-        stopped = (after.vel == 0).all(dim=1, keepdim=True)  # as sleeping nodes are: it must not be driven back by what stopped it
+        stopped = (after.vel == 0).all(dim=1, keepdim=True)  # sleeping nodes, for example: the stop must not be repeated
         return replace(after, internal=_Held(torch.where(stopped, 0.0, acceleration), self.frames - 1, after.internal))
 
     def _go_on(self, state: State, held: _Held) -> State:

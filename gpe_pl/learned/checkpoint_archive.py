@@ -1,7 +1,7 @@
-"""Archives of PyTorch that anyone may have written, looked at before their pickle is read.
+"""Checks of PyTorch archives from unknown sources, made before their pickle is read.
 
-PyTorch's safe loading runs no code, but a few bytes in a file can still ask it for gigabytes or for hours: members that unpack to far more than is stored,
-members that share their bytes, empty arrays of any length, keys of tables that are tuples of tuples.
+PyTorch's safe loading runs no code. A few bytes in a file can still make it use gigabytes or run for hours. Such files have members that unpack to far more
+than is stored, members that share their bytes, empty arrays of any length, or keys of tables that are tuples of tuples.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import torch
 from gpe_pl.files.zip_members import num_members
 
 MOST_MEMBERS = 2**16
-"""One for each tensor; the largest run has some thousands."""
+"""Maximum number of members. There is one per tensor; the largest run has some thousands."""
 MOST_PICKLE_BYTES = 2**24
 MOST_VALUES, MOST_LEVELS = 2**20, 32
-"""Of what a checkpoint holds; a value that is referred to in several places counts in each."""
+"""Maximum number of values in a checkpoint, and of levels of nesting. A value that is referred to in several places counts each time."""
 MOST_TUPLES = 16
-"""Levels of tuples within each other; tensors have five."""
+"""Maximum number of levels of nested tuples; tensors have five."""
 
 CALLED = {"collections OrderedDict", "torch._utils _rebuild_tensor_v2", "torch._utils _rebuild_parameter"}
 NAMED = re.compile(r"torch \w+Storage")
@@ -34,16 +34,16 @@ OPCODES = {
     *("SHORT_BINSTRING", "EMPTY_TUPLE", "TUPLE", "TUPLE1", "TUPLE2", "TUPLE3"),
     *("EMPTY_LIST", "APPEND", "APPENDS", "EMPTY_DICT", "SETITEM", "SETITEMS"),
 }
-"""Those that ``torch.save`` writes, which is in protocol 2."""
+"""Opcodes that ``torch.save`` writes, which uses protocol 2."""
 _MARK = (-1, "")
 
 
 def check_archive(path: Path) -> None:
-    """Compare an archive with what ``torch.save`` writes, its checksums included.
+    """Check that an archive is like those that ``torch.save`` writes, and that its checksums match.
 
     Raises:
-        ValueError: it is something else; the message says what.
-        OSError, zipfile.BadZipFile: it is no archive, or damaged.
+        ValueError: the archive has other contents; the message names them.
+        OSError, zipfile.BadZipFile: the file is damaged, or not an archive.
     """
     if (count := num_members(path)) > MOST_MEMBERS:
         raise ValueError(f"{count} members, at most {MOST_MEMBERS} are read")
@@ -66,7 +66,11 @@ def check_archive(path: Path) -> None:
 
 
 def check_pickle(content: bytes) -> None:
-    """Follow a pickle as far as it takes to know what it calls, and how deep its tuples are; raises ``ValueError`` for anything that tensors do not need."""
+    """Interpret a pickle as far as needed to find the functions that it calls and the depth of its tuples.
+
+    Raises:
+        ValueError: the pickle has anything that tensors do not need.
+    """
     stack: list[tuple[int, str]] = []  # levels of tuples in each value, and its name where it is a global
     memo: dict[int, tuple[int, str]] = {}
     argument: Any
@@ -90,13 +94,13 @@ def check_pickle(content: bytes) -> None:
 
 
 def _apply(opcode: pickletools.OpcodeInfo, stack: list[tuple[int, str]]) -> None:
-    """What an opcode takes from the stack, and what it leaves there."""
+    """Apply the effect of an opcode to the stack."""
     taken: list[tuple[int, str]] = []
     for kind in reversed(opcode.stack_before):
         if kind is pickletools.stackslice:
             while (top := stack.pop()) is not _MARK:
                 taken.append(top)
-        elif kind is not pickletools.markobject:  # taken with what lies above it
+        elif kind is not pickletools.markobject:  # the slice above has removed the mark
             taken.append(stack.pop())
     if opcode.name == "REDUCE" and taken[-1][1] not in CALLED:
         raise ValueError(f"a pickle that calls {taken[-1][1][:100] or 'something'}")
@@ -110,10 +114,10 @@ def _apply(opcode: pickletools.OpcodeInfo, stack: list[tuple[int, str]]) -> None
 
 
 def check_values(values: Any) -> None:
-    """Compare what was read with limits before anything goes through it.
+    """Check values that were read against limits on number and depth.
 
     Raises:
-        ValueError: too many values, too deeply nested, or a tensor with fewer values than its shape says.
+        ValueError: there are too many values, they are nested too deeply, or a tensor has fewer values than its shape says.
     """
     count, level = 0, [values]
     for _ in range(MOST_LEVELS):

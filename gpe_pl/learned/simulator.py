@@ -69,12 +69,12 @@ class LearnedSimulator(nn.Module):
         builder: makes the graphs.
 
     Attributes:
-        skips: what steps leave out.
-        holds_parameters: material parameters outside the range of the training data are taken for the nearest trained value, which a network is more to be
-            trusted with than with its own continuation.
-        static_friction: share of what gravity gives within a frame below which what lies on a wall stays where it is (see ``nn.static_friction``); 0: none.
+        skips: levels of skipping.
+        holds_parameters: clamp material parameters outside the range of training to the nearest trained value. A network is less reliable outside this range.
+        static_friction: nodes on a wall keep their positions if they are slower than this fraction of the speed that gravity gives in one frame (see
+            ``nn.static_friction``); 0 switches it off.
 
-    All may be changed at any time; a checkpoint that ``save`` writes keeps ``static_friction`` alone.
+    You may change these attributes at any time. A checkpoint that ``save`` writes keeps ``static_friction`` only.
     """
 
     model: Model
@@ -89,7 +89,7 @@ class LearnedSimulator(nn.Module):
         self.model, self.builder = model, builder
         self._static_friction = 0.0
         self._warned: set[str] = set()
-        self._unknown: list[str | EdgeType] | None = None  # not looked for yet
+        self._unknown: list[str | EdgeType] | None = None  # None: not determined yet
         self.standardizer = GraphStandardizer(builder.spec)
         self.register_buffer("acceleration_std", torch.ones((), dtype=torch.float64))
         self.register_buffer("stress_std", torch.ones((), dtype=torch.float64))
@@ -104,7 +104,7 @@ class LearnedSimulator(nn.Module):
         return torch.tensor([[-torch.inf], [torch.inf]], dtype=torch.float64).repeat(1, len(self.builder.spec.materials))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        state_dict.setdefault(f"{prefix}trained_mass", self._any_mass())  # which the models that come with the package do not know
+        state_dict.setdefault(f"{prefix}trained_mass", self._any_mass())  # shipped models lack it
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     @property
@@ -137,7 +137,7 @@ class LearnedSimulator(nn.Module):
     @static_friction.setter
     def static_friction(self, share: Any) -> None:
         if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
-            raise ValueError(f"static_friction={share!r}: must be a number from 0 to less than 1, a share of gravity")
+            raise ValueError(f"static_friction={share!r}: must be a number from 0 to less than 1, a fraction of gravity")
         if share and not self.builder.spec.islands:
             raise SceneError(f"static_friction={share:g}: needs a model that was trained with graph.islands=true; 0 turns it off")
         self._static_friction = float(share)
@@ -153,13 +153,16 @@ class LearnedSimulator(nn.Module):
     ) -> None:
         """Set feature statistics, the range of material parameters, and the scales of acceleration and stress from training graphs with ``target``.
 
-        Each scale is one scalar for all axes or components and all materials, with mean zero. Materials and relations without statistics are named in a
-        warning.
+        Each scale is one scalar for all axes or components and all materials; no mean is subtracted. A warning names materials and relations without
+        statistics.
 
         Args:
-            graphs: a sample of the training data; as a ``StatisticsSample``, it knows more graphs of what is rare.
-            parameter_ranges: lowest and highest value [2, param] of each material's parameters in all of them; by default in the sample.
-            trained_scene: what all of their scenes have, as in ``scene_ranges``; by default nothing is known of it.
+            graphs: sample of the training data; a ``StatisticsSample`` can provide more graphs of rare materials and contacts.
+            parameter_ranges: lowest and highest value [2, param] of each material's parameters in all training data; None takes those of the sample.
+            trained_scene: range of gravity and boundary nodes in all training scenes, as in ``scene_ranges``; None leaves it unlimited.
+
+        Raises:
+            ValueError: all accelerations are zero, or some are not finite.
         """
         sample = graphs if isinstance(graphs, StatisticsSample) else StatisticsSample(list(graphs))
         self._unknown = None
@@ -191,12 +194,11 @@ class LearnedSimulator(nn.Module):
 
     @torch.no_grad()
     def start_from(self, trained: LearnedSimulator) -> None:
-        """Take over what another simulator has learned, with the statistics that its weights are made for, as far as it has them; trained ranges then
-        cover both.
+        """Copy the weights and statistics of another simulator. Statistics that it lacks are kept. Trained ranges then cover both trainings.
 
         Raises:
-            SceneError: the other one was trained on another frame interval, spacing, dimension or materials.
-            CheckpointError: it is another model, or makes other graphs; names the settings to choose.
+            SceneError: the other simulator was trained with another frame interval, spacing, dimension or materials.
+            CheckpointError: the other simulator has another model or other graphs; names the settings to choose.
         """
         trained.check_scene(self.builder.metadata)
         there, now = trained._choices(), self._choices()
@@ -208,12 +210,12 @@ class LearnedSimulator(nn.Module):
         scene, mass = self.trained_scene.cpu().numpy().copy(), self.trained_mass.clone()
         try:
             self.load_state_dict(trained.state_dict())
-        except RuntimeError as error:  # one set of weights per level of a mesh, and meshes of other sizes
+        except RuntimeError as error:  # weights per level of a mesh, and another number of levels
             raise CheckpointError(f"the model to start from has meshes of other sizes ({reason(error)})") from None
         statistics.take_over(self.standardizer)
         self.standardizer, self._unknown = statistics, None
         for material, values in self.trained_ranges():
-            known = [r for r in (values.clone(), ranges[material]) if bool(r.isfinite().all())]  # of materials that a training had
+            known = [r for r in (values.clone(), ranges[material]) if bool(r.isfinite().all())]  # of trainings with this material
             if known:
                 values[0].copy_(torch.stack(known).amin(dim=0)[0])
                 values[1].copy_(torch.stack(known).amax(dim=0)[1])
@@ -222,7 +224,7 @@ class LearnedSimulator(nn.Module):
         self.trained_mass[1] = torch.maximum(mass[1], self.trained_mass[1])
 
     def _choices(self) -> dict[str, str]:
-        """Overrides that make such a model and such graphs; the radius in spacings, whether the graph's or the data set's."""
+        """Return the overrides that choose this model and these graphs. The radius is given in spacings, even if it is the data set's."""
         own = self.description()
         spacings = {"connectivity_spacings": float(f"{self.builder.scales.radius / self.builder.scales.spacing:.6g}")}
         parts = {"model": {"_target_": own["model"], **own["settings"]}, "graph": own["graph"] | spacings}
@@ -238,7 +240,7 @@ class LearnedSimulator(nn.Module):
             yield material, self.get_buffer(f"trained_{material}")
 
     def described_training(self) -> Iterator[tuple[str, str]]:
-        """What training had of material parameters, masses, gravity and boundary nodes: a name and its values with their unit, for each kind of value."""
+        """Yield a name, and the range in training with its unit, for each material parameter, mass, gravity and property of boundary nodes."""
         for material, trained in self.trained_ranges():
             spec = MATERIALS[material]
             for low, high in trained.T.tolist():
@@ -249,7 +251,7 @@ class LearnedSimulator(nn.Module):
         yield from described(self.trained_scene.cpu().numpy())
 
     def untrained_parameters(self, state: State) -> list[str]:
-        """What in a scene lies outside the range of the training data: one line per material parameter, empty if nothing does."""
+        """Return one line for each material parameter of a scene that is outside the range of training."""
         return [line for _, line in self._outside_parameters(state)]
 
     def _outside_parameters(self, state: State) -> Iterator[tuple[str, str]]:
@@ -264,7 +266,7 @@ class LearnedSimulator(nn.Module):
                 yield kind, f"{kind} is {values[is_outside][0].item():g} {spec.unit}, trained were {low:g} to {high:g}"
 
     def untrained_scene(self, state: State) -> list[str]:
-        """What masses, gravity and boundary nodes of a scene are that training had not: one line per kind of value, empty if there is nothing."""
+        """Return one line for each kind of mass, gravity and property of boundary nodes of a scene that is outside the range of training."""
         return [line for _, line in self._outside_scene(state)]
 
     def _outside_scene(self, state: State) -> Iterator[tuple[str, str]]:
@@ -289,14 +291,14 @@ class LearnedSimulator(nn.Module):
         A warning names material parameters, gravity and boundary nodes outside the range of training, and another version of the solver, once per kind.
 
         Raises:
-            IndexError: too few frames before ``frame``.
-            SceneError: another frame interval, dimension or material than in training, or a value that is not finite; names the node.
+            IndexError: there are too few frames before ``frame``.
+            SceneError: the frame interval, dimension or materials differ from training, or a value is not finite; names the node.
         """
         self.check_scene(trajectory.metadata)
         own, scene = self.builder.metadata, trajectory.metadata
         if scene.solver == own.solver and scene.solver_version != own.solver_version:
             version = f"version {scene.solver_version} of the solver {scene.solver}, in training version {own.solver_version}"
-            self._warn_once("solver", f"the ground truth is of {version}, whose trajectories differ")
+            self._warn_once("solver", f"the ground truth is from {version}, whose trajectories differ")
         state = trajectory.state(frame, history=self.builder.config.history).to_torch(self.acceleration_std.device)
         return self._checked(state, f"frame {frame}")
 
@@ -348,7 +350,7 @@ class LearnedSimulator(nn.Module):
                 if wrong.any():
                     node, value = int(rows[wrong][0]), float(column[wrong][0])
                     raise SceneError(f"node {node} ({material}): {spec.name} is {value:g} {spec.unit}, must be {spec.rule}")
-        held = "; taken for the nearest trained value" if self.holds_parameters else ""
+        held = "; clamped to the nearest trained value" if self.holds_parameters else ""
         found = [(kind, line + held) for kind, line in self._outside_parameters(state)]
         for kind, line in (*found, *self._outside_scene(state)):
             self._warn_once(kind, line)
@@ -460,11 +462,11 @@ class LearnedSimulator(nn.Module):
 
     @classmethod
     def _check_size(cls, description: dict[str, Any], weights: dict[str, Tensor]) -> None:
-        """Raise ``ValueError`` where weights are not those of a description, before a model of any size is made of it."""
+        """Raise ``ValueError`` if weights do not have the names, shapes and types of a description. This allocates no memory for the model."""
         try:
             with torch.device("meta"):
                 expected = cls.from_description(description).state_dict()
-        except RuntimeError:  # of a model that looks at its own values while it is made; any other comes again
+        except RuntimeError:  # the constructor of a model reads its values; other errors will be raised again
             return
         for name, value in weights.items():
             if name in expected and value.shape != expected[name].shape:
@@ -510,7 +512,11 @@ class LearnedSimulator(nn.Module):
 
     @classmethod
     def from_description(cls, values: dict[str, Any]) -> LearnedSimulator:
-        """Rebuild from ``description``; raises ``ValueError`` for anything else."""
+        """Return a simulator rebuilt from ``description``.
+
+        Raises:
+            ValueError: ``values`` are not such a description.
+        """
         check_plain(values)
         if values.get("format") != CHECKPOINT_FORMAT:
             raise ValueError(f"checkpoint format {values.get('format')!r}, this version reads {CHECKPOINT_FORMAT}")
@@ -523,7 +529,7 @@ class LearnedSimulator(nn.Module):
         return simulator
 
     def save(self, path: Path | str) -> None:
-        """Write weights and description alone, which ``from_checkpoint`` reads, atomically; a training checkpoint also holds the optimiser's state."""
+        """Write weights and description, atomically, for ``from_checkpoint``. A training checkpoint also has the optimiser's state."""
         weights = {f"simulator.{name}": value.detach().cpu().clone() for name, value in self.state_dict().items()}
         content = io.BytesIO()  # PyTorch's own writer aborts the process on a full disk
         torch.save({"simulator": self.description(), "state_dict": weights}, content)
@@ -531,14 +537,16 @@ class LearnedSimulator(nn.Module):
 
     @classmethod
     def from_checkpoint(cls, path: Path | str, device: Any = "cpu") -> LearnedSimulator:
-        """Load a training checkpoint (averaged weights if the run averaged them), in evaluation mode. Only tensors and plain values are unpickled.
+        """Return the simulator of a checkpoint, in evaluation mode. If the run averaged its weights, it has the averages.
+
+        Only tensors and plain values are unpickled.
 
         Args:
-            path: of the file; or a run's folder, of which the best checkpoint is taken; or the name of a model that comes with the package.
-            device: where to.
+            path: path of the file, folder of a run, whose best checkpoint is loaded, or name of a shipped model.
+            device: device of the simulator.
 
         Raises:
-            CheckpointError: not a readable checkpoint of gpe_pl, damaged, or one of another model.
+            CheckpointError: the file is damaged, not a checkpoint of gpe_pl, or one of another model.
         """
         path = checkpoint_path(path)
         checkpoint = load_checkpoint(path, device)
@@ -556,13 +564,13 @@ class LearnedSimulator(nn.Module):
 
 
 def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:
-    """What is in a checkpoint; only tensors and plain values are unpickled, and the checksums of the archive are compared first, which PyTorch does not.
+    """Return the content of a checkpoint. Only tensors and plain values are unpickled. The checksums of the archive are compared first; PyTorch does not do so.
 
     Raises:
-        CheckpointError: no such file, damaged, or with anything else in it.
+        CheckpointError: the file does not exist, is damaged, or has any other content.
     """
     if not Path(path).is_file():
-        shipped = f", or a model that comes with the package: {', '.join(names())}" if names() else ""
+        shipped = f", or a shipped model: {', '.join(names())}" if names() else ""
         raise CheckpointError(f"{path}: no such checkpoint; give the folder of a run, the path of a checkpoint{shipped}")
     try:
         check_archive(Path(path))

@@ -504,7 +504,7 @@ def test_material_parameters_outside_the_training_data_are_named(caplog: pytest.
     assert again.untrained_parameters(replace(state, material_params=params)) == [line]
     for _ in range(2):  # a rollout in Python has no other way to learn of it; once is enough
         again.standing(replace(state, material_params=params), build.metadata)
-    assert [r.getMessage() for r in caplog.records] == [f"outside the training data: {line}; taken for the nearest trained value"]
+    assert [r.getMessage() for r in caplog.records] == [f"outside the training data: {line}; clamped to the nearest trained value"]
 
 
 def test_the_trained_range_is_that_of_all_data_where_graphs_are_a_sample() -> None:

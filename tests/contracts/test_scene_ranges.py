@@ -230,4 +230,4 @@ def test_another_version_of_the_solver_is_warned_of(new_trajectory: Callable[...
         for frame in (3, 4):
             simulator.initial_state(trajectory, frame)
     (line,) = [r.getMessage() for r in caplog.records if "solver" in r.getMessage()]
-    assert line.startswith("outside the training data: the ground truth is of version 2 of the solver random, in training version 1")
+    assert line.startswith("outside the training data: the ground truth is from version 2 of the solver random, in training version 1")

@@ -25,7 +25,7 @@ MAX_CELLS = 12
 # After four steps of training a rollout may well go wrong; two training scenes have few of the parameters that are asked for; models that come with the
 # package may be older than the solver.
 TRUE_OF_MINIATURES = re.compile(
-    r"(val|test|test_unseen) \d+ stopped: \w+, frame \d+: |outside the training data: (friction_angle of sand is |the ground truth is of version )"
+    r"(val|test|test_unseen) \d+ stopped: \w+, frame \d+: |outside the training data: (friction_angle of sand is |the ground truth is from version )"
 )
 
 # Everything as small as it goes: every split and both kinds of unseen parameters, few particles, frames and steps.

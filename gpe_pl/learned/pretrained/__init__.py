@@ -1,4 +1,4 @@
-"""Trained simulators that come with the package: ``{name}.ckpt``, and its model card ``{name}.md``."""
+"""Shipped models: trained simulators ``{name}.ckpt`` with their model cards ``{name}.md``."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from gpe_pl.files.names import portable
 FOLDER = Path(__file__).parent
 SUFFIX = ".ckpt"
 BEST = Path("checkpoints") / f"best{SUFFIX}"
-"""Of a run, relative to its folder."""
+"""Path of the best checkpoint in the folder of a run."""
 
 
 def names() -> list[str]:
-    """What can be named in the place of a checkpoint's path."""
+    """Return the names of the shipped models, which can be given instead of a checkpoint's path."""
     return sorted(path.stem for path in FOLDER.glob(f"*{SUFFIX}"))
 
 
 def checkpoint_path(checkpoint: Path | str) -> Path:
-    """The file of a shipped model, the best checkpoint of a run's folder, or the path itself if it is neither."""
+    """Return the path of a checkpoint, given by its path, the name of a shipped model, or the folder of a run, whose best checkpoint is taken."""
     if str(checkpoint) in names():
         return FOLDER / f"{checkpoint}{SUFFIX}"
     path = Path(checkpoint)
@@ -27,13 +27,16 @@ def checkpoint_path(checkpoint: Path | str) -> Path:
 
 
 def fingerprint(checkpoint: Path | str) -> str:
-    """What a configuration knows a checkpoint by, wherever it lies: its file's name and the beginning of its checksum."""
+    """Return the text that identifies a checkpoint in configurations, independent of its folder: the file's name and the beginning of its checksum."""
     path = checkpoint_path(checkpoint)
     return f"{path.name} (sha256 {sha256(path.read_bytes()).hexdigest()[:12]})"
 
 
 def model_name(checkpoint: Path | str | None, runs: Path | str) -> str:
-    """What a model is called in the name of a folder: as it is shipped, or as its run below the folder ``runs``, ``_`` for ``/``. It is ``names.portable``."""
+    """Return the name of a model for use in folder names: that of a shipped model, or the path of its run below ``runs`` with ``_`` for ``/``.
+
+    All characters are allowed in file names (``names.portable``).
+    """
     if checkpoint is None or str(checkpoint) in names():
         return str(checkpoint)
     path = Path(checkpoint).resolve()
