@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import multiprocessing
 import os
@@ -203,7 +204,10 @@ def _run_command(command: str, arguments: list[str], output: str, prepare: Calla
     if prepare is not None:
         prepare()
     sys.argv = [command, *arguments]
-    runpy.run_module(f"gpe_pl.{command}", run_name="__main__", alter_sys=True)
+    try:
+        runpy.run_module(f"gpe_pl.{command}", run_name="__main__", alter_sys=True)
+    finally:
+        atexit._run_exitfuncs()  # a process of multiprocessing ends without them, and leaves locks behind
 
 
 def waited(process: Any, seconds: float) -> bool:

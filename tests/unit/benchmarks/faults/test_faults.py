@@ -104,6 +104,13 @@ def test_small_files_and_archives(tmp_path: Path, step: int) -> None:
 # --- and it is seen when it is not ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
+def test_a_refused_command_releases_its_folder(tmp_path: Path) -> None:
+    ended = isolation.run("fit", ["seed=-1", f"paths.runs={tmp_path}", f"paths.data={tmp_path}"])
+    assert ended.code == 2 and "seed=-1" in ended.output
+    assert runs.leftovers(tmp_path) == []
+
+
 def test_judges_tell_what_came_of_it() -> None:
     def fails(error: Exception) -> None:
         raise error
