@@ -38,7 +38,7 @@ def test_lines_without_an_encoding_are_found() -> None:
 
 
 def test_a_command_prints_utf8_in_a_latin_locale(tmp_path: Path) -> None:
-    """The line holds characters that Latin-1 has not, and a name that is no UTF-8."""
+    """The line has characters that Latin-1 lacks, and a name that is not UTF-8."""
     environment = {**os.environ, "PYTHONIOENCODING": "latin-1", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
     command = [sys.executable, "-m", "gpe_pl.data.validate", str(tmp_path / "größe … 数")]
     child = subprocess.run(command, capture_output=True, cwd=ROOT, env=environment, check=False)

@@ -100,7 +100,7 @@ def single_simulator(build: GraphBuilder, island_momentum: Any = "ignored") -> L
 
 @pytest.mark.parametrize("skips", [Skips(), Skips(edges_at_once=7, sorted_from=1), EVERYTHING])
 def test_bodies_with_loose_nodes_do_not_push_themselves(skips: Skips) -> None:
-    """Also several scenes at once, and as the program that is exported."""
+    """Also tests several scenes at once, and the exported program."""
     build = builder(("elastomer",))
     simulator, s = single_simulator(build), with_loose_nodes().to_torch()
     simulator.skips = skips
@@ -137,7 +137,7 @@ def test_sand_at_bodies_with_loose_nodes_keeps_the_momentum_that_is_asked_for(is
 
 
 def test_a_loose_node_moves_with_the_body_that_it_lies_beside_at_rest() -> None:
-    """Directly or by others of its material; where there is none it is a body of its own."""
+    """It lies beside the body directly, or through other loose nodes of its material. Without a body beside it, it is a separate body."""
     points: list[list[float]] = [[0, 0], [1, 0], [1, 1], [0, 1], [8, 0], [9, 0], [9, 1], [8, 1]]  # two cells
     points += [[2, 0], [3.5, 0], [10, 0], [20, 0]]  # beside the first, beside that one, beside the second, far from all
     points += [[11.5, 0], [13, 0]]  # sand, and an elastomer beside sand alone

@@ -117,7 +117,7 @@ def test_nodes_of_other_masses_are_warned_of(factor: float, caplog: pytest.LogCa
 
 
 def test_an_obstacle_with_wider_gaps_than_the_walls_is_warned_of() -> None:
-    """Few of many nodes, so that the typical spacing is that of training; nodes that are cut out where shapes meet are none."""
+    """The obstacle has few of many nodes, so the typical spacing stays that of training. Nodes left out where shapes meet make no gap."""
     simulator, space = trained(ONE), scenes.SPACING
     ball = Sphere((0.5, 0.4), 0.15, 0.3)
     whole = Boundary.sample((*WALLS, ball), space, 2)

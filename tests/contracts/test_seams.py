@@ -215,7 +215,7 @@ FLOORS = {
 @pytest.mark.parametrize("knows", [True, False])
 @pytest.mark.parametrize("corners", FLOORS.values(), ids=FLOORS)
 def test_a_polygon_from_seam_to_seam_has_no_face_there(corners: Any, knows: bool) -> None:
-    """It is as deep at the seam as its image beside it says, and no boundary node lies in it; where its ends differ, a step is left."""
+    """Its depth at the seam is that of its adjacent image, and no boundary node lies inside. If its ends differ, a step remains."""
     floor = Polygon(corners, 0.3)
     (here,) = repeated((floor,), CHANNEL)
     long = [Polygon(tuple((x + shift, y) for x, y in corners), 0.3) for shift in (-0.8, 0.0, 0.8)]

@@ -139,7 +139,7 @@ def from_a_file(part, folder):
 
 @pytest.mark.parametrize("way", ["frame", "first frame of a part", "first frame of a stored part", "stored frames"])
 def test_stored_frame_is_continued_or_refused(case, way, tmp_path):
-    """A stored frame has positions and velocities only. A solver that needs more refuses it; the others go on as if they had not stopped."""
+    """A stored frame has positions and velocities only. Solvers that need more refuse it; others continue as if they had not stopped."""
     solver, state = case
     whole = rollout(solver, state, 30, metadata(solver.materials, state.dim))
     if way == "stored frames":

@@ -310,7 +310,7 @@ def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(
 def test_one_corrupted_batch_does_not_end_a_run(
     tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, push_share: float
 ) -> None:
-    """It is named and changes nothing: weights and moments are those of the step before."""
+    """The batch is named and changes nothing: weights and moments stay those of the step before."""
     plain = TrainingModule.training_step
     weights: dict[int, list[torch.Tensor]] = {}
 

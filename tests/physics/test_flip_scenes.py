@@ -183,7 +183,7 @@ def test_volume_at_rest_in_the_bowl_of_the_data(physics, size, cells, count, lim
 
 @pytest.mark.parametrize("frame_dt", [0.02, 5e-3])
 def test_numerical_viscosity(physics, frame_dt):
-    """A weak shear wave inside a free body that is nearly inviscid decays by the share of the grid's velocity alone, whatever the time step."""
+    """A weak shear wave inside a nearly inviscid free body decays only by the fraction of the grid's velocity, for any time step."""
     wave, duration = 4 * math.pi, 0.2
     solver = FLIP(bounds=unit(2), grid_spacing=1 / 32, frame_dt=frame_dt)
 

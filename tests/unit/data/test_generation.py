@@ -398,7 +398,7 @@ def test_small_disk_is_refused_before_anything_is_written(tmp_path):
 
 @pytest.mark.parametrize("materials", [("sand",), ("sand", "snow", "elastomer")])
 def test_sheet_shows_the_first_scene_with_all_materials(monkeypatch, materials):
-    """It looks no further than it must: at no scene where there is one material, else up to the first with all of them."""
+    """The search is short: with one material it looks at no scene, else it stops at the first scene with all materials."""
     scene = replace(SCENE, materials=materials, max_bodies=3)
     values = {"sand": (20.0, 30.0), "snow": (5.0, 8.0), "elastomer": (5e4, 1e5)}
     parameters = {m: ParameterValues(seen=values[m]) for m in materials}

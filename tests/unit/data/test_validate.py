@@ -382,7 +382,7 @@ def test_report_counts_disturbed_islands(
 
 
 def test_an_island_that_was_tied_a_frame_ago_is_not_in_free_flight(new_trajectory: Callable[..., Trajectory]) -> None:
-    """Its last velocity still holds the push of the wall. Without any free island the report says that nothing was tested."""
+    """Its last velocity still contains the push of the wall. Without any free island, the report says that nothing was tested."""
     t = falling(new_trajectory, 0.1)
     pos = t.pos.copy()
     pos[::2, :2, 1] -= 0.55  # at the floor in every second frame

@@ -109,7 +109,7 @@ def test_graphs_of_programs_are_those_of_the_builder(kind: str) -> None:
 
 @pytest.mark.parametrize("loose", [False, True])
 def test_descent_follows_from_parents(loose: bool) -> None:
-    """Also where a mesh has nodes of no cell, and bodies whose root lies below the highest level."""
+    """This also holds for nodes without a cell, and for bodies whose root is below the highest level."""
     state = scenes.mesh_state("lattice", ("elastomer",), num_bodies=3)
     assert state.cells is not None
     cells = state.cells[::3] if loose else state.cells

@@ -19,7 +19,7 @@ def test_what_json_writes_is_read(values: Any) -> None:
 
 
 def test_numbers_that_are_none_are_read() -> None:
-    """They mean something in some places, and those who use them say where."""
+    """NaN and infinity have a meaning in some fields; the callers check which."""
     assert math.isnan(parsed("NaN")) and parsed("-Infinity") == -math.inf
 
 

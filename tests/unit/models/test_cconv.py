@@ -118,7 +118,7 @@ def test_uses_nothing_of_edges_but_where_the_neighbour_is() -> None:
 
 @pytest.mark.parametrize("features", ["paper", "contact"])
 def test_offset_is_the_displacement_over_the_radius(features: str) -> None:
-    """Also after standardisation, whatever edges carry besides."""
+    """This also holds after standardisation, and with any other edge features."""
     build = scenes.builder(features=features)
     s = scenes.state()
     data = build(s.to_torch())

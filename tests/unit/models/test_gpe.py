@@ -199,7 +199,7 @@ def test_affine_embedding_interpolates_as_the_paper_says(kind: str) -> None:
 
 @pytest.mark.parametrize("interaction", ["odd", "odd_even"])
 def test_odd_interactions_are_mirror_free_without_any_rule(interaction: str) -> None:
-    """Also edges whose displacement is exactly zero, where a geometric rule has nothing to hold on to."""
+    """This includes edges with zero displacement, for which a geometric rule has no direction."""
     build = scenes.builder()
     s = scenes.state(20)
     pos = s.pos.copy()

@@ -61,7 +61,7 @@ def test_oracle_survives_hundreds_of_inexact_time_steps(new_trajectory: New) -> 
 
 
 def test_part_of_a_trajectory_knows_when_it_begins(trajectory: Trajectory) -> None:
-    """Also one that was predicted from a frame after the first."""
+    """This also holds for a prediction that starts after the first frame."""
     dt, part = trajectory.metadata.frame_dt, trajectory.frames(2)
     assert [part.state(k).time for k in (0, 3)] == pytest.approx([2 * dt, 5 * dt])
     assert part.frames(-2).state(0).time == pytest.approx((trajectory.num_frames - 2) * dt)
@@ -191,7 +191,7 @@ def test_a_path_around_an_obstacle_is_no_tunnel(new_trajectory: New) -> None:
 
 @pytest.mark.parametrize("way", [0.24, 0.6])
 def test_a_thin_obstacle_is_seen_on_a_way_of_any_length(new_trajectory: New, way: float) -> None:
-    """Also where another node is much faster."""
+    """This also holds if another node is much faster."""
     two = new_trajectory(num_nodes=2, gravity=(0.0, 0.0))
     before = replace(two.state(0), pos=np.array([[0.38, 0.05], [0.5, 0.5]]))
     after = replace(before, pos=np.array([[0.38 + way, 0.05], [1e4, 0.5]]))

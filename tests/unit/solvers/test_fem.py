@@ -60,7 +60,7 @@ def test_same_input_gives_same_bytes(case):
 
 
 def test_restart_equals_run_through(case):
-    """Positions and velocities are the whole state; a prepared mesh is none of it."""
+    """The state consists of positions and velocities only; a prepared mesh is not part of it."""
     fem, state = case
     middle = run(fem, state, 20)
     assert middle.internal is None
@@ -111,7 +111,7 @@ def test_translation(case):
 
 
 def test_forces_are_the_slope_of_the_energy(case):
-    """Also where cells are crushed and inverted."""
+    """This also holds for crushed and inverted cells."""
     fem, state = case
     mesh = build_mesh(state.rest_pos, state.cells, state.mass)
     lam, mu = (np.full(len(state.cells), x) for x in lame_parameters(1e6, fem.poisson_ratio))
@@ -208,7 +208,7 @@ def falling_square(shapes, *, velocity=(0.0, -1.0), damping=0.2, low=(0.4, 0.5))
 
 @pytest.mark.parametrize("shape", ["spike", "box"])
 def test_corner_between_nodes_holds_the_edge(shape):
-    """An obstacle narrower than the mesh is fine, under the middle of an edge: it neither passes between the nodes nor sticks out on the inside."""
+    """An obstacle narrower than the mesh supports the middle of an edge. It does not pass between the nodes or stick out on the inside."""
     obstacle = {
         "spike": Polygon(((0.43, 0.2), (0.47, 0.2), (0.45, 0.4)), STICKY),
         "box": Box((0.44, 0.1), (0.46, 0.4), STICKY),

@@ -232,7 +232,7 @@ def test_particles_inside_a_solid_come_out():
 
 
 def test_several_viscosities_in_one_scene():
-    """Each particle has its own: the thick half of a falling liquid is left behind by the thin one when both spread on the floor."""
+    """Each particle has its own viscosity: when a liquid spreads on the floor, its thin half moves further than its thick half."""
     lattice = np.stack(np.meshgrid(np.arange(16), np.arange(16), indexing="ij"), axis=-1).reshape(-1, 2) / 32 + 1 / 64
     pos = lattice + np.array([0.25, 0.0])
     thick = pos[:, 0] < 0.5
@@ -299,7 +299,7 @@ def test_boundaries_that_do_not_fit_are_refused():
 
 @pytest.mark.parametrize("seed", range(6))
 def test_anything_finite_gives_a_state_in_the_domain_or_a_typed_error(seed):
-    """Few or many particles, clumped or spread, of any mass, viscosity, speed and gravity, also inside obstacles."""
+    """States have few or many particles, clumped or spread, of any mass, viscosity, speed and gravity, some of them inside obstacles."""
     rng = np.random.default_rng(seed)
     dim = 2 + seed % 2
     count = int(rng.integers(1, 300))

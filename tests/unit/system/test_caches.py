@@ -95,7 +95,7 @@ def compiled_functions(tree: ast.Module) -> Iterator[ast.FunctionDef]:
 
 @pytest.mark.parametrize("path", [path for path in MODULES if "njit" in path.read_text(encoding="utf-8")], ids=dotted)
 def test_what_compiled_functions_are_made_of_counts(path: Path) -> None:
-    """Their own file and every file of the package from which they take a name."""
+    """``caches.COMPILED`` covers the file of each compiled function and every file of the package from which the function takes a name."""
     sources = {source for pattern in caches.COMPILED for source in (ROOT / "gpe_pl").glob(pattern)}
     tree = ast.parse(path.read_text(encoding="utf-8"))
     functions = [*compiled_functions(tree)]

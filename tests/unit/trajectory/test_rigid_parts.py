@@ -80,7 +80,7 @@ def test_a_small_wheel_with_a_hub_turns_as_a_whole_in_a_wide_domain(radius: floa
 
 
 def test_bodies_that_part_later_are_two() -> None:
-    """They leave together; after half of the time one of them begins to turn. They also lie within each other, so that nearness tells nothing."""
+    """The parts move together; after half of the time, one of them begins to turn. They lie within each other, so distance cannot separate them."""
     body, normal = disc((0.3, 0.3), 0.1)
     other, other_normal = disc((0.32, 0.3), 0.105, 11)
     shift = np.stack([0.4 * TIME, 0.1 * TIME], axis=1)[:, None]

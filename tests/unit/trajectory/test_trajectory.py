@@ -95,7 +95,7 @@ def test_only_some_frames(shard: Path, trajectory: Trajectory) -> None:
 
 
 def test_a_part_remembers_when_it_begins(tmp_path: Path, trajectory: Trajectory) -> None:
-    """Also from the end, as a part of a part, and with a checksum; whole trajectories have no such attribute."""
+    """This also holds for parts from the end, parts of parts and with a checksum. Whole trajectories do not have the attribute."""
     dt, last = trajectory.metadata.frame_dt, trajectory.num_frames - 1
     write_shard(tmp_path / "part.h5", [trajectory, trajectory.frames(1)])
     whole, part = (read_trajectory(tmp_path / "part.h5", name, verify=True) for name in ("00000", "00001"))

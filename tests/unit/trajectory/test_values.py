@@ -128,7 +128,7 @@ BROKEN_SHAPES: list[tuple[Shape, str]] = [
 def test_shapes_that_break_a_rule_are_refused_by_the_reader_and_by_rollouts(
     tmp_path: Path, trajectory: Trajectory, shape: Shape, message: str
 ) -> None:
-    """The distance to one that is not a number is none, and containment would let everything through."""
+    """The distance to a shape with NaN is NaN, so containment would let all nodes through."""
     broken = replace(trajectory, boundary=replace(trajectory.boundary, shapes=(BALL, shape)))
     write_shard(tmp_path / "a.h5", [broken])
     with pytest.raises(UnsoundError, match=rf"a\.h5:00000: shape 1 .*{message}"):
@@ -205,7 +205,7 @@ def test_parameters_are_not_negative_and_positive_where_they_enter_by_their_loga
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_the_largest_numbers(dtype: Any, trajectory: Trajectory) -> None:
-    """Also many that are allowed, whose squares overflow in sum."""
+    """Many allowed numbers pass, although the sum of their squares overflows."""
     for factor, number in ((0.999, 0), (1.001, 1)):
         pos = np.full((3, 100, 2), factor * LARGEST, dtype)
         assert len(list(faults({"pos": pos}, (), (), ()))) == number

@@ -83,7 +83,7 @@ def test_outer_faces_point_outward_and_know_their_cell(mesh, dim):
 
 
 def test_cells_are_drawn_by_their_kind(mesh, dim):
-    """Surfaces as they are; of volumes the faces that only one has, also where triangles meet the faces of hexahedra."""
+    """Surface cells are drawn unchanged. Volume cells show the faces that only one cell has, even where triangles meet faces of hexahedra."""
     number = np.arange(27).reshape(3, 3, 3)
     if dim == 2:
         mixed = replace(
