@@ -215,7 +215,7 @@ class LearnedSimulator(nn.Module):
         statistics.take_over(self.standardizer)
         self.standardizer, self._unknown = statistics, None
         for material, values in self.trained_ranges():
-            known = [r for r in (values.clone(), ranges[material]) if bool(r.isfinite().all())]  # of trainings with this material
+            known = [r for r in (values.clone(), ranges[material]) if bool(r.isfinite().all())]  # skips ranges never set
             if known:
                 values[0].copy_(torch.stack(known).amin(dim=0)[0])
                 values[1].copy_(torch.stack(known).amax(dim=0)[1])

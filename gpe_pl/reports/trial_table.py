@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 TRIALS_CSV, TRIALS_MD = "trials.csv", "trials.md"
 CONSEQUENCES = ("training.val_interval", "seed")
-"""Keys that may differ between trials but are no settings on trial. The validation interval follows from the number of steps; the seed is chance."""
+"""Keys that may differ between trials but are not on trial. The validation interval follows from the number of steps; the seed is chance."""
 NUM_STEPS = "training.num_steps"
 """Key of the number of steps. It is a setting on trial only if it differs between runs with equal other settings and seed; else it follows from a time
 budget."""

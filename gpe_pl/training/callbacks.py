@@ -60,7 +60,7 @@ class RolloutValidation(Callback):
         simulator.eval()
         value = self._mse(simulator)
         simulator.train(was_training)
-        pl_module.log("val/rollout_mse", value, sync_dist=True)  # equal on all ranks already; without it Lightning warns
+        pl_module.log("val/rollout_mse", value, sync_dist=True)  # equal on all ranks; Lightning warns without sync_dist
 
     def _mse(self, simulator: LearnedSimulator) -> float:
         history = simulator.builder.config.history

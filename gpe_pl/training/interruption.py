@@ -51,4 +51,4 @@ class Interruption:
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
-        os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, NOTICE.encode())  # print may be what the signal interrupted
+        os.write(sys.__stderr__.fileno() if sys.__stderr__ else 2, NOTICE.encode())  # the signal may have interrupted print

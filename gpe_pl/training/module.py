@@ -153,7 +153,7 @@ class TrainingModule(L.LightningModule):
         try:
             yield
         finally:
-            del model.compute  # restores the method of the class
+            del model.compute  # leaves the method of the class
 
     def loss(self, samples: Samples) -> Tensor:
         """Mean squared error of the normalised accelerations, plus that of the normalised stress if the model decodes one.
@@ -242,7 +242,7 @@ class TrainingModule(L.LightningModule):
         self._excursions.clear()  # they were made with older weights; and the checkpoints that follow stay small
 
     def on_validation_epoch_end(self) -> None:
-        self.log("val/one_step_nmse", self.val_nmse.compute(), sync_dist=True)  # equal on all ranks already; without it Lightning warns
+        self.log("val/one_step_nmse", self.val_nmse.compute(), sync_dist=True)  # equal on all ranks; Lightning warns without sync_dist
         self.val_nmse.reset()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:

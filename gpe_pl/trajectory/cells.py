@@ -31,7 +31,7 @@ def kinds_of(cells: np.ndarray, cell_dim: int | None, dim: int) -> np.ndarray:
     """
     ordered = np.sort(cells, axis=1)
     corners = 1 + (ordered[:, 1:] != ordered[:, :-1]).sum(axis=1)
-    repeated = (is_corner(cells) != (np.arange(cells.shape[1]) < corners[:, None])).any(axis=1)  # but for the last, at the end
+    repeated = (is_corner(cells) != (np.arange(cells.shape[1]) < corners[:, None])).any(axis=1)  # except the last corner
     kinds = np.full(len(cells), -1)
     for code, (own_dim, number) in enumerate(CELL_KINDS.values()):
         kinds[(corners == number) & (own_dim == (cell_dim or dim) or number == 3)] = code

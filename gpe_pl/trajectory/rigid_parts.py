@@ -252,7 +252,7 @@ def rotations(arms: np.ndarray, change: np.ndarray, tolerance: float) -> np.ndar
 def _closest(covariance: np.ndarray) -> np.ndarray:
     """Return the rotations R [..., dim, dim] that maximise tr(R C) for covariances C = Σ a bᵀ of arms a before and b after."""
     u, _, vt = np.linalg.svd(covariance)
-    u[..., -1] *= np.linalg.det(u @ vt)[..., None]  # a rotation, no reflection
+    u[..., -1] *= np.linalg.det(u @ vt)[..., None]  # makes it a rotation, not a reflection
     return np.asarray(np.swapaxes(u @ vt, -1, -2))
 
 
