@@ -25,7 +25,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     from gpe_pl.config.datasets import ensure_split, evaluated_config, scene_metadata
     from gpe_pl.evaluation.rollouts import EvaluationSettings, evaluate
     from gpe_pl.files.names import run_name
-    from gpe_pl.files.run_folder import claim, release
+    from gpe_pl.files.run_folder import claim, release, without_orphans
     from gpe_pl.learned.pretrained import names
     from gpe_pl.learned.simulator import LearnedSimulator
     from gpe_pl.reports.sweep_table import conclusion
@@ -52,10 +52,11 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     with held(folder), recorded(folder, "evaluate", sys.argv[1:], cfg.paths.runs):
         root = ensure_split(evaluated, cfg.split)
         claim(folder, _identity(evaluated, root), results=["*"])
-        try:
-            evaluate(simulator, root, settings, folder)
-        finally:
-            release(folder)
+        with without_orphans(folder):
+            try:
+                evaluate(simulator, root, settings, folder)
+            finally:
+                release(folder)
         if shown is not None:
             shown(folder)
     print(conclusion(folder))

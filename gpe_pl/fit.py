@@ -18,6 +18,7 @@ def fit(cfg: DictConfig) -> float:
     """
     from gpe_pl.config.fit_run import FitRun
     from gpe_pl.files.names import data_name, run_name
+    from gpe_pl.files.run_folder import without_orphans
     from gpe_pl.system.locks import held
 
     data_name(cfg.data.name, "data.name")
@@ -29,10 +30,11 @@ def fit(cfg: DictConfig) -> float:
         run.prepare_data()
         run.choose_num_steps()
         run.claim_folder()
-        if not run.is_evaluated:
-            run.check_evaluation()
-            run.evaluate(run.finished_model() or run.train())
-        return run.error()
+        with without_orphans(folder):
+            if not run.is_evaluated:
+                run.check_evaluation()
+                run.evaluate(run.finished_model() or run.train())
+            return run.error()
 
 
 main = entry_point("fit")(fit)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import shutil
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +60,16 @@ def refuse_links(run_dir: Path) -> None:
     for path in sorted(path for folder in (run_dir, run_dir / HYDRA) if folder.is_dir() for path in folder.iterdir()):
         if path.is_symlink() and not path.resolve().is_relative_to(inside):
             raise RunError(f"{path}: a link that leads out of its folder; remove it, or make the folder itself a link")
+
+
+@contextlib.contextmanager
+def without_orphans(run_dir: Path) -> Iterator[None]:
+    """Remove a claimed folder at the end if somebody deleted it meanwhile, and with it what was written since: no command would continue from that."""
+    try:
+        yield
+    finally:
+        if not (run_dir / CONFIG).exists():
+            shutil.rmtree(run_dir, ignore_errors=True)
 
 
 def release(run_dir: Path) -> None:

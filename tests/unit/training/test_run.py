@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import torch
 from lightning.pytorch.utilities import rank_zero_only
 
 from gpe_pl.files import sealed
-from gpe_pl.files.run_folder import RunError, claim, without_tables
+from gpe_pl.files.run_folder import RunError, claim, without_orphans, without_tables
 from gpe_pl.training.parallel import end_later_processes
 from gpe_pl.training.run import TrainerSettings, adopt, set_up
 
@@ -54,6 +55,19 @@ def test_what_data_and_sizes_offer_is_no_part_of_a_run(tmp_path: Path) -> None:
     for config in (now, {**CONFIG, **offered}):
         claim(folder, {**config, "evaluation": {"splits": ["test"]}})
     assert adopt(tmp_path / "there", now, tmp_path / "now") is not None
+
+
+@pytest.mark.parametrize("is_deleted", [True, False])
+def test_files_written_after_a_deletion_are_removed(tmp_path: Path, is_deleted: bool) -> None:
+    claim(tmp_path / "run", CONFIG)
+    with pytest.raises(OSError, match="gone"), without_orphans(tmp_path / "run"):
+        if is_deleted:
+            shutil.rmtree(tmp_path / "run")
+        (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+        (tmp_path / "run" / "checkpoints" / "last.ckpt").touch()
+        raise OSError("gone")
+    assert (tmp_path / "run").exists() != is_deleted
+    claim(tmp_path / "run", CONFIG)  # not refused
 
 
 def test_of_processes_started_together_one_takes_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
