@@ -172,7 +172,7 @@ class Ended:
 def start(command: str, arguments: Sequence[str], output: Path, prepare: Callable[[], Any] | None = None) -> Any:
     """Start ``python -m gpe_pl.{command} {arguments}`` as a process that prints to a file; it first calls ``prepare``."""
     output.touch()  # the file exists even if the process is killed before it prints
-    process = forks().Process(target=_run_command, args=(command, list(arguments), str(output), prepare))
+    process = forks().Process(target=_run_to_exit, args=(command, list(arguments), str(output), prepare))
     process.start()
     return process
 
@@ -195,6 +195,14 @@ def end(process: Any) -> None:
     process.join()
 
 
+def _run_to_exit(*arguments: Any) -> None:
+    """Run a command and the functions of ``atexit``: a process of multiprocessing ends without them, and would leave locks behind."""
+    try:
+        _run_command(*arguments)
+    finally:
+        atexit._run_exitfuncs()
+
+
 def _run_command(command: str, arguments: list[str], output: str, prepare: Callable[[], Any] | None) -> None:
     early_interrupts.catch()  # as `python -m` does
     with open(output, "wb", buffering=0) as file:
@@ -204,10 +212,7 @@ def _run_command(command: str, arguments: list[str], output: str, prepare: Calla
     if prepare is not None:
         prepare()
     sys.argv = [command, *arguments]
-    try:
-        runpy.run_module(f"gpe_pl.{command}", run_name="__main__", alter_sys=True)
-    finally:
-        atexit._run_exitfuncs()  # a process of multiprocessing ends without them, and leaves locks behind
+    runpy.run_module(f"gpe_pl.{command}", run_name="__main__", alter_sys=True)
 
 
 def waited(process: Any, seconds: float) -> bool:
