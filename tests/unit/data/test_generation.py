@@ -234,7 +234,7 @@ def test_accelerations_that_would_be_rounding_are_refused_before_they_are_stored
 def test_complete_data_set_is_left_alone(folder):
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("*")}
     seen = []
-    generate(folder.parents[2], SPEC, on_progress=lambda done, total: seen.append((done, total)))
+    generate(folder.parents[1], SPEC, on_progress=lambda done, total: seen.append((done, total)))
     assert {p: p.stat().st_mtime_ns for p in folder.rglob("*")} == before
     assert seen == [(15, 15)]
 
@@ -242,7 +242,7 @@ def test_complete_data_set_is_left_alone(folder):
 def test_other_spec_is_refused_by_key(folder):
     other = replace(SPEC, seed=2, solver=replace(SOLVER, cfl=0.4))
     with pytest.raises(GenerationError, match=r"seed is 1, now 2; solver\.cfl is 0\.5, now 0\.4") as error:
-        generate(folder.parents[2], other)
+        generate(folder.parents[1], other)
     assert "Delete the folder" in str(error.value)
 
 
@@ -453,7 +453,7 @@ def test_plan_counts_what_is_missing(folder, tmp_path):
     parts = [plan(tmp_path / "new", SPEC, (k, 3)) for k in range(3)]
     assert sorted(shard for p in parts for shard in p.missing) == sorted(nothing.missing)
     assert sum(p.num_missing for p in parts) == 15 and sum(p.bytes_needed for p in parts) == nothing.bytes_needed
-    complete = plan(folder.parents[2], SPEC)
+    complete = plan(folder.parents[1], SPEC)
     assert (complete.missing, complete.num_done, complete.num_missing, complete.bytes_needed) == ((), 15, 0, 0)
     assert seconds_per_trajectory(SPEC, budget=0.01) > 0
 
