@@ -26,7 +26,7 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
-from gpe_pl.reports.finished_runs import Run
+from gpe_pl.reports.finished_runs import Run, table_of
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests.runs import compose
@@ -230,7 +230,7 @@ def test_runs_of_one_model_are_told_apart_by_their_training(spec: DatasetSpec, s
     def made(name: str, model: Subject, **training: Any) -> Run:
         model.simulator.save(tmp_path / name / "checkpoints" / "best.ckpt")
         config = {"data.name": spec.name, "size.name": spec.size, "seed": len(name), "training.num_steps": len(name)}
-        return Run(tmp_path / name, config | {f"training.{key}": value for key, value in training.items()}, [])
+        return Run(tmp_path / name, config | {f"training.{key}": value for key, value in training.items()}, table_of([]))
 
     plain, tuned = subject(spec, scenes), subject(spec, scenes, **SHIPPED)
     runs = [
