@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import logging
+import re
 import shlex
 import time
 from collections.abc import Iterator, Sequence
@@ -71,5 +72,6 @@ def sessions(folder: Path) -> list[dict[str, Any]]:
 
 def shown(command: str, arguments: Sequence[str], runs: str) -> str:
     """Return a command line to repeat the command, without folders of this machine."""
-    kept = [argument.replace(runs, "paths.runs") for argument in arguments if not argument.lstrip("+").startswith(LOCAL)]
+    folder = re.compile(rf"(?<![^=,\[\"' ]){re.escape(runs)}(?![^/,\]\"' ])")  # as a whole path or the beginning of one
+    kept = [folder.sub("paths.runs", argument) for argument in arguments if not argument.lstrip("+").startswith(LOCAL)]
     return shlex.join(["python", "-m", f"gpe_pl.{command}", *kept])

@@ -31,6 +31,12 @@ def test_a_command_is_shown_without_the_folders_of_one_machine() -> None:
     assert shown("fit", arguments, "/home/me/runs") == "python -m gpe_pl.fit -m 'name=a b' checkpoint=paths.runs/sand"
 
 
+def test_only_paths_are_replaced_where_the_folder_has_a_common_name() -> None:
+    arguments = ["suite.runs=[runs/table1,other/runs]", "num_runs=3", "checkpoint=runs/sand", "name=reruns"]
+    expected = "'suite.runs=[paths.runs/table1,other/runs]' num_runs=3 checkpoint=paths.runs/sand name=reruns"
+    assert shown("fit", arguments, "runs") == f"python -m gpe_pl.fit {expected}"
+
+
 def test_a_damaged_file_does_not_end_the_command(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / PROVENANCE).write_text("{")
     with recorded(tmp_path, "fit", [], "runs"):
