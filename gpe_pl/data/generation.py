@@ -17,7 +17,6 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -32,7 +31,7 @@ from gpe_pl.data.motion import ROUNDING_SHARE, motion_of, rounding_fault, roundi
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.files import sealed
 from gpe_pl.files.atomic import free_bytes, replace_text
-from gpe_pl.files.run_folder import refuse_links
+from gpe_pl.files.run_folder import refuse_links, without_orphans
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.solvers.caution import unresolved
 from gpe_pl.system.locks import held
@@ -318,7 +317,7 @@ def _generate(folder: Path, to_do: Plan, spec: DatasetSpec, num_workers: int, on
     draws_sheet = part[0] == 0 and not sheet.is_file()
     if to_do.missing or draws_sheet:
         _compile(spec)  # once, here: the workers load the compiled kernels from disk
-    with _without_orphans(folder), pool(num_workers) as workers:
+    with without_orphans(folder, SPEC_FILE), pool(num_workers) as workers:
         if draws_sheet:  # first, so that hours of wrong data are seen within a minute
             _draw_contact_sheet(spec, sheet, workers)
         for count in results(workers, _write_shard, [(spec, folder, split, k) for split, k in to_do.missing]):
@@ -330,17 +329,6 @@ def _generate(folder: Path, to_do: Plan, spec: DatasetSpec, num_workers: int, on
             paths = [shard_path(folder, *shard) for shard in train]
             moments = {str(path): sums for path, sums in results(workers, shard_moments, [(path,) for path in paths])}
             sealed.write(statistics, {**combined([moments[str(path)] for path in paths]), "data_sha256": split_checksum(folder, "train")})
-
-
-@contextlib.contextmanager
-def _without_orphans(folder: Path) -> Iterator[None]:
-    """Remove shards that were written after somebody deleted the data set: the same command would refuse to resume from them."""
-    try:
-        yield
-    finally:
-        if not (folder / SPEC_FILE).is_file():
-            for path in folder.glob("*/shard-*.h5"):
-                path.unlink(missing_ok=True)
 
 
 def _draw_contact_sheet(spec: DatasetSpec, path: Path, workers: Executor | None) -> None:

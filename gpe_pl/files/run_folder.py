@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,13 +64,43 @@ def refuse_links(run_dir: Path) -> None:
 
 
 @contextlib.contextmanager
-def without_orphans(run_dir: Path) -> Iterator[None]:
-    """Remove a claimed folder at the end if somebody deleted it meanwhile, and with it what was written since: no command would continue from that."""
+def without_orphans(folder: Path, description: str = CONFIG) -> Iterator[None]:
+    """Remove at the end what the block wrote into a folder after somebody deleted it. No command would continue from such files.
+
+    A folder is removed only if it is not the one of the beginning and lacks its description, so that nothing else is lost.
+
+    Args:
+        folder: of a run or a data set.
+        description: name of the file that says what the folder holds.
+    """
+    with watched(folder) as is_same:
+        try:
+            yield
+        finally:
+            if not is_same() and not (folder / description).exists():
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def watched(folder: Path) -> Iterator[Callable[[], bool]]:
+    """Yield a function that says whether a folder is still the one of the beginning, neither deleted nor replaced."""
+    before, handle = _identity(folder), None
+    if before is not None:
+        with contextlib.suppress(OSError):  # Windows cannot open folders
+            handle = os.open(folder, os.O_RDONLY)  # keeps the system from giving the folder's number to another folder
     try:
-        yield
+        yield lambda: _identity(folder) == before
     finally:
-        if not (run_dir / CONFIG).exists():
-            shutil.rmtree(run_dir, ignore_errors=True)
+        if handle is not None:
+            os.close(handle)
+
+
+def _identity(folder: Path) -> tuple[int, int] | None:
+    try:
+        found = folder.stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def release(run_dir: Path) -> None:

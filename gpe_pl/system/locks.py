@@ -25,6 +25,7 @@ from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 
 from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replace_text
+from gpe_pl.files.run_folder import watched
 
 log = logging.getLogger(__name__)
 
@@ -150,32 +151,18 @@ def _make(folder: Path, key: str) -> list[Path]:
 @contextlib.contextmanager
 def _same(folder: Path) -> Iterator[None]:
     """Raise ``FolderError`` if a folder that exists at the start of the block has been deleted or replaced at its end."""
-    before = _identity(folder)
-    handle = None
-    if before is not None:
-        with contextlib.suppress(OSError):  # Windows cannot open folders
-            handle = os.open(folder, os.O_RDONLY)  # keeps the system from giving the folder's number to another folder
     lost = f"{folder}: was deleted or replaced while this command wrote to it; run the command again"
-    try:
-        yield
-        if before is not None and _identity(folder) != before:
-            raise FolderError(lost)
-    except OSError as error:
-        is_missing = isinstance(error, FileNotFoundError | NotADirectoryError) or error.errno == getattr(errno, "ESTALE", errno.ENOENT)
-        if is_missing and _identity(folder) != before:  # after another error, the command itself removes its unfinished folder
-            raise FolderError(lost) from error
-        raise
-    finally:
-        if handle is not None:
-            os.close(handle)
-
-
-def _identity(folder: Path) -> tuple[int, int] | None:
-    try:
-        found = folder.stat()
-    except OSError:
-        return None
-    return found.st_dev, found.st_ino
+    existed = folder.exists()
+    with watched(folder) as is_same:
+        try:
+            yield
+            if existed and not is_same():
+                raise FolderError(lost)
+        except OSError as error:
+            is_missing = isinstance(error, FileNotFoundError | NotADirectoryError) or error.errno == getattr(errno, "ESTALE", errno.ENOENT)
+            if is_missing and not is_same():  # after another error, the command itself removes its unfinished folder
+                raise FolderError(lost) from error
+            raise
 
 
 def is_later_process() -> bool:

@@ -57,17 +57,22 @@ def test_what_data_and_sizes_offer_is_no_part_of_a_run(tmp_path: Path) -> None:
     assert adopt(tmp_path / "there", now, tmp_path / "now") is not None
 
 
-@pytest.mark.parametrize("is_deleted", [True, False])
-def test_files_written_after_a_deletion_are_removed(tmp_path: Path, is_deleted: bool) -> None:
-    claim(tmp_path / "run", CONFIG)
-    with pytest.raises(OSError, match="gone"), without_orphans(tmp_path / "run"):
-        if is_deleted:
-            shutil.rmtree(tmp_path / "run")
-        (tmp_path / "run" / "checkpoints").mkdir(parents=True)
-        (tmp_path / "run" / "checkpoints" / "last.ckpt").touch()
-        raise OSError("gone")
-    assert (tmp_path / "run").exists() != is_deleted
-    claim(tmp_path / "run", CONFIG)  # not refused
+@pytest.mark.parametrize("deleted", ["folder", "config.json", None])
+def test_files_written_after_a_deletion_are_removed(tmp_path: Path, deleted: str | None) -> None:
+    """A run whose description alone is gone keeps its files."""
+    run = tmp_path / "run"
+    claim(run, CONFIG)
+    with pytest.raises(OSError, match="failed"), without_orphans(run):
+        if deleted == "folder":
+            shutil.rmtree(run)
+        elif deleted is not None:
+            (run / deleted).unlink()
+        (run / "checkpoints").mkdir(parents=True)
+        (run / "checkpoints" / "last.ckpt").touch()
+        raise OSError("failed")
+    assert run.exists() == (deleted != "folder")
+    if deleted == "folder":
+        claim(run, CONFIG)  # not refused
 
 
 def test_of_processes_started_together_one_takes_the_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
