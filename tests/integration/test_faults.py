@@ -53,7 +53,7 @@ def test_two_trainings_at_once(data: Path, tmp_path: Path) -> None:
     own = tmp_path / "pair"
     own.mkdir()
     verdict = pairs.together((fit, fit), (left, left), 0.5, 600.0, own)
-    assert verdict.status == "refused" and pairs.HELD.search(verdict.detail), verdict
+    assert verdict.status == "refused" and pairs.SAYS_WHY.search(verdict.detail), verdict
 
 
 @pytest.mark.parametrize("state", outside.STATES)

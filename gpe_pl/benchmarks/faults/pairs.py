@@ -16,7 +16,8 @@ from gpe_pl.benchmarks.faults import isolation, runs
 from gpe_pl.benchmarks.faults.runs import Command
 from gpe_pl.benchmarks.faults.verdict import GOOD, MAX_DETAIL, Fault, Verdict
 
-HELD = re.compile(r"another command writes to it \((process \d+ on .+|which has just begun)\)")
+SAYS_WHY = re.compile(r"another command writes to it \((process \d+ on .+|which has just begun)\)|exists already")
+"""Reasons of a refused command that ended first: the other one holds the folder, or has put its results there and is about to end."""
 Results = dict[str, str]
 """Digests of a command's results, see ``runs.digests``."""
 
@@ -24,7 +25,8 @@ Results = dict[str, str]
 def together(commands: Sequence[Command], expected: Sequence[Results], delay: float, limit: float, folder: Path) -> Verdict:
     """Start two commands in one folder, the second ``delay`` seconds after the first.
 
-    The outcome is sound if the folder contains exactly the results of the commands that succeeded, and each refused command names the one that ran.
+    The outcome is sound if the folder contains exactly the results of the commands that succeeded, and each refused command names the one that ran or says
+    that its results exist.
     """
     own, outputs = folder / "own", [folder / f"output-{k}" for k in range(len(commands))]
     processes = []
@@ -47,8 +49,8 @@ def together(commands: Sequence[Command], expected: Sequence[Results], delay: fl
     refused = "; ".join(verdict.detail for verdict in verdicts if verdict.status == "refused")
     if not done:
         return Verdict("different", f"none succeeded: {refused}"[:MAX_DETAIL])
-    if refused and order[0] not in done and not HELD.search(printed[order[0]]):  # a verdict contains only the beginning of the output
-        return Verdict("accepted", f"does not say who holds the folder: {refused}"[:MAX_DETAIL])
+    if refused and order[0] not in done and not SAYS_WHY.search(printed[order[0]]):  # a verdict contains only the beginning of the output
+        return Verdict("accepted", f"does not say why: {refused}"[:MAX_DETAIL])
     found = runs.digests(own)
     wrong = {name for k in done for name, digest in expected[k].items() if found.get(name) != digest}
     wrong |= found.keys() - {name for k in done for name in expected[k]}

@@ -271,6 +271,8 @@ COMMANDS = [runs.Command(name, "fit", ()) for name in ("one", "other")]
         ((0, 1), "Traceback (most recent call last):", "first", "traceback"),
         ((2, 0), "error: something is in the way", "second", "accepted"),  # of whom?
         ((2, 0), HELD, "second", "refused"),
+        ((2, 0), "error: own/imported: exists already", "second", "refused"),  # the other has put its results there and is about to end
+        ((2, 0), "error: own/imported: exists already", "first", "different"),
         ((2, 0), HELD.replace("fit)", f"fit {'x' * 400})"), "second", "refused"),
     ],
 )
