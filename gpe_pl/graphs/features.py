@@ -31,6 +31,7 @@ from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata
 
 Features = Literal["paper", "contact"]
+ParameterScale = Literal["linear"]
 
 GAP_SCALE = 0.2
 """Gaps are resolved in units of this fraction of the rest spacing, …"""
@@ -49,6 +50,8 @@ class GraphConfig:
         boundary_condition: boundary nodes have normal, friction and restitution beside their velocity; without it, velocity only (paper).
         history: velocities per node.
         connectivity_spacings: neighbour radius in rest spacings; None takes the data set's radius.
+        parameter_scale: ``linear`` gives models the physical value of every material parameter, as the paper does. None takes the scale of each parameter
+            in ``schema.MATERIALS``, which is logarithmic where values span decades.
         trim_boundary: leave out boundary nodes without an edge, which cannot influence anything.
         mesh: connect ``schema.MESH_MATERIALS`` along their cells and put levels of virtual nodes above them; without it they are particles like the others.
         num_levels: number of levels of virtual nodes; None takes as many as lead to one root in any body of the domain.
@@ -59,6 +62,7 @@ class GraphConfig:
     boundary_condition: bool = True
     history: Annotated[int, Field(ge=1, le=20)] = HISTORY
     connectivity_spacings: Annotated[float, Field(gt=0)] | None = None
+    parameter_scale: ParameterScale | None = None
     trim_boundary: bool = True
     mesh: bool = False
     num_levels: Annotated[int, Field(ge=0, le=20)] | None = None

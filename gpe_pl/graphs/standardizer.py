@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
+from gpe_pl.graphs.features import ParameterScale
 from gpe_pl.nn.blocks import Standardize
 from gpe_pl.schema import MATERIALS, RADIUS, EdgeType, FeatureSpec, role
 
@@ -50,13 +51,17 @@ class GraphStandardizer(nn.Module):
     """Standardises every feature of a graph with training statistics; odd edge channels are only scaled, so they stay odd.
 
     All levels of virtual nodes share their statistics, so that a graph may have more of them than those in training.
+
+    Args:
+        spec: channels of the graphs.
+        parameter_scale: scale of material parameters, as in ``GraphConfig``.
     """
 
     mass: Tensor
 
-    def __init__(self, spec: FeatureSpec) -> None:
+    def __init__(self, spec: FeatureSpec, parameter_scale: ParameterScale | None = None) -> None:
         super().__init__()
-        self.spec = spec
+        self.spec, self.parameter_scale = spec, parameter_scale
         self.node = nn.ModuleDict({role(t): Standardize(c) for t, c in spec.node_channels.items()})
         self.params = nn.ModuleDict({m: Standardize(c).to(self._precision(m)) for m, c in spec.param_channels.items()})
         self.odd = nn.ModuleDict({self._key(r): Standardize(spec.odd_channels[r], centered=False) for r in spec.relations})
@@ -68,14 +73,15 @@ class GraphStandardizer(nn.Module):
         source, name, target = relation
         return f"{role(source)}__{name}__{role(target)}"
 
-    @staticmethod
-    def _precision(material: str) -> torch.dtype:
-        """Logarithms are in double precision: another unit shifts them, and single precision would round them to other digits."""
-        return torch.float64 if MATERIALS[material].scale == "log" else torch.float32
+    def _is_logarithmic(self, material: str) -> bool:
+        return self.parameter_scale is None and MATERIALS[material].scale == "log"
 
-    @classmethod
-    def _material_scale(cls, material: str, params: Tensor) -> Tensor:
-        return params.to(cls._precision(material)).log() if MATERIALS[material].scale == "log" else params
+    def _precision(self, material: str) -> torch.dtype:
+        """Logarithms are in double precision: another unit shifts them, and single precision would round them to other digits."""
+        return torch.float64 if self._is_logarithmic(material) else torch.float32
+
+    def _material_scale(self, material: str, params: Tensor) -> Tensor:
+        return params.to(self._precision(material)).log() if self._is_logarithmic(material) else params
 
     def fit(self, graphs: Iterable[HeteroData]) -> list[str]:
         """Set all statistics from graphs of the training split; a ``StatisticsSample`` adds graphs of rare materials and contacts.

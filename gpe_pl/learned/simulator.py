@@ -90,7 +90,7 @@ class LearnedSimulator(nn.Module):
         self._static_friction = 0.0
         self._warned: set[str] = set()
         self._unknown: list[str | EdgeType] | None = None  # None: not determined yet
-        self.standardizer = GraphStandardizer(builder.spec)
+        self.standardizer = GraphStandardizer(builder.spec, builder.config.parameter_scale)
         self.register_buffer("acceleration_std", torch.ones((), dtype=torch.float64))
         self.register_buffer("stress_std", torch.ones((), dtype=torch.float64))
         self.register_buffer("trained_scene", torch.from_numpy(unlimited(builder.spec.dim)))

@@ -27,7 +27,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl.errors import GpeError
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.nn.continuous_conv import ContinuousConv, interpolate
-from gpe_pl.nn.homogeneous import Homogeneous, first_rows
+from gpe_pl.nn.homogeneous import Homogeneous, MaterialEmbeddingKind, first_rows
 from gpe_pl.schema import BOUNDARY, RADIUS, EdgeType, FeatureSpec
 
 Offsets = dict[EdgeType, tuple[Tensor, Tensor]]
@@ -46,6 +46,7 @@ class ContinuousConvNet(Model):
         num_convolutions: number of layers, the first and the last included; 4 in the paper.
         hidden_channels: width between layers; each of the three parts of the first layer has half of it; 64 in the paper.
         kernel_size: filter points per axis; 4 in the paper.
+        material_embedding: ``feature``: the material parameter is a feature of nodes like the others; ``none`` leaves it out, as a control.
 
     Raises:
         NotAParticleGraphError: the graphs have relations of meshes.
@@ -57,15 +58,22 @@ class ContinuousConvNet(Model):
         num_convolutions: Annotated[int, Field(ge=2, le=64)] = 4,
         hidden_channels: Annotated[int, Field(ge=2, le=4096)] = 64,
         kernel_size: Annotated[int, Field(ge=2, le=16)] = 4,
+        material_embedding: MaterialEmbeddingKind = "feature",
     ) -> None:
-        super().__init__(spec, num_convolutions=num_convolutions, hidden_channels=hidden_channels, kernel_size=kernel_size)
+        super().__init__(
+            spec,
+            num_convolutions=num_convolutions,
+            hidden_channels=hidden_channels,
+            kernel_size=kernel_size,
+            material_embedding=material_embedding,
+        )
         others = sorted({r[1] for r in spec.relations} - {RADIUS})
         if others:
             raise NotAParticleGraphError(
                 f"ContinuousConvNet convolves over {RADIUS} edges; the graph also has {', '.join(others)}: set graph.mesh=false"
             )
         self.kernel_size = kernel_size
-        self.particles = Homogeneous(spec, spec.materials)
+        self.particles = Homogeneous(spec, spec.materials, material_embedding)
         in_channels, first = self.particles.node_channels + self.particles.num_kinds, hidden_channels // 2
         self.conv_boundary = ContinuousConv(spec.node_channels[BOUNDARY], first, spec.dim, kernel_size)
         self.conv_particles = ContinuousConv(in_channels, first, spec.dim, kernel_size)

@@ -33,7 +33,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.nn.blocks import EdgeLinear, ReluMLP
-from gpe_pl.nn.homogeneous import Edges, Homogeneous, first_rows, present
+from gpe_pl.nn.homogeneous import Edges, Homogeneous, MaterialEmbeddingKind, first_rows, present
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, RADIUS, SAME, EdgeType, FeatureSpec
 
 Relations = list[EdgeType]
@@ -77,6 +77,7 @@ class DPINet(Model):
         spec: channels of the graphs.
         num_propagation_steps: L; 2 in the authors' code.
         hidden_channels: width of particle codes and effects; relation codes are 1.5 times as wide; 200 and 300 in the authors' code.
+        material_embedding: ``feature``: the material parameter is a feature of nodes like the others; ``none`` leaves it out, as a control.
     """
 
     def __init__(
@@ -84,10 +85,13 @@ class DPINet(Model):
         spec: FeatureSpec,
         num_propagation_steps: Annotated[int, Field(ge=1, le=64)] = 2,
         hidden_channels: Annotated[int, Field(ge=2, le=4096)] = 200,
+        material_embedding: MaterialEmbeddingKind = "feature",
     ) -> None:
-        super().__init__(spec, num_propagation_steps=num_propagation_steps, hidden_channels=hidden_channels)
+        super().__init__(
+            spec, num_propagation_steps=num_propagation_steps, hidden_channels=hidden_channels, material_embedding=material_embedding
+        )
         self.num_propagation_steps, self.hidden_channels = num_propagation_steps, hidden_channels
-        self.graph = Homogeneous(spec, spec.node_types)
+        self.graph = Homogeneous(spec, spec.node_types, material_embedding)
         names = ("leaves", "up", "same", "down") if spec.num_levels else ("leaves",)
         node_channels = self.graph.node_channels + self.graph.num_kinds
         self.stages = nn.ModuleDict({name: Stage(node_channels, self.graph.edge_channels, hidden_channels) for name in names})

@@ -27,7 +27,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.nn.blocks import EdgeLinear, ReluMLP
-from gpe_pl.nn.homogeneous import Edges, Homogeneous, present
+from gpe_pl.nn.homogeneous import Edges, Homogeneous, MaterialEmbeddingKind, present
 from gpe_pl.schema import FeatureSpec
 
 TINY = 1e-12
@@ -58,6 +58,7 @@ class GNS(Model):
         hidden_channels: width of all hidden states and layers; 128 in the paper.
         num_hidden_layers: number of hidden layers of every MLP; 2 in the paper, 1 in LagrangeBench's GNS-10-128.
         type_channels: width of the embedding of the particle type; 16 in the paper.
+        material_embedding: ``feature``: the material parameter is a feature of nodes like the others; ``none`` leaves it out, as a control.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class GNS(Model):
         hidden_channels: Annotated[int, Field(ge=1, le=4096)] = 128,
         num_hidden_layers: Annotated[int, Field(ge=1, le=8)] = 2,
         type_channels: Annotated[int, Field(ge=1, le=1024)] = 16,
+        material_embedding: MaterialEmbeddingKind = "feature",
     ) -> None:
         super().__init__(
             spec,
@@ -74,8 +76,9 @@ class GNS(Model):
             hidden_channels=hidden_channels,
             num_hidden_layers=num_hidden_layers,
             type_channels=type_channels,
+            material_embedding=material_embedding,
         )
-        self.graph = Homogeneous(spec, spec.node_types)
+        self.graph = Homogeneous(spec, spec.node_types, material_embedding)
         hidden, layers = hidden_channels, num_hidden_layers
         self.type_embedding = nn.Embedding(self.graph.num_kinds, type_channels)
         self.node_encoder = ReluMLP(self.graph.node_channels + type_channels, hidden, hidden, layers, norm=True)

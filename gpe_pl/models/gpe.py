@@ -30,7 +30,7 @@ from gpe_pl.schema import CELL, RADIUS, EdgeType, FeatureSpec, grid, is_symmetri
 
 Decoder = Literal["node", "pair", "contact"]
 LevelWeights = Literal["shared", "separate"]
-MaterialEmbeddingKind = Literal["affine", "mlp"]
+MaterialEmbeddingKind = Literal["affine", "mlp", "none"]
 NodeNorm = Literal["none", "layer"]
 
 
@@ -57,7 +57,10 @@ class Decoded(NamedTuple):
 
 
 class MaterialEmbedding(nn.Module):
-    """Θ(v) of the paper, section 2.1; ``affine`` satisfies Θ(λv₁ + (1−λ)v₂) = λΘ(v₁) + (1−λ)Θ(v₂), ``mlp`` serves for comparison."""
+    """Θ(v) of the paper, section 2.1; ``affine`` satisfies Θ(λv₁ + (1−λ)v₂) = λΘ(v₁) + (1−λ)Θ(v₂), ``mlp`` serves for comparison.
+
+    The rule holds for the values that the graphs give: logarithms of some parameters, or physical values with ``graph.parameter_scale=linear``.
+    """
 
     def __init__(self, param_channels: int, hidden_channels: int, kind: MaterialEmbeddingKind, is_fused: bool) -> None:
         super().__init__()
@@ -162,7 +165,7 @@ class GPE(Model):
             and each node adds only its deformation. Nodes without a cell belong to the body beside them. Forces between bodies sum to zero. Materials
             without a mesh have an acceleration per node; beside a mesh they need ``island_momentum`` to conserve the sum of momentum.
         edge_state: ``latent`` updates a hidden state per edge (Algorithm 1); ``geometry`` feeds the raw edge features to every layer.
-        material_embedding: ``affine`` (the paper's interpolation rule) or ``mlp``.
+        material_embedding: ``affine`` (the paper's interpolation rule) or ``mlp``; ``none`` leaves the parameter out, as a control.
         num_message_passing_steps: number of processor layers; 12 in the paper.
         hidden_channels: width of all hidden states and layers; 128 in the paper.
         implementation: ``factored`` or ``plain``; both compute the same function of the same parameters.
@@ -229,15 +232,15 @@ class GPE(Model):
         hidden, norm = hidden_channels, node_norm == "layer"
         is_fused = implementation == "factored"
         mlp = partial(MLP, is_fused=is_fused)
-        params = {m: c for m, c in spec.param_channels.items() if c}
-        self.material_embedding = nn.ModuleDict({m: MaterialEmbedding(c, hidden, material_embedding, is_fused) for m, c in params.items()})
+        read = {} if material_embedding == "none" else {m: c for m, c in spec.param_channels.items() if c}
+        self.material_embedding = nn.ModuleDict({m: MaterialEmbedding(c, hidden, material_embedding, is_fused) for m, c in read.items()})
         readable = self._readable()
         relations = [r for r in spec.relations if {r[0], r[2]} & readable[0]]
         ends = readable[0].union(*({r[0], r[2]} for r in relations))
         self.node_encoder, self.edge_encoder = nn.ModuleDict(), nn.ModuleDict()
         for t in spec.node_types:
             if t in ends and self.type_key(t) not in self.node_encoder:
-                self.node_encoder[self.type_key(t)] = mlp(spec.node_channels[t] + (hidden if t in params else 0), hidden, hidden, norm)
+                self.node_encoder[self.type_key(t)] = mlp(spec.node_channels[t] + (hidden if t in read else 0), hidden, hidden, norm)
         for relation in relations if edge_state == "latent" else []:
             if self.key(relation) not in self.edge_encoder:
                 odd, even = spec.odd_channels[relation], spec.even_channels[relation]

@@ -5,6 +5,7 @@ without them: motion of materials, boundary nodes, virtual nodes, one block for 
 """
 
 from collections.abc import Iterable
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int64
@@ -13,6 +14,9 @@ from torch.nn import functional
 from torch_geometric.data import HeteroData
 
 from gpe_pl.schema import EdgeType, FeatureSpec, role
+
+MaterialEmbeddingKind = Literal["feature", "none"]
+"""Whether the material parameter is a feature of nodes like the others, or left out as a control."""
 
 Edges = dict[EdgeType, tuple[Tensor, Tensor, Tensor]]
 """``edge_index``, ``odd`` and ``even`` of each relation that has edges."""
@@ -24,6 +28,7 @@ class Homogeneous:
     Args:
         spec: channels of the typed graphs.
         node_types: node types that take part, all materials among them.
+        material_embedding: how the material parameter enters.
 
     Attributes:
         kind: number of each node type in the model; virtual nodes of all levels share one.
@@ -32,7 +37,7 @@ class Homogeneous:
         edge_channels: number of columns of ``edges``.
     """
 
-    def __init__(self, spec: FeatureSpec, node_types: tuple[str, ...]) -> None:
+    def __init__(self, spec: FeatureSpec, node_types: tuple[str, ...], material_embedding: MaterialEmbeddingKind) -> None:
         kinds = list(dict.fromkeys(role(t) for t in node_types))
         self.kind = {t: kinds.index(role(t)) for t in node_types}
         self.num_kinds = len(kinds)
@@ -41,10 +46,11 @@ class Homogeneous:
         widths: dict[str, int] = {}
         for t in node_types:
             widths[block[t]] = max(widths.get(block[t], 0), spec.node_channels[t])
-        widths |= {f"parameters of {m}": spec.param_channels[m] for m in spec.materials}
+        read = spec.materials if material_embedding == "feature" else ()
+        widths |= {f"parameters of {m}": spec.param_channels[m] for m in read}
         first = _first_columns(widths)
         self._x = {t: first[block[t]] for t in node_types}
-        self._params = {m: first[f"parameters of {m}"] for m in spec.materials}
+        self._params = {m: first[f"parameters of {m}"] for m in read}
         self.node_channels = sum(widths.values())
 
         edge_widths: dict[str, int] = {}
@@ -60,7 +66,7 @@ class Homogeneous:
         rows, kinds = [], []
         for t, features in x.items():
             row = _place(features, self._x[t], self.node_channels)
-            if t in params:
+            if t in self._params and t in params:
                 row = row + _place(params[t], self._params[t], self.node_channels)
             rows.append(row)
             kinds.append(torch.full((features.shape[0],), self.kind[t], dtype=torch.int64, device=features.device))

@@ -274,6 +274,22 @@ def test_a_checkpoint_rebuilds_the_simulator(simulator: LearnedSimulator, tmp_pa
     assert float(again.acceleration_std) == pytest.approx(3.0)
 
 
+def test_a_checkpoint_keeps_the_scale_of_parameters_and_one_without_it_is_of_the_schemas(tmp_path: Path) -> None:
+    states = [scenes.state(40, ("elastomer",), seed=k).to_torch() for k in range(2)]
+    scales: dict[str | None, torch.Tensor] = {}
+    for scale in ("linear", None):
+        build = scenes.builder(("elastomer",), parameter_scale=scale)
+        simulator = learned(build, material_embedding="affine")
+        simulator.standardizer.fit([build(state) for state in states])
+        description = simulator.description()
+        if scale is None:
+            del description["graph"]["parameter_scale"]
+        again = LearnedSimulator.from_checkpoint(save(simulator, tmp_path / f"{scale}.ckpt", simulator=description))
+        assert torch.equal(simulator.eval().step(states[0]).pos, again.step(states[0]).pos)
+        scales[scale] = again.standardizer(build(states[0]))["elastomer"].material_params
+    assert float((scales["linear"] - scales[None]).abs().max()) > 0.1
+
+
 def test_a_saved_simulator_holds_itself_and_nothing_else(simulator: LearnedSimulator, tmp_path: Path) -> None:
     path = tmp_path / "models" / "a.ckpt"
     simulator.save(path)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 
 from gpe_pl.learned.testing import scenes
-from gpe_pl.learned.testing.contract import CHECKS, MESH_CHECKS, Check, Factory, check_every_parameter_is_used, factory
+from gpe_pl.learned.testing.changes import to_dtype
+from gpe_pl.learned.testing.contract import CHECKS, MESH_CHECKS, Check, Factory, check_every_parameter_is_used, factory, predict
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
@@ -21,18 +23,22 @@ def gpe(**settings: Any) -> Factory:
     return factory(GPE, num_message_passing_steps=3, hidden_channels=16, **settings)
 
 
+BASELINES: dict[str, type[Model]] = {"gns": GNS, "dpinet": DPINet, "cconv": ContinuousConvNet}
+
 MODELS: dict[str, Factory] = {
     **{
         f"gpe-{i}-{d}-{e}": gpe(interaction=i, decoder=d, edge_state=e)
         for i, d, e in itertools.product(("directed", "negated", "odd", "odd_even"), ("node", "pair"), ("latent", "geometry"))
     },
     "gpe-mlp-embedding": gpe(material_embedding="mlp"),
+    "gpe-no-embedding": gpe(material_embedding="none"),
     "gpe-plain": gpe(implementation="plain"),
     "gpe-linear": gpe(island_momentum="linear"),
     "gpe-angular": gpe(island_momentum="angular"),
     "gns": factory(GNS, num_message_passing_steps=3, hidden_channels=16),
     "dpinet": factory(DPINet, hidden_channels=16),
     "cconv": factory(ContinuousConvNet, hidden_channels=16),
+    **{f"{name}-no-embedding": factory(model, hidden_channels=16, material_embedding="none") for name, model in BASELINES.items()},
 }
 
 USUAL = {
@@ -56,6 +62,16 @@ def test_contract(check: str, name: str) -> None:
 @pytest.mark.parametrize("check", MESH_CHECKS)
 def test_contract_on_meshes(check: str, name: str) -> None:
     MESH_CHECKS[check](MODELS[name])
+
+
+@pytest.mark.parametrize("name", ["gpe", *BASELINES])
+def test_only_models_without_embedding_ignore_the_parameter(name: str) -> None:
+    build, state = scenes.builder(("sand", "snow")), scenes.state(materials=("sand", "snow")).to_torch()
+    other = replace(state, material_params=1.5 * state.material_params)
+    for key, reads in ((f"{name}-no-embedding", False), ("gpe-mlp-embedding" if name == "gpe" else name, True)):
+        model = MODELS[key](build.spec)
+        predicted, with_other = (predict(model, to_dtype(build(s), torch.float64), 40) for s in (state, other))
+        assert (float((predicted - with_other).norm()) > 1e-6) == reads
 
 
 class Faulty(GNS):

@@ -35,6 +35,7 @@ def assert_is_the_papers(cfg: DictConfig) -> None:
     noise.check(scene_metadata(cfg, "train"))
     graph = cfg.graph
     assert (graph.features, graph.history, graph.connectivity_spacings, graph.boundary_condition) == ("paper", 1, None, False)
+    assert graph.parameter_scale == "linear"
     model = {key: value for key, value in cfg.model.items() if key != "_target_"}
     assert model["hidden_channels"] == 128
     assert model.get("num_message_passing_steps", 12) == 12

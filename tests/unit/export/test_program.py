@@ -271,14 +271,17 @@ def test_a_program_of_a_periodic_domain(tmp_path: Path) -> None:
     ("model", "kind"),
     [
         *((m, "particles") for m in SMALL),
+        (GPE, "no parameter"),
         (GPE, "mesh"),
         (GPE, "bodies"),
         *(pytest.param(m, "mesh", marks=pytest.mark.long) for m in (GNS, DPINet)),
     ],
 )
 def test_every_model_becomes_a_program(model: Any, kind: str, tmp_path: Path) -> None:
-    config = {"mesh": True, "num_levels": 2, "islands": model is GPE} if kind != "particles" else {}
+    config = {"mesh": True, "num_levels": 2, "islands": model is GPE} if kind in ("mesh", "bodies") else {}
     settings: dict[str, Any] = {"stress": True, "island_momentum": "angular"} if config and model is GPE else {}
+    if kind == "no parameter":
+        settings["material_embedding"] = "none"
     if kind == "bodies":
         settings["decoder"] = "contact"
     materials, dim = (("sand", "solid"), 3) if config else (("sand",), 2)

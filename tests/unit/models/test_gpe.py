@@ -11,9 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
-from gpe_pl.models.gpe import GPE, MaterialEmbedding, StressError
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE, StressError
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.schema import is_symmetric
+from gpe_pl.schema import MATERIALS, is_symmetric
 from tests import scenes
 
 DOUBLE = torch.float64
@@ -187,14 +188,33 @@ def test_pair_forces_push_two_materials_apart_equally() -> None:
     assert total.norm() < 1e-13 * sum(float((out[m] * data[m].mass[:, None]).norm()) for m in out)
 
 
-@pytest.mark.parametrize("kind", ["affine", "mlp"])
-def test_affine_embedding_interpolates_as_the_paper_says(kind: str) -> None:
-    """Θ(λv₁ + (1−λ)v₂) = λΘ(v₁) + (1−λ)Θ(v₂) holds for ``affine`` and, generically, not for ``mlp``."""
+@pytest.mark.parametrize("material", ["sand", "snow", "fluid", "elastomer", "solid"])
+@pytest.mark.parametrize(("kind", "scale"), [("affine", "linear"), ("affine", None), ("mlp", "linear")])
+def test_affine_embedding_interpolates_physical_values_as_the_paper_says(kind: str, scale: str | None, material: str) -> None:
+    """Θ(λv₁ + (1−λ)v₂) = λΘ(v₁) + (1−λ)Θ(v₂) for values in SI units holds for ``affine`` of linear parameters and, generically, for nothing else."""
     torch.manual_seed(0)
-    theta = MaterialEmbedding(1, 32, kind, is_fused=True).double()  # type: ignore[arg-type]
-    v1, v2 = torch.tensor([[-1.3]], dtype=DOUBLE), torch.tensor([[2.1]], dtype=DOUBLE)
-    errors = [(theta(x * v1 + (1 - x) * v2) - x * theta(v1) - (1 - x) * theta(v2)).norm() for x in torch.linspace(-1, 2, 7, dtype=DOUBLE)]
-    assert (max(errors) < 1e-13) == (kind == "affine")
+    build = scenes.builder((material,), parameter_scale=scale)
+    simulator = LearnedSimulator(GPE(build.spec, material_embedding=kind, hidden_channels=32), build).double()  # type: ignore[arg-type]
+    low, high = {"sand": (20.0, 42.5), "snow": (5.0, 14.0), "fluid": (1e-3, 1e-1), "elastomer": (3e4, 6e5), "solid": (1e6, 4e6)}[material]
+    graph = scenes.to_dtype(build(scenes.state(40, (material,)).to_torch()), DOUBLE)
+
+    def with_values(values: torch.Tensor) -> HeteroData:
+        changed = graph.clone()
+        changed[material].material_params = values[:, None]
+        return changed
+
+    simulator.standardizer.fit([with_values(torch.linspace(low, high, 40, dtype=DOUBLE))])
+    simulator.standardizer.double()
+
+    def theta(value: float) -> torch.Tensor:
+        scaled = simulator.standardizer(with_values(torch.full((40,), value, dtype=DOUBLE)))[material].material_params
+        return cast(nn.ModuleDict, simulator.model.material_embedding)[material](scaled)[0].detach()
+
+    ends = theta(low), theta(high)
+    mixed = [(x, theta(x * low + (1 - x) * high)) for x in (0.1, 0.4, 0.7)]
+    errors = [float((value - x * ends[0] - (1 - x) * ends[1]).norm() / (ends[0] - ends[1]).norm()) for x, value in mixed]
+    is_linear = scale == "linear" or MATERIALS[material].scale == "linear"
+    assert (max(errors) < 1e-9) == (kind == "affine" and is_linear)
 
 
 @pytest.mark.parametrize("interaction", ["odd", "odd_even"])
