@@ -9,9 +9,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
-
-from tests.architecture.test_imports import MODULES, ROOT, dotted
+from tests.architecture.test_imports import MODULES, ROOT, dotted, syntax
 
 
 def without_encoding(tree: ast.Module) -> Iterator[int]:
@@ -27,9 +25,8 @@ def without_encoding(tree: ast.Module) -> Iterator[int]:
             yield node.lineno
 
 
-@pytest.mark.parametrize("path", MODULES, ids=dotted)
-def test_text_has_an_encoding(path: Path) -> None:
-    assert not list(without_encoding(ast.parse(path.read_text(encoding="utf-8"))))
+def test_text_has_an_encoding() -> None:
+    assert not [f"{dotted(path)}:{line}" for path in MODULES for line in without_encoding(syntax(path))]
 
 
 def test_lines_without_an_encoding_are_found() -> None:
