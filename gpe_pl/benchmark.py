@@ -43,7 +43,7 @@ def benchmark(cfg: DictConfig) -> None:
     from omegaconf import OmegaConf
 
     from gpe_pl.config.datasets import dataset
-    from gpe_pl.system.locks import held
+    from gpe_pl.system.locks import locked
     from gpe_pl.system.machine import environment, keep_freed_memory
     from gpe_pl.system.provenance import recorded
     from gpe_pl.training.run import TrainerSettings
@@ -61,7 +61,7 @@ def benchmark(cfg: DictConfig) -> None:
     keep_freed_memory()  # as trainings and evaluations do
     cases = getattr(settings, "cases", None)  # data sets by name, in suites that need some
     folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name
-    with held(folder), recorded(folder, "benchmark", sys.argv[1:], cfg.paths.runs):
+    with locked(folder), recorded(folder, "benchmark", sys.argv[1:], cfg.paths.runs):
         records, table = suite.run(settings) if cases is None else suite.run(settings, {k: dataset(*c.overrides) for k, c in cases.items()})
         for name, figure in getattr(suite, "figures", lambda _: {})(records).items():
             save_figure(figure, folder / f"{name}.png", dpi=150)

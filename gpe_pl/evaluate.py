@@ -30,7 +30,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     from gpe_pl.learned.simulator import LearnedSimulator
     from gpe_pl.reports.sweep_table import conclusion
     from gpe_pl.rollout.skips import Skips
-    from gpe_pl.system.locks import held
+    from gpe_pl.system.locks import locked
     from gpe_pl.system.provenance import recorded
     from gpe_pl.training.run import TrainerSettings, set_up
 
@@ -49,7 +49,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
         simulator.check_scene(scene, _own_data(simulator) or "data=… size=…")
     shown = None if cfg.data.get("showcase") is None else _showcase(cfg, simulator)
     folder = Path(cfg.paths.runs) / run_name(cfg.name)
-    with held(folder), recorded(folder, "evaluate", sys.argv[1:], cfg.paths.runs):
+    with locked(folder), recorded(folder, "evaluate", sys.argv[1:], cfg.paths.runs):
         root = ensure_split(evaluated, cfg.split)
         claim(folder, _identity(evaluated, root), results=["*"])
         with without_orphans(folder):

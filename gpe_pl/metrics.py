@@ -227,11 +227,11 @@ def _motion(trajectory: Trajectory, num_steps: int) -> _Motion:
         steps = displacement(pos[1:], pos[:-1], trajectory.metadata)
         pos = np.concatenate([pos[:1], pos[:1] + np.cumsum(steps, axis=0)])
     vel, pos = integrators.velocities(pos, dt), pos[1:]
-    share = trajectory.mass.astype(np.float64) / trajectory.mass.sum(dtype=np.float64)
-    momentum = np.einsum("n,fnd->fd", share, vel)
-    arm = pos - np.einsum("n,fnd->fd", share, pos)[:, None]
-    moment = np.einsum("n,fni,fnj->fij", share, arm, vel)
-    return _Motion(momentum, moment - moment.swapaxes(1, 2), 0.5 * np.einsum("n,fnd,fnd->f", share, vel, vel))
+    fraction = trajectory.mass.astype(np.float64) / trajectory.mass.sum(dtype=np.float64)
+    momentum = np.einsum("n,fnd->fd", fraction, vel)
+    arm = pos - np.einsum("n,fnd->fd", fraction, pos)[:, None]
+    moment = np.einsum("n,fni,fnj->fij", fraction, arm, vel)
+    return _Motion(momentum, moment - moment.swapaxes(1, 2), 0.5 * np.einsum("n,fnd,fnd->f", fraction, vel, vel))
 
 
 def _motion_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps: int) -> dict[str, float]:

@@ -63,9 +63,11 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
     """Return records of step times [s], throughput [nodes/s] and speed-ups, and a Markdown table."""
     most = max(settings.num_processes)
     if most > settings.num_graphs:
-        raise ParallelError(f"suite.num_graphs={settings.num_graphs}: too few for {most} processes, each of which takes at least one")
+        raise ParallelError(
+            f"suite.num_graphs={settings.num_graphs}: too few for {most} processes, each of which takes at least one; raise it"
+        )
     if settings.accelerator == "gpu" and most > torch.cuda.device_count():
-        raise ParallelError(f"suite.num_processes={settings.num_processes}: this machine has {torch.cuda.device_count()} GPUs")
+        raise ParallelError(f"suite.num_processes={settings.num_processes}: this machine has {torch.cuda.device_count()} GPUs; lower it")
     records, lines = [], []
     for number in settings.num_processes:
         step, exchange = np.median(np.array(step_times(settings, number)), axis=0).tolist()

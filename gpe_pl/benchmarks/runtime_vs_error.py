@@ -47,7 +47,7 @@ Frame = tuple[np.ndarray, np.ndarray]
 DATA = "solver, as for the data"
 SPACING, STEPS = "spacing × ", "steps × "
 BALLISTIC = "ballistic"
-HELD = ", held predictions"
+REPEATED = ", repeated predictions"
 
 
 class ComparisonError(GpeError, ValueError):
@@ -142,8 +142,8 @@ def _models(runs: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[
         seconds = training_seconds(run)
         found[label] = simulator.to(settings.device), seconds
         for hold in settings.holds:
-            holding = simulator.configured(skips=replace(simulator.skips, hold=hold))
-            found[f"{label}{HELD} × {hold}"] = holding, seconds
+            repeating = simulator.configured(skips=replace(simulator.skips, hold=hold))
+            found[f"{label}{REPEATED} × {hold}"] = repeating, seconds
     return found
 
 
@@ -311,8 +311,8 @@ def _timed(simulator: Any, at: _Restricted, data: Trajectory, history: int) -> t
     return trajectory, seconds / max(1, num_steps) / (every * dt)
 
 
-def _between(before: Frame, after: Frame, share: float) -> Frame:
-    return before[0] + share * (after[0] - before[0]), before[1] + share * (after[1] - before[1])
+def _between(before: Frame, after: Frame, fraction: float) -> Frame:
+    return before[0] + fraction * (after[0] - before[0]), before[1] + fraction * (after[1] - before[1])
 
 
 def _numpy(state: State) -> Frame:
@@ -535,7 +535,7 @@ def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
                         if others not in point.name:
                             lines[label].append(place)
                 elif point.family == "learned":
-                    marks.setdefault(point.name.partition(" ")[0] + (HELD if HELD in point.name else ""), []).append(place)
+                    marks.setdefault(point.name.partition(" ")[0] + (", repeated" if REPEATED in point.name else ""), []).append(place)
             levels = {p.name: p.error(horizon) for p in points if p.family == "trivial"}
             panels[f"frames 1 – {horizon}" if horizon != "full" else "all frames"] = CostAndError(
                 {label: places for label, places in lines.items() if len(places) > 1}, marks, levels

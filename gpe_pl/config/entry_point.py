@@ -359,24 +359,24 @@ class Report(Callback):
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         with contextlib.suppress(OmegaConfBaseException):  # a refused name, which Hydra resolves again and reports
-            self._hold(Path(config.hydra.run.dir), config, num_processes(config))
+            self._lock_folder(Path(config.hydra.run.dir), config, num_processes(config))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         with contextlib.suppress(OmegaConfBaseException):
-            self._hold(Path(config.hydra.sweep.dir), config)
+            self._lock_folder(Path(config.hydra.sweep.dir), config)
 
-    def _hold(self, folder: Path, config: DictConfig, num_processes: int = 1) -> None:
+    def _lock_folder(self, folder: Path, config: DictConfig, num_processes: int = 1) -> None:
         """Lock the folder until the process ends, and end the process if the folder cannot be used.
 
         Hydra would turn an exception of a callback into a warning and continue.
         """
-        from gpe_pl.system.locks import held, is_later_process
+        from gpe_pl.system.locks import is_later_process, locked
         from gpe_pl.system.provenance import recorded
 
         _results.append(folder)
         try:
             refuse_links(folder)
-            self._lock.enter_context(held(folder, num_processes=num_processes))
+            self._lock.enter_context(locked(folder, num_processes=num_processes))
             if num_processes == 1 or not is_later_process():
                 self._lock.enter_context(recorded(folder, config.hydra.job.name, sys.argv[1:], str(config.paths.runs)))
         except GpeError as error:

@@ -106,7 +106,9 @@ class OptunaSweeper(Sweeper):
         (outcome,) = self.launcher.launch([_overrides(fixed, trial)], initial_job_idx=trial.number)
         value = outcome._return_value
         if outcome.status is JobStatus.FAILED:
-            raise SweepError(f"{folder}: trial {trial.number} of an earlier start cannot be repeated: {value}")
+            raise SweepError(
+                f"{folder}: trial {trial.number} of an earlier start cannot be repeated: {value}; choose another name=… or delete the folder"
+            )
         if value != trial.value:
             raise SweepError(
                 f"{folder}: trial {trial.number} of an earlier start had {trial.value:.6g} and has {value} now, so settings or data have changed; "

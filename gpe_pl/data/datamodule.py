@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 from torch_geometric.data import HeteroData
 
 from gpe_pl.data.checksum import split_checksum
-from gpe_pl.data.dataset import HeldGraphs, StoredTrajectory, WindowDataset, collated, long_enough, open_split, usable
+from gpe_pl.data.dataset import CachedGraphs, StoredTrajectory, WindowDataset, collated, long_enough, open_split, usable
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling, probabilities
 from gpe_pl.data.statistics import acceleration_std
@@ -207,11 +207,13 @@ class TrajectoryDataModule(L.LightningDataModule):
     def val_dataloader(self) -> DataLoader:
         windows = [int(w) for w in _spread(len(self.val_set), self.num_val_windows)]
         if len(windows) < ranks.num_ranks():
-            raise StoreError(f"{self.root}: split 'val' has {len(windows)} windows, too few for {ranks.num_ranks()} processes")
+            raise StoreError(
+                f"{self.root}: split 'val' has {len(windows)} windows, too few for {ranks.num_ranks()} processes; lower trainer.devices"
+            )
         max_nodes = self.batch_size.max_nodes
         size = BatchSize(NUM_VAL_GRAPHS, None if max_nodes is None else max(1, max_nodes // ranks.num_ranks()))
         batches = size.once(self.val_set, windows[ranks.rank() :: ranks.num_ranks()])
-        return DataLoader(HeldGraphs(self.val_set), batch_sampler=batches, collate_fn=collated)
+        return DataLoader(CachedGraphs(self.val_set), batch_sampler=batches, collate_fn=collated)
 
 
 def _spread(length: int, count: int) -> np.ndarray:

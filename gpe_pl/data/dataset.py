@@ -36,14 +36,14 @@ class StartKey(NamedTuple):
     Attributes:
         sample: sample number.
         window: number of the window at which the unroll starts.
-        own_steps: number of steps of the unroll.
+        num_steps: number of steps of the unroll.
         lane: number of the lane.
         correction: fraction of the velocity's deviation after the unroll that the target removes within one step.
     """
 
     sample: int
     window: int
-    own_steps: int
+    num_steps: int
     lane: int = 0
     correction: float = 1.0
 
@@ -71,14 +71,14 @@ class StoredTrajectory:
         name: name of the trajectory in the shard.
         num_frames: number of frames.
         num_nodes: number of dynamic nodes.
-        held: the trajectory if the split is cached in memory and its values are valid, else None.
+        cached: the trajectory if the split is cached in memory and its values are valid, else None.
     """
 
     path: Path
     name: str
     num_frames: int
     num_nodes: int
-    held: Trajectory | None
+    cached: Trajectory | None
 
     def window(self, start: int, stop: int) -> Trajectory:
         """Return the frames ``start:stop``.
@@ -86,29 +86,29 @@ class StoredTrajectory:
         Raises:
             StoreError: the trajectory cannot be read, or has values that nothing can be learned from.
         """
-        if self.held is not None:
-            return self.held.frames(start, stop)
+        if self.cached is not None:
+            return self.cached.frames(start, stop)
         return read_trajectory(self.path, self.name, frames=slice(start, stop))
 
     def whole(self) -> Trajectory:
         """Return all frames, checked against their stored digest; raises ``StoreError`` as ``window`` does."""
-        return read_trajectory(self.path, self.name, verify=True) if self.held is None else self.held
+        return read_trajectory(self.path, self.name, verify=True) if self.cached is None else self.cached
 
 
 def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> list[StoredTrajectory]:
     """Index all trajectories of a split, and cache them in memory if the split is small enough."""
     paths = shards(root, split)
-    hold = 2 * sum(p.stat().st_size for p in paths) <= cache_bytes
+    fits = 2 * sum(p.stat().st_size for p in paths) <= cache_bytes
     stored = []
     for path in paths:
         with open_shard(path) as file:
             shapes = {name: open_field(open_group(file, name), "pos").shape[:2] for name in sorted(file)}
         for name, (num_frames, num_nodes) in shapes.items():
-            held = None
-            if hold:
+            cached = None
+            if fits:
                 with suppress(UnsoundError):  # ``usable`` reports it
-                    held = _read_only(read_trajectory(path, name, verify=True))
-            stored.append(StoredTrajectory(path, name, num_frames, num_nodes, held))
+                    cached = _read_only(read_trajectory(path, name, verify=True))
+            stored.append(StoredTrajectory(path, name, num_frames, num_nodes, cached))
     return stored
 
 
@@ -156,7 +156,9 @@ def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
     num_damaged = len(trajectories) - len(found)
     if not found or num_damaged > max(1, MAX_DAMAGED * len(trajectories)):
         where = trajectories[0].path.parent
-        raise StoreError(f"{where}: {num_damaged} of {len(trajectories)} trajectories cannot be used; see the warnings above")
+        raise StoreError(
+            f"{where}: {num_damaged} of {len(trajectories)} trajectories cannot be used; see the warnings above, then generate or import the data again"
+        )
     return found
 
 
@@ -212,8 +214,8 @@ class Start:
 
     Attributes:
         state: initial state with noise, as float64 tensors.
-        truth: true positions [own_steps + 2, node, dim] in m of the frames from the state's on.
-        stress: true Cauchy stress [own_steps + 1, node, component] in Pa of the frames after the state's, if it is asked for.
+        truth: true positions [num_steps + 2, node, dim] in m of the frames from the state's on.
+        stress: true Cauchy stress [num_steps + 1, node, component] in Pa of the frames after the state's, if it is asked for.
         position_correction: fraction of the deviation from the true position that the target removes within one step; see ``Noise``.
         velocity_correction: fraction of the deviation from the true velocity that the target removes within one step, after the unroll; as in the key.
         about: numbers of trajectory and frame, and the weight in the loss if there is one.
@@ -230,7 +232,7 @@ class Start:
     lane: int
 
     @property
-    def own_steps(self) -> int:
+    def num_steps(self) -> int:
         """Number of steps of the unroll."""
         return self.truth.shape[0] - 2
 
@@ -289,7 +291,7 @@ def window_counts(trajectories: Sequence[StoredTrajectory], history: int) -> lis
         longest = max((t.num_frames for t in trajectories), default=0)
         where = f"{trajectories[0].path.parent}: " if trajectories else ""
         needed = f"{history + 2} frames that a start at frame {history} needs (graph.history, evaluation.start_frame)"
-        raise StoreError(f"{where}no trajectory has the {needed}; the longest has {longest}")
+        raise StoreError(f"{where}no trajectory has the {needed}; the longest has {longest}; choose a smaller frame or longer trajectories")
     return counts
 
 
@@ -366,7 +368,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         number, frame = self.locate(window)
         history = self.builder.config.history
         stored = self.trajectories[number]
-        ahead = 0 if start is None else min(start.own_steps, stored.num_frames - 2 - frame)
+        ahead = 0 if start is None else min(start.num_steps, stored.num_frames - 2 - frame)
         trajectory = stored.window(frame - history, frame + 2 + ahead)
         dt = trajectory.metadata.frame_dt
         truth = trajectory.pos.astype(np.float64)
@@ -405,7 +407,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         return training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[-1], about)
 
 
-class HeldGraphs(Dataset[HeteroData]):
+class CachedGraphs(Dataset[HeteroData]):
     """Windows as graphs that are built at first use and then cached.
 
     Args:
@@ -415,14 +417,14 @@ class HeldGraphs(Dataset[HeteroData]):
 
     def __init__(self, windows: WindowDataset, cache_bytes: int = CACHE_BYTES) -> None:
         self.windows, self.free_bytes = windows, cache_bytes
-        self.held: dict[int, HeteroData] = {}
+        self.graphs: dict[int, HeteroData] = {}
 
     def __getitem__(self, window: int) -> HeteroData:
-        if window in self.held:
-            return self.held[window]
+        if window in self.graphs:
+            return self.graphs[window]
         graph = self.windows[window]
         size = sum(value.nbytes for store in graph.stores for value in store.values() if isinstance(value, Tensor))
         if size <= self.free_bytes:
             self.free_bytes -= size
-            self.held[window] = graph
+            self.graphs[window] = graph
         return graph

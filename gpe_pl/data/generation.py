@@ -27,14 +27,14 @@ import numpy as np
 
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.ground_truth import DatasetSpec, GenerationError, generate_trajectory, initial_state
-from gpe_pl.data.motion import ROUNDING_SHARE, motion_of, rounding_fault, rounding_of
+from gpe_pl.data.motion import ROUNDING_FRACTION, motion_of, rounding_fault, rounding_of
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.files import sealed
 from gpe_pl.files.atomic import free_bytes, replace_text
 from gpe_pl.files.run_folder import refuse_links, without_orphans
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.solvers.caution import unresolved
-from gpe_pl.system.locks import held
+from gpe_pl.system.locks import locked
 from gpe_pl.system.progress import Progress
 from gpe_pl.system.workers import pool, results
 from gpe_pl.trajectory.store import StoreError, read_trajectory, trajectory_names, write_shard
@@ -50,7 +50,7 @@ SCENES_LOOKED_AT = 8
 """Number of scenes that are checked for meshes that are too thin, because bodies of one data set differ."""
 
 ROUNDING_REFUSED = 0.5
-"""Maximum rounding error of accelerations due to stored positions, as a fraction of the accelerations. Above ``ROUNDING_SHARE`` a warning is logged."""
+"""Maximum rounding error of accelerations due to stored positions, as a fraction of the accelerations. Above ``ROUNDING_FRACTION`` a warning is logged."""
 
 # --- shards --------------------------------------------------------------------------------------------------------------------------------
 
@@ -237,7 +237,7 @@ def check_rounding(spec: DatasetSpec) -> None:
     """
     dt = spec.solver.frame_dt
     rounding = float(rounding_of(np.abs(np.array(spec.scene.bounds)).max(axis=1), dt).max())
-    if rounding <= ROUNDING_SHARE * float(np.linalg.norm(spec.scene.gravity)):  # nodes that meet a wall accelerate at least as much
+    if rounding <= ROUNDING_FRACTION * float(np.linalg.norm(spec.scene.gravity)):  # nodes that meet a wall accelerate at least as much
         return
     trajectory = generate_trajectory(spec, "train", 0)
     acceleration = motion_of(trajectory.metadata, trajectory.pos).acceleration
@@ -293,15 +293,15 @@ def generate(
 
 
 def written(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1), waits: bool = False) -> AbstractContextManager[None]:
-    """Keep other processes from writing the data set, or the same part of it, inside the block; arguments and errors are those of ``locks.held``."""
+    """Keep other processes from writing the data set, or the same part of it, inside the block; arguments and errors are those of ``locks.locked``."""
     folder = Path(root) / spec.name / spec.size
     if part[1] == 1:
-        return held(folder, "paths.data", waits)
-    return held(folder.with_name(f"{spec.size}-part-{part[0]}-of-{part[1]}"), "paths.data", waits, makes=False)
+        return locked(folder, "paths.data", waits)
+    return locked(folder.with_name(f"{spec.size}-part-{part[0]}-of-{part[1]}"), "paths.data", waits, makes=False)
 
 
 def _generate(folder: Path, to_do: Plan, spec: DatasetSpec, num_workers: int, on_progress: Progress | None, part: tuple[int, int]) -> None:
-    with held(folder, "paths.data", waits=True):  # of parts generated at the same time, one writes the spec
+    with locked(folder, "paths.data", waits=True):  # of parts generated at the same time, one writes the spec
         _claim(folder, spec)
     if not to_do.fits:
         raise GenerationError(
@@ -338,11 +338,11 @@ def _draw_contact_sheet(spec: DatasetSpec, path: Path, workers: Executor | None)
     from gpe_pl.viz.saving import save_figure
 
     rows: dict[str, dict[str, float]] = {}
-    for share in np.linspace(0.0, 1.0, SHEET_ROWS):
+    for fraction in np.linspace(0.0, 1.0, SHEET_ROWS):
         values = {}
         for material, choices in spec.parameters.items():
             every = sorted({*choices.seen, *choices.interpolated, *choices.extrapolated})
-            values[material] = every[round(share * (len(every) - 1))]
+            values[material] = every[round(fraction * (len(every) - 1))]
         rows[row_label(values)] = values
     index = _most_varied_scene(spec)
     arguments = [(spec, index, label, values) for label, values in rows.items()]

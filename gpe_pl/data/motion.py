@@ -22,7 +22,7 @@ from gpe_pl.trajectory.trajectory import Metadata
 Precision = type[np.float16] | type[np.float32] | type[np.float64]
 PRECISIONS: tuple[Precision, ...] = (np.float16, np.float32, np.float64)
 
-ROUNDING_SHARE = 0.1
+ROUNDING_FRACTION = 0.1
 """Largest acceptable rounding error of accelerations, as a fraction of the accelerations. It is a hundredth of their variance, which no model can learn."""
 
 
@@ -57,7 +57,7 @@ def rounding_fault(rounding: float, acceleration: float, where: str = "in float3
         acceleration: rms acceleration of the data [m/s²].
         where: how positions are rounded, for the message.
     """
-    if rounding <= ROUNDING_SHARE * acceleration:
+    if rounding <= ROUNDING_FRACTION * acceleration:
         return ""
     return f"positions {where} round accelerations by {rounding:.3g} m/s², those of the data are {acceleration:.3g} m/s² rms"
 

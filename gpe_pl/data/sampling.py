@@ -18,7 +18,7 @@ from gpe_pl.trajectory.store import StoreError
 Sampling = Literal["uniform", "activity"]
 """How often windows are drawn: ``uniform`` draws all equally often, ``activity`` in proportion to their rms acceleration."""
 
-UNIFORM_SHARE = 0.2
+UNIFORM_FRACTION = 0.2
 """Fraction of samples that ``activity`` sampling draws uniformly, which limits the weights to 5."""
 
 
@@ -35,7 +35,7 @@ def probabilities(activity: np.ndarray) -> np.ndarray:
     total = activity.sum()
     if not total > 0:
         return np.full(len(activity), 1 / len(activity))
-    return UNIFORM_SHARE / len(activity) + (1 - UNIFORM_SHARE) * activity / total
+    return UNIFORM_FRACTION / len(activity) + (1 - UNIFORM_FRACTION) * activity / total
 
 
 NUM_LANES = 16
@@ -69,10 +69,10 @@ class PushForward:
         lanes = [next(batches) for _ in range(NUM_LANES)]
         for turn in count():
             for lane in range(NUM_LANES):
-                own_steps = (turn + lane * num_visits // NUM_LANES) % num_visits
-                if turn and not own_steps:
+                num_steps = (turn + lane * num_visits // NUM_LANES) % num_visits
+                if turn and not num_steps:
                     lanes[lane] = next(batches)
-                yield [StartKey(sample, window, own_steps, lane, self.correction) for sample, window in lanes[lane]]
+                yield [StartKey(sample, window, num_steps, lane, self.correction) for sample, window in lanes[lane]]
 
 
 class StepSampler(Sampler[tuple[int, int]]):
@@ -167,7 +167,9 @@ class BatchSampler(Sampler[list[Key]]):
         if fewest < ranks.num_ranks() > 1:
             what = f"training.batch_size={size.num_graphs}" if size.max_nodes is None else f"batching.max_nodes={size.max_nodes}"
             nodes = "" if size.max_nodes is None else f" of up to {largest} nodes"
-            raise StoreError(f"{what}: too small for {ranks.num_ranks()} processes, each of which takes at least one graph{nodes}")
+            raise StoreError(
+                f"{what}: too small for {ranks.num_ranks()} processes, each of which takes at least one graph{nodes}; raise it, or lower trainer.devices"
+            )
 
     def __iter__(self) -> Iterator[list[Key]]:
         first, push = self.step(), self.push_forward

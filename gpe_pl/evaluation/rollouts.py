@@ -94,7 +94,9 @@ class EvaluationSettings:
             StartError: ``start_frame`` leaves too little history.
         """
         if self.start_frame is not None and self.start_frame < history:
-            raise StartError(f"evaluation.start_frame={self.start_frame}: graph.history={history} needs as many frames before it")
+            raise StartError(
+                f"evaluation.start_frame={self.start_frame}: graph.history={history} needs as many frames before it; choose at least {history}"
+            )
         return history if self.start_frame is None else self.start_frame
 
 
@@ -151,7 +153,7 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
         raise ExportError(
             "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
         )
-    simulator = simulator.configured(holds_parameters=settings.hold_parameters, static_friction=settings.static_friction)
+    simulator = simulator.configured(clamps_parameters=settings.hold_parameters, static_friction=settings.static_friction)
     run_dir.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     for split in settings.splits:

@@ -62,7 +62,7 @@ class Input:
     doc: str
 
 
-class PortableStep(nn.Module):
+class ExportedStep(nn.Module):
     """Step of a learned simulator on plain tensors: the simulator's own graph features, model and integration, with the topology as an input.
 
     Args:
@@ -247,7 +247,7 @@ def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
     path = Path(path)
     if path.suffix != ".pt2":
         raise ValueError(f"{path}: an exported program ends in .pt2")
-    step = PortableStep(copy.deepcopy(simulator).cpu().eval())
+    step = ExportedStep(copy.deepcopy(simulator).cpu().eval())
     step.simulator.skips = EVERYTHING
     inputs = describe(simulator)
     example, sizes = _example(inputs)

@@ -108,7 +108,9 @@ class GraphBuilder:
         if sum(len(r) for r in rows.values()) != state.num_nodes:
             present = {NODE_TYPES[code] for code in state.node_type.unique().tolist()}
             unknown, known = ", ".join(sorted(present - {*self.spec.materials})), ", ".join(self.spec.materials)
-            raise GraphError(f"state has nodes of {unknown}; the data set {self.metadata.dataset!r} has {known}")
+            raise GraphError(
+                f"state has nodes of {unknown}; the data set {self.metadata.dataset!r} has {known}; take a model that was trained on {unknown}"
+            )
         return find_topology(state, rows, self.config, self.spec, self.scales, self.skips)
 
     def _check(self, state: State) -> None:
@@ -116,10 +118,15 @@ class GraphBuilder:
             raise GraphError(f"positions are {state.pos.dtype}; convert the state with State.to_torch, which makes them float64")
         if state.periodicity.axes != self.metadata.periodicity.axes:
             own, other = (", ".join("xyz"[a] for a in p.axes) or "no axis" for p in (self.metadata.periodicity, state.periodicity))
-            raise GraphError(f"state is periodic along {other}, the data set {self.metadata.dataset!r} along {own}")
+            raise GraphError(
+                f"state is periodic along {other}, the data set {self.metadata.dataset!r} along {own}; make the state with the same periodic axes"
+            )
         history = history_of(state)
         if history.shape[1] != self.config.history:
-            raise GraphError(f"state has a history of {history.shape[1]} velocities, the graph needs {self.config.history}")
+            raise GraphError(
+                f"state has a history of {history.shape[1]} velocities, the graph needs {self.config.history}; "
+                "make the state with initial_state of the simulator"
+            )
         bad = ~(torch.cat([state.pos, history.flatten(1)], dim=1).abs() < LARGEST).all(dim=1)
         if bad.any():
             node = int(bad.nonzero()[0])

@@ -30,7 +30,7 @@ def approximate(simulator: LearnedSimulator) -> Simulator:
     runner: Simulator = simulator
     if skips.sleep_after is not None:
         runner = Sleeping(simulator)
-    return runner if skips.hold == 1 else Holding(runner, dt, skips.hold)
+    return runner if skips.hold == 1 else Repeating(runner, dt, skips.hold)
 
 
 class Batched(ABC):
@@ -141,9 +141,9 @@ def _rest_of(state: State) -> Tensor:
 
 def _in_the_same_island(chosen: np.ndarray, label: np.ndarray) -> np.ndarray:
     """Return a mask [node] of all nodes in islands with a chosen node; ``chosen`` is a mask [node]."""
-    holds = np.zeros(label.max(initial=-1) + 1, dtype=bool)
-    holds[label[chosen]] = True
-    return holds[label]
+    has_chosen = np.zeros(label.max(initial=-1) + 1, dtype=bool)
+    has_chosen[label[chosen]] = True
+    return has_chosen[label]
 
 
 def _combined_stress(state: State, after: State, awake: Tensor, moved: Tensor) -> Stress | None:
@@ -155,7 +155,7 @@ def _combined_stress(state: State, after: State, awake: Tensor, moved: Tensor) -
 
 
 @dataclass(frozen=True)
-class _Held:
+class _Repeated:
     """A prediction that is repeated.
 
     Attributes:
@@ -169,7 +169,7 @@ class _Held:
     inner: Any
 
 
-class Holding(Batched):
+class Repeating(Batched):
     """Simulator that predicts once in ``frames`` frames and repeats the accelerations in between. Contacts that begin or end in between have no effect.
 
     Args:
@@ -182,24 +182,26 @@ class Holding(Batched):
         self.simulator, self.dt, self.frames = simulator, dt, frames
 
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        held = [s.internal if isinstance(s.internal, _Held) else None for s in states]
-        asked = [replace(s, internal=h.inner if h else s.internal) for s, h in zip(states, held, strict=True) if h is None or h.frames == 0]
+        repeated = [s.internal if isinstance(s.internal, _Repeated) else None for s in states]
+        asked = [
+            replace(s, internal=h.inner if h else s.internal) for s, h in zip(states, repeated, strict=True) if h is None or h.frames == 0
+        ]
         answers = iter(step_all(self.simulator, asked))
         results: list[State | SimulationError] = []
-        for state, h in zip(states, held, strict=True):
+        for state, h in zip(states, repeated, strict=True):
             if h is not None and h.frames > 0:
-                results.append(self._go_on(state, h))
+                results.append(self._repeat(state, h))
                 continue
             after = next(answers)
-            results.append(after if isinstance(after, SimulationError) else self._hold(state, after))
+            results.append(after if isinstance(after, SimulationError) else self._with_repetition(state, after))
         return results
 
-    def _hold(self, state: State, after: State) -> State:
+    def _with_repetition(self, state: State, after: State) -> State:
         acceleration = integrators.acceleration(after.vel, state.vel, self.dt)
         stopped = (after.vel == 0).all(dim=1, keepdim=True)  # sleeping nodes, for example: the stop must not be repeated
-        return replace(after, internal=_Held(torch.where(stopped, 0.0, acceleration), self.frames - 1, after.internal))
+        return replace(after, internal=_Repeated(torch.where(stopped, 0.0, acceleration), self.frames - 1, after.internal))
 
-    def _go_on(self, state: State, held: _Held) -> State:
-        pos, vel = integrators.advance(state.pos, state.vel, held.acceleration, self.dt)
-        internal = replace(held, frames=held.frames - 1)
+    def _repeat(self, state: State, repeated: _Repeated) -> State:
+        pos, vel = integrators.advance(state.pos, state.vel, repeated.acceleration, self.dt)
+        internal = replace(repeated, frames=repeated.frames - 1)
         return state.later(self.dt, pos, vel, stress=state.stress, num_asleep=state.num_asleep, internal=internal)

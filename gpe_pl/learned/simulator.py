@@ -32,7 +32,7 @@ from gpe_pl.learned.checkpoint_archive import check_archive, check_values
 from gpe_pl.learned.pretrained import checkpoint_path, names
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.lookup import model_class
-from gpe_pl.nn.static_friction import is_held, supported
+from gpe_pl.nn.static_friction import keeps_position, supported
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, MATERIALS, EdgeType, node_code
@@ -70,7 +70,7 @@ class LearnedSimulator(nn.Module):
 
     Attributes:
         skips: levels of skipping.
-        holds_parameters: clamp material parameters outside the range of training to the nearest trained value. A network is less reliable outside this range.
+        clamps_parameters: clamp material parameters outside the range of training to the nearest trained value. A network is less reliable outside this range.
         static_friction: nodes on a wall keep their positions if they are slower than this fraction of the speed that gravity gives in one frame (see
             ``nn.static_friction``); 0 switches it off.
 
@@ -82,7 +82,7 @@ class LearnedSimulator(nn.Module):
     stress_std: Tensor
     trained_scene: Tensor
     trained_mass: Tensor
-    holds_parameters: bool = True
+    clamps_parameters: bool = True
 
     def __init__(self, model: Model, builder: GraphBuilder) -> None:
         super().__init__()
@@ -117,15 +117,15 @@ class LearnedSimulator(nn.Module):
         self.model.skips = skips
 
     def configured(
-        self, *, skips: Skips | None = None, holds_parameters: bool | None = None, static_friction: float | None = None
+        self, *, skips: Skips | None = None, clamps_parameters: bool | None = None, static_friction: float | None = None
     ) -> LearnedSimulator:
         """Return a copy with other settings; None keeps a setting. The copy shares the weights and leaves this simulator unchanged."""
         other = copy.copy(self)
         other._modules = {**self._modules, "model": copy.copy(self.model)}
         if skips is not None:
             other.skips = skips
-        if holds_parameters is not None:
-            other.holds_parameters = holds_parameters
+        if clamps_parameters is not None:
+            other.clamps_parameters = clamps_parameters
         if static_friction is not None:
             other.static_friction = static_friction
         return other
@@ -135,12 +135,12 @@ class LearnedSimulator(nn.Module):
         return self._static_friction
 
     @static_friction.setter
-    def static_friction(self, share: Any) -> None:
-        if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
-            raise ValueError(f"static_friction={share!r}: must be a number from 0 to less than 1, a fraction of gravity")
-        if share and not self.builder.spec.islands:
-            raise SceneError(f"static_friction={share:g}: needs a model that was trained with graph.islands=true; 0 turns it off")
-        self._static_friction = float(share)
+    def static_friction(self, fraction: Any) -> None:
+        if isinstance(fraction, bool) or not isinstance(fraction, int | float) or not 0 <= fraction < 1:
+            raise ValueError(f"static_friction={fraction!r}: must be a number from 0 to less than 1, a fraction of gravity")
+        if fraction and not self.builder.spec.islands:
+            raise SceneError(f"static_friction={fraction:g}: needs a model that was trained with graph.islands=true; 0 turns it off")
+        self._static_friction = float(fraction)
 
     @property
     def num_hops(self) -> int:
@@ -173,7 +173,9 @@ class LearnedSimulator(nn.Module):
         target = torch.cat([g[m].target for g in sample for m in self.builder.spec.materials]).double()
         rms = target.square().mean().sqrt()
         if not torch.isfinite(rms) or rms == 0:
-            raise ValueError(f"the training data's accelerations without gravity have rms {float(rms)}; nothing to learn from")
+            raise ValueError(
+                f"the training data's accelerations without gravity have rms {float(rms)}; nothing to learn from: check positions, gravity and frame_dt"
+            )
         self.acceleration_std.copy_(rms)
         stress = [g[m].stress_target for m in self.builder.spec.stress_channels for g in sample.of(m) if "stress_target" in g[m]]
         if stress:
@@ -282,7 +284,7 @@ class LearnedSimulator(nn.Module):
 
     def forward(self, data: HeteroData) -> Prediction:
         """Return accelerations without gravity per material, in units of ``acceleration_std``."""
-        limits = dict(self.trained_ranges()) if self.holds_parameters else None
+        limits = dict(self.trained_ranges()) if self.clamps_parameters else None
         return self.model(self.standardizer(data, self.skips.absent_types, limits))
 
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
@@ -337,11 +339,13 @@ class LearnedSimulator(nn.Module):
         for name, values in (("pos", state.pos), ("velocity", history_of(state))):
             bad = ~torch.isfinite(values).flatten(1).all(dim=1)
             if bad.any():
-                raise SceneError(f"{where}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
+                raise SceneError(
+                    f"{where}: node {int(bad.nonzero()[0])} has a {name} that is not finite; correct it, or start at another frame"
+                )
         bad = ~(torch.isfinite(state.mass) & (state.mass > 0))
         if bad.any():
             node = int(bad.nonzero()[0])
-            raise SceneError(f"node {node} has a mass of {float(state.mass[node]):g} kg")
+            raise SceneError(f"node {node} has a mass of {float(state.mass[node]):g} kg; give every node a positive and finite mass")
         for material, spec in MATERIALS.items():
             if material in self.builder.metadata.materials:
                 rows = torch.nonzero(state.node_type == node_code(material)).flatten()
@@ -350,8 +354,8 @@ class LearnedSimulator(nn.Module):
                 if wrong.any():
                     node, value = int(rows[wrong][0]), float(column[wrong][0])
                     raise SceneError(f"node {node} ({material}): {spec.name} is {value:g} {spec.unit}, must be {spec.rule}")
-        held = "; clamped to the nearest trained value" if self.holds_parameters else ""
-        found = [(kind, line + held) for kind, line in self._outside_parameters(state)]
+        clamped = "; clamped to the nearest trained value" if self.clamps_parameters else ""
+        found = [(kind, line + clamped) for kind, line in self._outside_parameters(state)]
         for kind, line in (*found, *self._outside_scene(state)):
             self._warn_once(kind, line)
         return state
@@ -423,15 +427,15 @@ class LearnedSimulator(nn.Module):
     def integrated(self, state: State, graph: HeteroData, acc: Tensor) -> State:
         """Return the next state under an acceleration [node, dim] in m/s², gravity included; static friction keeps slow nodes in place."""
         new = self.advance(state, acc)
-        return self._held(state, new, graph) if self.static_friction else new
+        return self._with_static_friction(state, new, graph) if self.static_friction else new
 
-    def _held(self, state: State, new: State, graph: HeteroData) -> State:
+    def _with_static_friction(self, state: State, new: State, graph: HeteroData) -> State:
         """Return the new state with the old positions of the nodes that static friction keeps in place."""
         island = torch.empty(state.num_nodes, dtype=torch.int64, device=state.pos.device)
         for material in self.builder.spec.materials:
             island[graph[material].node_id] = graph[material].island
-        held = is_held(state.vel, new.vel, island, self.supported(graph), self.slowest(state.gravity))[:, None]
-        return new.corrected(torch.where(held, state.pos, new.pos), torch.where(held, 0.0, new.vel))
+        stays = keeps_position(state.vel, new.vel, island, self.supported(graph), self.slowest(state.gravity))[:, None]
+        return new.corrected(torch.where(stays, state.pos, new.pos), torch.where(stays, 0.0, new.vel))
 
     def slowest(self, gravity: Tensor) -> Tensor:
         """Return the speed [m/s] below which static friction keeps nodes in place."""
@@ -489,12 +493,12 @@ class LearnedSimulator(nn.Module):
                 raise ValueError(f"{name} has values that are not positive")
         for material, trained in self.trained_ranges():
             if not bool((trained[0] <= trained[1]).all()):
-                raise ValueError(f"trained_{material} ends before it begins")
+                raise ValueError(f"the lowest value of trained_{material} is above the highest")
         low, high = self.trained_scene
         if not bool(((low <= high) | (low.isposinf() & high.isneginf())).all()):
-            raise ValueError("trained_scene ends before it begins")
+            raise ValueError("the lowest value of trained_scene is above the highest")
         if not bool((self.trained_mass[0] <= self.trained_mass[1]).all()):
-            raise ValueError("trained_mass ends before it begins")
+            raise ValueError("the lowest value of trained_mass is above the highest")
 
     # --- checkpoints ----------------------------------------------------------------------------------------------------------------------
 
@@ -559,7 +563,9 @@ class LearnedSimulator(nn.Module):
             simulator.load_state_dict(weights)
             simulator._check_values()
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-            raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model ({reason(error)})") from None
+            raise CheckpointError(
+                f"{path}: not a checkpoint of gpe_pl or one of another model ({reason(error)}); take another one of the run, such as last.ckpt"
+            ) from None
         return simulator.to(device).eval()
 
 

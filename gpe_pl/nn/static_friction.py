@@ -28,7 +28,7 @@ def supported(is_free: Bool[Tensor, " island"], contacts: Iterable[tuple[Tensor,
     return ~is_free & (pushes == 0)
 
 
-def is_held(
+def keeps_position(
     before: Float[Tensor, "node dim"],
     after: Float[Tensor, "node dim"],
     island: Int64[Tensor, " node"],

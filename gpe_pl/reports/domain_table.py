@@ -55,7 +55,7 @@ PAPER = {
 }
 """Average MSE ×1e-3 of Yang et al. 2022, table 1. The units of the paper are not ours, so only ratios can be compared."""
 
-JUDGED = "test_unseen"
+EVALUATED = "test_unseen"
 """Split that is evaluated in every domain: all scenes with material parameters that training did not have, between the trained values and outside. The paper
 names its test parameters for solids only, and does the same there (trained on 1–4 MPa, tested on 0.5–10 MPa)."""
 
@@ -185,7 +185,7 @@ def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, C
     """
     found = {}
     for model, runs in by_model.items():
-        values = {name: values_by_seed(runs, name, JUDGED, "rollout_mse", "full") for name in (LEARNED, *BASELINES)}
+        values = {name: values_by_seed(runs, name, EVALUATED, "rollout_mse", "full") for name in (LEARNED, *BASELINES)}
         if values[LEARNED] and values[STAND_IN]:
             found[model] = {name: table for name, table in values.items() if table}
     trajectories = shared_trajectories(*(table for values in found.values() for table in values.values()))
@@ -197,10 +197,10 @@ def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, C
     row = {}
     for model, values in found.items():
         errors = shared_table(values.pop(LEARNED), trajectories)
-        judged = shared_table(rollout_errors(by_model[model], JUDGED, "full"), trajectories)
+        counted = shared_table(rollout_errors(by_model[model], EVALUATED, "full"), trajectories)
         trivial = {name: float(shared_table(table[:1], trajectories).mean()) for name, table in values.items()}
         num_failed = int((~np.isfinite(errors)).sum())
-        row[model] = Cell(judged, num_failed, trivial), Cell(errors, num_failed, trivial)
+        row[model] = Cell(counted, num_failed, trivial), Cell(errors, num_failed, trivial)
     return row
 
 
@@ -280,7 +280,7 @@ def _medians(domains: list[str], models: list[str], cells: dict[tuple[str, str],
         others = [value for m, value in own.items() if m != OWN]
         ratio = f"{own[OWN] / min(others):.2f}" if OWN in own and others else "–"
         lines.append(table_row([domain, *(f"{1e3 * own[m]:.3g}" if m in own else "–" for m in models), ratio]))
-    return ["", "The median over trajectories and seeds instead; it judges nothing.", "", *lines]
+    return ["", "The median over trajectories and seeds instead; no comparison uses it.", "", *lines]
 
 
 def _text(cell: Cell | None) -> str:

@@ -191,7 +191,7 @@ def _training_table(names: list[str], variants: dict[Variant, list[Run]], ratios
     note = (
         "Validation loss: last value, mean over seeds (range). Forward time: trained models on one graph, by PyTorch's operations alone, "
         "median of paired ratios to the first row. "
-        "Outside: share of particle-frames inside a wall or obstacle when containment is off; corrected: share of particle-steps that containment moves."
+        "Outside: fraction of particle-frames inside a wall or obstacle when containment is off; corrected: fraction of particle-steps that containment moves."
     )
     return [*lines, *rows, "", note]
 

@@ -117,8 +117,8 @@ class Guard:
         deepest = np.zeros(len(end))
         for some in np.array_split(suspects, max(1, len(suspects) // SUSPECTS_AT_ONCE)):
             count = min(MAX_PATH_SAMPLES, math.ceil(float(length[some].max(initial=0.0)) / (0.5 * tolerance)))
-            for share in np.arange(1, count) / max(1, count):
-                deepest[some] = np.maximum(deepest[some], -signed_distance(shapes, start[some] + share * way[some]))
+            for fraction in np.arange(1, count) / max(1, count):
+                deepest[some] = np.maximum(deepest[some], -signed_distance(shapes, start[some] + fraction * way[some]))
         node = int(np.argmax(deepest))
         if not deepest[node] > tolerance:
             return None

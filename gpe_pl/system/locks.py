@@ -36,7 +36,7 @@ WITHOUT_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP}
 RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
 """Environment variables that number the processes of one run, as Lightning reads them."""
 
-_held: set[Path] = set()
+_locked: set[Path] = set()
 """Locks that this process holds."""
 
 
@@ -58,7 +58,7 @@ class Holder:
 
 
 @contextlib.contextmanager
-def held(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bool = True, num_processes: int = 1) -> Iterator[None]:
+def locked(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bool = True, num_processes: int = 1) -> Iterator[None]:
     """Keep other commands from writing to a folder inside the block.
 
     A process that already holds the lock may take it again.
@@ -77,20 +77,20 @@ def held(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bool
     if num_processes > 1 and is_later_process():
         yield
         return
-    if path in _held:
+    if path in _locked:
         with _same(folder):
             yield
         return
     made = _make(folder if makes else folder.parent, key)
     lock = _acquired(folder, path, waits)
-    _held.add(path)
+    _locked.add(path)
     holder = _beside(folder, "holder")
     try:
         replace_text(holder, json.dumps(asdict(_this_process())))
         with _same(folder):
             yield
     finally:
-        _held.discard(path)
+        _locked.discard(path)
         with contextlib.suppress(OSError):
             holder.unlink(missing_ok=True)
         if not isinstance(lock, SoftFileLock):
@@ -120,7 +120,7 @@ def _acquired(folder: Path, path: Path, waits: bool) -> BaseFileLock:
         except OSError as error:
             if isinstance(error, Timeout) or error.errno not in WITHOUT_LOCKS:
                 raise FolderError(f"{path}: cannot be locked ({error.strerror or error}); choose a folder that can be written") from None
-    raise FolderError(f"{path}: the disk has no locks; choose a folder on another")
+    raise FolderError(f"{path}: the disk has no locks; choose a folder on another disk")
 
 
 def _beside(folder: Path, suffix: str) -> Path:

@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 WARM_UP_STEPS = NUM_LANES
 MEASURED_STEPS = 25
 ROUNDS = 5
-SHARE_TO_MEASURE = 0.5
+FRACTION_TO_MEASURE = 0.5
 """Fraction of the budget after which no further round of measurements begins."""
 TIMES = TypeAdapter(dict[str, Annotated[float, Field(gt=0, strict=True)]])
 RATE = "FLOP/s in products"
@@ -73,7 +73,7 @@ class BudgetError(GpeError, ValueError):
 
 def mean_step_time(module: TrainingModule, data: WindowDataset, size: BatchSize, settings: TrainingSettings) -> float:
     """Mean time per optimiser step [s] over a whole run: without push-forward at first, with it in the last ``push_share`` of the steps."""
-    limit = math.inf if settings.budget_minutes is None else SHARE_TO_MEASURE * 60 * settings.budget_minutes
+    limit = math.inf if settings.budget_minutes is None else FRACTION_TO_MEASURE * 60 * settings.budget_minutes
     if not settings.push_share:
         return step_time(module, data, size, settings.gradient_clip, limit=limit)
     plain = step_time(module, data, size, settings.gradient_clip, limit=limit / 2)

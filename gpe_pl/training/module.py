@@ -173,10 +173,10 @@ class TrainingModule(L.LightningModule):
         if "weight" in batch:
             acceleration = self._weighted(batch, predicted.acceleration, acceleration)
             stress = self._weighted(batch, predicted.stress, stress)
-        shares = self._shares(acceleration, stress)
-        loss = torch.cat(acceleration).mean() * shares[0]
+        fractions = self._fractions(acceleration, stress)
+        loss = torch.cat(acceleration).mean() * fractions[0]
         if stress:
-            loss = loss + self.stress_weight * torch.cat(stress).mean() * shares[1]
+            loss = loss + self.stress_weight * torch.cat(stress).mean() * fractions[1]
         return loss
 
     @staticmethod
@@ -185,7 +185,7 @@ class TrainingModule(L.LightningModule):
         weight = batch.weight.float()
         return [weight[batch[m].batch][:, None] * error for m, error in zip(materials, errors, strict=True)]
 
-    def _shares(self, *errors: list[Tensor]) -> list[float]:
+    def _fractions(self, *errors: list[Tensor]) -> list[float]:
         """Fraction of all ranks' errors that is on this rank, for each kind. A rank without errors of a kind takes part in the exchange, too."""
         if ranks.num_ranks() == 1:
             return [1.0] * len(errors)

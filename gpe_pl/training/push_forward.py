@@ -125,7 +125,7 @@ class Excursions:
 
 
 def _graph(simulator: LearnedSimulator, start: Start, state: State, step: int) -> HeteroData | None:
-    if step > start.own_steps:
+    if step > start.num_steps:
         return None
     try:
         return start.graph(simulator.builder, state, step)
@@ -164,12 +164,12 @@ class _Trainable(Batched):
 
 @torch.no_grad()
 def walked(simulator: LearnedSimulator, starts: Sequence[Start]) -> tuple[list[State], list[int]]:
-    """States after unrolling each start for ``own_steps`` steps, all starts together, and the number of steps of each.
+    """States after unrolling each start for ``num_steps`` steps, all starts together, and the number of steps of each.
 
     An unroll whose scene has no graph any more ends earlier.
     """
     states, steps = [start.state for start in starts], [0] * len(starts)
-    num_steps = {k: start.own_steps for k, start in enumerate(starts)}
+    num_steps = {k: start.num_steps for k, start in enumerate(starts)}
     was_training = simulator.training
     simulator.eval()
     try:

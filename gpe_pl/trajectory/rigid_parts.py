@@ -180,8 +180,8 @@ def _hold_together(paths: _Paths, label: np.ndarray) -> np.ndarray:
         of_part, count = label[nodes] >= 0, np.bincount(label[nodes] + 1)
         own = (label[near] == label[nodes][:, None]).sum(axis=1)
         most = np.minimum(hangs.sum(axis=1), count[label[nodes] + 1] - 1)
-        share, whole = (np.bincount(label[nodes][of_part], values[of_part]) for values in (own, most))
-        accepted = np.flatnonzero((2 * share >= whole) & (count[1:] > 0))
+        fraction, whole = (np.bincount(label[nodes][of_part], values[of_part]) for values in (own, most))
+        accepted = np.flatnonzero((2 * fraction >= whole) & (count[1:] > 0))
         if not len(accepted):
             return is_rigid
         is_rigid |= np.isin(label, accepted)

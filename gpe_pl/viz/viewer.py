@@ -95,7 +95,8 @@ def write_viewer(
     for name, trajectory in trajectories.items():
         if not np.array_equal(trajectory.node_type, ground_truth.node_type):
             raise ViewerError(
-                f"{name!r} has {trajectory.num_nodes} nodes and the {heading(ground_truth)} {ground_truth.num_nodes}, or their materials differ"
+                f"{name!r} has {trajectory.num_nodes} nodes and the {heading(ground_truth)} {ground_truth.num_nodes}, or their materials differ; "
+                "give rollouts of the same scene"
             )
     about = ground_truth.metadata
     title = title or " ".join(word for word in (about.dataset, about.split) if word)

@@ -40,8 +40,8 @@ def long_horizon_figure(models: Curves) -> Figure:
     labels = (
         ("frame", "E / E₀, median"),
         ("frame", "|Σ m v| / Σ m [m/s], median"),
-        ("share of scenes", "valid frames"),
-        ("frame", "share of scenes alive"),
+        ("fraction of scenes", "valid frames"),
+        ("frame", "fraction of scenes alive"),
     )
     for panel, (x, y) in zip(axes.flat, labels, strict=True):
         panel.set_xlabel(x, fontsize=7)

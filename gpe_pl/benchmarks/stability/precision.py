@@ -86,17 +86,17 @@ def compilations() -> int:
 @stress_test(28, "skipped work", "exact levels: change < 1e-6; sleeping: error after 20 steps ≤ 1.05 times that of computing everything")
 def skipping(subject: Subject) -> Outcome:
     changes = []
-    for share in (0.1, 0.5, 0.9):
-        state = subject.state(0, share)
+    for fraction in (0.1, 0.5, 0.9):
+        state = subject.state(0, fraction)
         everything = acceleration(_skipping(subject, NOTHING), state)
         changes += [relative_change(acceleration(_skipping(subject, skips), state), everything) for skips in EXACT]
         builder = subject.simulator.builder
         other = GraphBuilder(replace(builder.config, trim_boundary=not builder.config.trim_boundary), builder.metadata, NOTHING)
         untrimmed = output(subject.simulator, other(state), state.num_nodes).double() * subject.acceleration_std
         changes.append(relative_change(untrimmed, everything))
-    ratio, speed_up, share = sleeping(subject)
-    slept = f"sleeping {ratio:.3f} times the error, {speed_up:.2f} times as fast, {100 * share:.2g} % asleep"
-    text = f"exact levels {max(changes):.1e}; {slept if share > 0 else 'nothing fell asleep'}"
+    ratio, speed_up, fraction = sleeping(subject)
+    slept = f"sleeping {ratio:.3f} times the error, {speed_up:.2f} times as fast, {100 * fraction:.2g} % asleep"
+    text = f"exact levels {max(changes):.1e}; {slept if fraction > 0 else 'nothing fell asleep'}"
     return Outcome(max(changes) < 1e-6 and ratio <= 1.05, text)
 
 

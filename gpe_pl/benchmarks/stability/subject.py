@@ -68,15 +68,15 @@ class Subject:
     def acceleration_std(self) -> float:
         return self.simulator.acceleration_std.item()
 
-    def state(self, scene: int = 0, share: float = 0.5) -> State:
+    def state(self, scene: int = 0, fraction: float = 0.5) -> State:
         """Return the state after a fraction of a scene's frames, in float64."""
         truth = self.scenes[scene % len(self.scenes)]
-        frame = max(self.history, round(share * (truth.num_frames - 1)))
+        frame = max(self.history, round(fraction * (truth.num_frames - 1)))
         return self.simulator.initial_state(truth, frame)
 
-    def free_state(self, scene: int = 0, share: float = 0.5) -> State:
+    def free_state(self, scene: int = 0, fraction: float = 0.5) -> State:
         """Return the same state without gravity and boundary."""
-        state = self.state(scene, share)
+        state = self.state(scene, fraction)
         return replace(state, gravity=torch.zeros_like(state.gravity), boundary=no_boundary(state))
 
     def guard(self) -> Guard:

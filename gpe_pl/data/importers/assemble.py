@@ -17,7 +17,7 @@ from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
 from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
-from gpe_pl.data.motion import ROUNDING_SHARE, MotionSummary, better_origin, motion_of, rounding_fault
+from gpe_pl.data.motion import ROUNDING_FRACTION, MotionSummary, better_origin, motion_of, rounding_fault
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.errors import GpeError
 from gpe_pl.files import sealed
@@ -26,7 +26,7 @@ from gpe_pl.files.names import NameRefused, data_name
 from gpe_pl.geometry.periodicity import PeriodicityError
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.schema import HISTORY, MATERIALS, NODE_TYPES, SPLITS, ParameterGroup, node_code, param_names
-from gpe_pl.system.locks import held
+from gpe_pl.system.locks import locked
 from gpe_pl.system.progress import Progress
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.arrays import ArrayError, nearest_distances
@@ -223,7 +223,7 @@ class _Conversion:
 
     def run(self, contact_sheet: bool = False) -> Report:
         """Run both passes; the folder appears with its complete content."""
-        with held(self.folder, "paths.data", makes=False):
+        with locked(self.folder, "paths.data", makes=False):
             _check_free(self.folder)  # again, because another command may just have written it
             self._look()
             self._decide()
@@ -411,7 +411,7 @@ class _Conversion:
         report, suspects, motions = self.report, self.survey.suspects, self.survey.motions
         typical = float(np.median([motion.acceleration for _, _, motion in motions]))
         nowhere = np.zeros_like(motions[0][2].low)
-        self.origin = better_origin([motion for _, _, motion in motions], ROUNDING_SHARE * typical)
+        self.origin = better_origin([motion for _, _, motion in motions], ROUNDING_FRACTION * typical)
         if self.origin.any():
             lost = max(motion.rounding(np.float32, nowhere).max() for _, _, motion in motions)
             where = ", ".join(f"{x:.12g}" for x in self.origin)
@@ -531,7 +531,10 @@ class _Conversion:
         report = self.report
         report.velocity_std, report.acceleration_std = statistics["velocity_std"], statistics["acceleration_std"]
         if report.acceleration_std == 0:
-            raise ImportFailure(f"{report.source}: nothing accelerates other than by gravity, so there is nothing to learn")
+            raise ImportFailure(
+                f"{report.source}: nothing accelerates other than by gravity, so there is nothing to learn; check frame_dt and gravity, "
+                "or add scenes in which nodes touch something"
+            )
         sample = list(islice(iter_trajectories(folder, split), NUM_SAMPLED))
         degrees = [degree for trajectory in sample for degree in _degrees(trajectory)]
         among, boundary = (np.concatenate(part) for part in zip(*degrees, strict=True))

@@ -375,11 +375,11 @@ def _strings(data, rows, size):
     count = 0
     for k in range(len(rows)):
         stop = rows[k, 1] + rows[k, 2]
-        number, wire, start, held, place = _field(data, rows[k, 1], stop)
+        number, wire, start, num_bytes, place = _field(data, rows[k, 1], stop)
         if rows[k, 0] != _BYTES or number != 1 or wire != _BYTES or place != stop:
             break
-        number, wire, start, held, place = _field(data, start, stop)
-        if number != 1 or wire != _BYTES or held != size or place != stop:
+        number, wire, start, num_bytes, place = _field(data, start, stop)
+        if number != 1 or wire != _BYTES or num_bytes != size or place != stop:
             break
         starts[k] = start
         count += 1

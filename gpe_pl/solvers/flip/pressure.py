@@ -17,7 +17,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-SMALLEST_SHARE = 0.01
+SMALLEST_FRACTION = 0.01
 """Lower limit of θ."""
 
 
@@ -34,7 +34,7 @@ def surface_distance(density):
 @no_type_check
 def _drop(inside, outside):
     """Return 1/θ of the face between a liquid and an empty cell."""
-    return 1.0 / max(SMALLEST_SHARE, inside / (inside - outside))
+    return 1.0 / max(SMALLEST_FRACTION, inside / (inside - outside))
 
 
 @njit(cache=True, error_model="numpy")
@@ -65,10 +65,10 @@ def extend_into_solids(active, strides, area, cell_room, half, density, viscous)
         for k in range(2 * strides.shape[0]):
             other = c + strides[k // 2] if k % 2 == 0 else c - strides[k // 2]
             if cell_room[other] >= half:
-                share = area[k // 2, max(c, other)]
-                opening += share
-                total += share * density[other]
-                total_viscous += share * viscous[other]
+                part = area[k // 2, max(c, other)]
+                opening += part
+                total += part * density[other]
+                total_viscous += part * viscous[other]
         if opening > 0.0:
             density[c] = (density[c] + half * total / opening) / (cell_room[c] + half)
             viscous[c] = (viscous[c] + half * total_viscous / opening) / (cell_room[c] + half)

@@ -26,7 +26,7 @@ MATERIAL = "fluid"
 TOUCH = 1e-30
 """Weight of faces whose velocity is known although no particle reaches them."""
 
-SHARE_TIME = 0.01
+REFERENCE_TIME = 0.01
 """Time in s to which the fractions ``pic`` and ``evening`` refer, for any length of frames and substeps."""
 
 MODIFIED = 0.97
@@ -162,7 +162,7 @@ class FLIP:
     @property
     def numerical_viscosity(self) -> float:
         """Kinematic viscosity in m²/s that ``pic`` adds to that of the liquid; infinite for ``pic = 1``, which acts once per substep."""
-        rate = math.inf if self.pic == 1 else -math.log1p(-self.pic) / SHARE_TIME
+        rate = math.inf if self.pic == 1 else -math.log1p(-self.pic) / REFERENCE_TIME
         return rate * self.grid_spacing**2 / 6.0
 
     @property
@@ -256,9 +256,9 @@ class FLIP:
         if np.all(liquid.is_free):
             return
         excess = pressure.excess_density(liquid.cells, fields.liquid, self.grid.strides, solids.is_open, fields.density, LARGEST_EXCESS)
-        share = _share(self.evening, h) * self.grid_spacing
-        right = np.where(liquid.is_free, 0.0, share * solids.cell_room[liquid.cells] * excess)
-        self._correct("density", liquid, right, DENSITY_TOLERANCE * share, solids, fields, fields.shift)
+        fraction = _in_substep(self.evening, h) * self.grid_spacing
+        right = np.where(liquid.is_free, 0.0, fraction * solids.cell_room[liquid.cells] * excess)
+        self._correct("density", liquid, right, DENSITY_TOLERANCE * fraction, solids, fields, fields.shift)
 
     def _correct(
         self, what: str, liquid: Liquid, right: np.ndarray, tolerance: float, solids: Solids, fields: Fields, target: np.ndarray
@@ -318,7 +318,7 @@ class FLIP:
         flying = islands.Flying.select(fields.island[self._cell(pos)], is_free, pos, vel, mass)
         transfer.gather(
             pos, vel, grid.origin, grid.spacing, grid.strides, grid.counts, grid.corners, fields.old, fields.velocity, fields.shift,
-            fields.weight, _share(self.pic, h), h,
+            fields.weight, _in_substep(self.pic, h), h,
         )  # fmt: skip
         flying.balance(pos, vel, gravity, h)
         transfer.push_out(pos, vel, grid.origin, grid.spacing, grid.strides, grid.counts, grid.corners, solids.distance)
@@ -413,9 +413,9 @@ class FLIP:
         return np.ascontiguousarray(values)
 
 
-def _share(share: float, h: float) -> float:
-    """Convert a fraction per ``SHARE_TIME`` to a fraction per time h [s]."""
-    return float(1.0 - (1.0 - share) ** (h / SHARE_TIME))
+def _in_substep(fraction: float, h: float) -> float:
+    """Convert a fraction per ``REFERENCE_TIME`` to a fraction per time h [s]."""
+    return float(1.0 - (1.0 - fraction) ** (h / REFERENCE_TIME))
 
 
 def _require(good: np.ndarray, message: str, reason: str = "input") -> None:

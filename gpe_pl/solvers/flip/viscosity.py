@@ -17,7 +17,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-SMALLEST_SHARE = 0.1
+SMALLEST_FRACTION = 0.1
 """Lower limit of θ."""
 
 SMALLEST_MASS = 1e-6
@@ -51,7 +51,7 @@ def _theta(a, upper, lower, unknown, face_distance):
     if unknown[a, upper] > 0 or unknown[a, lower] > 0:
         liquid, solid = (upper, lower) if unknown[a, upper] > 0 else (lower, upper)
         inside, outside = face_distance[a, liquid], face_distance[a, solid]
-        return min(1.0, max(SMALLEST_SHARE, inside / (inside - outside)))
+        return min(1.0, max(SMALLEST_FRACTION, inside / (inside - outside)))
     if face_distance[a, upper] > 0.0 or face_distance[a, lower] > 0.0:
         return 0.0
     return -1.0
@@ -106,9 +106,9 @@ def viscosity_system(axes, cells, unknown, strides, is_open, face_distance, weig
                 theta_b = _theta(b, edge, edge - sa, unknown, face_distance)
                 if not total > 0.0 or theta_a == 0.0 or theta_b == 0.0:
                     continue
-                share = min(theta_a, theta_b) if theta_b > 0.0 else theta_a
+                fraction = min(theta_a, theta_b) if theta_b > 0.0 else theta_a
                 mine = (1.0 if side == 0 else -1.0) / theta_a
-                k = step * total / count * share * mine
+                k = step * total / count * fraction * mine
                 diagonal[i] += k * mine
                 j = unknown[a, edge - sb if side == 0 else edge] - 1
                 if 0 <= j < i:

@@ -82,11 +82,11 @@ def set_aside(particles, remainder, active, counts, origin, inv, h):
     else:
         transfer_3d.grid_to_particles(travelling, flat, counts, origin, inv, 0.0)
     for p in range(kept.shape[0]):
-        share = remainder.mass[p] / particles.mass[p]
+        fraction = remainder.mass[p] / particles.mass[p]
         for i in range(dim):
-            kept[p, i] = share * (particles.vel[p, i] - kept[p, i])
+            kept[p, i] = fraction * (particles.vel[p, i] - kept[p, i])
             for j in range(dim):
-                rest[p, i, j] = share * (particles.affine[p, i, j] - rest[p, i, j])
+                rest[p, i, j] = fraction * (particles.affine[p, i, j] - rest[p, i, j])
 
 
 @njit(cache=True, error_model="numpy")

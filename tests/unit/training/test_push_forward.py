@@ -49,7 +49,7 @@ def test_a_walk_is_the_simulators_own_rollout(data: WindowDataset, simulator: Le
     assert steps == [2, 1] and simulator.training
     for start, state in zip(starts, states, strict=True):
         expected = start.state
-        for _ in range(start.own_steps):
+        for _ in range(start.num_steps):
             expected = simulator.step(expected)
         assert torch.allclose(state.pos, expected.pos, rtol=0, atol=1e-9)
 
@@ -91,7 +91,7 @@ def test_at_the_end_of_the_truth_and_after_falling_apart_a_sample_is_at_its_star
 ) -> None:
     module, last = TrainingModule(simulator, num_steps=10), len(data) - 2
     turns = visits(data, [(0, last)], 0, 4)
-    assert turns[3][0].own_steps == 1  # as far as the trajectory goes
+    assert turns[3][0].num_steps == 1  # as far as the trajectory goes
     usual = batched([turns[0][0].graph(data.builder, turns[0][0].state, 0)])
     for starts in turns[:2]:
         module.loss(starts)
@@ -125,7 +125,7 @@ def test_a_validation_ends_all_excursions(data: WindowDataset, simulator: Learne
     assert_equal_graphs(module._excursions.graphs(simulator, turns[2]), expected)
 
 
-def test_own_steps_get_no_gradient(data: WindowDataset, simulator: LearnedSimulator) -> None:
+def test_an_unroll_gets_no_gradient(data: WindowDataset, simulator: LearnedSimulator) -> None:
     module = TrainingModule(simulator, num_steps=10)
     starts = [data[StartKey(0, 0, 2)]]
     graph = module._excursions.graphs(simulator, starts)
@@ -151,7 +151,7 @@ def test_weights_of_graphs_weigh_their_nodes(data: WindowDataset, simulator: Lea
 def test_a_start_can_be_moved(data: WindowDataset) -> None:
     start = data[StartKey(0, 0, 2)]
     moved = start.to("cpu")
-    assert moved.own_steps == 2 and torch.equal(moved.truth, start.truth)
+    assert moved.num_steps == 2 and torch.equal(moved.truth, start.truth)
 
 
 def test_the_last_steps_are_unrolled() -> None:

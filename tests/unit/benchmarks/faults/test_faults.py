@@ -21,7 +21,7 @@ import torch
 from gpe_pl.benchmarks.faults import checkpoints, configs, field_values, isolation, pairs, runs, scenes, side_files, stores, suite
 from gpe_pl.benchmarks.faults.isolation import CANARY, Ended, verdicts
 from gpe_pl.benchmarks.faults.suite import report
-from gpe_pl.benchmarks.faults.verdict import GOOD, Fault, Verdict, judge
+from gpe_pl.benchmarks.faults.verdict import GOOD, Fault, Verdict, verdict_of
 from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.errors import GpeError
@@ -115,11 +115,11 @@ def test_judges_tell_what_came_of_it() -> None:
     def fails(error: Exception) -> None:
         raise error
 
-    assert judge(lambda: 1, lambda x: x == 1).status == "harmless"
-    assert judge(lambda: 2, lambda x: x == 1).status == "accepted"
-    assert judge(lambda: fails(GpeError("file, reason")), lambda _: True) == Verdict("refused", "file, reason")
-    assert judge(lambda: fails(GpeError("")), lambda _: True).status == "traceback"
-    assert judge(lambda: fails(KeyError("x")), lambda _: True) == Verdict("traceback", "KeyError: 'x'")
+    assert verdict_of(lambda: 1, lambda x: x == 1).status == "harmless"
+    assert verdict_of(lambda: 2, lambda x: x == 1).status == "accepted"
+    assert verdict_of(lambda: fails(GpeError("file, reason")), lambda _: True) == Verdict("refused", "file, reason")
+    assert verdict_of(lambda: fails(GpeError("")), lambda _: True).status == "traceback"
+    assert verdict_of(lambda: fails(KeyError("x")), lambda _: True) == Verdict("traceback", "KeyError: 'x'")
 
 
 def test_a_changed_value_with_a_fitting_checksum_is_accepted(shard: Path, tmp_path: Path) -> None:
