@@ -1,4 +1,4 @@
-"""Run a benchmark suite: ``python -m gpe_pl.benchmark suite=speed``; results in ``{paths.runs}/benchmark/{suite}/``."""
+"""Command ``python -m gpe_pl.benchmark suite=speed``: run a benchmark suite. Results go to ``{paths.runs}/benchmark/{suite}/``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NAMED = 5
 
 
 def without_folder(value: Any, runs: str) -> Any:
-    """Settings with ``paths.runs`` in place of the results folder ``runs``, so that they can be published."""
+    """Replace the results folder ``runs`` in settings by the text ``paths.runs``, so that published settings name no folder of this machine."""
     if isinstance(value, dict):
         return {key: without_folder(item, runs) for key, item in value.items()}
     if isinstance(value, list):
@@ -32,13 +32,13 @@ def without_folder(value: Any, runs: str) -> Any:
 
 
 def _suite(name: str) -> Any:
-    """Module of a suite: ``benchmarks.{name}``, or ``benchmarks.{name}.suite`` if that is a package."""
+    """Import the module of a suite: ``benchmarks.{name}``, or ``benchmarks.{name}.suite`` if ``benchmarks.{name}`` is a package."""
     package = importlib.import_module(f"gpe_pl.benchmarks.{name}")
     return importlib.import_module(f"{package.__name__}.suite") if hasattr(package, "__path__") else package
 
 
 def benchmark(cfg: DictConfig) -> None:
-    """Run one suite and write ``results.json``, ``table.md`` and its figures. The exit status is 1 if the suite's ``failures`` names any."""
+    """Run one suite and write ``results.json``, ``table.md`` and its figures. The exit status is 1 if the suite's function ``failures`` returns any."""
     import torch
     from omegaconf import OmegaConf
 

@@ -1,4 +1,4 @@
-"""Evaluate a checkpoint: ``python -m gpe_pl.evaluate checkpoint=… split=test_unseen``."""
+"""Command ``python -m gpe_pl.evaluate checkpoint=… split=test_unseen``: evaluate a trained model."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
 
 
 def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
-    """Settings and checksums on which the metrics of an evaluation depend. An evaluation with others needs another folder."""
+    """Return the settings and checksums on which the metrics of an evaluation depend. If one of them differs, the evaluation needs another folder."""
     from omegaconf import OmegaConf
 
     from gpe_pl.data.checksum import split_checksum
@@ -84,7 +84,7 @@ def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
 
 
 def _own_data(simulator: LearnedSimulator) -> str:
-    """Overrides that choose data like those of the training; empty if there are none."""
+    """Return the overrides that choose data like the training data, for a message; empty if no data set fits."""
     from gpe_pl.config.datasets import IMPORTED, dataset
     from gpe_pl.data.ground_truth import trajectory_metadata
 
@@ -100,7 +100,7 @@ def _own_data(simulator: LearnedSimulator) -> str:
 
 
 def _showcase(cfg: DictConfig, simulator: LearnedSimulator) -> Callable[[Path], None]:
-    """Build the showcase's scene, and return a function that rolls the simulator out in it and writes results into a folder.
+    """Build the scene of the showcase. Return a function that rolls the simulator out in it and writes the results into a folder.
 
     The scene is built first so that errors in its settings are reported before the evaluation.
 

@@ -1,4 +1,4 @@
-"""Train and evaluate: ``python -m gpe_pl.fit experiment=…``."""
+"""Command ``python -m gpe_pl.fit experiment=…``: train a model and evaluate it."""
 
 from __future__ import annotations
 

@@ -6,8 +6,8 @@ Three rules apply to every metric of a rollout:
 - A horizon that the ground truth does not reach is left out, never shortened.
 - The error of a rollout is infinite from the frame where it stopped early or has a value that is not finite, so that no failure improves a score.
 
-Velocities of both trajectories are computed from positions (``integrators``). A solver's own velocities are instantaneous, and those of a learned simulator are
-averages over a frame. In free fall they would differ by ``g dt / 2``.
+Velocities of both trajectories are computed from positions (``integrators``). The velocities that a solver stores are instantaneous, while those of a learned
+simulator are averages over a frame. In free fall they would differ by ``g dt / 2``.
 """
 
 import math
@@ -79,8 +79,8 @@ def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.
     """Mean squared position error of every frame [m²], over nodes and dimensions.
 
     Returns:
-        One value per frame, including frame 0 (zero up to rounding). If the rollout stopped early, the array is as long as the ground truth, with ``inf``
-        from the first missing frame on. If the prediction was meant to be shorter, the array is as long as the prediction.
+        One value per frame, including frame 0 (zero up to rounding). If the rollout stopped early, the array has the length of the ground truth, with ``inf``
+        from the first missing frame on. If the rollout was meant to be shorter, the array has the length of the prediction.
 
     Raises:
         ValueError: the trajectories do not describe the same nodes from the same start.
@@ -142,9 +142,9 @@ def energy_distance(
 ) -> float:
     """Energy distance [m] between two clouds of particles with mass: ``2 E|A - B| - E|A - A'| - E|B - B'|``.
 
-    It compares the distributions of material, not single particles. It therefore stays meaningful when chaos has made particle-wise errors meaningless. It is
-    zero only for equal distributions. The value is exact, without the smoothing length and the stopping rule of a Sinkhorn divergence. It takes O(N²) time and
-    O(N) memory.
+    The distance compares distributions of material, not single particles. It therefore stays meaningful after chaotic motion has made errors of single
+    particles meaningless. It is zero only for equal distributions. The value is exact; unlike a Sinkhorn divergence, it needs no smoothing length and no
+    stopping rule. It takes O(N²) time and O(N) memory.
 
     Source: Székely and Rizzo, Energy statistics, J. Stat. Plan. Inference 143 (2013).
     """
@@ -161,7 +161,7 @@ def _mean_distance(a: np.ndarray, b: np.ndarray, mass_a: np.ndarray, mass_b: np.
 
 
 def _cloud_distance(prediction: Trajectory, ground_truth: Trajectory, frame: int) -> float:
-    """Energy distance [m] of each material, averaged by mass, so that materials which swap places count as an error."""
+    """Return the energy distance [m], computed for each material and averaged by mass. Two materials that swap places are then an error."""
     mass, types = ground_truth.mass.astype(np.float64), ground_truth.node_type
     total = 0.0
     for code in np.unique(types):
@@ -188,7 +188,7 @@ def _relative_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps
 
 
 def _stress_error(stress: np.ndarray, reference: np.ndarray, num_steps: int) -> float:
-    """Root mean square error over the first frames, relative to the root mean square of the reference over all frames.
+    """Return the root mean squared error over the first frames, relative to the root mean square of the reference over all frames.
 
     All frames are used for the reference, because there is no stress before an impact.
     """
@@ -197,7 +197,10 @@ def _stress_error(stress: np.ndarray, reference: np.ndarray, num_steps: int) -> 
 
 
 def _whole(stress: np.ndarray) -> np.ndarray:
-    """Stresses [..., component] with weighted shears, so that the sum of squares is that of the tensor, which has every shear twice."""
+    """Return stresses [..., component] with shear components multiplied by √2.
+
+    The sum of squares then equals that of the whole tensor, which contains each shear twice.
+    """
     shears = (1,) if stress.shape[-1] == 4 else (1, 2, 4)
     weight = np.ones(stress.shape[-1])
     weight[[*shears]] = np.sqrt(2)

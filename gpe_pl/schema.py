@@ -84,7 +84,7 @@ def level_of(node_type: str) -> int:
 
 
 def role(node_type: str) -> str:
-    """Role of a node type. Types with one role share statistics and weights.
+    """Role of a node type. Types with the same role use the same statistics and weights.
 
     Virtual nodes of all levels have one role; every other node type has its own.
     """
@@ -92,7 +92,7 @@ def role(node_type: str) -> str:
 
 
 def is_symmetric(relation: EdgeType) -> bool:
-    """Whether the ends of an edge can be swapped: they have one type, and neither is the parent of the other."""
+    """Whether the ends of an edge can be swapped: they have the same type, and neither is the parent of the other."""
     source, name, target = relation
     return source == target and name != DOWN
 

@@ -34,7 +34,7 @@ NUM_WARM_UPS = 3
 
 
 class ParallelError(GpeError, ValueError):
-    """This number of processes cannot share this machine or these batches."""
+    """Raised when there are too many processes for this machine or for these batches."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def _ms(*times: float) -> list[str]:
 
 
 def step_times(settings: Settings, num_processes: int) -> list[tuple[float, float]]:
-    """Return seconds of each step, and of its exchange of gradients, as measured by the first process of a new group of processes."""
+    """Return the time of each step and of its exchange of gradients [s], as measured by the first process of a new group."""
     with tempfile.TemporaryDirectory() as folder, ProcessPoolExecutor(num_processes, multiprocessing.get_context("spawn")) as pool:
         meeting = (Path(folder) / "rendezvous").as_uri()
         futures = [pool.submit(_times_on_rank, settings, rank, num_processes, meeting) for rank in range(num_processes)]

@@ -1,4 +1,7 @@
-"""Benchmark of skipping: the cost of a step when a scene grows by irrelevant parts: distant walls, falling particles, absent materials, piles at rest."""
+"""Benchmark of skipping: the cost of a step when irrelevant parts are added to a scene.
+
+Such parts are distant walls, falling particles, materials without particles, and piles at rest.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +68,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Growth:
-    """A grown scene.
+    """A scene with an added part.
 
     Attributes:
         metric: name of the metric: the fraction by which a step takes longer.

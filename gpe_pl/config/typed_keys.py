@@ -1,4 +1,4 @@
-"""Check that every override has an effect. Overrides that no other setting would use are refused."""
+"""Check that every override has an effect. An override that the run would never read is refused."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _is_offer(key: str) -> bool:
 
 
 def _is_read(cfg: DictConfig, key: str) -> bool:
-    """Whether another setting uses the key's entry of a lookup table. If so, the configuration cannot be resolved without the entry."""
+    """Whether another setting uses this entry of a lookup table. In that case, the configuration cannot be resolved without the entry."""
     without = copy.deepcopy(cfg)
     group, table, entry = key.split(".")[:3]
     OmegaConf.set_struct(without, False)

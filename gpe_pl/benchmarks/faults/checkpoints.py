@@ -187,6 +187,6 @@ def _others(sound: Path) -> Iterator[tuple[str, str, Callable[[Path], Verdict]]]
 
 
 def faults(sound: Path, num_damages: int, seed: int = 0) -> list[Fault]:
-    """Return damages to the bytes of a sound checkpoint, and other contents of a file with its name."""
+    """Return faults of a checkpoint: damaged bytes of a sound one, and other content in a file of its name."""
     found = [Fault(f"checkpoint, {kind}", name, partial(load_damaged, sound, damage)) for kind, name, damage in damages(num_damages, seed)]
     return found + [Fault(*other) for other in _others(sound)]

@@ -1,4 +1,4 @@
-"""Faults of runs: commands that are killed, run out of disk, or find damaged files; and the same command again."""
+"""Faults of runs. Commands are killed, run out of disk space or find damaged files; then the same command runs again."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Command:
     seconds: float = math.inf
 
     def given(self, folder: Path) -> list[str]:
-        """Return the arguments with the folders."""
+        """Return the arguments, including those that name the folders."""
         return [*self.arguments, f"paths.data={self.data or folder / 'data'}", f"paths.runs={folder / 'runs'}"]
 
 
@@ -129,7 +129,7 @@ def _digest(value: Any) -> str:
 
 
 def incomplete(folder: Path) -> list[str]:
-    """Return final files that cannot be read."""
+    """Return the files with final names that cannot be read."""
     found = []
     for path in _final_files(folder):
         try:
@@ -265,7 +265,7 @@ def changed_file(command: Command, sound: Path, name: str, change: Callable[[Pat
 
 
 def _hold_the_same(sound: Path, damaged: Path) -> bool:
-    """Tell whether two files are shards with equal content in different bytes, because some bytes have no meaning."""
+    """Tell whether two files are shards of equal content. Their bytes may differ, because some bytes have no meaning."""
     return sound.suffix == ".h5" and damaged.exists() and stores.contents(sound) == stores.contents(damaged)
 
 

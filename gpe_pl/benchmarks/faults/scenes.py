@@ -28,7 +28,7 @@ NUM_STEPS = 3
 
 
 class Stopped(GpeError):
-    """A rollout was stopped by its guard; the message has reason, frame and node."""
+    """Raised when a guard stops a rollout; the message has reason, frame and node."""
 
 
 def twice(state: State, offset: np.ndarray) -> State:

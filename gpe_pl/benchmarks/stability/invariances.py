@@ -39,7 +39,7 @@ def relabelling_error(subject: Subject, dtype: torch.dtype, seed: int) -> float:
 
 
 def turning_error(subject: Subject, dtype: torch.dtype, seed: int, *, turn: bool, shuffle: bool) -> float:
-    """Return the relative change of the output when edges are reversed or shuffled."""
+    """Return the relative change of the output when edges are reversed (``turn``) or shuffled."""
     simulator = in_double(subject.simulator) if dtype == torch.float64 else subject.simulator
     state = subject.state(seed)
     graph = simulator.builder(state)

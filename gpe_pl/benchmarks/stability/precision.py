@@ -1,4 +1,4 @@
-"""Stress tests of rounding, equal implementations, memory, training under attack, and the guard."""
+"""Stress tests of rounding, of implementations that should agree, of memory, of training on extreme data, and of the guard."""
 
 from __future__ import annotations
 
@@ -116,7 +116,10 @@ def _skipping(subject: Subject, skips: Skips) -> LearnedSimulator:
 
 
 def sleeping(subject: Subject, num_steps: int = 20) -> tuple[float, float, float]:
-    """Measure sleeping: ratio of mean square errors over rollouts that start throughout the scenes, ratio of times, and fraction asleep."""
+    """Compare rollouts with and without sleeping, from starts throughout the scenes.
+
+    Returns the ratio of the mean squared errors, the ratio of the times, and the fraction of particle-steps asleep.
+    """
     runners = {"asleep": approximate(_skipping(subject, ASLEEP)), "awake": subject.simulator}
     errors, seconds, num_asleep, num_steps_of_nodes = dict.fromkeys(runners, 0.0), dict.fromkeys(runners, 0.0), 0, 0
 
@@ -252,7 +255,7 @@ def guard(subject: Subject) -> Outcome:
 
 
 def attacks(subject: Subject, limits: Guard) -> dict[str, Callable[[State, State], State]]:
-    """Return the changes of a new state, by the reason that the guard must give."""
+    """Return functions that spoil a new state, by the reason for which the guard must stop."""
 
     def placed(new: State, rows: slice, to: torch.Tensor) -> State:
         pos = new.pos.clone()

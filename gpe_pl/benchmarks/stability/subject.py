@@ -36,7 +36,7 @@ class Subject:
         scenes: ground truth that was not used in training.
         max_speed: largest speed [m/s] in training trajectories.
         is_gating: whether a failure of this model fails the suite.
-        peers: the simulators of this domain by name, this one included.
+        peers: all simulators of this domain by name, including this one.
         horizon_factors: lengths of long rollouts over the trained horizon, which is the number of frames of a scene.
         num_rest_steps: number of frames over which a pile at rest is observed.
     """
@@ -91,7 +91,7 @@ class Subject:
 
     @cached_property
     def one_step_rmse(self) -> float:
-        """Root mean square error [m/s²] of one-step accelerations over some frames of all scenes."""
+        """Root mean squared error of one-step accelerations [m/s²], over some frames of all scenes."""
         errors = []
         for number, truth in enumerate(self.scenes):
             for frame in np.linspace(self.history, truth.num_frames - 2, 4).astype(int).tolist():
@@ -195,5 +195,5 @@ def shifted(state: State, offset: Tensor) -> State:
 
 
 def with_velocities(state: State, history: Tensor) -> State:
-    """Return the state with another velocity history [node, history, dim]."""
+    """Return the state with another velocity history [node, history, dim] in m/s."""
     return replace(state, vel=history[:, -1], velocity_history=history)
