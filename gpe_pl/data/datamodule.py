@@ -63,7 +63,7 @@ def data_statistics(root: Path | str) -> dict[str, float]:
 
 
 class TrajectoryDataModule(L.LightningDataModule):
-    """Training windows in an endless, resumable, seeded order, and a fixed sample of validation windows without noise.
+    """Training windows in an endless, seeded order that can be resumed, and a fixed sample of validation windows without noise.
 
     Args:
         root: folder of the data set.
@@ -78,7 +78,8 @@ class TrajectoryDataModule(L.LightningDataModule):
         num_statistics_windows: number of windows from which features are standardised, evenly spread over the ``train`` split.
 
     Attributes:
-        push_forward: settings of the push-forward trick, in whose steps batches are starts of unrolls instead of graphs; None if it is not used.
+        push_forward: settings of the push-forward trick; None if it is not used. In steps with push-forward, batches contain starts of unrolls instead of
+            graphs.
 
     Raises:
         StoreError: a split or its statistics are missing or damaged.
@@ -129,7 +130,8 @@ class TrajectoryDataModule(L.LightningDataModule):
     def _rare_graphs(self, roles: frozenset[str]) -> list[HeteroData]:
         """Sample graphs evenly from the trajectories that have nodes of all these roles.
 
-        The list is empty if the sample of the whole split has enough such trajectories, or if all or no trajectories have these roles.
+        The list is empty in two cases: the sample of the whole split already has enough such trajectories, or either all or none of the trajectories have these
+        roles.
         """
         has = np.array([roles <= own for own in self._roles])
         if has.all() or not has.any():
@@ -143,7 +145,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         return [self.train_set[int(windows[k])] for k in _spread(len(windows), enough)]
 
     def _touching_graphs(self, relation: EdgeType, known: list[HeteroData]) -> list[HeteroData]:
-        """Search random windows for graphs with edges of a relation, if few of the known graphs have any; otherwise return the known ones."""
+        """Return graphs with edges of a relation. If few of the ``known`` graphs have such edges, random windows are searched for more."""
         num_known = sum(graph[relation].edge_index.shape[1] > 0 for graph in known)
         if num_known >= max(1, round(FEW_CONTACTS * self.num_statistics_windows)):
             return known

@@ -1,6 +1,6 @@
 """Training samples: short windows of trajectories as graphs with a target acceleration.
 
-A sample is a pure function of split, seed and sample number. Runs therefore resume exactly, with any number of workers. Stored arrays are read-only.
+A sample depends only on split, seed and sample number. Runs therefore resume exactly, with any number of workers. Cached arrays are read-only.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class StoredTrajectory:
         return read_trajectory(self.path, self.name, frames=slice(start, stop))
 
     def whole(self) -> Trajectory:
-        """Return all frames, checked against their stored digest; raises ``StoreError`` as ``window`` does."""
+        """Return all frames after comparing them with their stored digest. Errors are those of ``window``."""
         return read_trajectory(self.path, self.name, verify=True) if self.cached is None else self.cached
 
 
@@ -113,7 +113,7 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
 
 
 def long_enough(root: Path | str, split: str, history: int) -> Iterator[Trajectory]:
-    """Yield the valid trajectories of a split with at least ``history + 2`` frames; warns of the others.
+    """Yield the valid trajectories of a split that have at least ``history + 2`` frames, and warn of the others.
 
     A model needs ``history`` velocities before a frame and one frame to predict.
     """
@@ -138,10 +138,10 @@ def _warn(path: Path, name: str, fault: str) -> None:
 
 
 def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
-    """Return the trajectories that can be learned from; warns of the others.
+    """Return the trajectories that can be learned from, and warn of the others.
 
     Raises:
-        StoreError: none can be used, or more than one and more than a fraction ``MAX_DAMAGED`` of them cannot.
+        StoreError: no trajectory can be used, or too many cannot: more than one, and more than the fraction ``MAX_DAMAGED``.
     """
     found = []
     for stored in trajectories:
@@ -163,7 +163,7 @@ def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
 
 
 def damage(trajectory: Trajectory) -> str | None:
-    """Describe why a trajectory with valid values cannot be learned from, with frame and node; None if it can."""
+    """Say why nothing can be learned from a trajectory whose values are valid, with frame and node. None means that it can be used."""
     pos, metadata = trajectory.pos, trajectory.metadata
     if trajectory.num_nodes == 0:
         return "it has no nodes"
@@ -182,7 +182,7 @@ def damage(trajectory: Trajectory) -> str | None:
 def _jump(trajectory: Trajectory) -> str | None:
     """Describe the first node that moves farther than ``MAX_JUMP`` radii between two frames, but hardly moves before or after them.
 
-    A fast node is fast for more than one frame. A corrupt frame would be the largest acceleration of all, and would distort the scale of all others.
+    A node that is really fast is fast for several frames. A single corrupt frame would give the largest acceleration of the data set and distort its scale.
     """
     limit = MAX_JUMP * trajectory.metadata.connectivity_radius
     for start in range(0, trajectory.num_frames - 1, FRAMES_AT_ONCE):
@@ -215,7 +215,7 @@ class Start:
     Attributes:
         state: initial state with noise, as float64 tensors.
         truth: true positions [num_steps + 2, node, dim] in m of the frames from the state's on.
-        stress: true Cauchy stress [num_steps + 1, node, component] in Pa of the frames after the state's, if it is asked for.
+        stress: true Cauchy stress [num_steps + 1, node, component] in Pa of the frames after the state's; None if the data set was made without ``stress``.
         position_correction: fraction of the deviation from the true position that the target removes within one step; see ``Noise``.
         velocity_correction: fraction of the deviation from the true velocity that the target removes within one step, after the unroll; as in the key.
         about: numbers of trajectory and frame, and the weight in the loss if there is one.
@@ -345,7 +345,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         return self.trajectories[self.locate(window)[0]].num_nodes
 
     def activity(self) -> np.ndarray:
-        """Root mean square acceleration without gravity of each window [window] in m/s²; reads the whole split."""
+        """Root mean square acceleration without gravity of each window [window] in m/s². This reads the whole split."""
         values = []
         for stored in self.trajectories:
             trajectory = stored.window(0, stored.num_frames)

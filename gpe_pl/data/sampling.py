@@ -44,7 +44,7 @@ NUM_LANES = 16
 
 @dataclass(frozen=True)
 class PushForward:
-    """Settings of the push-forward trick: late in training, samples are states that the model itself has reached from a true state.
+    """Settings of the push-forward trick: late in training, samples are states that the model has reached by an unroll from a true state.
 
     Such an unroll has up to ``max_steps`` steps, without gradient [Brandstetter et al. 2022, section 3.1].
 
@@ -108,8 +108,8 @@ class BatchSize:
 
     Attributes:
         num_graphs: number of samples, unless ``max_nodes`` is given.
-        max_nodes: maximum number of nodes (see ``WindowDataset.num_nodes``). A step then takes the next samples in the order until this limit, and at least
-            one.
+        max_nodes: maximum number of nodes (see ``WindowDataset.num_nodes``). With it, a step takes the next samples in order up to this limit, but at least one
+            sample.
     """
 
     num_graphs: Annotated[int, Field(ge=1)]
@@ -145,7 +145,7 @@ class BatchSize:
 
 
 class BatchSampler(Sampler[list[Key]]):
-    """Samples of this rank in each optimiser step. All ranks follow one order, which is also the order of a single process.
+    """Samples of this rank in each optimiser step. All ranks together follow the order that a single process would follow.
 
     Args:
         data: training windows.

@@ -21,7 +21,7 @@ FRAMES_AT_ONCE = 2048
 
 
 def shard_moments(path: Path) -> tuple[str, dict[str, Any]]:
-    """Return the path of a shard and the sums over it from which the statistics follow."""
+    """Return the path of a shard, and sums over its trajectories, from which the statistics are computed."""
     sums: dict[str, Any] = {"velocity": [0, 0.0], "acceleration": [0, 0.0], "params": None, "nodes": 0, "frames": 0, "trajectories": 0}
     for name in trajectory_names(path):
         trajectory = read_trajectory(path, name)
@@ -67,8 +67,8 @@ def _scaled(trajectory: Trajectory) -> np.ndarray:
 def combined(moments: list[dict[str, Any]]) -> dict[str, Any]:
     """Combine the sums of shards into statistics.
 
-    They are root mean squares per component of velocities and accelerations, and mean and standard deviation of material parameters on the scale that
-    ``schema`` gives them.
+    The statistics are the root mean squares per component of velocities [m/s] and accelerations [m/s²], and the mean and standard deviation of each material
+    parameter on its scale in ``schema``.
     """
     rms = {}
     for key in ("velocity", "acceleration"):

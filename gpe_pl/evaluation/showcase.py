@@ -1,6 +1,8 @@
-"""Showcase: a rollout in a scene far larger than those in training, without ground truth. Measures its cost and its plausibility, and draws it.
+"""Showcase: a rollout in a scene far larger than those in training, without ground truth.
 
-Memory does not grow with the length of the rollout, as only the frames of the animation are kept.
+Its cost and some signs of errors are measured, such as particles in walls, and it is drawn.
+
+Memory does not grow with the length of the rollout, because only the frames of the animation are kept.
 """
 
 from __future__ import annotations
@@ -66,7 +68,7 @@ class Record:
 
 
 def start(simulator: LearnedSimulator, scene: Scene, settings: ShowcaseSettings) -> tuple[State, Metadata]:
-    """Initial state of the scene, at rest, for the simulator, and the scene's metadata.
+    """Return the initial state of the scene, at rest, and the scene's metadata.
 
     Raises:
         SceneError: the scene does not fit the simulator.
@@ -195,13 +197,13 @@ def _frames(simulator: Simulator, state: State, num_steps: int, metadata: Metada
 
 
 def _fall_speed(state: State, metadata: Metadata) -> float:
-    """Speed of the fastest node after a free fall through the domain [m/s]."""
+    """Return the speed of the fastest node after a free fall through the domain [m/s]."""
     height = sum((high - low) * abs(g) for (low, high), g in zip(metadata.bounds, metadata.gravity, strict=True))
     return math.sqrt(2 * height + float(state.vel.norm(dim=1).max()) ** 2)
 
 
 def _share_deeper(state: State, depth: float) -> float:
-    """Fraction of nodes deeper than ``depth`` [m] inside a solid."""
+    """Return the fraction of nodes deeper than ``depth`` [m] inside a solid."""
     distance = signed_distance(state.boundary.shapes, state.pos)
     return float(cast(Any, distance < -depth).double().mean())
 

@@ -1,4 +1,4 @@
-"""JSON files with a checksum, which the project writes and reads itself.
+"""JSON files with a checksum, for tables that only this package writes and reads.
 
 A file contains a table. Its key ``sha256`` is the checksum of the other keys, so every changed digit is detected. Reading checks size, depth and numbers before
 any value is used. A damaged or hostile file raises ``SealError`` with a one-line message.

@@ -20,7 +20,7 @@ def _polar(radius: np.ndarray) -> Loop:
 
 
 def _rounded(corners: np.ndarray, radius: float) -> Loop:
-    """Replace the corners of a counter-clockwise polygon by arcs of this radius, or of the largest radius that the edges allow."""
+    """Replace the corners of a counter-clockwise polygon by arcs of a radius, or of the largest radius that the edges allow if that is smaller."""
     pieces = []
     for before, at, after in zip(np.roll(corners, 1, axis=0), corners, np.roll(corners, -1, axis=0), strict=True):
         a, b = before - at, after - at

@@ -91,7 +91,7 @@ def mesh_distances(corners: np.ndarray, low: np.ndarray, spacing: float, counts:
 def cloud_distances(points: np.ndarray, normals: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
     """Signed distances [m] to an oriented point cloud: weighted means of the distances to the tangent planes of the nearest points.
 
-    Far from the cloud, tangent planes say little. There it is the distance to the nearest point, with the sign of the weighted mean.
+    Tangent planes are good approximations only near the cloud. Far from it, the result is the distance to the nearest point with the sign of the weighted mean.
     """
     from scipy.spatial import cKDTree
 
@@ -119,7 +119,10 @@ def unsigned(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple
 
 
 def _num_pairs(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> float:
-    """Number of pairs of triangle and grid node that ``unsigned`` compares: nodes in the box around each triangle, extended by ``_BAND`` cells."""
+    """Return the number of pairs of a triangle and a grid node that ``unsigned`` compares.
+
+    These are the nodes in the box around each triangle, extended by ``_BAND`` cells.
+    """
     place = (corners - low) / spacing
     last = np.array(counts) - 1.0
     first = np.floor(np.clip(place.min(axis=1) - _BAND, 0.0, last))
@@ -182,7 +185,10 @@ def _node(x, count):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _near(triangles, origin, spacing, band, distance, nearest):
-    """Compute squared distances of the nodes within ``band`` cells of a triangle. A triangle outside the grid counts for the nodes at the rim."""
+    """Compute squared distances of the nodes within ``band`` cells of a triangle.
+
+    A triangle outside the grid is compared with the nodes at the rim of the grid.
+    """
     nx, ny, nz = distance.shape
     for f in range(len(triangles)):
         t = triangles[f]
@@ -201,7 +207,7 @@ def _near(triangles, origin, spacing, band, distance, nearest):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _spread(triangles, origin, spacing, distance, nearest):
-    """Fast sweeping: every node tries the nearest triangles of its neighbours, in two rounds of all eight orders."""
+    """Fast sweeping: compare every node with the nearest triangles of its neighbours, in two rounds of all eight sweeping orders."""
     nx, ny, nz = distance.shape
     for sweep in range(16):
         di, dj, dk = 1 - 2 * (sweep & 1), 1 - (sweep & 2), 1 - (sweep & 4) // 2

@@ -296,7 +296,7 @@ def _cubic_lattice(reach: float, spacing: float, rng: np.random.Generator) -> tu
 
 
 def _peeled(cells: np.ndarray) -> np.ndarray:
-    """Remove cells with two or more surface faces, which would become flat on a smooth surface."""
+    """Remove cells with two or more surface faces. Such cells would become flat when their nodes move onto a smooth surface."""
     while len(cells):
         faces = np.sort(np.concatenate([np.delete(cells, k, axis=1) for k in range(4)]), axis=1)
         _, which, times = np.unique(faces, axis=0, return_inverse=True, return_counts=True)

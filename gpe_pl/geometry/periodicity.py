@@ -78,7 +78,7 @@ class Periodicity:
         return xp.where((period > 0) & (inside >= period), 0.0 * inside, inside)  # the subtraction may round up to the period
 
     def check_radius(self, radius: float) -> None:
-        """Raise ``PeriodicityError`` if a node can have more than one image within the radius [m]."""
+        """Raise ``PeriodicityError`` if a node can have several images within the radius [m]."""
         for axis in self.axes:
             if not 2 * radius < self.period[axis]:
                 raise PeriodicityError(
@@ -87,7 +87,7 @@ class Periodicity:
                 )
 
     def _turns(self, length: Array, round_down: bool) -> Array:
-        """Multiples of the period nearest to lengths along each axis, or below them [m]."""
+        """Return the multiples of the period nearest to lengths along each axis, or the next ones below with ``round_down`` [m]."""
         xp = array_namespace(length)
         period = self._row(self.period, length)
         turns = length / self._row(np.where(self.period > 0, self.period, 1.0), length)

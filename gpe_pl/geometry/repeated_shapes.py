@@ -1,4 +1,4 @@
-"""Shapes in periodic domains. A shape stands for all its images, so an obstacle across a seam continues on the other side."""
+"""Shapes in periodic domains. A shape represents all its periodic images, so an obstacle that crosses a seam continues on the other side."""
 
 from __future__ import annotations
 

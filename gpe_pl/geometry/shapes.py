@@ -1,4 +1,4 @@
-"""Shapes of walls and obstacles with their signed distances, which solvers, containment and pictures share.
+"""Shapes of walls and obstacles with their signed distances. Solvers, containment and pictures use the same shapes.
 
 ``Shape.signed_distance(points)`` is in m, positive in free space and negative inside the wall or obstacle. ``Shape.sample(spacing)`` places boundary nodes on
 the surface. All shapes take NumPy arrays or torch tensors [..., dim].
@@ -239,7 +239,7 @@ class Box:
 
 
 def _require_simple(vertices: np.ndarray) -> None:
-    """Raise ``ValueError`` if an edge of the outline [vertex, 2] has no length, or two edges touch anywhere but at their common vertex."""
+    """Raise ``ValueError`` if an edge of the outline [vertex, 2] has no length, or if two edges touch at another point than their common vertex."""
     count, shortest = len(vertices), 1e-12 * float(np.max(np.ptp(vertices, axis=0)))
     edges = np.roll(vertices, -1, axis=0) - vertices
     for k in range(count):
@@ -416,7 +416,7 @@ class DistanceGrid:
         return distance + xp.sum(gradient * (place - nearest), axis=-1), gradient / self.spacing
 
     def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes on the part of the surface inside the grid. Every point of it has a node within ``spacing`` [m]."""
+        """Nodes on the part of the surface inside the grid. Every point of this part has a node within ``spacing`` [m]."""
         points = self._surface(spacing)
         if len(points) == 0:
             return points, points.copy()

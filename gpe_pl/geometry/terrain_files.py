@@ -74,7 +74,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Heights:
-    """A height map on a square lattice.
+    """A height map on a square lattice, in the unit of the file.
 
     Attributes:
         values: heights [along x, along y].

@@ -1,4 +1,4 @@
-"""Conversion of a source to a data set of the store: two passes, checks across trajectories, statistics and the report."""
+"""Conversion of a source to a stored data set: two passes over the source, checks across trajectories, statistics and the report."""
 
 from __future__ import annotations
 
@@ -181,9 +181,9 @@ class _Survey:
         bounds: bounds of each trajectory, ``(low, high)`` per axis [m].
         spacings, distances, radii: spacing, median distance to the nearest node, and connectivity radius of each sampled trajectory [m].
         velocity_ratios: mean displacement over mean velocity × frame interval, of each sampled trajectory.
-        scenes: name of each trajectory, by the digest of its positions.
+        scenes: names of trajectories by the digest of their positions.
         motions: split, name and motion of each trajectory.
-        assumes_gravity: whether the gravity of each trajectory is the usual one of the format.
+        assumes_gravity: for each trajectory, whether its gravity is only assumed to be the usual one of the format.
         suspects: warnings about trajectories.
         num_bytes: size of all arrays.
         flights: of each sampled trajectory, whether its gravity is assumed, and its groups in free flight.
@@ -407,7 +407,7 @@ class _Conversion:
             )
 
     def _compare_with_rounding(self) -> None:
-        """Choose the origin that float32 needs, and warn of trajectories with a large rounding error even so."""
+        """Choose the origin at which float32 is precise enough, and warn of trajectories whose rounding error is still large."""
         report, suspects, motions = self.report, self.survey.suspects, self.survey.motions
         typical = float(np.median([motion.acceleration for _, _, motion in motions]))
         nowhere = np.zeros_like(motions[0][2].low)
@@ -494,7 +494,7 @@ class _Conversion:
         return replace(trajectory, metadata=metadata, material_params=columns)
 
     def _parameter_group(self, columns: np.ndarray, names: tuple[str, ...]) -> ParameterGroup:
-        """Whether parameters of ``test_unseen`` lie inside or outside the range of the training values."""
+        """Return whether parameters of ``test_unseen`` lie inside or outside the range of the training values."""
         for column, name in zip(columns.T, names, strict=True):
             low, high = self.trained.get(name, (np.inf, -np.inf))
             if (column < low).any() or (column > high).any():
@@ -565,7 +565,7 @@ class _Conversion:
 
 
 def _faults(m: Metadata, arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
-    """Yield reasons why the store could not read a trajectory again."""
+    """Yield the reasons why the store would refuse to read a trajectory."""
     yield from (f"{key} {violation}" for key, violation in m.violations())
     yield from size_conflicts(arrays, m.dim, len(m.param_names))
     yield from map(str, faults(arrays, NODE_TYPES, m.materials, m.param_names))
@@ -581,7 +581,7 @@ def _free_flight(trajectory: Trajectory) -> FreeFlight:
 
 
 def _degrees(trajectory: Trajectory) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the numbers of dynamic and of boundary neighbours of each dynamic node [node], for some frames."""
+    """Yield two arrays for each of some frames: the number of dynamic neighbours and of boundary neighbours of each dynamic node [node]."""
     m, count = trajectory.metadata, trajectory.num_nodes
     walls = np.ascontiguousarray(trajectory.boundary.pos, dtype=np.float64)
     for frame in np.unique(np.linspace(0, trajectory.num_frames - 1, FRAMES_SAMPLED).astype(int)):
