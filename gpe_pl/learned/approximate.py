@@ -1,6 +1,6 @@
-"""Approximate levels of skipping: nodes at rest are not computed, and one prediction is repeated for several frames.
+"""Approximate levels of skipping: nodes at rest are not computed, or one prediction is repeated for several frames.
 
-The data that this needs between steps are in ``State.internal``, so a rollout can stop at any frame and continue.
+What these simulators remember between steps is in ``State.internal``, so a rollout can stop at any frame and continue.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ def approximate(simulator: LearnedSimulator) -> Simulator:
 
 
 class Batched(ABC):
-    """Base class that derives ``step`` from ``step_all``."""
+    """Base class of simulators that advance several scenes together. ``step`` is derived from ``step_all``."""
 
     @abstractmethod
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        """Return the states one frame later, or the error of a scene that has none."""
+        """Return the states one frame later. A scene that cannot be advanced has its error instead."""
 
     def step(self, state: State) -> State:
         (after,) = self.step_all([state])
@@ -55,12 +55,14 @@ class _Rest:
 
 
 class Sleeping(Batched):
-    """Simulator in which islands at rest sleep: they stand still and are not computed until a moving node or wall comes within the graph's radius of them.
+    """Simulator in which islands at rest sleep: their nodes keep their positions and are not computed.
 
-    An island (``graphs.islands``, connected by the radius of the graph) sleeps if all its nodes have been at rest in the last ``Skips.sleep_after``
-    predictions, by ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings``. Islands sleep as a whole, so no edge has a sleeping and a moving end.
-    Moving nodes keep their surroundings: the model gets all nodes within its reach. The momentum of an island that falls asleep is lost. New states have the
-    lost momentum (``State.lost_impulse``) and the number of sleeping nodes (``State.num_asleep``).
+    An island wakes up when a moving node or wall comes within the radius of the graph.
+
+    An island (see ``graphs.islands``) falls asleep if all its nodes have been at rest in the last ``Skips.sleep_after`` predictions.
+    ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` define rest. Islands sleep as a whole, so no edge connects a sleeping and a moving
+    node. For moving nodes, the model gets all nodes that can influence them, also sleeping ones. An island that falls asleep loses its momentum. New states
+    contain this loss (``State.lost_impulse``) and the number of sleeping nodes (``State.num_asleep``).
 
     Args:
         simulator: simulator, whose ``skips`` set when islands sleep.
@@ -81,7 +83,7 @@ class Sleeping(Batched):
         return results
 
     def _awake_and_seen(self, state: State) -> tuple[Tensor, Tensor]:
-        """Return masks [node] of the awake nodes, and of the nodes in the graph for their predictions, which include them."""
+        """Return masks [node] of the awake nodes and of all nodes that the graph for their prediction contains."""
         after = self.simulator.skips.sleep_after
         assert after is not None
         is_calm = (_rest_of(state) >= after).cpu().numpy()
@@ -114,7 +116,7 @@ class Sleeping(Batched):
         return near
 
     def _combined(self, state: State, after: State, awake: Tensor, seen: Tensor) -> State:
-        """Return the next state: awake nodes are at their new positions, the others stay."""
+        """Return the next state, in which awake nodes have moved and all others stay."""
         pos, vel = state.pos.clone(), torch.zeros_like(state.vel)
         moved = awake[seen]
         pos[awake], vel[awake] = after.pos[moved], after.vel[moved]

@@ -1,4 +1,4 @@
-"""Momentum of islands in free flight, which is conserved exactly for any network, and of bodies, which forces move as a whole.
+"""Exact conservation of momentum for islands in free flight, with any network, and the rigid part of the accelerations of bodies.
 
 An island without edges to anything outside keeps its linear and angular momentum. With a the accelerations without gravity of its nodes, m their masses and r
 their positions relative to the island's centre of mass::

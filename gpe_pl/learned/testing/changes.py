@@ -1,4 +1,4 @@
-"""Changes of states and graphs that change a prediction in a known way, or not at all."""
+"""Changes of states and graphs whose effect on a prediction is known, or that have no effect."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gpe_pl.trajectory.state import State
 
 
 def permuted(state: State, order: Any) -> State:
-    """Return the state with its nodes in another order, or with some of them (then without its mesh)."""
+    """Return the state with its nodes in another order, or with only some of them. A state with some of its nodes has no mesh."""
     taken = state.take(order)
     return taken if len(order) == state.num_nodes else replace(taken, cells=None, rest_pos=None)
 

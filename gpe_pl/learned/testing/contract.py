@@ -1,4 +1,4 @@
-"""The contract of every model: symmetries, independence, degenerate input, gradients, settings. A check raises ``AssertionError`` where a model breaks it.
+"""The contract of every model: symmetries, independence of bodies, degenerate input, gradients, settings. A check raises ``AssertionError`` if a model fails.
 
 In a test of another package::
 
@@ -8,7 +8,7 @@ In a test of another package::
     def test_contract(check):
         check(factory(Net, hidden_channels=16))
 
-``MESH_CHECKS`` are for models of graphs with meshes. Models compute in double precision here, features are made in single precision.
+``MESH_CHECKS`` are for models of graphs with meshes. In all checks, features are made in single precision and models compute in double precision.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def check_translation(make: Factory) -> None:
 
 
 def check_batches(make: Factory) -> None:
-    """A batch gives what its graphs give alone, whatever types are present."""
+    """A batch gives the same predictions as its graphs alone, also if graphs lack some node types."""
     build = scenes.builder(TWO)
     states = [
         scenes.state(30, ("sand",), seed=1),
@@ -97,7 +97,7 @@ def check_batches(make: Factory) -> None:
 
 
 def check_bodies_out_of_reach(make: Factory) -> None:
-    """Bodies that have no edges between them do not feel each other."""
+    """Bodies without edges between them do not influence each other."""
     build = scenes.builder()
     near, far = scenes.state(20, walls=False, seed=1), scenes.state(15, walls=False, seed=2)
     far = replace(far, pos=far.pos + 10.0)
@@ -107,7 +107,7 @@ def check_bodies_out_of_reach(make: Factory) -> None:
 
 
 def check_degenerate_geometry(make: Factory, case: str) -> None:
-    """Predictions and gradients are finite for coincident, isolated, single and resting nodes; there is none without nodes."""
+    """Predictions and gradients are finite for coincident, isolated, single and resting nodes. Without nodes, there is no prediction."""
     build = scenes.builder()
     state = scenes.state({"one": 1, "two coincident at rest": 2, "none": 0}.get(case, 12), walls=case != "one")
     assert state.velocity_history is not None
@@ -133,7 +133,7 @@ def check_degenerate_geometry(make: Factory, case: str) -> None:
 
 
 def check_gradients(make: Factory) -> None:
-    """Gradients by features of nodes and edges equal finite differences."""
+    """Gradients with respect to features of nodes and edges equal finite differences."""
     build = scenes.builder()
     data = _graph(build, scenes.state(5, high=0.2, seed=3))
     model = make(build.spec)
@@ -161,7 +161,7 @@ def check_every_parameter_is_used(make: Factory, may_be_unused: Collection[str] 
 
 
 def check_settings(make: Factory) -> None:
-    """The settings rebuild the model, and its weights fit."""
+    """``Model.settings`` rebuild the model, and its weights fit the rebuilt model."""
     build = scenes.builder(TWO)
     model = make(build.spec)
     again = type(model)(build.spec, **model.settings).double()
@@ -199,7 +199,7 @@ def check_mesh(make: Factory) -> None:
 
 
 def check_batches_of_meshes(make: Factory) -> None:
-    """A batch of scenes with and without a mesh gives what its graphs give alone."""
+    """A batch of scenes with and without a mesh gives the same predictions as its graphs alone."""
     build = scenes.builder(WITH_MESH, mesh=True)
     states = [
         scenes.mesh_state(materials=WITH_MESH),
