@@ -1,8 +1,8 @@
 """Table 1 of the paper from a sweep over domains, models and seeds, as CSV and Markdown, and two figures.
 
-Models are compared by the rollout MSE over all frames: the mean over a domain's trajectories with unseen material parameters, the median over seeds. A failed
-rollout counts as ballistic flight in the same scene (``finished_runs.rollout_errors``), in all domains. A separate column has the ratio if the error of a
-failed rollout is infinite instead.
+Models are compared by the rollout MSE over all frames. It is averaged over a domain's trajectories with unseen material parameters; then the median over seeds
+is taken. In all domains, a failed rollout counts as ballistic flight in the same scene (``finished_runs.rollout_errors``). A separate column gives the ratio
+with an infinite error for failed rollouts.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ SAME_IN_A_ROW = ("data.", "evaluation.data.", "evaluation.containment", "evaluat
 
 
 class TableError(GpeError, ValueError):
-    """Runs do not belong into one table. The message names them and says what to do."""
+    """Raised when runs do not belong in one table. The message names them and says what to do."""
 
 
 @dataclass(frozen=True)
@@ -179,9 +179,9 @@ def _first_frame(run: Run) -> int | None:
 
 
 def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, Cell]]:
-    """Two cells for each model of a domain: failed rollouts count as ballistic flight in the first, and as infinite errors in the second.
+    """Return two cells for each model of a domain. Failed rollouts count as ballistic flight in the first cell, and as infinite errors in the second.
 
-    Both use the trajectories that all runs of the domain have evaluated.
+    Both cells use the trajectories that all runs of the domain have evaluated.
     """
     found = {}
     for model, runs in by_model.items():
@@ -257,7 +257,10 @@ def _markdown(
 def _ratios(
     domains: list[str], cells: dict[tuple[str, str], Cell], strict: dict[tuple[str, str], Cell], by_cell: dict[tuple[str, str], list[Run]]
 ) -> list[dict[str, str]]:
-    """Ratios of each domain by column: with failed rollouts as ballistic flight, with infinite errors, and the paper's ratio if its scenes were evaluated."""
+    """Return the ratios of each domain by column: failed rollouts as ballistic flight, failed rollouts as infinite errors, and the ratio in the paper.
+
+    The last column is left out if models were evaluated in other scenes than those of the paper.
+    """
     other_scenes = any(key.startswith("evaluation.data.scene") for runs in by_cell.values() for run in runs for key in run.config)
     rows = []
     for domain in domains:

@@ -1,4 +1,4 @@
-"""Finished training runs: their configuration and metrics, and selections of values across several runs."""
+"""Finished training runs: reads their configurations and metrics, and selects values of several runs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Run:
 
     Attributes:
         folder: folder of the run; for an archived run, the folder before archiving.
-        config: flat configuration: values by keys such as ``training.num_steps``.
+        config: values of the configuration by keys such as ``training.num_steps``.
         rows: metrics: a table with the fields of ``evaluation.rollouts.Row`` as columns.
         data: checksums of the data, by key of the configuration.
         curve: validation curve of an archived run; None if it is in the run's folder (see ``validation_curve``).
@@ -142,7 +142,7 @@ def replaced_data(runs: list[Run]) -> list[str]:
 
 
 def distinct_runs(runs: list[Run]) -> list[Run]:
-    """Runs with different configurations; of equal ones, the first."""
+    """Return the runs without repetitions: of runs with the same configuration, only the first."""
     first: dict[str, Run] = {}
     for run in runs:
         kept = first.setdefault(json.dumps(run.config, sort_keys=True), run)
@@ -167,7 +167,7 @@ def axes_of(runs: list[Run]) -> list[str]:
 
 
 def with_groups(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows with those of unseen parameters repeated under the split ``split/group``, where the group is in ``UNSEEN_GROUPS``."""
+    """Return the rows, and the rows of unseen parameters a second time under the name ``split/group`` with a group in ``UNSEEN_GROUPS``."""
     unseen = rows[rows["parameter_group"].isin(UNSEEN_GROUPS)]
     return pd.concat([rows, unseen.assign(split=unseen["split"] + "/" + unseen["parameter_group"])], ignore_index=True)
 
@@ -232,7 +232,7 @@ STAND_IN = "ballistic"
 
 
 def rollout_errors(runs: list[Run], split: str, horizon: str) -> Values:
-    """Rollout MSE [m²] of learned models, as in tables: a failed rollout gets the error of ballistic flight in the same scene over the same frames.
+    """Return rollout MSE [m²] of learned models as tables show it: a failed rollout has the error of ballistic flight in the same scene over the same frames.
 
     The error stays infinite if ballistic flight was not evaluated. ``values_by_seed`` returns the errors without this replacement.
     """
@@ -245,12 +245,12 @@ def rollout_errors(runs: list[Run], split: str, horizon: str) -> Values:
 
 
 def shared_trajectories(*values: Values) -> list[int]:
-    """Numbers of the trajectories that all seeds in all of ``values`` have evaluated."""
+    """Return the numbers of the trajectories that all seeds in all of ``values`` have evaluated."""
     seeds = [set(seed) for table in values for seed in table]
     return sorted(set.intersection(*seeds)) if seeds else []
 
 
 def shared_table(values: Values, trajectories: list[int] | None = None) -> np.ndarray:
-    """Values as an array [seed, trajectory]. Without ``trajectories``, it has those that all seeds have evaluated."""
+    """Return values as an array [seed, trajectory]. Without ``trajectories``, the array has those that all seeds have evaluated."""
     chosen = shared_trajectories(values) if trajectories is None else trajectories
     return np.array([[seed[k] for k in chosen] for seed in values]).reshape(len(values), len(chosen))

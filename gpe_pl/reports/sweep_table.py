@@ -60,7 +60,7 @@ def report(folder: Path) -> None:
 
 
 def variants_of(runs: list[Run]) -> tuple[list[str], dict[Variant, list[Run]]]:
-    """Configuration keys, other than the seed, in which runs differ, and the runs by their values of these keys."""
+    """Return the configuration keys in which runs differ, without the seed, and the runs by their values of these keys."""
     axes = [axis for axis in axes_of(runs) if axis != "seed"]
     variants: dict[Variant, list[Run]] = defaultdict(list)
     for run in runs:
@@ -89,7 +89,7 @@ def _report(folder: Path, runs: list[Run]) -> None:
 
 
 def conclusion(folder: Path) -> str:
-    """Last output of a command: the metrics of the run or evaluation in a folder, and the viewers to open."""
+    """Return the last output of a command: the metrics of the run or evaluation in a folder, and the viewers to open."""
     viewers = sorted(folder.glob("rollout_*_00.html"))
     return "\n".join([summary(table_of(read_rows(folder / "metrics.csv"))), *(printable(f"look at {viewer}") for viewer in viewers)])
 
@@ -132,7 +132,7 @@ def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
 
 
 def _interval(values: Values, scale: float = 1.0) -> str:
-    """Mean with its bootstrap interval; where rollouts failed, which makes the mean infinite, their number and the median."""
+    """Format a mean with its bootstrap interval. If rollouts failed, the mean is infinite; then the number of failures and the median are shown."""
     if not values:
         return "–"
     table = shared_table(values) * scale
@@ -144,7 +144,7 @@ def _interval(values: Values, scale: float = 1.0) -> str:
 
 
 def forward_time_ratios(folder: Path, variants: dict[Variant, list[Run]]) -> dict[Variant, float]:
-    """Forward time of each variant's model over that of the first, as ``benchmarks.forward_times`` measured them; empty where it did not."""
+    """Return the forward time of each variant divided by that of the first, as measured by ``benchmarks.forward_times``; empty if it was not measured."""
     path = folder / FORWARD_TIMES
     if not path.exists():
         return {}

@@ -1,4 +1,4 @@
-"""Writes tables and figures of the finished runs in a folder. The command ``python -m gpe_pl.reports FOLDER`` does so from stored results alone."""
+"""Writes tables and figures of the finished runs in a folder. The command ``python -m gpe_pl.reports FOLDER`` writes them again from stored results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gpe_pl.system.locks import locked
 
 
 def write_tables(folder: Path, runs: list[Run]) -> Path:
-    """Write tables and figures into the folder of a sweep. Which ones depends on the settings in which its runs differ.
+    """Write tables and figures into the folder of a sweep. The settings in which its runs differ decide which tables are written.
 
     Returns:
         Path of the table in Markdown. It does not exist if no run has finished.

@@ -1,7 +1,7 @@
 """Table of trials: for each model and domain, compares several settings and marks the best.
 
-Settings are compared by the rollout MSE over all frames: the mean over the trajectories of a split, the median over seeds. Failed rollouts count as in
-``finished_runs.rollout_errors``.
+Settings are compared by the rollout MSE over all frames. It is averaged over the trajectories of a split; then the median over seeds is taken. Failed rollouts
+count as in ``finished_runs.rollout_errors``.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _by_model(runs: list[Run]) -> dict[tuple[str, str], list[Run]]:
 
 
 def _settings(runs: list[Run]) -> list[str]:
-    """Configuration keys of the settings on trial."""
+    """Return the configuration keys of the settings that trials compare."""
     keys = [key for key in axes_of(runs) if key not in (*CONSEQUENCES, NUM_STEPS)]
     steps: dict[tuple[str, ...], set[Any]] = defaultdict(set)
     for run in runs:

@@ -1,4 +1,4 @@
-"""Warnings of what a solver does not resolve, given before data are made; ``docs/results/convergence.md`` has measurements."""
+"""Warnings of scenes and parameters that a solver does not resolve. They appear before data are generated; ``docs/results/convergence.md`` has measurements."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def unresolved(solver: Any, parameters: Mapping[str, Sequence[float]], scenes: I
 
 
 def thin_nodes(cells: np.ndarray, num_nodes: int, dim: int) -> np.ndarray:
-    """Return a mask [node] of the nodes outside every part of a mesh that is ``CELLS_ACROSS`` cells thick; cells [cell, corner] of one kind.
+    """Return a mask [node] of the nodes in thin parts of a mesh, which are fewer than ``CELLS_ACROSS`` cells thick; cells [cell, corner] are of one kind.
 
     This is a morphological opening along the edges: half of ``CELLS_ACROSS`` steps from the surface inward, then as many outward.
     """

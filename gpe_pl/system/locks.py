@@ -1,8 +1,8 @@
 """Locks that let only one command at a time write to a folder.
 
 The lock of ``FOLDER`` is the file ``.FOLDER.lock`` in the same parent folder. The operating system holds it and releases it however the process ends.
-``.FOLDER.holder`` says which process has the lock. Some disks have no such locks; there the existence of the file is the lock. A file left by an ended
-process is then removed on the same machine, and on another machine the message says which file to delete. Readers need no lock.
+``.FOLDER.holder`` names the process that has the lock. On disks without such locks, the existence of the file is the lock. If a process has ended and left its
+file there, the next command on the same machine removes it; on another machine, a message names the file to delete. Readers need no lock.
 """
 
 from __future__ import annotations

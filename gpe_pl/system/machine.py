@@ -1,4 +1,4 @@
-"""The machine: its description, its peak rates and the memory that functions need.
+"""The machine: its description, its peak rates of computation and copying, and the memory that functions need.
 
 The rates of matrix products and copies give lower bounds of run times.
 """
@@ -189,9 +189,9 @@ def _peak_memory(sender: Any, function: Callable[..., Callable[[], Any]], argume
 
 
 def _resident() -> int:
-    """Memory in use [bytes], after resetting the peak on Linux.
+    """Memory of this process in use [bytes], after resetting the recorded peak on Linux.
 
-    Other systems cannot reset it. There the result is the peak so far, and a smaller need is not visible.
+    Other systems cannot reset the peak. There the result is the peak so far, and a function that needs less memory than that peak seems to need none.
     """
     if not CLEAR_REFS.exists():
         return peak_resident()

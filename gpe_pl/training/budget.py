@@ -91,8 +91,8 @@ def step_time(
 ) -> float:
     """Time per optimiser step [s], including the building of its graphs: the fastest of several rounds.
 
-    The time is processor time on a CPU and wall time on a GPU. The fastest round counts because other processes can only lengthen a step: even processor time
-    grows when they share caches and memory. After ``limit`` seconds of rounds no further one begins; the first always runs.
+    The time is processor time on a CPU and wall time on a GPU. The fastest round is taken because other processes can only slow a step down; even processor
+    time grows when they use the same caches and memory. No further round begins after ``limit`` seconds; the first always runs.
     """
     on_gpu = next(module.parameters()).is_cuda
     clock = time.perf_counter if on_gpu else time.process_time
@@ -126,7 +126,7 @@ def _on(device: torch.device, samples: Samples) -> Samples:
 def within_budget(
     settings: TrainingSettings, path: Path, key: str, measure: Callable[[TrainingSettings], float], device: str = "cpu"
 ) -> TrainingSettings:
-    """Settings with the number of steps that fits into ``settings.budget_minutes``, and as many validations as before.
+    """Return settings with the number of steps that fits into ``settings.budget_minutes``. The number of validations does not change.
 
     The budget does not include the time of compilation.
 
@@ -135,7 +135,7 @@ def within_budget(
         path: JSON file of step times [s]. The runs of a sweep share it, and their trainings pause during a measurement (``PauseForMeasurements``).
         key: key of the step time in that file (``step_time_key``).
         measure: measures the step time [s] under given settings; called if the file does not have it yet.
-        device: device to compute on. A warning says if it is faster or slower than the one on which the file's first time was measured.
+        device: device to compute on. A warning is logged if it is faster or slower than the device on which the first time in the file was measured.
 
     Raises:
         BudgetError: the file is damaged.
@@ -166,7 +166,7 @@ def _measured(settings: TrainingSettings, measure: Callable[[TrainingSettings], 
 
 
 def _check_machine(times: dict[str, float], path: Path, key: str, device: str) -> None:
-    """Warn if the stored times come from another machine, as equal budgets on both are not equal work. Into empty ``times``, add this machine's rate."""
+    """Warn if the stored times come from another machine, because equal budgets are then not equal work. If ``times`` is empty, add this machine's rate."""
     rate = gemm_rate(*PRODUCTS, device)
     before = times.get(RATE, rate) if times else times.setdefault(RATE, rate)
     if not 1 / SAME_MACHINE < rate / before < SAME_MACHINE:

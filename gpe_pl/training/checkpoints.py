@@ -26,7 +26,7 @@ SCORE = "val/rollout_mse"
 
 
 class Checkpoints(Checkpoint):
-    """Saves ``last.ckpt`` regularly, and ``best.ckpt`` after each validation that is better than all before it.
+    """Saves ``last.ckpt`` regularly, and ``best.ckpt`` after each validation with the best score so far.
 
     ``last.ckpt`` is saved after every validation, every ``seconds`` between validations, and when training is interrupted. A checkpoint stores the best score
     and its step but no path, so a run's folder can be moved. All ranks save and stop together.
@@ -91,7 +91,7 @@ class Checkpoints(Checkpoint):
 
     @staticmethod
     def _agreed(module: L.LightningModule, *wishes: bool) -> list[bool]:
-        """For each wish, whether any rank has it; all ranks get the same answer."""
+        """For each wish, return whether any rank has it. All ranks get the same answer."""
         if ranks.num_ranks() == 1:
             return list(wishes)
         return [bool(count) for count in ranks.summed(torch.tensor(wishes, dtype=torch.int64, device=module.device)).tolist()]

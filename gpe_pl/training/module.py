@@ -54,7 +54,7 @@ def _rows(tensor: Tensor) -> int:
 
 
 class TrainingError(GpeError, RuntimeError):
-    """Training cannot continue; the message names step, trajectories and frames."""
+    """Raised when training cannot continue; the message names step, trajectories and frames."""
 
 
 class TrainingModule(L.LightningModule):
@@ -186,14 +186,14 @@ class TrainingModule(L.LightningModule):
         return [weight[batch[m].batch][:, None] * error for m, error in zip(materials, errors, strict=True)]
 
     def _fractions(self, *errors: list[Tensor]) -> list[float]:
-        """Fraction of all ranks' errors that is on this rank, for each kind. A rank without errors of a kind takes part in the exchange, too."""
+        """For each kind of error, return the fraction of all ranks' values that is on this rank. Ranks without values also take part in the exchange."""
         if ranks.num_ranks() == 1:
             return [1.0] * len(errors)
         here = torch.tensor([sum(e.numel() for e in kind) for kind in errors], device=self.device)
         return [n / max(1, total) for n, total in zip(here.tolist(), ranks.summed(here).tolist(), strict=True)]
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor | None:
-        """Loss of a batch. Without a finite loss the step changes nothing; one process then returns None."""
+        """Return the loss of a batch. If the loss is not finite, the step changes nothing; a run of one process then returns None."""
         loss = self.loss(batch)
         if not loss.requires_grad:  # no node has an edge, so all fall freely by design: nothing to learn from this batch
             loss = loss + 0.0 * torch.stack([p.sum() for p in self.simulator.parameters() if p.requires_grad]).sum()

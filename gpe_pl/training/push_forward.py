@@ -1,7 +1,7 @@
 """Push-forward: trains a simulator on states that its own unrolls reach.
 
-A training step predicts the accelerations that the unroll needs for its next step, so the unroll costs no extra pass of the model. Each batch of states is
-trained on, advanced by this prediction, and kept until its lane comes up again.
+A training step predicts the accelerations that the unroll needs for its next step, so the unroll needs no additional pass of the model. The model is trained on
+a batch of states; the prediction then advances these states, which are kept until the next turn of their lane.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def _moved(start: State, scene: dict[str, Any]) -> State:
 
 @dataclass(frozen=True)
 class _Trainable(Batched):
-    """A learned simulator whose states can be trained on; those of ``LearnedSimulator.step_all`` are for inference only."""
+    """A learned simulator whose states can be used in training. States from ``LearnedSimulator.step_all`` can be used for inference only."""
 
     simulator: LearnedSimulator
 
@@ -166,7 +166,7 @@ class _Trainable(Batched):
 def walked(simulator: LearnedSimulator, starts: Sequence[Start]) -> tuple[list[State], list[int]]:
     """States after unrolling each start for ``num_steps`` steps, all starts together, and the number of steps of each.
 
-    An unroll whose scene has no graph any more ends earlier.
+    An unroll ends earlier if no graph of its scene can be built any more.
     """
     states, steps = [start.state for start in starts], [0] * len(starts)
     num_steps = {k: start.num_steps for k, start in enumerate(starts)}

@@ -77,7 +77,7 @@ class LoggerSettings:
 
 
 class Log(CSVLogger):
-    """CSV logger that replaces its file as a whole. A reader could not tell a number that is cut off from a complete one."""
+    """CSV logger that replaces its file as a whole, so that a reader never sees a number that is cut off."""
 
     @rank_zero_only
     def save(self) -> None:
@@ -101,7 +101,7 @@ class Log(CSVLogger):
 
 
 class TrackingError(GpeError):
-    """W&B refuses a run; the message says why."""
+    """Raised when W&B refuses a run; the message says why."""
 
 
 def has_key() -> bool:

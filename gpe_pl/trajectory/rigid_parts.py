@@ -4,9 +4,9 @@ Nodes belong to one rigid part if one motion describes them in every frame::
 
     x_n(t) = c(t) + R(t) (x_n(0) − c(0))
 
-R(t) is the rotation that brings the part from the first frame closest to its present position [Kabsch 1976]. Near nodes need not belong to one part: a piston
-that slides over a floor is another part than the floor. Nodes of a membrane that happen to move alike are no part, as most of the nodes connected to them move
-differently.
+R(t) is the rotation that best maps the part from the first frame to its present position [Kabsch 1976]. Nodes that are near each other need not belong to one
+part: a piston that slides over a floor is a part of its own. Nodes of a membrane that happen to move alike are not a rigid part, because most nodes connected
+to them move differently.
 """
 
 from __future__ import annotations

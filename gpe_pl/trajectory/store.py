@@ -35,11 +35,11 @@ from gpe_pl.trajectory.values import faults, size_conflicts
 
 
 class StoreError(GpeError, ValueError):
-    """A file of the store is missing, damaged or of another schema; the message names file, trajectory and field."""
+    """Raised when a file of the store is missing, damaged or of another schema; the message names file, trajectory and field."""
 
 
 class UnsoundError(StoreError):
-    """A stored trajectory can be read, but has invalid values.
+    """Raised when a stored trajectory can be read but has invalid values.
 
     Attributes:
         fault: the fault, without file and trajectory.

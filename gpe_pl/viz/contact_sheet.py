@@ -13,7 +13,7 @@ DPI = 220
 
 
 def telling_color(trajectories: Sequence[Trajectory]) -> ColorBy:
-    """Choose stress if a mesh has it, else material if there are several, else the height at the start."""
+    """Choose what to colour by: the stress of a mesh if there is one, else the material if there are several, else the height at the start."""
     if any(trajectory.stress is not None for trajectory in trajectories):
         return "von_mises"
     return "material" if len(trajectories[0].metadata.materials) > 1 else "height"

@@ -60,7 +60,7 @@ SOLID_CELLS = 4
 
 
 class ViewerError(GpeError, ValueError):
-    """Trajectories do not show the same scene."""
+    """Raised when trajectories do not show the same scene."""
 
 
 def write_viewer(

@@ -53,10 +53,10 @@ def reach_into_solids(active, strides, area, cell_room, half, density, touched):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def extend_into_solids(active, strides, area, cell_room, half, density, viscous):
-    """Add liquid to cells with a solid centre: the amount in ``half`` a cell of their open neighbours.
+    """Add liquid to cells with a solid centre: as much as the volume ``half`` of their open neighbours contains.
 
-    Too few particles measure their density otherwise: liquid that seems empty would draw in its surroundings. The cell's own mass counts too; otherwise
-    particles would gather in it.
+    Such cells contain few particles, so their density would be too low, and the correction of the density would draw liquid into them. The mass in the cell
+    itself is counted too; otherwise particles would gather in it.
     """
     for c in active:
         if cell_room[c] >= half:

@@ -113,9 +113,9 @@ class FLIP:
     with no slip, for any friction coefficient; at a small viscosity the layer at rest has its physical thickness. Bodies of liquid that touch no solid follow
     a parabola exactly. Obstacles and gaps should be at least two cells wide.
 
-    The fraction ``pic`` acts like an additional kinematic viscosity ``Δ²/(6τ)`` with ``τ = -10 ms / ln(1 - pic)``, for any length of substeps, because a
-    transfer to the grid and back spreads momentum with the variance Δ²/3 along each axis. ``numerical_viscosity`` gives its value. Below this value, the
-    viscosity of the liquid has little effect.
+    The fraction ``pic`` acts like an additional kinematic viscosity ``Δ²/(6τ)`` with ``τ = -10 ms / ln(1 - pic)``, for any length of substeps: a transfer to
+    the grid and back spreads momentum with the variance Δ²/3 along each axis. ``numerical_viscosity`` returns this value. A smaller viscosity of the liquid has
+    little effect.
 
     Attributes:
         bounds: ``(low, high)`` of the domain along each of two or three axes [m]; each extent is a whole multiple of the grid spacing.
@@ -126,7 +126,7 @@ class FLIP:
         pic: fraction of the grid's velocity in a particle's velocity after 10 ms, which damps motion that the grid does not resolve.
         evening: fraction of the error of the particle density that is corrected in 10 ms, except in bodies that fly freely.
         cfl: number of cells that a particle may cross in one substep.
-        max_substeps: largest number of substeps per frame; needing more counts as an explosion.
+        max_substeps: largest number of substeps per frame. If a frame needs more, the step fails as an explosion.
         pressure_tolerance: largest relative change of a liquid cell's volume in a substep.
         viscosity_tolerance: largest residual of the viscous system over the largest speed.
         max_iterations: largest number of iterations of each linear solver.
@@ -161,7 +161,7 @@ class FLIP:
 
     @property
     def numerical_viscosity(self) -> float:
-        """Kinematic viscosity in m²/s that ``pic`` adds to that of the liquid; infinite for ``pic = 1``, which acts once per substep."""
+        """Kinematic viscosity in m²/s that ``pic`` adds to the viscosity of the liquid; infinite for ``pic = 1``, which acts once per substep."""
         rate = math.inf if self.pic == 1 else -math.log1p(-self.pic) / REFERENCE_TIME
         return rate * self.grid_spacing**2 / 6.0
 
@@ -273,7 +273,7 @@ class FLIP:
         return x
 
     def liquid(self, active: np.ndarray, solids: Solids, fields: Fields) -> tuple[Liquid, np.ndarray]:
-        """Number the liquid cells; the second result tells for each label of ``fields.island`` whether that island touches no solid."""
+        """Number the liquid cells. The second result tells, for each label of ``fields.island``, whether that island touches no solid."""
         strides = self.grid.strides
         cells = pressure.liquid_cells(active, solids.is_open, fields.density, fields.liquid)
         is_free, is_closed = islands.find_islands(active, strides, solids.area, fields.density, fields.weight, fields.liquid, fields.island)

@@ -4,10 +4,10 @@ The velocities after a time h minimise, over all faces f and stress samples s (B
 
     Σ_f m_f (u_f - u*_f)² / 2  +  h Σ_s w_s ν_s ε_s : ε_s,     ε = (∇u + ∇uᵀ) / 2
 
-The free surface thus needs no condition, and velocities without strain, such as rigid rotations, do not change. Masses m and weights w are the densities that
-the particles give to the grid, so momentum is conserved. Normal strains are sampled at cell centres, shear strains at edges. Where a difference quotient
-meets a face with a solid centre, the surface of the solid replaces it. Velocity is then 0 at the fraction θ of the distance, and the weight is multiplied by
-θ, which gives the finite-volume flux to a wall at that distance.
+The free surface therefore needs no condition, and velocities without strain, such as rigid rotations, do not change. Masses m and weights w are the densities
+that the particles give to the grid, so momentum is conserved. Normal strains are sampled at cell centres, shear strains at edges. If one of the two faces in a
+difference quotient has a solid centre, the surface of the solid is used instead of that face: velocity is 0 at the fraction θ of the distance. The weight is
+multiplied by θ, which gives the finite-volume flux to a wall at that distance.
 """
 
 from __future__ import annotations

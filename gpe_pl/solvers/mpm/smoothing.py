@@ -1,4 +1,4 @@
-"""The loss of particle velocities in a transfer to the grid and back, and how much of it particles keep.
+"""Smoothing of particle velocities by a transfer to the grid and back, and the part of the lost velocity that particles keep.
 
 The grid holds fewer numbers than the particles, so a transfer to it and back smooths their velocities. APIC applies this filter in every substep, so its loss
 of energy per second grows without bound as substeps get shorter. Here the remainder of the filter, ``s - G P s`` with the velocity and the affine part of all
