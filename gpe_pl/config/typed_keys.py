@@ -9,7 +9,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gpe_pl.files.run_folder import OFFERED
+from gpe_pl.files.run_folder import LOOKUPS
 
 OF_SWEEPS = "size.comparison.seeds"
 """Key that is read at the start of a sweep, not in its runs."""
@@ -37,7 +37,7 @@ def without_effect(cfg: DictConfig, overrides: Sequence[str]) -> str:
     """
     for override in overrides:
         key, _, value = override.lstrip("+").partition("=")
-        if _is_offer(key) and not key.startswith(OF_SWEEPS) and not _is_read(cfg, key):
+        if _is_in_lookup(key) and not key.startswith(OF_SWEEPS) and not _is_read(cfg, key):
             return f"{key}={value}: has no effect, because no other setting takes its value here; leave it out"
         other, is_unread = UNREAD.get(key, ("", bool))
         if other and value != "0" and is_unread(decides := OmegaConf.select(cfg, other)):
@@ -45,10 +45,10 @@ def without_effect(cfg: DictConfig, overrides: Sequence[str]) -> str:
     return ""
 
 
-def _is_offer(key: str) -> bool:
+def _is_in_lookup(key: str) -> bool:
     """Whether a key belongs to a lookup table."""
     parts = key.split(".")
-    return len(parts) > 2 and parts[0] in ("data", "size") and parts[1] in OFFERED
+    return len(parts) > 2 and parts[0] in ("data", "size") and parts[1] in LOOKUPS
 
 
 def _is_read(cfg: DictConfig, key: str) -> bool:

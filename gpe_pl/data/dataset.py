@@ -252,8 +252,8 @@ class Start:
         if step:  # the velocity noise of the start is removed entirely
             before = integrators.velocities(self.truth[step - 1 : step + 1], dt, where)[0]
             vel = vel + (1 - self.velocity_correction) * (state.vel - before)
-        astray = integrators.velocities(torch.stack([self.truth[step], state.pos]), dt, where)[0]
-        target = integrators.acceleration(vel - self.position_correction * astray, state.vel, dt) - state.gravity
+        deviation = integrators.velocities(torch.stack([self.truth[step], state.pos]), dt, where)[0]
+        target = integrators.acceleration(vel - self.position_correction * deviation, state.vel, dt) - state.gravity
         return training_graph(builder, state, target, None if self.stress is None else self.stress[step], self.about)
 
 

@@ -17,7 +17,7 @@ DATA_CHECKSUMS = "data_sha256"
 """Configuration key with the checksums of the splits that a run used, because data of the same name may be replaced."""
 HYDRA = ".hydra"
 """Subfolder of a run folder that Hydra writes. Hydra follows links in it."""
-OFFERED = ("comparison", "larger")
+LOOKUPS = ("comparison", "larger")
 """Lookup tables of ``data`` and ``size`` from which other configuration keys take their values."""
 
 
@@ -111,13 +111,13 @@ def release(run_dir: Path) -> None:
 
 
 def without_tables(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a configuration without the lookup tables (``OFFERED``) of ``data`` and ``size``.
+    """Return a configuration without the lookup tables (``LOOKUPS``) of ``data`` and ``size``.
 
     The values taken from these tables are kept under graph, model, training and the evaluated scene. The time budget of a comparison stays, because it
     decides the number of steps.
     """
     kept = {
-        name: {key: value for key, value in part.items() if key not in OFFERED}
+        name: {key: value for key, value in part.items() if key not in LOOKUPS}
         for name in ("data", "size")
         if isinstance(part := values.get(name), dict)
     }

@@ -111,7 +111,7 @@ def test_a_refused_command_releases_its_folder(tmp_path: Path) -> None:
     assert runs.leftovers(tmp_path) == []
 
 
-def test_judges_tell_what_came_of_it() -> None:
+def test_a_verdict_tells_what_came_of_an_action() -> None:
     def fails(error: Exception) -> None:
         raise error
 
@@ -161,7 +161,7 @@ def test_payloads_work_where_they_are_let(tmp_path: Path) -> None:
         (None, "", "hung"),
     ],
 )
-def test_a_command_is_judged_by_its_last_words(code: int | None, output: str, status: str) -> None:
+def test_the_verdict_of_a_command_follows_from_its_last_words(code: int | None, output: str, status: str) -> None:
     assert Ended(code, output).verdict().status == status
 
 
@@ -276,7 +276,7 @@ COMMANDS = [runs.Command(name, "fit", ()) for name in ("one", "other")]
         ((2, 0), HELD.replace("fit)", f"fit {'x' * 400})"), "second", "refused"),
     ],
 )
-def test_two_commands_are_judged_by_what_they_leave(
+def test_the_verdict_of_two_commands_follows_from_what_they_leave(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codes: tuple[int, int], said: str, left: str, status: str
 ) -> None:
     expected = ({"a": "1", "b": "2"}, {"a": "1", "c": "3"})
