@@ -35,9 +35,9 @@ Features = Literal["paper", "contact"]
 ParameterScale = Literal["linear"]
 
 GAP_SCALE = 0.2
-"""Gaps are resolved in units of this fraction of the rest spacing, …"""
+"""Unit of gaps in features, as a fraction of the rest spacing."""
 GAP_LIMIT = 6.0
-"""… and clipped here, so that the channel resolves contact and saturates beyond it."""
+"""Largest gap in features, in the unit of gaps. Larger gaps are clipped, so that the channel resolves contacts."""
 TINY = 1e-12
 """Length given to an edge between coincident nodes, in rest spacings or widths of a level."""
 

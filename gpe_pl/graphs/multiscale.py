@@ -27,13 +27,13 @@ from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.graphs.islands import unwrapped
 
 SNAP = 1e-3
-"""Nodes this near (in rest spacings) below the face of a box count as on it, so that rounding does not tear the rows of a lattice apart."""
+"""Nodes this near below the face of a box count as on it [rest spacings]. Rounding then does not divide a row of a lattice between two boxes."""
 
-MESHES_HELD = 1024
+MAX_CACHED = 1024
 """Largest number of multi-scale graphs kept in memory; a graph of a thousand nodes takes about 0.2 MB."""
 
 REACH = 2.0
-"""Distance within which a node of no cell is part of a body, in rest spacings; longer than the diagonal of a cubic cell."""
+"""Distance within which a node without a cell belongs to a body [rest spacings]. It is longer than the diagonal of a cubic cell."""
 
 
 class MeshError(GpeError, ValueError):
@@ -127,7 +127,7 @@ def multiscale_graph(
     return _cached(rest_pos.tobytes(), rest_pos.shape, cells.tobytes(), cells.shape, spacing, num_levels, periodicity)
 
 
-@lru_cache(maxsize=MESHES_HELD)
+@lru_cache(maxsize=MAX_CACHED)
 def _cached(
     rest_pos: bytes,
     rest_shape: tuple[int, ...],
@@ -145,7 +145,7 @@ def _cached(
     return graph
 
 
-@lru_cache(maxsize=MESHES_HELD)
+@lru_cache(maxsize=MAX_CACHED)
 def _moving_bodies(graph: MultiscaleGraph, kind: bytes, spacing: float) -> Int64[np.ndarray, " node"]:
     body, kinds = graph.body[: graph.num_nodes].copy(), np.frombuffer(kind, np.int64)
     is_placed = np.zeros(graph.num_nodes, dtype=bool)

@@ -25,10 +25,9 @@ log = logging.getLogger(__name__)
 
 TRIALS_CSV, TRIALS_MD = "trials.csv", "trials.md"
 CONSEQUENCES = ("training.val_interval", "seed")
-"""Keys that may differ between trials but are not on trial. The validation interval follows from the number of steps; the seed is chance."""
+"""Keys that may differ between trials but are not compared: the validation interval, which follows from the number of steps, and the seed."""
 NUM_STEPS = "training.num_steps"
-"""Key of the number of steps. It is a setting on trial only if it differs between runs with equal other settings and seed; else it follows from a time
-budget."""
+"""Key of the number of steps. It is compared only if it differs between runs with equal other settings and seed; else it follows from a time budget."""
 
 
 def compares_settings(runs: list[Run]) -> bool:

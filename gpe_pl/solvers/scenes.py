@@ -33,10 +33,10 @@ CLEARANCE = 0.25
 """Smallest initial distance between a liquid particle and a solid, in spacings; a jittered lattice beside a wall just satisfies it."""
 
 JITTER = 0.25
-"""Largest displacement from the seeding lattice along each axis, in spacings; a regular lattice would crack along its rows when it spreads."""
+"""Largest displacement from the initial lattice along each axis [spacings]. A regular lattice would separate along its rows when the material spreads."""
 
 MESHED = ("elastomer",)
-"""Materials whose particles keep their neighbours: they start on a regular lattice and carry its cells."""
+"""Materials whose particles keep their neighbours. Their particles start on a regular lattice, whose cells form their mesh."""
 
 
 @runtime_checkable

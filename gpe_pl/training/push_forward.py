@@ -86,7 +86,7 @@ class Excursions:
         samples, lane = [start.sample for start in starts], starts[0].lane
         under_way = self._lanes.get(lane)
         if under_way is None or under_way.samples != samples:
-            under_way = self._taken_up(lane, starts) or Excursion(samples, *walked(simulator, starts), [])
+            under_way = self._taken_up(lane, starts) or Excursion(samples, *unrolled(simulator, starts), [])
         under_way.graphs = []
         for k, start in enumerate(starts):
             if start.state.boundary.motion is not None:  # this start's stretch of the motion may reach further than the last
@@ -163,7 +163,7 @@ class _Trainable(Batched):
 
 
 @torch.no_grad()
-def walked(simulator: LearnedSimulator, starts: Sequence[Start]) -> tuple[list[State], list[int]]:
+def unrolled(simulator: LearnedSimulator, starts: Sequence[Start]) -> tuple[list[State], list[int]]:
     """States after unrolling each start for ``num_steps`` steps, all starts together, and the number of steps of each.
 
     An unroll ends earlier if no graph of its scene can be built any more.

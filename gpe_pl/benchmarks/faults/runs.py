@@ -258,13 +258,13 @@ def changed_file(command: Command, sound: Path, name: str, change: Callable[[Pat
         return ended.verdict()
     try:
         expected, found = digests(sound), digests(folder)
-        wrong = sorted(k for k in expected if found.get(k) != expected[k] and not _hold_the_same(sound / k, folder / k))
+        wrong = sorted(k for k in expected if found.get(k) != expected[k] and not _have_equal_content(sound / k, folder / k))
     except GpeError as error:  # the command did not need the file; commands that need it are refused
         return Verdict("refused", str(error)[:MAX_DETAIL])
     return Verdict("accepted", f"no error, but {', '.join(wrong)} differ") if wrong else Verdict("harmless")
 
 
-def _hold_the_same(sound: Path, damaged: Path) -> bool:
+def _have_equal_content(sound: Path, damaged: Path) -> bool:
     """Tell whether two files are shards of equal content. Their bytes may differ, because some bytes have no meaning."""
     return sound.suffix == ".h5" and damaged.exists() and stores.contents(sound) == stores.contents(damaged)
 

@@ -21,7 +21,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.training.module import TrainingModule
-from gpe_pl.training.push_forward import walked
+from gpe_pl.training.push_forward import unrolled
 from gpe_pl.training.run import TrainingSettings
 from gpe_pl.trajectory.boundary import Motion
 from gpe_pl.trajectory.state import State
@@ -45,7 +45,7 @@ def simulator(data: WindowDataset) -> LearnedSimulator:
 def test_a_walk_is_the_simulators_own_rollout(data: WindowDataset, simulator: LearnedSimulator) -> None:
     starts = [data[StartKey(0, 0, 2)], data[StartKey(1, 3, 1)]]
     simulator.train()
-    states, steps = walked(simulator, starts)
+    states, steps = unrolled(simulator, starts)
     assert steps == [2, 1] and simulator.training
     for start, state in zip(starts, states, strict=True):
         expected = start.state
@@ -63,7 +63,7 @@ def test_a_scene_that_falls_apart_on_the_way_ends_where_it_was_whole(
         return [SimulationError("no") if state.time > first.state.time else new for state, new in zip(states, usual(states), strict=True)]
 
     monkeypatch.setattr(simulator, "next_states", fails_later)
-    (state,), steps = walked(simulator, [first])
+    (state,), steps = unrolled(simulator, [first])
     assert steps == [1] and torch.equal(state.pos, simulator.step(first.state).pos)
 
 
@@ -79,7 +79,7 @@ def test_steps_of_training_move_the_states_on(data: WindowDataset, simulator: Le
         for turn in lanes:
             excursions = copy.deepcopy(module._excursions)
             graph = excursions.graphs(simulator, turn[step])
-            states, steps = walked(simulator, turn[step])
+            states, steps = unrolled(simulator, turn[step])
             assert steps == [step, step]
             expected = [start.graph(data.builder, state, step) for start, state in zip(turn[step], states, strict=True)]
             assert_equal_graphs(graph, batched(expected), rtol=1e-4, atol=1e-4)
@@ -117,7 +117,7 @@ def test_a_validation_ends_all_excursions(data: WindowDataset, simulator: Learne
     optimizer = torch.optim.SGD(module.parameters(), lr=1e-3)
     module.loss(turns[1]).backward()
     optimizer.step()
-    (state,), _ = walked(simulator, turns[2])
+    (state,), _ = unrolled(simulator, turns[2])
     expected = batched([turns[2][0].graph(data.builder, state, 2)])
     going_on = copy.deepcopy(module._excursions).graphs(simulator, turns[2])
     assert not torch.equal(going_on["sand"].target, expected["sand"].target)

@@ -136,9 +136,9 @@ def test_bytes_without_meaning_may_change(shard: Path, tmp_path: Path) -> None:
     shutil.copy(shard, other)
     with h5py.File(other, "r+") as file:
         file["00000"]["pos"][0, 0, 0] += 0.5
-    assert runs._hold_the_same(shard, same)
-    assert not runs._hold_the_same(shard, other)
-    assert not runs._hold_the_same(shard, tmp_path / "missing.h5")
+    assert runs._have_equal_content(shard, same)
+    assert not runs._have_equal_content(shard, other)
+    assert not runs._have_equal_content(shard, tmp_path / "missing.h5")
 
 
 def test_payloads_work_where_they_are_let(tmp_path: Path) -> None:
