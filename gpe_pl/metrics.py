@@ -71,12 +71,12 @@ class Interval:
 def displacement(
     pos: Float[np.ndarray, "*axes dim"], reference: Float[np.ndarray, "*axes dim"], metadata: Metadata
 ) -> Float[np.ndarray, "*axes dim"]:
-    """Displacement ``pos - reference`` [m] in float64; the minimum image along periodic axes."""
+    """Return the displacement ``pos - reference`` [m] in float64; the minimum image along periodic axes."""
     return metadata.periodicity.shortest(pos.astype(np.float64) - reference.astype(np.float64))
 
 
 def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.ndarray, "frame"]:
-    """Mean squared position error of every frame [m²], over nodes and dimensions.
+    """Return the mean squared position error of every frame [m²], over nodes and dimensions.
 
     Returns:
         One value per frame, including frame 0 (zero up to rounding). If the rollout stopped early, the array has the length of the ground truth, with ``inf``
@@ -140,7 +140,7 @@ def energy_distance(
     mass_a: Float[np.ndarray, "node_a"],
     mass_b: Float[np.ndarray, "node_b"],
 ) -> float:
-    """Energy distance [m] between two clouds of particles with mass: ``2 E|A - B| - E|A - A'| - E|B - B'|``.
+    """Return the energy distance [m] between two clouds of particles with mass: ``2 E|A - B| - E|A - A'| - E|B - B'|``.
 
     The distance compares distributions of material, not single particles. It therefore stays meaningful after chaotic motion has made errors of single
     particles meaningless. It is zero only for equal distributions. The value is exact; unlike a Sinkhorn divergence, it needs no smoothing length and no
@@ -172,7 +172,10 @@ def _cloud_distance(prediction: Trajectory, ground_truth: Trajectory, frame: int
 
 
 def _relative_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps: int) -> dict[str, float]:
-    """L2 errors over frames 1 to ``num_steps`` and all nodes, relative to the norm of the ground truth; infinite if that is zero and the error is not."""
+    """Return L2 errors over frames 1 to ``num_steps`` and all nodes, relative to the norm of the ground truth.
+
+    An error is infinite if that norm is zero and the error is not.
+    """
     own, true = prediction.pos[: num_steps + 1], ground_truth.pos[: num_steps + 1]
     metadata = ground_truth.metadata
     steps, true_steps = displacement(own[1:], own[:-1], metadata), displacement(true[1:], true[:-1], metadata)
@@ -383,7 +386,7 @@ BOTH = (-2, -1)
 
 
 def median_of_means(table: np.ndarray, axis: tuple[int, int]) -> Any:
-    """Median over seeds of means over trajectories; a ``statistic`` for ``bootstrap_interval``."""
+    """Return the median over seeds of means over trajectories; a ``statistic`` for ``bootstrap_interval``."""
     return np.median(table.mean(axis=axis[1], keepdims=True), axis=axis)
 
 
@@ -394,7 +397,7 @@ def bootstrap_interval(
     num_resamples: int = 2000,
     seed: int = 0,
 ) -> Interval:
-    """Percentile interval of a statistic that varies with training seed and test trajectory.
+    """Return a percentile interval of a statistic that varies with training seed and test trajectory.
 
     Seeds and trajectories are resampled independently. All seeds are tested on the same trajectories, and a hard trajectory is hard for all of them, so
     resampling trajectories within each seed would make the interval too narrow. With fewer than about five seeds, any bootstrap underestimates the spread
@@ -433,7 +436,7 @@ def bootstrap_ratio(
     num_resamples: int = 2000,
     seed: int = 0,
 ) -> Interval:
-    """Percentile interval of the ratio of a statistic between two models on the same trajectories.
+    """Return a percentile interval of the ratio of a statistic between two models on the same trajectories.
 
     Trajectories are resampled together for both models. The other arguments are those of ``bootstrap_interval``.
 
@@ -463,7 +466,7 @@ def _drawn(num_resamples: int, rng: np.random.Generator, *counts: int) -> list[n
 
 
 def _resampled(table: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Resampled tables [resample, seed, trajectory]."""
+    """Return resampled tables [resample, seed, trajectory]."""
     return table[rows[:, :, None], columns[:, None, :]]
 
 

@@ -174,7 +174,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         return found
 
     def parameter_ranges(self) -> dict[str, torch.Tensor]:
-        """Lowest and highest value [2, 1] of the parameter of each material that occurs in the training trajectories."""
+        """Return the lowest and highest value [2, 1] of the parameter of each material that occurs in the training trajectories."""
         found: dict[str, list[np.ndarray]] = {}
         for stored in self.train_set.trajectories:
             first = stored.window(0, 1)
@@ -186,7 +186,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         return {m: torch.tensor([[np.min(pairs)], [np.max(pairs)]], dtype=torch.float32) for m, pairs in found.items()}
 
     def trained_scene(self) -> np.ndarray:
-        """Ranges of gravity and of boundary nodes over all training trajectories; see ``scene_ranges``."""
+        """Return ranges of gravity and of boundary nodes over all training trajectories; see ``scene_ranges``."""
         return united(map(_scene, self.train_set.trajectories))
 
     def val_trajectories(self, count: int) -> list[Trajectory]:

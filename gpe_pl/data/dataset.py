@@ -345,7 +345,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         return self.trajectories[self.locate(window)[0]].num_nodes
 
     def activity(self) -> np.ndarray:
-        """Root mean square acceleration without gravity of each window [window] in m/s². This reads the whole split."""
+        """Return the root mean square acceleration without gravity of each window [window] in m/s². This reads the whole split."""
         values = []
         for stored in self.trajectories:
             trajectory = stored.window(0, stored.num_frames)

@@ -56,7 +56,7 @@ ROUNDING_REFUSED = 0.5
 
 
 def shard_path(folder: Path, split: str, shard: int) -> Path:
-    """Path of a shard inside the folder of a data set."""
+    """Return the path of a shard inside the folder of a data set."""
     return folder / split / f"shard-{shard:05d}.h5"
 
 

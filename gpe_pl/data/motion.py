@@ -40,12 +40,12 @@ ON_MARKS = 0.99
 
 
 def rounding_to(step: np.ndarray, frame_dt: float) -> np.ndarray:
-    """Rms error of accelerations [dim] in m/s² if positions are rounded to multiples of ``step`` [dim] in m."""
+    """Return the rms error of accelerations [dim] in m/s² if positions are rounded to multiples of ``step`` [dim] in m."""
     return step / (math.sqrt(2) * frame_dt**2)
 
 
 def rounding_of(farthest: np.ndarray, frame_dt: float, precision: Precision = np.float32) -> np.ndarray:
-    """Rms error of accelerations [dim] in m/s² if positions at most ``farthest`` [dim] in m from the origin are rounded to a precision."""
+    """Return the rms error of accelerations [dim] in m/s² if positions at most ``farthest`` [dim] in m from the origin are rounded to a precision."""
     return rounding_to(np.spacing(np.abs(farthest).astype(precision)).astype(np.float64), frame_dt)
 
 
@@ -63,7 +63,7 @@ def rounding_fault(rounding: float, acceleration: float, where: str = "in float3
 
 
 def marks(changes: np.ndarray, rounding: float) -> float:
-    """Distance of the marks [m] of which coordinates are multiples; 0 if there are none, or if they are only those of floating-point numbers.
+    """Return the distance of the marks [m] of which coordinates are multiples; 0 if there are none, or if they are only those of floating-point numbers.
 
     Second differences of coordinates on marks are multiples of the marks' distance and have both signs. Rounding has no direction, unlike gravity.
 
@@ -108,7 +108,7 @@ class MotionSummary:
     node: int
 
     def rounding(self, precision: Precision, origin: np.ndarray) -> np.ndarray:
-        """Rms error of accelerations [dim] in m/s² if positions are rounded to a precision in coordinates with this origin [dim] in m."""
+        """Return the rms error of accelerations [dim] in m/s² if positions are rounded to a precision in coordinates with this origin [dim] in m."""
         return rounding_of(np.maximum(np.abs(self.low - origin), np.abs(self.high - origin)), self.frame_dt, precision)
 
     @property

@@ -23,7 +23,7 @@ UNIFORM_FRACTION = 0.2
 
 
 def probabilities(activity: np.ndarray) -> np.ndarray:
-    """Probability of each window [window] with ``activity`` sampling.
+    """Return the probability of each window [window] with ``activity`` sampling.
 
     The gradient of a squared error grows with the error, and the error grows with the acceleration to predict. Drawing in proportion to the acceleration and
     weighting by the inverse reduces the variance and does not change the expected gradient [importance sampling, Katharopoulos and Fleuret 2018,

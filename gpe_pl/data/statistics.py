@@ -41,7 +41,7 @@ def shard_moments(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def acceleration_std(trajectories: Iterable[Trajectory]) -> float:
-    """Root mean square per component of accelerations without gravity [m/s²]."""
+    """Return the root mean square per component of accelerations without gravity [m/s²]."""
     sums = [(float(np.sum(v * v)), v.size) for t in trajectories for key, v in motion(t) if key == "acceleration"]
     power, count = np.sum(sums, axis=0)
     return math.sqrt(power / max(1, count))
@@ -58,7 +58,7 @@ def motion(trajectory: Trajectory) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _scaled(trajectory: Trajectory) -> np.ndarray:
-    """Material parameters [node, param]; natural logarithms of those with a logarithmic scale."""
+    """Return material parameters [node, param]; natural logarithms of those with a logarithmic scale."""
     scale = {p.name: p.scale for p in MATERIALS.values()}
     columns = trajectory.material_params.astype(np.float64).T
     return np.stack([np.log(c) if scale[n] == "log" else c for n, c in zip(trajectory.metadata.param_names, columns, strict=True)], axis=-1)

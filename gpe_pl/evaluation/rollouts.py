@@ -88,7 +88,7 @@ class EvaluationSettings:
     export: list[Export] = field(default_factory=list)
 
     def first_frame(self, history: int) -> int:
-        """Frame at which rollouts of a model with this history [frames] start.
+        """Return the frame at which rollouts of a model with this history [frames] start.
 
         Raises:
             StartError: ``start_frame`` leaves too little history.

@@ -244,11 +244,11 @@ class _Film:
 
 
 def table(records: list[Record], stopped: str | None) -> str:
-    """Table in Markdown with one row per record, and the reason if the rollout stopped early."""
+    """Return a table in Markdown with one row per record, and the reason if the rollout stopped early."""
     lines = ["| | value | unit |", "|---|---|---|", *(f"| {r.metric.replace('_', ' ')} | {r.value:.6g} | {r.unit} |" for r in records)]
     return "\n".join([*lines, *(["", f"Stopped: {stopped}"] if stopped else []), ""])
 
 
 def summary(records: list[Record]) -> str:
-    """Plain text with one line per record."""
+    """Return plain text with one line per record."""
     return "\n".join(f"showcase  {r.metric:28} {r.value:12.6g} {r.unit}" for r in records)

@@ -75,7 +75,7 @@ def unnamed(error: OSError, folders: Iterable[Path]) -> OSError | FullDiskError:
 
 
 def free_bytes(folder: Path) -> int:
-    """Free bytes on the disk of a folder. The folder need not exist yet."""
+    """Return the number of free bytes on the disk of a folder. The folder need not exist yet."""
     return shutil.disk_usage(next(place for place in (folder, *folder.absolute().parents) if place.exists())).free
 
 

@@ -64,7 +64,7 @@ def attribute(owner: h5py.HLObject, name: str) -> Any:
 
 
 def most_unpacked(stored: int) -> int:
-    """Maximum number of bytes that ``stored`` bytes may unpack to."""
+    """Return the maximum number of bytes that ``stored`` bytes may unpack to."""
     return min(stored * LARGEST_DEFLATE_RATIO, stored * LARGEST_RATIO + SPARE_UNPACKED)
 
 

@@ -40,7 +40,7 @@ def sealed(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def checksum(values: dict[str, Any]) -> str:
-    """SHA-256 of values, independent of the order of their keys."""
+    """Return the SHA-256 of values, independent of the order of their keys."""
     plain = json.loads(json.dumps(values, allow_nan=False))  # keys become text, so that they can be sorted
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 

@@ -53,11 +53,11 @@ class Periodicity:
         return np.array([high - low if repeats else 0.0 for (low, high), repeats in zip(self.bounds, self.periodic, strict=True)])
 
     def shortest(self, difference: Array) -> Array:
-        """Minimum images of differences of positions [..., dim] in m; returns the same object if no axis is periodic."""
+        """Return minimum images of differences of positions [..., dim] in m; returns the same object if no axis is periodic."""
         return difference - self._turns(difference, round_down=False) if self else difference
 
     def wrapped(self, pos: Array) -> Array:
-        """Images of positions [..., dim] in m that satisfy ``low <= x < high`` along periodic axes, in the precision of ``pos``.
+        """Return images of positions [..., dim] in m that satisfy ``low <= x < high`` along periodic axes, in the precision of ``pos``.
 
         Positions inside the domain are unchanged to the bit. The same object is returned if no axis is periodic.
         """
@@ -71,7 +71,7 @@ class Periodicity:
         return xp.where(folds, folded, pos)
 
     def from_corner(self, pos: Array) -> Array:
-        """Wrapped positions [..., dim] in m relative to the domain's lower corner, below the period along periodic axes, as a k-d tree needs them."""
+        """Return wrapped positions [..., dim] in m relative to the domain's lower corner, below the period along periodic axes, as a k-d tree needs them."""
         xp = array_namespace(pos)
         low, period = self._row([low for low, _ in self.bounds], pos), self._row(self.period, pos)
         inside = self.wrapped(pos) - low

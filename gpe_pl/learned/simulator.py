@@ -504,7 +504,7 @@ class LearnedSimulator(nn.Module):
     # --- checkpoints ----------------------------------------------------------------------------------------------------------------------
 
     def description(self) -> dict[str, Any]:
-        """Plain values from which ``from_description`` rebuilds this simulator, weights excluded."""
+        """Return plain values from which ``from_description`` rebuilds this simulator, weights excluded."""
         cls = type(self.model)
         return {
             "format": CHECKPOINT_FORMAT,

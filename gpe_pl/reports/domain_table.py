@@ -138,12 +138,12 @@ def report_domains(folder: Path, runs: list[Run]) -> None:
 
 
 def domain_of(run: Run) -> str:
-    """Name of the data set that a run was trained on."""
+    """Return the name of the data set that a run was trained on."""
     return str(run.config["data.name"])
 
 
 def model_of(run: Run) -> str:
-    """Class name of a run's model."""
+    """Return the class name of a run's model."""
     return str(run.config["model._target_"]).rpartition(".")[2]
 
 
@@ -275,7 +275,7 @@ def _lines(header: list[str], rows: list[list[str]]) -> list[str]:
 
 
 def _medians(domains: list[str], models: list[str], cells: dict[tuple[str, str], Cell]) -> list[str]:
-    """Table of median errors. They describe the typical scene; the mean depends on a few scenes with large errors."""
+    """Return a table of median errors. They describe the typical scene; the mean depends on a few scenes with large errors."""
     header = ["domain", *models, f"{OWN} / best baseline"]
     lines = [table_row(header), "|" + "---|" * len(header)]
     for domain in domains:
@@ -297,7 +297,7 @@ def _text(cell: Cell | None) -> str:
 
 
 def _ratio(cells: dict[str, Cell]) -> str:
-    """Ratio of GPE's error to that of the best baseline that has learned, with its interval; bold if the interval excludes 1."""
+    """Return the ratio of GPE's error to that of the best baseline that has learned, with its interval; bold if the interval excludes 1."""
     own, others = cells.get(OWN), [c for m, c in cells.items() if m != OWN]
     baselines = [c for c in others if c.is_learned]
     if own is None or not others:

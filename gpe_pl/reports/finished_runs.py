@@ -55,7 +55,7 @@ TRAINED = {"data.name": str, "model._target_": str, "training.num_steps": int}
 
 
 def table_of(rows: Iterable[Row]) -> pd.DataFrame:
-    """Table with one line per row of ``metrics.csv``."""
+    """Return a table with one line per row of ``metrics.csv``."""
     return pd.DataFrame([[*vars(row).values()] for row in rows], columns=run_archive.COLUMNS)
 
 
@@ -76,7 +76,7 @@ CURVE = ("validation_steps", "validation_losses")
 
 
 def run_name(run: Run, root: Path) -> str:
-    """Path of a run relative to the folder of its sweep."""
+    """Return the path of a run relative to the folder of its sweep."""
     return run.folder.relative_to(root).as_posix()
 
 
@@ -91,7 +91,7 @@ def _archived(folder: Path) -> list[Run]:
 
 
 def finished_runs(folder: Path) -> list[Run]:
-    """All finished training runs below a folder, in order of their paths, or those of an archive in it.
+    """Return all finished training runs below a folder, in order of their paths, or those of an archive in it.
 
     Folders that ``evaluate`` has written are not training runs.
 
@@ -136,7 +136,7 @@ def _warn_of_replaced_data(runs: list[Run]) -> None:
 
 
 def replaced_data(runs: list[Run]) -> list[str]:
-    """Keys of data for which runs have different checksums. A run without a checksum is not compared."""
+    """Return keys of data for which runs have different checksums. A run without a checksum is not compared."""
     keys = sorted({key for run in runs for key in run.data})
     return [key for key in keys if len({run.data[key] for run in runs if key in run.data}) > 1]
 
@@ -160,7 +160,7 @@ def _flatten(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
 
 
 def axes_of(runs: list[Run]) -> list[str]:
-    """Configuration keys whose values differ between runs, ``seed`` last."""
+    """Return configuration keys whose values differ between runs, ``seed`` last."""
     keys = sorted({k for r in runs for k in r.config})
     different = [k for k in keys if len({json.dumps(r.config.get(k)) for r in runs}) > 1]
     return sorted(different, key=lambda k: (k == "seed", k))
@@ -173,12 +173,12 @@ def with_groups(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def splits_of(run: Run) -> list[str]:
-    """Splits on which a run was evaluated, including ``split/group`` for groups of unseen parameters."""
+    """Return splits on which a run was evaluated, including ``split/group`` for groups of unseen parameters."""
     return sorted(with_groups(run.rows)["split"].unique())
 
 
 def validation_curve(run: Run) -> Curve:
-    """Validation curve of a run, over all its starts.
+    """Return the validation curve of a run, over all its starts.
 
     Raises:
         MetricsError: a log is damaged.
@@ -207,7 +207,7 @@ Values = list[dict[int, float]]
 
 
 def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon: str) -> Values:
-    """Values of a metric for each run, in order of trajectories.
+    """Return values of a metric for each run, in order of trajectories.
 
     Args:
         runs: runs that differ in their seeds only.

@@ -95,7 +95,10 @@ def conclusion(folder: Path) -> str:
 
 
 def summary(rows: pd.DataFrame) -> str:
-    """Means over trajectories as plain text: one line per split, metric and model, one column per horizon. Trivial models show their rollout MSE only."""
+    """Return means over trajectories as plain text: one line per split, metric and model, one column per horizon.
+
+    For trivial models, only the rollout MSE is shown.
+    """
     shown = with_groups(rows[~rows["model"].isin(BASELINES) | (rows["metric"] == "rollout_mse")])
     groups: dict[tuple[str, str, str], dict[str, float]] = defaultdict(dict)
     for (split, metric, model, horizon), value in shown.groupby(["split", "metric", "model", "horizon"])["value"].mean().items():
@@ -233,7 +236,7 @@ def _horizons(run: Run) -> list[str]:
 
 
 def _stress_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[str]:
-    """Table of the errors of displacement, velocity and stress for models that decode a stress; empty if none does."""
+    """Return a table of the errors of displacement, velocity and stress for models that decode a stress; empty if none does."""
     stressed = {key: runs for key, runs in variants.items() if runs[0].rows["metric"].isin(STRESS_METRICS).any()}
     if not stressed:
         return []

@@ -47,7 +47,7 @@ SAME_MACHINE = 1.4
 
 
 def step_time_key(config: dict[str, Any], training: TrainingSettings, trainer: TrainerSettings, data: str | None = None) -> str:
-    """Key of a step time: a text that differs where the time of a training step can differ.
+    """Return the key of a step time: a text that differs between runs whose step times can differ.
 
     Args:
         config: resolved configuration of the run without its lookup tables of data and sizes (``run_folder.without_tables``). Entries for other data must not
@@ -72,7 +72,7 @@ class BudgetError(GpeError, ValueError):
 
 
 def mean_step_time(module: TrainingModule, data: WindowDataset, size: BatchSize, settings: TrainingSettings) -> float:
-    """Mean time per optimiser step [s] over a whole run: without push-forward at first, with it in the last ``push_share`` of the steps."""
+    """Return the mean time per optimiser step [s] over a whole run. The fraction ``push_share`` of the steps, at the end, uses push-forward."""
     limit = math.inf if settings.budget_minutes is None else FRACTION_TO_MEASURE * 60 * settings.budget_minutes
     if not settings.push_share:
         return step_time(module, data, size, settings.gradient_clip, limit=limit)
@@ -156,7 +156,7 @@ def within_budget(
 
 
 def _measured(settings: TrainingSettings, measure: Callable[[TrainingSettings], float]) -> float:
-    """Step time [s] with or without compilation, as in the run itself: with ``compile: auto`` that depends on the number of steps."""
+    """Return the step time [s] with or without compilation, as in the run itself. With ``compile: auto``, the number of steps decides."""
     assert settings.budget_minutes is not None
     if settings.compile != "auto":
         return measure(settings)
@@ -212,7 +212,7 @@ def _announcement(path: Path) -> Path:
 
 
 def read_times(path: Path) -> dict[str, float]:
-    """Step times [s] by key, and the machine's rate under ``RATE``; empty if there is no file.
+    """Return step times [s] by key, and the machine's rate under ``RATE``; empty if there is no file.
 
     Raises:
         BudgetError: the file is damaged.

@@ -53,7 +53,7 @@ class Checkpoints(Checkpoint):
         self._saved_at = time.monotonic()
 
     def where_saved(self) -> str | None:
-        """Path and step of ``last.ckpt``, for messages; None if there is none."""
+        """Return the path and step of ``last.ckpt``, for messages; None if there is none."""
         if not self.last.exists():
             return None
         return str(self.last) if self.saved_step is None else f"{self.last}, step {self.saved_step}"
@@ -142,7 +142,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
         replace_bytes(Path(path), content.getbuffer())
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = True) -> dict[str, Any]:
-        """Content of a checkpoint. Unpickles only tensors and plain values, whatever ``weights_only`` says.
+        """Return the content of a checkpoint. Only tensors and plain values are unpickled, whatever ``weights_only`` is.
 
         Raises:
             CheckpointError: the file is damaged, or not a checkpoint.

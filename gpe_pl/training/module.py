@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 
 def clipped_norm(gradient_clip: float | None) -> float:
-    """Largest allowed norm of a gradient. Without clipping it is infinite, so that clipping still computes the norm and changes nothing."""
+    """Return the largest allowed norm of a gradient. Without clipping it is infinite, so that clipping still computes the norm and changes nothing."""
     return math.inf if gradient_clip is None else gradient_clip
 
 
@@ -105,7 +105,7 @@ class TrainingModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def learning_rate_factor(self, step: int) -> float:
-        """Learning rate at a step divided by ``learning_rate``."""
+        """Return the learning rate at a step divided by ``learning_rate``."""
         ratio = self.final_learning_rate / self.learning_rate
         if self.schedule == "exponential":
             return ratio ** (min(step, self.num_steps) / self.num_steps)
@@ -156,7 +156,7 @@ class TrainingModule(L.LightningModule):
             del model.compute  # leaves the method of the class
 
     def loss(self, samples: Samples) -> Tensor:
-        """Mean squared error of the normalised accelerations, plus that of the normalised stress if the model decodes one.
+        """Return the mean squared error of the normalised accelerations, plus that of the normalised stress if the model decodes one.
 
         With several ranks, it is this rank's part of the sum. For push-forward samples, the graphs show the states that the unrolls have reached, and the
         predictions advance these unrolls by one step.
@@ -181,7 +181,7 @@ class TrainingModule(L.LightningModule):
 
     @staticmethod
     def _weighted(batch: HeteroData, materials: Iterable[str], errors: list[Tensor]) -> list[Tensor]:
-        """Errors [node, …] of each material, multiplied by the weights of their graphs."""
+        """Return errors [node, …] of each material, multiplied by the weights of their graphs."""
         weight = batch.weight.float()
         return [weight[batch[m].batch][:, None] * error for m, error in zip(materials, errors, strict=True)]
 

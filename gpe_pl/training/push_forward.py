@@ -62,7 +62,7 @@ class Excursions:
         self._loaded.clear()
 
     def state_dict(self) -> Stored:
-        """Unrolls of all ranks: ``steps``, ``time`` and the tensors ``pos``, ``vel``, ``velocity_history`` of each scene. All ranks have to call it."""
+        """Return unrolls of all ranks: ``steps``, ``time`` and the tensors ``pos``, ``vel``, ``velocity_history`` of each scene. All ranks have to call it."""
         own: Stored = {lane: dict(scenes) for lane, scenes in self._loaded.items()}  # loaded from a checkpoint and not used since
         for lane, way in self._lanes.items():
             scenes = zip(way.samples, way.states, way.steps, strict=True)
@@ -79,7 +79,7 @@ class Excursions:
         self._loaded = {lane: dict(scenes) for lane, scenes in stored.items()}
 
     def graphs(self, simulator: LearnedSimulator, starts: Sequence[Start]) -> HeteroData:
-        """Batch of graphs of the states that the unrolls have reached.
+        """Return a batch of graphs of the states that the unrolls have reached.
 
         Scenes whose unroll failed or passed the last ground-truth frame restart.
         """
@@ -101,7 +101,7 @@ class Excursions:
         return batched(under_way.graphs)
 
     def _taken_up(self, lane: int, starts: Sequence[Start]) -> Excursion | None:
-        """Batch of these samples as a checkpoint stored it; None if the checkpoint does not have all of them."""
+        """Return a batch of these samples as a checkpoint stored it; None if the checkpoint does not have all of them."""
         stored = self._loaded.pop(lane, {})
         if not all(start.sample in stored for start in starts):
             return None
@@ -134,7 +134,7 @@ def _graph(simulator: LearnedSimulator, start: Start, state: State, step: int) -
 
 
 def _moved(start: State, scene: dict[str, Any]) -> State:
-    """State of a start with the fields in ``MOVED`` replaced by those of a checkpoint.
+    """Return the state of a start with the fields in ``MOVED`` replaced by those of a checkpoint.
 
     Raises:
         CheckpointError: a field has another shape or type.
@@ -164,7 +164,7 @@ class _Trainable(Batched):
 
 @torch.no_grad()
 def unrolled(simulator: LearnedSimulator, starts: Sequence[Start]) -> tuple[list[State], list[int]]:
-    """States after unrolling each start for ``num_steps`` steps, all starts together, and the number of steps of each.
+    """Return states after unrolling each start for ``num_steps`` steps, all starts together, and the number of steps of each.
 
     An unroll ends earlier if no graph of its scene can be built any more.
     """

@@ -42,7 +42,7 @@ class LoggerSettings:
     mode: Literal["online", "offline", "disabled"] | None = None
 
     def loggers(self, run_dir: Path, name: str, config: Mapping[str, Any]) -> list[Logger]:
-        """Loggers of a run: CSV under ``run_dir/log``, one version per start of the run, and W&B if configured.
+        """Return loggers of a run: CSV under ``run_dir/log``, one version per start of the run, and W&B if configured.
 
         Args:
             run_dir: folder of the run; it keeps the identifier under which a resumed run continues in W&B.
@@ -117,7 +117,7 @@ def has_key() -> bool:
 
 
 def run_id(run_dir: Path) -> str:
-    """Identifier of a run in W&B. It is written to ``RUN_ID`` once, so that a resumed run finds it again.
+    """Return the identifier of a run in W&B. It is written to ``RUN_ID`` once, so that a resumed run finds it again.
 
     Raises:
         TrackingError: the file holds something else, which W&B would use in paths.

@@ -285,7 +285,7 @@ def _surroundings(paths: _Paths, nodes: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _local_rotations(paths: _Paths, nodes: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield for every frame the rotation of the surroundings of each of ``nodes`` [node, dim, dim]."""
+    """Yield, for every frame, the rotations [node, dim, dim] of the nodes around each of ``nodes``."""
     near, arms, hangs = _surroundings(paths, nodes)
     arms, dim = np.where(hangs[..., None], arms, 0.0), arms.shape[2]
     extent = np.linalg.svd(np.einsum("nkd,nke->nde", arms, arms), compute_uv=False)

@@ -480,7 +480,7 @@ def count_in(values: Mapping[str, Any], key: str, path: Path) -> int | None:
 
 
 def natural(name: str) -> tuple[Any, ...]:
-    """Sorting key that puts ``traj2`` before ``traj10``."""
+    """Return a sorting key that puts ``traj2`` before ``traj10``."""
     parts = re.split(r"([0-9]+)", name)  # text and digits in turn; digits compare by length first, so that no number is too long
     return tuple((len(digits := part.lstrip("0")), digits) if k % 2 else part for k, part in enumerate(parts)), name
 

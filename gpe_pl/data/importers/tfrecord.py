@@ -66,7 +66,7 @@ def _crc32c(data, table):
 
 
 def masked_crc(data: bytes) -> int:
-    """Checksum of a record's length or data."""
+    """Return the checksum of a record's length or data."""
     crc = int(_crc32c(np.frombuffer(data, np.uint8), _TABLE))
     return ((crc >> 15 | crc << 17) + _MASK) & 0xFFFFFFFF
 

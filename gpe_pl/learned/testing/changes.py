@@ -31,7 +31,7 @@ def to_dtype(data: HeteroData, dtype: torch.dtype) -> HeteroData:
 
 
 def turned(data: HeteroData, spec: FeatureSpec, seed: int = 0, *, turn: bool = True, shuffle: bool = True) -> HeteroData:
-    """Return the graph with half of the reversible edges reversed, and with shuffled edges."""
+    """Return the graph with half of its reversible edges reversed (``turn``), and with its edges in random order (``shuffle``)."""
     out = data.clone()
     random = torch.Generator().manual_seed(seed)
     for relation in spec.relations:

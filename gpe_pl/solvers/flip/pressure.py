@@ -33,7 +33,7 @@ def surface_distance(density):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _drop(inside, outside):
-    """Return 1/θ of the face between a liquid and an empty cell."""
+    """Return 1/θ of the face between a liquid and an empty cell, from the signed distances inside and outside."""
     return 1.0 / max(SMALLEST_FRACTION, inside / (inside - outside))
 
 
