@@ -31,7 +31,7 @@ FILES = (
     *("trials.md", "trials.csv", "showcase.json", "showcase.md"),
 )
 PICTURES = (
-    *("table1.png", "error_by_parameter.png", "validation_loss.png", "scaling.png", "showcase.png"),
+    *("table1.png", "error_by_parameter.png", "validation_loss.png", "scaling.png", "showcase.png", "parameter_effect.png"),
     *("rollout_test_00.png", "rollout_test_unseen_00.png", "stress_test_unseen_00.png", "error_curve_test.png"),
     *("long_horizon_*.png", "perturbation_*.png", "cost_error_*.png"),
 )

@@ -22,6 +22,9 @@ IMPORTED = "imported"
 AUTOMATIC_BYTES = 2**30
 """``fit`` generates data sets smaller than this [bytes]. Generate larger ones with ``simulate``."""
 
+TABLES = ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds", "larger", "comparison", "showcase", "split_name")
+"""Keys of ``data`` from which other keys take their values."""
+
 
 def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     """Return the specification of a config's data set. A ``ConfigError`` names the key and the value."""
@@ -32,7 +35,7 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     if cfg.size.name not in cfg.data.sizes:
         raise ConfigError(f"size={cfg.size.name}: data={cfg.data.name} has the sizes {', '.join(cfg.data.sizes)}")
     values: dict[str, Any] = OmegaConf.to_container(cfg.data, resolve=True)  # type: ignore[assignment]
-    for table in ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds", "larger", "comparison", "showcase"):
+    for table in TABLES:
         values.pop(table, None)
     scene = construct_target(values.pop("scene"), "data.scene", "gpe_pl.solvers.")
     solver = construct_target(values.pop("solver"), "data.solver", "gpe_pl.solvers.")

@@ -43,7 +43,7 @@ from gpe_pl.printable import clean_messages, one_line, speak_utf8
 from gpe_pl.system import early_interrupts
 from gpe_pl.system.signatures import checked, parameters
 
-WITHOUT_KEY = {"comparison", "experiment", "recipe", "scene", "solver", "tuned"}
+WITHOUT_KEY = {"comparison", "experiment", "parameters", "recipe", "scene", "solver", "tuned"}
 """Config groups that set keys under other names than their own."""
 
 plugins.register()  # files in conf/ use the plugins
@@ -195,7 +195,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             except InterpolationKeyError as error:
                 if verbose:
                     raise
-                hint = "; data, scene and dimension do not fit together" if "'data." in str(error) else ""
+                hint = "; data, scene, dimension and parameters do not fit together" if "'data." in str(error) else ""
                 _fail(ConfigError(f"{' '.join(str(error).split())}{hint}"))
             except (
                 GpeError,

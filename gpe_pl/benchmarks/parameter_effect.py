@@ -1,0 +1,300 @@
+"""How much the material parameter changes the ground truth, beside what halving the solver's time step changes.
+
+One scene is simulated from the same initial positions and velocities with its own, unseen value, with other values, and with half the time step. A split of
+values into trained and unseen ones can tell models apart only if the truth changes more from an unseen value to the nearest trained one than it changes with
+the time step. A start with rounded positions tells whether scenes are chaotic.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+from pydantic import Field
+
+from gpe_pl.benchmarks.trained import Case
+from gpe_pl.data.ground_truth import DatasetSpec, Solver, initial_state, parameter_values
+from gpe_pl.errors import GpeError
+from gpe_pl.files import sealed
+from gpe_pl.files.markdown import table_row
+from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio
+from gpe_pl.rollout.loop import SimulationError, steps
+from gpe_pl.schema import MATERIALS
+from gpe_pl.system.progress import progress_bar
+from gpe_pl.system.workers import pool, results
+from gpe_pl.trajectory.state import State
+from gpe_pl.viz.coloring import PALETTE
+from gpe_pl.viz.film_strip import TEXT_WIDTH, new_figure
+
+SPLIT = "test_unseen"
+TOLD = 10.0
+"""Smallest ratio of the change by the nearest trained value to the change by half the time step at which a split can tell models apart."""
+DIGITS = 4
+NUM_POINTS = 50
+"""Number of points of a curve in the results."""
+
+Horizon = Annotated[int, Field(ge=1)] | Literal["full"]
+
+CHANGES = {
+    "range": "lowest against highest trained value",
+    "lowest": "lowest trained value",
+    "highest": "highest trained value",
+    "nearest": "nearest trained value",
+    "half_step": "half the time step",
+    "rounded": "initial positions rounded to float32",
+}
+"""What is changed. All but ``range`` are compared with the scene's own value."""
+
+GROUPS = ("below", "between", "above")
+"""Where an unseen value lies: below, between or above the trained ones."""
+
+
+class EffectError(GpeError):
+    """A scene could not be simulated; the message names it."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of the suite.
+
+    Attributes:
+        cases: data sets, by label.
+        num_scenes: number of scenes per data set, the first ones of its split ``test_unseen``.
+        horizons: numbers of frames over which changes are averaged; ``full`` is the length of a scene.
+        folder: folder of finished scenes. The same command simulates only the missing ones.
+        num_workers: number of processes, each of which simulates one scene.
+    """
+
+    cases: Annotated[dict[str, Case], Field(min_length=1)]
+    folder: str
+    num_scenes: Annotated[int, Field(ge=1)] = 20
+    horizons: Annotated[list[Horizon], Field(min_length=1)] = field(default_factory=lambda: [20, 50, 100, "full"])
+    num_workers: Annotated[int, Field(ge=1)] = 1
+
+
+# --- one scene ------------------------------------------------------------------------------------------------------------------------------
+
+
+def nearest(material: str, value: float, choices: Sequence[float]) -> float:
+    """Return the choice nearest to a value on the scale of the material's parameter, the lower of two equally near ones."""
+    scale: Callable[[float], float] = math.log if MATERIALS[material].scale == "log" else float
+    return min(sorted(choices), key=lambda choice: round(abs(scale(choice) - scale(value)), 12))
+
+
+def trained_values(spec: DatasetSpec, values: dict[str, float]) -> dict[str, dict[str, float]]:
+    """Return the trained values of each material that are lowest, highest and nearest to unseen ones, by change."""
+    seen = {material: choices.seen for material, choices in spec.parameters.items()}
+    return {
+        "lowest": {m: min(v) for m, v in seen.items()},
+        "highest": {m: max(v) for m, v in seen.items()},
+        "nearest": {m: nearest(m, values[m], v) for m, v in seen.items()},
+    }
+
+
+def with_half_steps(solver: Any) -> Any:
+    """Return a solver of half the frame interval and half the ``cfl``, which takes as many substeps in half a frame as the given one in a frame."""
+    return replace(solver, frame_dt=solver.frame_dt / 2, cfl=solver.cfl / 2)
+
+
+def positions(solver: Solver, state: State, num_frames: int, stride: int = 1) -> np.ndarray:
+    """Return positions [frame, node, dim] in m of the frames after the initial state, of each ``stride`` steps one."""
+    states = steps(solver, state, num_frames * stride)
+    return np.stack([np.array(later.pos) for k, later in enumerate(states, start=1) if k % stride == 0])
+
+
+def scene_changes(spec: DatasetSpec, index: int) -> dict[str, list[float]]:
+    """Return the mean squared change [m²] over nodes and axes of each frame after the start, for each of ``CHANGES``.
+
+    Raises:
+        EffectError: a simulation stopped early.
+    """
+    values, _ = parameter_values(spec, SPLIT, index)
+    start, num_frames = initial_state(spec, SPLIT, index), spec.num_frames - 1
+    try:
+        own = positions(spec.solver, start, num_frames)
+        others = {
+            name: positions(spec.solver, initial_state(spec, SPLIT, index, trained), num_frames)
+            for name, trained in trained_values(spec, values).items()
+        }
+        others["half_step"] = positions(with_half_steps(spec.solver), start, num_frames, stride=2)
+        rounded = replace(start, pos=np.asarray(start.pos).astype(np.float32).astype(np.float64))
+        others["rounded"] = positions(spec.solver, rounded, num_frames)
+    except SimulationError as error:
+        raise EffectError(
+            f"{spec.name} {spec.size}, scene {index} of {SPLIT}: {error}; leave the data set out, or change its scenes"
+        ) from error
+    pairs = {name: (pos, own) for name, pos in others.items()} | {"range": (others["lowest"], others["highest"])}
+    return {name: ((pairs[name][0] - pairs[name][1]) ** 2).mean(axis=(1, 2)).tolist() for name in CHANGES}
+
+
+def stored_changes(spec: DatasetSpec, index: int, folder: str) -> dict[str, list[float]]:
+    """Return ``scene_changes`` from the folder of finished scenes, or compute and store them."""
+    values, _ = parameter_values(spec, SPLIT, index)
+    about = spec.as_dict()
+    kept: dict[str, Any] = {name: about[name] for name in ("scene", "solver", "seed", "num_frames", "input_files")}
+    seen = {material: list(choices.seen) for material, choices in spec.parameters.items()}
+    key = sealed.checksum({**kept, "values": values, "seen": seen, "index": index})
+    path = Path(folder) / f"{spec.name}-{spec.size}-{index:03d}-{key[:12]}.json"
+    if path.exists():
+        changes: dict[str, list[float]] = sealed.read(path, "delete it, and run the same command again")["changes"]
+        return changes
+    changes = scene_changes(spec, index)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    sealed.write(path, {"key": key, "changes": changes})
+    return changes
+
+
+def group_of(spec: DatasetSpec, values: dict[str, float]) -> str:
+    """Return which of ``GROUPS`` the value of the data set's first material is in."""
+    material, choices = next(iter(spec.parameters.items()))
+    low, high = min(choices.seen), max(choices.seen)
+    return "below" if values[material] < low else "above" if values[material] > high else "between"
+
+
+# --- all scenes -----------------------------------------------------------------------------------------------------------------------------
+
+
+def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
+    """Return a record per scene and horizon and one per mean curve, and Markdown tables."""
+    for label, spec in specs.items():
+        if spec.num_test_unseen < 1:
+            raise EffectError(f"suite.cases.{label}: the data set has no scenes with unseen values; set data.num_test_unseen")
+        spec.solver.compile_kernels()
+    jobs = [(label, index) for label, spec in specs.items() for index in range(min(settings.num_scenes, spec.num_test_unseen))]
+    found: dict[tuple[str, int], dict[str, list[float]]] = {}
+    with progress_bar("scenes") as on_progress, pool(settings.num_workers) as executor:
+        arguments = [(specs[label], label, index, settings.folder) for label, index in jobs]
+        for done, (label, index, changes) in enumerate(results(executor, _job, arguments), start=1):
+            found[label, index] = changes
+            on_progress(done, len(jobs))
+    records = [record for label, index in jobs for record in _scene_records(label, specs[label], index, found[label, index], settings)]
+    records += [record for label, spec in specs.items() for record in _curves(label, spec, [found[job] for job in jobs if job[0] == label])]
+    return records, report(records)
+
+
+def _job(spec: DatasetSpec, label: str, index: int, folder: str) -> tuple[str, int, dict[str, list[float]]]:
+    return label, index, stored_changes(spec, index, folder)
+
+
+def _scene_records(label: str, spec: DatasetSpec, index: int, changes: dict[str, list[float]], settings: Settings) -> list[dict[str, Any]]:
+    values, _ = parameter_values(spec, SPLIT, index)
+    about = {"case": label, "scene": index, "values": values, "group": group_of(spec, values)}
+    about["nearest"] = trained_values(spec, values)["nearest"]
+    records = []
+    for horizon in settings.horizons:
+        last = spec.num_frames - 1 if horizon == "full" else horizon
+        if last < spec.num_frames:
+            means = {name: _short(float(np.mean(curve[:last]))) for name, curve in changes.items()}
+            records.append({**about, "horizon": horizon, "seconds": _short(last * spec.solver.frame_dt), "unit": "m^2", **means})
+    return records
+
+
+def _curves(label: str, spec: DatasetSpec, scenes: Sequence[dict[str, list[float]]]) -> list[dict[str, Any]]:
+    """Return the means over scenes at evenly spaced frames."""
+    frames = np.unique(np.linspace(1, spec.num_frames - 1, NUM_POINTS).round().astype(int))
+    times = [_short(frame * spec.solver.frame_dt) for frame in frames]
+    means = {name: np.mean([scene[name] for scene in scenes], axis=0)[frames - 1] for name in CHANGES}
+    return [
+        {"case": label, "curve": name, "time": times, "change": [_short(v) for v in mean], "unit": "m^2"} for name, mean in means.items()
+    ]
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+# --- tables and figure ----------------------------------------------------------------------------------------------------------------------
+
+
+def _table(records: Sequence[dict[str, Any]], name: str) -> np.ndarray:
+    """Return one change of all scenes as ``bootstrap_interval`` takes it [1, scene]."""
+    return np.array([[record[name] for record in records]])
+
+
+def ratio(records: Sequence[dict[str, Any]]) -> Interval:
+    """Return the ratio of mean changes over scenes: nearest trained value over half the time step."""
+    return bootstrap_ratio(_table(records, "nearest"), _table(records, "half_step"), statistic=np.mean)
+
+
+def report(records: list[dict[str, Any]]) -> str:
+    """Return a table of changes over whole scenes, and a table of their ratio at every horizon."""
+    scenes = [record for record in records if "curve" not in record]
+    lines = [
+        "Change of the ground truth, ×1e-3 [m²]: mean squared distance of positions over frames, nodes, axes and scenes, with the 95 % bootstrap interval over "
+        "scenes. Whole scenes with unseen values.",
+        "",
+        table_row(["data", "scenes", "time [s]", *CHANGES.values()]),
+        "|" + "---|" * (3 + len(CHANGES)),
+    ]
+    for label, members in groupby(scenes, lambda r: r["case"]):
+        own = [r for r in members if r["horizon"] == "full"]
+        if own:
+            cells = [_interval(bootstrap_interval(_table(own, name), statistic=np.mean), 1e3) for name in CHANGES]
+            lines.append(table_row([label, str(len(own)), f"{own[0]['seconds']:g}", *cells]))
+    horizons = list(dict.fromkeys(record["horizon"] for record in scenes))
+    lines += [
+        "",
+        "Change by the nearest trained value over change by half the time step, with the 95 % bootstrap interval over scenes, for averages over the first "
+        f"frames. Ratios below {TOLD:g} are bold: there, the split cannot tell a model that reads the material from one that does not.",
+        "",
+        table_row(["data", "unseen values", "scenes", *(f"{h} frames" if h != "full" else "whole scenes" for h in horizons)]),
+        "|" + "---|" * (3 + len(horizons)),
+    ]
+    for label in dict.fromkeys(record["case"] for record in scenes):
+        for group in ("all", *GROUPS):
+            chosen = [r for r in scenes if r["case"] == label and group in ("all", r["group"])]
+            if chosen:
+                at = {h: [r for r in chosen if r["horizon"] == h] for h in horizons}
+                number = max(map(len, at.values()))
+                lines.append(table_row([label, _values(group, chosen), str(number), *(_ratio(at[h]) for h in horizons)]))
+    return "\n".join(lines)
+
+
+def _values(group: str, records: Sequence[dict[str, Any]]) -> str:
+    """Return the name of a group and the values in it."""
+    values = sorted({next(iter(record["values"].values())) for record in records})
+    return group if group == "all" else f"{group}: {', '.join(f'{v:g}' for v in values)}"
+
+
+def _interval(i: Interval, scale: float) -> str:
+    return f"{scale * i.estimate:.3g} [{scale * i.low:.3g}, {scale * i.high:.3g}]"
+
+
+def _ratio(records: Sequence[dict[str, Any]]) -> str:
+    if not records:
+        return "–"
+    found = ratio(records)
+    text = f"{found.estimate:.3g} [{found.low:.3g}, {found.high:.3g}]"
+    return text if found.estimate >= TOLD else f"**{text}**"
+
+
+def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
+    """Draw the mean changes of each data set over time."""
+    curves = [record for record in records if "curve" in record]
+    labels = list(dict.fromkeys(record["case"] for record in curves))
+    columns = min(5, len(labels))
+    rows = math.ceil(len(labels) / columns)
+    figure = new_figure(TEXT_WIDTH, 0.5 + 1.7 * rows)
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
+    for panel, label in zip(axes.flat, labels, strict=False):
+        for record in (r for r in curves if r["case"] == label and r["curve"] not in ("lowest", "highest")):
+            color = PALETTE[list(CHANGES).index(record["curve"]) % len(PALETTE)]
+            panel.plot(record["time"], record["change"], linewidth=1, color=color, label=CHANGES[record["curve"]])
+        panel.set_title(label, fontsize=7)
+        panel.set_yscale("log")
+        panel.set_ylim(1e-10, 1e-1)
+        panel.tick_params(labelsize=6)
+        panel.spines[["top", "right"]].set_visible(False)
+    for panel in axes.flat[len(labels) :]:
+        panel.set_axis_off()
+    figure.supxlabel("time [s]", fontsize=7)
+    figure.supylabel("mean squared change [m²]", fontsize=7)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=6, frameon=False, ncols=2, loc="outside upper center")
+    return {"parameter_effect": figure}
