@@ -1,4 +1,4 @@
-"""Command ``python -m gpe_pl.evaluate checkpoint=… split=test_unseen``: evaluate a trained model."""
+"""Evaluate a checkpoint: ``python -m gpe_pl.evaluate checkpoint=… split=test_unseen``."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 
 def evaluate_checkpoint(cfg: DictConfig) -> None:
     """Roll a trained model out on one split of a data set, and in the data set's showcase if it has one. Results go to ``{paths.runs}/{name}``."""
-    from gpe_pl.config.datasets import ensure_split, evaluated_config, scene_metadata
+    from gpe_pl.config.datasets import check_material_controls, ensure_split, evaluated_config, material_controls, scene_metadata
     from gpe_pl.evaluation.rollouts import EvaluationSettings, evaluate
     from gpe_pl.files.names import run_name
     from gpe_pl.files.run_folder import claim, release, without_orphans
     from gpe_pl.learned.pretrained import names
     from gpe_pl.learned.simulator import LearnedSimulator
-    from gpe_pl.reports.sweep_table import conclusion
+    from gpe_pl.reports.sweep_table import conclusion, report_evaluation
     from gpe_pl.rollout.skips import Skips
-    from gpe_pl.system.locks import locked
+    from gpe_pl.system.locks import held
     from gpe_pl.system.provenance import recorded
     from gpe_pl.training.run import TrainerSettings, set_up
 
@@ -40,6 +40,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     settings = construct(
         EvaluationSettings, {**{k: v for k, v in cfg.evaluation.items() if k != "data"}, "splits": [cfg.split]}, "evaluation"
     )
+    check_material_controls(cfg, settings)
     device = set_up(construct(TrainerSettings, cfg.trainer, "trainer"))
     simulator = LearnedSimulator.from_checkpoint(cfg.checkpoint, device)
     simulator.skips = construct(Skips, cfg.rollout, "rollout")
@@ -49,14 +50,16 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
         simulator.check_scene(scene, _own_data(simulator) or "data=… size=…")
     shown = None if cfg.data.get("showcase") is None else _showcase(cfg, simulator)
     folder = Path(cfg.paths.runs) / run_name(cfg.name)
-    with locked(folder), recorded(folder, "evaluate", sys.argv[1:], cfg.paths.runs):
+    with held(folder), recorded(folder, "evaluate", sys.argv[1:], cfg.paths.runs):
         root = ensure_split(evaluated, cfg.split)
         claim(folder, _identity(evaluated, root), results=["*"])
         with without_orphans(folder):
             try:
-                evaluate(simulator, root, settings, folder)
+                controls = material_controls(cfg, settings, root, settings.first_frame(simulator.builder.config.history))
+                evaluate(simulator, root, settings, folder, controls=controls)
             finally:
                 release(folder)
+        report_evaluation(folder)
         if shown is not None:
             shown(folder)
     print(conclusion(folder))
@@ -64,7 +67,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
 
 
 def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
-    """Return the settings and checksums on which the metrics of an evaluation depend. If one of them differs, the evaluation needs another folder."""
+    """Settings and checksums on which the metrics of an evaluation depend. An evaluation with others needs another folder."""
     from omegaconf import OmegaConf
 
     from gpe_pl.data.checksum import split_checksum
@@ -84,7 +87,7 @@ def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
 
 
 def _own_data(simulator: LearnedSimulator) -> str:
-    """Return the overrides that choose data like the training data, for a message; empty if no data set fits."""
+    """Overrides that choose data like those of the training; empty if there are none."""
     from gpe_pl.config.datasets import IMPORTED, dataset
     from gpe_pl.data.ground_truth import trajectory_metadata
 
@@ -100,7 +103,7 @@ def _own_data(simulator: LearnedSimulator) -> str:
 
 
 def _showcase(cfg: DictConfig, simulator: LearnedSimulator) -> Callable[[Path], None]:
-    """Build the scene of the showcase. Return a function that rolls the simulator out in it and writes the results into a folder.
+    """Build the showcase's scene, and return a function that rolls the simulator out in it and writes results into a folder.
 
     The scene is built first so that errors in its settings are reported before the evaluation.
 

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from gpe_pl.data.ground_truth import DatasetSpec
+    from gpe_pl.evaluation.material_controls import MaterialControls
+    from gpe_pl.evaluation.rollouts import EvaluationSettings
     from gpe_pl.trajectory.trajectory import Metadata
 
 IMPORTED = "imported"
@@ -27,7 +29,7 @@ TABLES = ("sizes", "dimensions", "default_dimension", "variant", "suffix", "boun
 
 
 def dataset_spec(cfg: DictConfig) -> DatasetSpec:
-    """Return the specification of a config's data set. A ``ConfigError`` names the key and the value."""
+    """Return the specification of a config's data set; raises ``ConfigError`` that names key and value."""
     from omegaconf import OmegaConf
 
     from gpe_pl.data.ground_truth import DatasetSpec
@@ -115,3 +117,27 @@ def evaluated_config(cfg: DictConfig) -> DictConfig:
 
     merged: Any = OmegaConf.merge(cfg, {"data": cfg.evaluation.data})
     return merged
+
+
+def check_material_controls(cfg: DictConfig, settings: EvaluationSettings) -> None:
+    """Raise ``ConfigError`` if an evaluation asks for controls that its data cannot have."""
+    from gpe_pl.evaluation.material_controls import UNSEEN
+
+    if settings.material_controls and UNSEEN not in settings.splits:
+        raise ConfigError(f"evaluation.material_controls=true: needs the split {UNSEEN}, evaluated are {', '.join(settings.splits)}")
+    if settings.material_controls and cfg.data.size == IMPORTED:
+        raise ConfigError(f"evaluation.material_controls=true: needs data that this package simulates; data={IMPORTED} has no solver")
+
+
+def material_controls(cfg: DictConfig, settings: EvaluationSettings, root: Path, start_frame: int) -> MaterialControls | None:
+    """Return the controls of an evaluation on the data in ``root``, or None if the settings want none. Missing solver runs are computed."""
+    from gpe_pl.evaluation.material_controls import MaterialControls
+    from gpe_pl.system.progress import progress_bar
+
+    if not settings.material_controls:
+        return None
+    spec = dataset_spec(evaluated_config(cfg))
+    controls = MaterialControls(root, spec, dataset_spec(cfg), start_frame, settings.num_trajectories)
+    with progress_bar(f"{spec.name} {spec.size} controls") as on_progress:
+        controls.prepare(os.cpu_count() or 1, on_progress)
+    return controls

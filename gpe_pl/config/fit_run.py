@@ -1,4 +1,4 @@
-"""The stages of a run of ``fit``: data, number of steps, folder, training, evaluation."""
+"""A run of ``fit``, divided into stages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from gpe_pl.config.datasets import IMPORTED, ensure_data, evaluated_config, scene_metadata
+from gpe_pl.config.datasets import IMPORTED, check_material_controls, ensure_data, evaluated_config, material_controls, scene_metadata
 from gpe_pl.config.entry_point import ConfigError, bind, construct
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
@@ -52,6 +52,7 @@ class FitRun:
         self.training = construct(TrainingSettings, cfg.training, "training")
         self.trainer = construct(TrainerSettings, cfg.trainer, "trainer")
         self.evaluation = construct(EvaluationSettings, {k: v for k, v in cfg.evaluation.items() if k != "data"}, "evaluation")
+        check_material_controls(cfg, self.evaluation)
         self.graph = construct(GraphConfig, cfg.graph, "graph")
         self.first_frame = self.evaluation.first_frame(self.graph.history)
         self.logger = construct(LoggerSettings, cfg.logger, "logger")
@@ -74,6 +75,7 @@ class FitRun:
                 self.start.check_scene(scenes)
         self.root = ensure_data(self.cfg)
         self.evaluated_root = ensure_data(evaluated_config(self.cfg)) if self.cfg.evaluation.data else self.root
+        self.controls = material_controls(self.cfg, self.evaluation, self.evaluated_root, self.first_frame)
         self.device = set_up(self.trainer)
 
     def choose_num_steps(self) -> None:
@@ -101,7 +103,7 @@ class FitRun:
             window_counts(open_split(self.evaluated_root, split, cache_bytes=0), self.first_frame)
 
     def finished_model(self) -> Path | None:
-        """Return the best checkpoint of a finished run with the same training in the sweep that ``reuse`` names, or None."""
+        """Return the best checkpoint of a finished run of the sweep ``reuse`` with the same training, or None."""
         best = None if self.cfg.reuse is None else adopt(self.runs / self.cfg.reuse, self._trained, self.folder)
         if best is not None:
             end_later_processes()
@@ -115,7 +117,8 @@ class FitRun:
 
     def evaluate(self, checkpoint: Path) -> None:
         """Roll the model out on the evaluated splits, and log the mean errors."""
-        rows = evaluate(LearnedSimulator.from_checkpoint(checkpoint, self.device), self.evaluated_root, self.evaluation, self.folder)
+        simulator = LearnedSimulator.from_checkpoint(checkpoint, self.device)
+        rows = evaluate(simulator, self.evaluated_root, self.evaluation, self.folder, controls=self.controls)
         publish(self._loggers, self.folder, means(rows))
 
     def error(self) -> float:

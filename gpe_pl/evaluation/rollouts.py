@@ -1,4 +1,4 @@
-"""Evaluation: rolls a learned simulator and the trivial baselines out over whole splits. Writes a table of metrics, figures and animations."""
+"""Evaluation: rolls a learned simulator and the trivial baselines out over whole splits, and writes a table of metrics, figures and animations."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from pydantic import Field
 
 from gpe_pl.data.dataset import WindowDataset, long_enough, open_split, usable
 from gpe_pl.errors import GpeError
+from gpe_pl.evaluation.material_controls import UNSEEN, MaterialControls, label_of
 from gpe_pl.export.program import export_model
 from gpe_pl.files import regular_files
 from gpe_pl.files.atomic import replace_text, replacing
@@ -53,7 +54,7 @@ SCENES_AT_ONCE = 16
 
 
 class StartError(GpeError, ValueError):
-    """Raised when the start frame of rollouts has fewer frames before it than the model needs."""
+    """The start frame of rollouts leaves a model too few frames before it."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ class EvaluationSettings:
         hold_parameters: clamp material parameters outside the trained range to the nearest trained value.
         static_friction: nodes on a wall stay in place if they are slower than this fraction of the speed that gravity gives in one frame (see
             ``nn.static_friction``); None takes the model's own value.
+        material_controls: roll scenes with unseen parameters out with other parameters, too (see ``material_controls``).
         num_pictures: number of trajectories per split that get a figure, an animation and a viewer.
         export: what to write for other programs: the trajectories with pictures as ``vtk`` series, ``npz`` and ``mp4``, and the ``model`` (see
             ``export.program``).
@@ -84,24 +86,23 @@ class EvaluationSettings:
     num_uncontained: Annotated[int, Field(ge=0)] | None = None
     hold_parameters: bool = True
     static_friction: Annotated[float, Field(ge=0, lt=1)] | None = None
+    material_controls: bool = False
     num_pictures: Annotated[int, Field(ge=0)] = 2
     export: list[Export] = field(default_factory=list)
 
     def first_frame(self, history: int) -> int:
-        """Return the frame at which rollouts of a model with this history [frames] start.
+        """Frame at which rollouts of a model with this history [frames] start.
 
         Raises:
             StartError: ``start_frame`` leaves too little history.
         """
         if self.start_frame is not None and self.start_frame < history:
-            raise StartError(
-                f"evaluation.start_frame={self.start_frame}: graph.history={history} needs as many frames before it; choose at least {history}"
-            )
+            raise StartError(f"evaluation.start_frame={self.start_frame}: graph.history={history} needs as many frames before it")
         return history if self.start_frame is None else self.start_frame
 
 
 class ExportError(GpeError):
-    """Raised when a requested export cannot be written; the message says what is missing."""
+    """A requested export cannot be written; the message says what is missing."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,14 @@ class Row:
     value: float
 
 
-def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettings, run_dir: Path, label: str = LEARNED) -> list[Row]:
+def evaluate(
+    simulator: LearnedSimulator,
+    root: Path,
+    settings: EvaluationSettings,
+    run_dir: Path,
+    label: str = LEARNED,
+    controls: MaterialControls | None = None,
+) -> list[Row]:
     """Roll out every trajectory of the splits, and write metrics and pictures to ``run_dir``.
 
     All rollouts start at ``settings.start_frame`` and run to the end of the ground truth. The files are ``metrics.csv`` and ``error_curve_*.png``. The first
@@ -128,11 +136,11 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
     These metrics are computed here:
 
     - ``share_outside_uncontained``: fraction of particle-frames outside with containment off, for the first ``settings.num_uncontained`` rollouts of a split.
-    - ``share_corrected``: fraction of particle-steps that containment corrects. These two are not reported for a boundary that consists of nodes only.
+    - ``share_corrected``: fraction of particle-steps that containment corrects. Neither is reported for a boundary that consists of nodes only.
     - ``skipping_mse`` [m²]: position MSE between the rollouts with and without the approximate levels of ``simulator.skips``, over the frames of both.
     - ``share_asleep``: fraction of particle-steps that the approximate levels did not compute.
-    - ``lost_impulse`` [kg m/s]: momentum that was lost when nodes fell asleep. The last three are reported if approximate levels are on. The rollout without
-      these levels is then evaluated, too.
+    - ``lost_impulse`` [kg m/s]: momentum that was lost when nodes fell asleep. The last three are reported if there are approximate levels; the rollout without
+      them is then evaluated, too.
 
     Args:
         simulator: trained simulator.
@@ -140,6 +148,7 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
         settings: what to evaluate.
         run_dir: folder for the files.
         label: name of the model in the rows.
+        controls: prepared controls of scenes with unseen parameters.
 
     Returns:
         The rows of ``metrics.csv``.
@@ -153,7 +162,7 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
         raise ExportError(
             "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
         )
-    simulator = simulator.configured(clamps_parameters=settings.hold_parameters, static_friction=settings.static_friction)
+    simulator = simulator.configured(holds_parameters=settings.hold_parameters, static_friction=settings.static_friction)
     run_dir.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     for split in settings.splits:
@@ -163,17 +172,22 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
         number, truth = 0, None
         while batch := list(islice(trajectories, SCENES_AT_ONCE)):
             left = len(batch) if settings.num_uncontained is None else max(0, settings.num_uncontained - number)
+            controlled = controls if split == UNSEEN else None
             for trajectory, (predictions, extra) in zip(
-                batch, _predict(simulator, batch, start_frame, settings.containment, left, label), strict=True
+                batch, _predict(simulator, batch, start_frame, settings.containment, left, label, controlled, number), strict=True
             ):
                 truth = trajectory.frames(start_frame)
                 stop = predictions[label].termination
                 if stop is not None:
                     log.warning("%s %d stopped: %s, %s", split, number, stop.reason, stop.message)
                 about = (split, number, truth.metadata.parameter_group, _parameter(trajectory))
-                for model, prediction in predictions.items():
-                    curves.setdefault(model, []).append(per_frame_mse(prediction, truth))
-                    for record in rollout_metrics(prediction, truth, [*settings.horizons, "full"]):
+                compared = {model: (prediction, truth) for model, prediction in predictions.items()}
+                if controlled is not None:
+                    compared |= controlled.solver_runs(number, truth)
+                for model, (prediction, reference) in compared.items():
+                    if model in BASELINES or model in (label, EXACT):
+                        curves.setdefault(model, []).append(per_frame_mse(prediction, reference))
+                    for record in rollout_metrics(prediction, reference, [*settings.horizons, "full"]):
                         rows.append(Row(model, *about, record.metric, str(record.horizon), record.value))
                 rows += [Row(label, *about, metric, "full", value) for metric, value in extra.items()]
                 if number < settings.num_pictures:
@@ -189,9 +203,16 @@ def evaluate(simulator: LearnedSimulator, root: Path, settings: EvaluationSettin
 
 
 def _predict(
-    simulator: LearnedSimulator, trajectories: list[Trajectory], start_frame: int, containment: bool, num_uncontained: int, label: str
+    simulator: LearnedSimulator,
+    trajectories: list[Trajectory],
+    start_frame: int,
+    containment: bool,
+    num_uncontained: int,
+    label: str,
+    controls: MaterialControls | None,
+    first: int,
 ) -> Iterator[tuple[dict[str, Trajectory], dict[str, float]]]:
-    """Yield for each trajectory the predictions by model, and further metrics of the learned model by name."""
+    """Yield for each trajectory the predictions by model, and further metrics of the learned model by name. ``first`` is the number of the first trajectory."""
     truths = [trajectory.frames(start_frame) for trajectory in trajectories]
     starts = [_start(simulator, start_frame, *pair) for pair in zip(trajectories, truths, strict=True)]
     totals = [{"num_corrected": 0.0, "num_asleep": 0.0, "lost_impulse": 0.0} for _ in starts]
@@ -208,12 +229,15 @@ def _predict(
     predicted = rollouts(within_walls(runner), starts, count)
     free = rollouts(runner, starts[:num_uncontained]) if containment else predicted
     exact = None if runner is simulator else rollouts(within_walls(simulator), starts)
+    others = None if controls is None else controls.predictions(within_walls(runner), starts, first)
     for scene, (trajectory, truth) in enumerate(zip(trajectories, truths, strict=True)):
         dt, steps, spacing = truth.metadata.frame_dt, truth.num_frames - 1, truth.metadata.spacing
         prediction = predicted[scene]
         predictions = {label: prediction} if exact is None else {label: prediction, EXACT: exact[scene]}
         for name, baseline in BASELINES.items():
             predictions[name] = rollout(baseline(dt), trajectory.state(start_frame, start_frame), steps, truth.metadata)
+        if others is not None:
+            predictions |= {label_of(label, control): other for control, other in others[scene].items()}
         num_steps = truth.num_nodes * max(1, prediction.num_frames - 1)
         extra = {"num_good_frames": float(prediction.num_frames - 1)}
         if truth.boundary.shapes:  # a boundary of nodes alone has no inside
@@ -229,14 +253,14 @@ def _predict(
 
 
 def _parameter(trajectory: Trajectory) -> float:
-    """Return the material parameter of a scene; NaN if the scene has several values or none."""
+    """Material parameter of a scene; NaN if it has several or none."""
     values = np.unique(np.asarray(trajectory.material_params, dtype=np.float64))
     values = values[np.isfinite(values)]
     return float(values[0]) if len(values) == 1 else float("nan")
 
 
 def _start(simulator: LearnedSimulator, start_frame: int, trajectory: Trajectory, truth: Trajectory) -> Start:
-    """Return the start of a rollout, with a guard whose limits are far beyond the ground truth."""
+    """Start of a rollout, with a guard whose limits are far beyond the ground truth."""
     bounds = truth.metadata.bounds
     size = max(high - low for low, high in bounds)
     across = size / (trajectory.num_frames * truth.metadata.frame_dt)  # the reference where everything rests
@@ -246,9 +270,7 @@ def _start(simulator: LearnedSimulator, start_frame: int, trajectory: Trajectory
 
 
 def _share_outside(prediction: Trajectory, first: int, last: int, tolerance: float) -> float:
-    """Return the fraction of particle-frames that are inside a wall or obstacle in frames ``first … last``.
-
-    All particles of the frames that a stopped rollout lacks count as inside.
+    """Fraction of particle-frames that are inside a wall or obstacle in frames ``first … last``. Frames that a stopped rollout lacks count in full.
 
     Args:
         prediction: rollout; frame 0 is its start.
@@ -260,7 +282,7 @@ def _share_outside(prediction: Trajectory, first: int, last: int, tolerance: flo
 
 
 def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windows: int = ONE_STEP_WINDOWS) -> float:
-    """Return the normalised one-step error without noise (``metrics.OneStepNMSE``), over windows spread evenly over a split. Predicting free fall gives 1."""
+    """One-step nMSE without noise, over windows spread evenly over a split: the error relative to predicting free fall."""
     dataset = WindowDataset(usable(open_split(root, split)), simulator.builder)
     windows = np.unique(np.linspace(0, len(dataset) - 1, min(len(dataset), num_windows)).round().astype(int))
     metric = OneStepNMSE()
@@ -291,7 +313,7 @@ GROUPS = ("", *get_args(ParameterGroup))
 
 
 class MetricsError(GpeError, ValueError):
-    """Raised for a damaged ``metrics.csv``. The message names the file, and the line if a line cannot be read."""
+    """A ``metrics.csv`` is damaged; the message names the file, and the line if one cannot be read."""
 
 
 def read_rows(path: Path) -> Iterator[Row]:
@@ -336,7 +358,7 @@ def _digest_file(path: Path) -> Path:
 
 
 def means(rows: list[Row], label: str = LEARNED) -> dict[str, float]:
-    """Return the means of a model's metrics over trajectories, by ``split/metric@horizon``."""
+    """Means of a model's metrics over trajectories, by ``split/metric@horizon``."""
     values: dict[str, list[float]] = {}
     for row in rows:
         if row.model == label:

@@ -1,4 +1,4 @@
-"""Finished training runs: reads their configurations and metrics, and selects values of several runs."""
+"""Finished training runs: their configuration and metrics, and selections of values across several runs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Run:
 
     Attributes:
         folder: folder of the run; for an archived run, the folder before archiving.
-        config: values of the configuration by keys such as ``training.num_steps``.
+        config: flat configuration: values by keys such as ``training.num_steps``.
         rows: metrics: a table with the fields of ``evaluation.rollouts.Row`` as columns.
         data: checksums of the data, by key of the configuration.
         curve: validation curve of an archived run; None if it is in the run's folder (see ``validation_curve``).
@@ -47,7 +47,7 @@ class Run:
     curve: Curve | None = None
 
 
-WITHOUT_CONSEQUENCE = {"evaluation.num_pictures", "evaluation.export"}
+WITHOUT_CONSEQUENCE = {"evaluation.num_pictures", "evaluation.export", "evaluation.material_controls"}
 """Keys ignored when comparing runs."""
 
 TRAINED = {"data.name": str, "model._target_": str, "training.num_steps": int}
@@ -55,7 +55,7 @@ TRAINED = {"data.name": str, "model._target_": str, "training.num_steps": int}
 
 
 def table_of(rows: Iterable[Row]) -> pd.DataFrame:
-    """Return a table with one line per row of ``metrics.csv``."""
+    """Table with one line per row of ``metrics.csv``."""
     return pd.DataFrame([[*vars(row).values()] for row in rows], columns=run_archive.COLUMNS)
 
 
@@ -70,13 +70,18 @@ def archive(runs: list[Run], root: Path, folder: Path) -> None:
     run_archive.write_archive(folder, about, {run_name(run, root): run.rows for run in runs})
 
 
+def evaluation_in(folder: Path) -> Run:
+    """Return the run in a folder of ``evaluate`` or ``fit``, with its whole configuration."""
+    return Run(folder, dict(_flatten(config_in(folder / "config.json"))), table_of(read_rows(folder / "metrics.csv")))
+
+
 CONFIG, DATA = "config:", "data:"
 """Prefixes of an archive's keys for the configuration of a run and for the checksums of its data."""
 CURVE = ("validation_steps", "validation_losses")
 
 
 def run_name(run: Run, root: Path) -> str:
-    """Return the path of a run relative to the folder of its sweep."""
+    """Path of a run relative to the folder of its sweep."""
     return run.folder.relative_to(root).as_posix()
 
 
@@ -91,7 +96,7 @@ def _archived(folder: Path) -> list[Run]:
 
 
 def finished_runs(folder: Path) -> list[Run]:
-    """Return all finished training runs below a folder, in order of their paths, or those of an archive in it.
+    """All finished training runs below a folder, in order of their paths, or those of an archive in it.
 
     Folders that ``evaluate`` has written are not training runs.
 
@@ -136,13 +141,13 @@ def _warn_of_replaced_data(runs: list[Run]) -> None:
 
 
 def replaced_data(runs: list[Run]) -> list[str]:
-    """Return keys of data for which runs have different checksums. A run without a checksum is not compared."""
+    """Keys of data for which runs have different checksums. A run without a checksum is not compared."""
     keys = sorted({key for run in runs for key in run.data})
     return [key for key in keys if len({run.data[key] for run in runs if key in run.data}) > 1]
 
 
 def distinct_runs(runs: list[Run]) -> list[Run]:
-    """Return the runs without repetitions: of runs with the same configuration, only the first."""
+    """Runs with different configurations; of equal ones, the first."""
     first: dict[str, Run] = {}
     for run in runs:
         kept = first.setdefault(json.dumps(run.config, sort_keys=True), run)
@@ -160,25 +165,25 @@ def _flatten(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
 
 
 def axes_of(runs: list[Run]) -> list[str]:
-    """Return configuration keys whose values differ between runs, ``seed`` last."""
+    """Configuration keys whose values differ between runs, ``seed`` last."""
     keys = sorted({k for r in runs for k in r.config})
     different = [k for k in keys if len({json.dumps(r.config.get(k)) for r in runs}) > 1]
     return sorted(different, key=lambda k: (k == "seed", k))
 
 
 def with_groups(rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows, and the rows of unseen parameters a second time under the name ``split/group`` with a group in ``UNSEEN_GROUPS``."""
+    """Rows with those of unseen parameters repeated under the split ``split/group``, where the group is in ``UNSEEN_GROUPS``."""
     unseen = rows[rows["parameter_group"].isin(UNSEEN_GROUPS)]
     return pd.concat([rows, unseen.assign(split=unseen["split"] + "/" + unseen["parameter_group"])], ignore_index=True)
 
 
 def splits_of(run: Run) -> list[str]:
-    """Return splits on which a run was evaluated, including ``split/group`` for groups of unseen parameters."""
+    """Splits on which a run was evaluated, including ``split/group`` for groups of unseen parameters."""
     return sorted(with_groups(run.rows)["split"].unique())
 
 
 def validation_curve(run: Run) -> Curve:
-    """Return the validation curve of a run, over all its starts.
+    """Validation curve of a run, over all its starts.
 
     Raises:
         MetricsError: a log is damaged.
@@ -207,7 +212,7 @@ Values = list[dict[int, float]]
 
 
 def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon: str) -> Values:
-    """Return values of a metric for each run, in order of trajectories.
+    """Values of a metric for each run, in order of trajectories.
 
     Args:
         runs: runs that differ in their seeds only.
@@ -231,26 +236,26 @@ STAND_IN = "ballistic"
 """Trivial model whose error counts for a failed rollout."""
 
 
-def rollout_errors(runs: list[Run], split: str, horizon: str) -> Values:
-    """Return rollout MSE [m²] of learned models as tables show it: a failed rollout has the error of ballistic flight in the same scene over the same frames.
+def rollout_errors(runs: list[Run], split: str, horizon: str, model: str = LEARNED) -> Values:
+    """Rollout MSE [m²] of learned models, as in tables: a failed rollout gets the error of ballistic flight in the same scene over the same frames.
 
     The error stays infinite if ballistic flight was not evaluated. ``values_by_seed`` returns the errors without this replacement.
     """
     errors = []
     for run in runs:
         trivial: dict[int, float] = dict(*values_by_seed([run], STAND_IN, split, "rollout_mse", horizon))
-        for seed in values_by_seed([run], LEARNED, split, "rollout_mse", horizon):
+        for seed in values_by_seed([run], model, split, "rollout_mse", horizon):
             errors.append({k: value if math.isfinite(value) else trivial.get(k, value) for k, value in seed.items()})
     return errors
 
 
 def shared_trajectories(*values: Values) -> list[int]:
-    """Return the numbers of the trajectories that all seeds in all of ``values`` have evaluated."""
+    """Numbers of the trajectories that all seeds in all of ``values`` have evaluated."""
     seeds = [set(seed) for table in values for seed in table]
     return sorted(set.intersection(*seeds)) if seeds else []
 
 
 def shared_table(values: Values, trajectories: list[int] | None = None) -> np.ndarray:
-    """Return values as an array [seed, trajectory]. Without ``trajectories``, the array has those that all seeds have evaluated."""
+    """Values as an array [seed, trajectory]. Without ``trajectories``, it has those that all seeds have evaluated."""
     chosen = shared_trajectories(values) if trajectories is None else trajectories
     return np.array([[seed[k] for k in chosen] for seed in values]).reshape(len(values), len(chosen))

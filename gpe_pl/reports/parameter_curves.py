@@ -17,7 +17,7 @@ PARAMETER_FIGURE = "error_by_parameter.png"
 
 
 def parameter_curves(by_domain: dict[str, dict[str, list[Run]]]) -> Figure:
-    """Return a figure of the rollout MSE over all frames against the material parameter. Failed rollouts count as in ``rollout_errors``.
+    """Figure of the rollout MSE over all frames against the material parameter. Failed rollouts count as in ``rollout_errors``.
 
     Args:
         by_domain: runs by domain and label of the curve.
@@ -38,10 +38,11 @@ def parameter_curves(by_domain: dict[str, dict[str, list[Run]]]) -> Figure:
                     for trajectory, parameter in zip(of_split["trajectory"], of_split["parameter"], strict=True):
                         points.setdefault(float(parameter), []).append(errors[int(trajectory)])
                 seen.setdefault(domain, set()).update(rows[rows["parameter_group"] == "seen"]["parameter"].tolist())
-    labels = {domain: _axis_label(next(iter(by_label.values()))[0]) for domain, by_label in by_domain.items()}
+    labels = {domain: axis_label(next(iter(by_label.values()))[0]) for domain, by_label in by_domain.items()}
     return parameter_figure(curves, {domain: sorted(values) for domain, values in seen.items()}, "rollout MSE [m²]", labels)
 
 
-def _axis_label(run: Run) -> str:
+def axis_label(run: Run) -> str:
+    """Label of an axis of a data set's material parameters."""
     varied = [m for m in MATERIALS if any(key.startswith(f"data.parameters.{m}.") for key in run.config)]
     return ", ".join(f"{MATERIALS[m].name.replace('_', ' ')}\n[{MATERIALS[m].unit}]" for m in varied)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gpe_pl.evaluation.rollouts import LEARNED, read_rows
+from gpe_pl.evaluation.rollouts import EXACT, LEARNED, read_rows
 from gpe_pl.files import sealed
 from gpe_pl.files.atomic import replace_text, replacing
 from gpe_pl.files.markdown import table_row
@@ -23,6 +23,7 @@ from gpe_pl.reports.finished_runs import (
     Values,
     axes_of,
     distinct_runs,
+    evaluation_in,
     finished_runs,
     rollout_errors,
     run_name,
@@ -33,6 +34,7 @@ from gpe_pl.reports.finished_runs import (
     values_by_seed,
     with_groups,
 )
+from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, verdict, write_material_figure
 from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.viz.saving import save_figure
@@ -60,7 +62,7 @@ def report(folder: Path) -> None:
 
 
 def variants_of(runs: list[Run]) -> tuple[list[str], dict[Variant, list[Run]]]:
-    """Return the configuration keys in which runs differ, without the seed, and the runs by their values of these keys."""
+    """Configuration keys, other than the seed, in which runs differ, and the runs by their values of these keys."""
     axes = [axis for axis in axes_of(runs) if axis != "seed"]
     variants: dict[Variant, list[Run]] = defaultdict(list)
     for run in runs:
@@ -82,24 +84,37 @@ def _report(folder: Path, runs: list[Run]) -> None:
         from gpe_pl.viz.figures import validation_loss_figure
 
         save_figure(validation_loss_figure(curves), folder / "validation_loss.png", dpi=150)
+    write_material_figure(folder / MATERIALS_FIGURE, _material_groups(variants))
     rows = runs[0].rows
     if (rows["parameter_group"].isin(UNSEEN_GROUPS) & np.isfinite(rows["parameter"])).any():
         by_label = {", ".join(v) or LEARNED: members for v, members in variants.items()}
         save_figure(parameter_curves({str(runs[0].config["data.name"]): by_label}), folder / PARAMETER_FIGURE, dpi=150)
 
 
+def _material_groups(variants: dict[Variant, list[Run]]) -> dict[tuple[str, str], list[Run]]:
+    return {(str(runs[0].config["data.name"]), ", ".join(v) or LEARNED): runs for v, runs in variants.items()}
+
+
+def report_evaluation(folder: Path) -> None:
+    """Write the figure of an evaluation by ``evaluate`` with controls."""
+    run = evaluation_in(folder)
+    write_material_figure(folder / MATERIALS_FIGURE, _material_groups({(): [run]}))
+
+
 def conclusion(folder: Path) -> str:
-    """Return the last output of a command: the metrics of the run or evaluation in a folder, and the viewers to open."""
+    """Last output of a command: the metrics of the run or evaluation in a folder, whether the model reads the material, and the viewers to open."""
     viewers = sorted(folder.glob("rollout_*_00.html"))
-    return "\n".join([summary(table_of(read_rows(folder / "metrics.csv"))), *(printable(f"look at {viewer}") for viewer in viewers)])
+    rows = table_of(read_rows(folder / "metrics.csv"))
+    reads = [line for line in [verdict([Run(folder, {}, rows)])] if line]
+    return "\n".join([summary(rows), *reads, *(printable(f"look at {viewer}") for viewer in viewers)])
 
 
 def summary(rows: pd.DataFrame) -> str:
-    """Return means over trajectories as plain text: one line per split, metric and model, one column per horizon.
+    """Means over trajectories as plain text: one line per split, metric and model, one column per horizon.
 
-    For trivial models, only the rollout MSE is shown.
+    Trivial models and controls show their rollout MSE only.
     """
-    shown = with_groups(rows[~rows["model"].isin(BASELINES) | (rows["metric"] == "rollout_mse")])
+    shown = with_groups(rows[rows["model"].isin([LEARNED, EXACT]) | (rows["metric"] == "rollout_mse")])
     groups: dict[tuple[str, str, str], dict[str, float]] = defaultdict(dict)
     for (split, metric, model, horizon), value in shown.groupby(["split", "metric", "model", "horizon"])["value"].mean().items():
         groups[split, metric, model][horizon] = value
@@ -135,7 +150,7 @@ def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
 
 
 def _interval(values: Values, scale: float = 1.0) -> str:
-    """Format a mean with its bootstrap interval. If rollouts failed, the mean is infinite; then the number of failures and the median are shown."""
+    """Mean with its bootstrap interval; where rollouts failed, which makes the mean infinite, their number and the median."""
     if not values:
         return "–"
     table = shared_table(values) * scale
@@ -147,7 +162,7 @@ def _interval(values: Values, scale: float = 1.0) -> str:
 
 
 def forward_time_ratios(folder: Path, variants: dict[Variant, list[Run]]) -> dict[Variant, float]:
-    """Return the forward time of each variant divided by that of the first, as measured by ``benchmarks.forward_times``; empty if it was not measured."""
+    """Forward time of each variant's model over that of the first, as ``benchmarks.forward_times`` measured them; empty where it did not."""
     path = folder / FORWARD_TIMES
     if not path.exists():
         return {}
@@ -160,7 +175,14 @@ def _markdown(axes: list[str], variants: dict[Variant, list[Run]], ratios: dict[
     names = [_column(a) for a in axes] or ["model"]
     first = next(iter(variants.values()))[0]
     return "\n".join(
-        [*_training_table(names, variants, ratios), "", *_rollout_table(names, variants, first), *_stress_table(names, variants), ""]
+        [
+            *_training_table(names, variants, ratios),
+            "",
+            *_rollout_table(names, variants, first),
+            *_stress_table(names, variants),
+            *(["", *lines] if (lines := material_lines(_material_groups(variants))) else []),
+            "",
+        ]
     )
 
 
@@ -194,7 +216,7 @@ def _training_table(names: list[str], variants: dict[Variant, list[Run]], ratios
     note = (
         "Validation loss: last value, mean over seeds (range). Forward time: trained models on one graph, by PyTorch's operations alone, "
         "median of paired ratios to the first row. "
-        "Outside: fraction of particle-frames inside a wall or obstacle when containment is off; corrected: fraction of particle-steps that containment moves."
+        "Outside: share of particle-frames inside a wall or obstacle when containment is off; corrected: share of particle-steps that containment moves."
     )
     return [*lines, *rows, "", note]
 
@@ -202,7 +224,7 @@ def _training_table(names: list[str], variants: dict[Variant, list[Run]], ratios
 def _rollout_table(names: list[str], variants: dict[Variant, list[Run]], first: Run) -> list[str]:
     splits = splits_of(first)
     horizons = _horizons(first)
-    baselines = sorted({*first.rows["model"]} - {LEARNED})
+    baselines = sorted({*first.rows["model"]} & {*BASELINES})
     header = [*names, "split", *(f"@{h}" for h in horizons)]
     lines = [table_row(header), "|" + "---|" * len(header)]
     for split in splits:
@@ -236,7 +258,7 @@ def _horizons(run: Run) -> list[str]:
 
 
 def _stress_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[str]:
-    """Return a table of the errors of displacement, velocity and stress for models that decode a stress; empty if none does."""
+    """Table of the errors of displacement, velocity and stress for models that decode a stress; empty if none does."""
     stressed = {key: runs for key, runs in variants.items() if runs[0].rows["metric"].isin(STRESS_METRICS).any()}
     if not stressed:
         return []

@@ -15,7 +15,7 @@ from gpe_pl.viz.film_strip import TEXT_WIDTH, new_figure
 
 
 def comparison_figure(intervals: Mapping[str, Mapping[str, Interval]], references: Mapping[str, Mapping[str, float]], label: str) -> Figure:
-    """Draw errors with intervals on a logarithmic axis, with a group per domain and a mark per model. Lines across a group mark the references.
+    """Draw errors with intervals on a logarithmic axis, a group per domain and a mark per model; a line across each group marks each reference.
 
     An interval without an upper end runs to the top of the figure. An infinite mark is a triangle at the top.
 
@@ -63,6 +63,7 @@ def parameter_figure(
     seen: Mapping[str, Sequence[float]],
     label: str,
     parameters: Mapping[str, str] = MappingProxyType({}),
+    references: Sequence[str] = (),
 ) -> Figure:
     """Draw median error over trajectories and seeds against the material parameter, a panel per domain; ticks at the bottom mark trained values.
 
@@ -71,6 +72,7 @@ def parameter_figure(
         seen: trained values by domain.
         label: label of the vertical axis.
         parameters: labels of the horizontal axes by domain.
+        references: models with dashed grey lines.
     """
     figure = new_figure(TEXT_WIDTH, 2.4)
     figure.set_layout_engine("constrained")
@@ -84,13 +86,14 @@ def parameter_figure(
         for k, model in enumerate(models):
             points = sorted((p, float(np.median(v))) for p, v in by_model.get(model, {}).items())
             points = [p for p in points if np.isfinite(p[1])]
+            style = ("s--", "d:")[references.index(model) % 2] if model in references else "o-"
             axes.plot(
                 [p for p, _ in points],
                 [v for _, v in points],
-                "o-",
+                style,
                 markersize=2.5,
                 linewidth=0.8,
-                color=PALETTE[k % len(PALETTE)],
+                color="0.45" if model in references else PALETTE[k % len(PALETTE)],
                 label=model,
             )
         axes.plot(
@@ -108,7 +111,7 @@ def parameter_figure(
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel(label, fontsize=8)
     lines, names = panels[0].get_legend_handles_labels()
-    figure.legend(lines, names, loc="outside lower center", ncols=len(models), fontsize=6, frameon=False)
+    figure.legend(lines, names, loc="outside lower center", ncols=min(len(models), 5), fontsize=6, frameon=False)
     return figure
 
 

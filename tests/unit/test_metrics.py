@@ -361,3 +361,12 @@ def test_a_ratio_of_failures_is_never_nan():
 def test_a_ratio_needs_the_same_trajectories():
     with pytest.raises(ValueError, match="same test trajectories, got 2 and 3"):
         bootstrap_ratio(np.ones((1, 2)), np.ones((1, 3)))
+
+
+def test_a_ratio_of_one_model_under_two_conditions_pairs_seeds_too():
+    lucky = np.array([[1.0], [10.0], [3.0]])  # seeds that differ more than the conditions
+    own, other = 0.9 * lucky * np.ones((1, 8)), lucky * np.ones((1, 8))
+    paired, apart = (bootstrap_ratio(own, other, np.mean, is_paired=p) for p in (True, False))
+    assert (paired.low, paired.high) == pytest.approx((0.9, 0.9)) and apart.low < 0.5 and apart.high > 1.5
+    with pytest.raises(ValueError, match="paired tables need the same seeds, got 2 and 3"):
+        bootstrap_ratio(own[:2], other, np.mean, is_paired=True)

@@ -1,0 +1,220 @@
+"""Scenes of a data set with other material parameters, as the solver computes them: controls for models that are said to read the material.
+
+The solver starts from the state in which a model's rollout starts, internal state included, so both see the change of the parameter from the same frame on.
+Runs depend on the data and the solver only. All models that are evaluated on the data share them. A killed command resumes. Layout::
+
+    {root}/{name}/{size}-controls/{split}-from-{frame}/00000.h5    runs of one scene: nearest, lowest and highest trained values
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gpe_pl.data.ground_truth import DatasetSpec, GenerationError, initial_state, parameter_values, trajectory_metadata
+from gpe_pl.geometry.shapes import ON_SURFACE
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import SimulationError, rollout, steps
+from gpe_pl.schema import MATERIALS, node_code
+from gpe_pl.system.locks import held
+from gpe_pl.system.progress import Progress
+from gpe_pl.system.workers import pool, results
+from gpe_pl.trajectory.store import StoreError, read_trajectory, trajectory_names, write_shard
+from gpe_pl.trajectory.trajectory import Trajectory
+
+Values = Mapping[str, Mapping[str, float]]
+"""Parameters of each material by name."""
+
+NEAREST, LOWEST, HIGHEST = "nearest", "lowest", "highest"
+RUNS = (NEAREST, LOWEST, HIGHEST)
+"""Names of the solver runs of a scene: nearest trained values, all parameters at their lowest trained value, and at their highest."""
+
+
+def scene_values(spec: DatasetSpec, split: str, index: int) -> dict[str, dict[str, float]]:
+    """Return the parameters of each material in one scene by name."""
+    return {material: {MATERIALS[material].name: value} for material, value in parameter_values(spec, split, index)[0].items()}
+
+
+def with_values(material_params: Any, node_type: Any, param_names: Sequence[str], values: Values) -> Any:
+    """Return material parameters [node, param] of a scene with other values.
+
+    Args:
+        material_params: parameters of the scene, an array or a tensor.
+        node_type: codes of the materials [node].
+        param_names: names of the columns.
+        values: new parameters.
+    """
+    new = 1 * material_params
+    for material, parameters in values.items():
+        rows = node_type == node_code(material)
+        for name, value in parameters.items():
+            new[rows, param_names.index(name)] = value
+    return new
+
+
+@dataclass(frozen=True)
+class TrainedValues:
+    """Values of material parameters in the training split of a data set, and choices among them. A material's parameters are chosen together, as a vector.
+
+    Distances between vectors are Euclidean. Each parameter has its scale of ``schema.MATERIALS``, divided by its trained range.
+    """
+
+    spec: DatasetSpec
+
+    @cached_property
+    def _vectors(self) -> dict[str, np.ndarray]:
+        """Trained vectors of each material [vector, param], in ascending order."""
+        scenes = [scene_values(self.spec, "train", index) for index in range(self.spec.num_train)]
+        return {m: np.unique([[*scene[m].values()] for scene in scenes], axis=0) for m in scenes[0]}
+
+    def nearest(self, own: Values) -> Values:
+        """Return the trained values nearest to a scene's own."""
+        return self._chosen({m: np.argmin(distance) for m, distance in self._distances(own).items()})
+
+    def farthest(self, own: Values) -> Values:
+        """Return the trained values farthest from a scene's own."""
+        return self._chosen({m: np.argmax(distance) for m, distance in self._distances(own).items()})
+
+    @property
+    def middle(self) -> Values:
+        """The trained values nearest to the middle of the trained ranges."""
+        return self._chosen({m: np.argmin(np.abs(self._scaled(m, v) - 0.5).max(axis=1)) for m, v in self._vectors.items()})
+
+    def end(self, name: str) -> Values:
+        """Return every parameter at its ``lowest`` or ``highest`` trained value."""
+        ends = {m: (v.min if name == LOWEST else v.max)(axis=0) for m, v in self._vectors.items()}
+        return {m: dict(zip(self._names[m], map(float, end), strict=True)) for m, end in ends.items()}
+
+    @cached_property
+    def _names(self) -> dict[str, list[str]]:
+        return {m: [*values] for m, values in scene_values(self.spec, "train", 0).items()}
+
+    def _chosen(self, number: Mapping[str, Any]) -> Values:
+        return {m: dict(zip(self._names[m], map(float, self._vectors[m][k]), strict=True)) for m, k in number.items()}
+
+    def _distances(self, own: Values) -> dict[str, np.ndarray]:
+        """Distance of each material's trained vectors to a scene's own [vector]."""
+        return {
+            m: np.linalg.norm(self._scaled(m, v) - self._scaled(m, np.array([[*own[m].values()]])), axis=1)
+            for m, v in self._vectors.items()
+        }
+
+    def _scaled(self, material: str, vectors: np.ndarray) -> np.ndarray:
+        """Return vectors in units in which each parameter is trained from 0 to 1."""
+        parameter = MATERIALS[material]
+        trained, given = ((np.log(v) if parameter.scale == "log" else v) for v in (self._vectors[material], vectors))
+        low, high = trained.min(axis=0), trained.max(axis=0)
+        return (given - low) / np.where(high > low, high - low, 1.0)
+
+
+@dataclass(frozen=True)
+class ControlRuns:
+    """Solver runs of the scenes of a split with other parameters.
+
+    Attributes:
+        root: folder of the data set.
+        spec: the data set.
+        trained: trained values of the models.
+        split: split whose scenes are computed.
+        start_frame: frame from which the parameters are the other ones.
+    """
+
+    root: Path
+    spec: DatasetSpec
+    trained: TrainedValues
+    split: str
+    start_frame: int
+
+    @property
+    def folder(self) -> Path:
+        return self.root.with_name(f"{self.root.name}-controls") / f"{self.split}-from-{self.start_frame}"
+
+    def values(self, index: int) -> dict[str, Values]:
+        """Return the parameters of each run of a scene."""
+        own = scene_values(self.spec, self.split, index)
+        return {NEAREST: self.trained.nearest(own), **{name: self.trained.end(name) for name in (LOWEST, HIGHEST)}}
+
+    def generate(self, indices: Sequence[int], num_workers: int = 1, on_progress: Progress | None = None) -> None:
+        """Compute the missing runs of these scenes. Waits while another process computes them.
+
+        Raises:
+            GenerationError: the solver stopped.
+            WorkerError: a process died.
+        """
+        if not self._missing(indices):
+            return
+        with held(self.folder, "paths.data", waits=True):
+            missing = self._missing(indices)
+            done, total = len(indices) - len(missing), len(indices)
+            if on_progress is not None:
+                on_progress(done, total)
+            with contextlib.suppress(SimulationError):  # the first scene reports impossible settings with its seed
+                self.spec.solver.compile_kernels()
+            with pool(min(num_workers, max(1, len(missing)))) as workers:
+                for _ in results(workers, self._write, [(index,) for index in missing]):
+                    done += 1
+                    if on_progress is not None:
+                        on_progress(done, total)
+
+    def read(self, index: int) -> dict[str, Trajectory]:
+        """Return the runs of a scene by name. Frame 0 is ``start_frame`` of the scene.
+
+        Raises:
+            StoreError: the runs were not computed.
+        """
+        return {name: read_trajectory(self._path(index), name) for name in RUNS}
+
+    def _path(self, index: int) -> Path:
+        return self.folder / f"{index:05d}.h5"
+
+    def _missing(self, indices: Sequence[int]) -> list[int]:
+        return [index for index in indices if not self._is_complete(index)]
+
+    def _is_complete(self, index: int) -> bool:
+        """Whether the runs of a scene exist, and are those of this data set, solver and parameters."""
+        metadata = trajectory_metadata(self.spec, self.split, index)
+        try:
+            if trajectory_names(self._path(index)) != sorted(RUNS):
+                return False
+            runs = self.read(index)
+        except StoreError:
+            return False
+        for name, values in self.values(index).items():
+            run = runs[name]
+            wanted = with_values(run.material_params, run.node_type, metadata.param_names, values)
+            if run.metadata != metadata or run.num_frames != self.spec.num_frames - self.start_frame:
+                return False
+            if not np.array_equal(wanted, run.material_params, equal_nan=True):
+                return False
+        return True
+
+    def _write(self, index: int) -> None:
+        runs = self._computed(index)
+        write_shard(self._path(index), (runs[name] for name in sorted(RUNS)), sorted(RUNS))
+
+    def _computed(self, index: int) -> dict[str, Trajectory]:
+        spec, metadata = self.spec, trajectory_metadata(self.spec, self.split, index)
+        where = f"split {self.split}, index {index}, seed {metadata.seed}"
+        state = initial_state(spec, self.split, index)
+        guard = Guard(bounds=spec.scene.bounds, margin=ON_SURFACE * max(high - low for low, high in spec.scene.bounds))
+        try:
+            *_, state = (state, *steps(spec.solver, state, self.start_frame))
+        except SimulationError as error:
+            raise GenerationError(f"{where}: {error}", self.split, index, metadata.seed) from None
+        runs = {}
+        for name, values in self.values(index).items():
+            params = with_values(state.material_params, state.node_type, metadata.param_names, values)
+            num_steps = spec.num_frames - 1 - self.start_frame
+            runs[name] = rollout(spec.solver, replace(state, material_params=params), num_steps, metadata, guard)
+            if (stop := runs[name].termination) is not None:
+                raise GenerationError(
+                    f"{where}, {name} trained values: {stop.reason}: {stop.message}; evaluate without evaluation.material_controls",
+                    self.split, index, metadata.seed,
+                )  # fmt: skip
+        return runs

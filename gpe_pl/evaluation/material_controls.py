@@ -1,0 +1,148 @@
+"""Rollouts with other material parameters, which show whether a model reads the material.
+
+A model at its own, unseen value has to be better than the same model at the nearest trained value, else it may have learned no more than its neighbours.
+For each scene with unseen parameters, the model starts from the same state with the nearest trained values, those in the middle of the trained range, the
+farthest ones, and those of another scene. The solver runs once with the nearest trained values, whose error is what the parameter does, and with the lowest
+and the highest, whose difference is the parameter's whole effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.data.control_runs import HIGHEST, LOWEST, NEAREST, ControlRuns, TrainedValues, Values, scene_values, with_values
+from gpe_pl.data.ground_truth import DatasetSpec, parameter_values
+from gpe_pl.errors import GpeError
+from gpe_pl.metrics import displacement
+from gpe_pl.rollout.loop import Simulator, Start, rollouts
+from gpe_pl.schema import Split
+from gpe_pl.system.progress import Progress
+from gpe_pl.trajectory.trajectory import Trajectory
+
+UNSEEN: Split = "test_unseen"
+"""Split whose scenes get controls."""
+CONTROLS = ("nearest", "middle", "far", "shuffled")
+"""Other values of a model's rollouts."""
+SOLVER_NEAREST, SOLVER_ENDS = "solver at nearest value", "solver at lowest against highest value"
+"""Labels of the solver's rows: against the ground truth, and of two runs against each other."""
+SAME_START = 1e-3
+"""Largest difference between a stored frame and the start of the solver's runs [spacings]."""
+MOST_DRAWS = 100
+"""Number of permutations from which the one with the fewest scenes that keep their values is taken."""
+
+
+class ControlError(GpeError):
+    """The solver does not reproduce the scenes of a data set, or the data set has no unseen parameters."""
+
+
+def label_of(model: str, control: str) -> str:
+    """Return the label of a model's rollouts with other values."""
+    return f"{model} at {control} value"
+
+
+@dataclass(frozen=True)
+class MaterialControls:
+    """Controls of one evaluation.
+
+    Attributes:
+        root: folder of the evaluated data set.
+        spec: the evaluated data set.
+        trained: the data set of the training, whose values are the trained ones.
+        start_frame: frame at which rollouts start.
+        num_trajectories: number of trajectories, from the start of the split; None takes all.
+    """
+
+    root: Path
+    spec: DatasetSpec
+    trained: DatasetSpec
+    start_frame: int
+    num_trajectories: int | None = None
+
+    def prepare(self, num_workers: int = 1, on_progress: Progress | None = None) -> None:
+        """Compute the missing solver runs.
+
+        Raises:
+            ControlError: the data set has no scenes with unseen parameters, or they are too short.
+            GenerationError: the solver stopped.
+        """
+        if not self._indices or self.spec.num_frames <= self.start_frame + 1:
+            raise ControlError(
+                f"evaluation.material_controls=true: {self.spec.name} has {self.spec.num_test_unseen} trajectories of {self.spec.num_frames} frames in "
+                f"{UNSEEN}, rollouts start at frame {self.start_frame}; choose data with more, or false"
+            )
+        self._runs.generate(self._indices, num_workers, on_progress)
+
+    def predictions(self, simulator: Simulator, starts: Sequence[Start], first: int) -> list[dict[str, Trajectory]]:
+        """Return the rollouts of scenes by control.
+
+        Args:
+            simulator: the model, with everything that its own rollouts have.
+            starts: starts of consecutive scenes with their own values.
+            first: number of the first scene.
+        """
+        found: list[dict[str, Trajectory]] = [{} for _ in starts]
+        for control in CONTROLS:
+            changed = [_changed(start, self.values[first + k][control]) for k, start in enumerate(starts)]
+            for scene, prediction in zip(found, rollouts(simulator, changed), strict=True):
+                scene[control] = prediction
+        return found
+
+    def solver_runs(self, number: int, truth: Trajectory) -> dict[str, tuple[Trajectory, Trajectory]]:
+        """Return the solver's runs of a scene and what each is compared with, by label.
+
+        Args:
+            number: number of the scene.
+            truth: its ground truth from ``start_frame`` on.
+
+        Raises:
+            ControlError: the runs do not start like the ground truth.
+        """
+        runs = self._runs.read(number)
+        start, spacing = runs[NEAREST], truth.metadata.spacing
+        is_same = start.metadata.seed == truth.metadata.seed and start.pos.shape == truth.pos.shape
+        if not is_same or np.abs(displacement(start.pos[0], truth.pos[0], truth.metadata)).max() > SAME_START * spacing:
+            raise ControlError(
+                f"{self.root}: the solver does not reproduce trajectory {number} of {UNSEEN}; generate the data again, or choose "
+                "evaluation.material_controls=false"
+            )
+        return {SOLVER_NEAREST: (start, truth), SOLVER_ENDS: (runs[LOWEST], runs[HIGHEST])}
+
+    @cached_property
+    def values(self) -> list[dict[str, Values]]:
+        """Values of each scene by control."""
+        trained, own = TrainedValues(self.trained), [scene_values(self.spec, UNSEEN, k) for k in self._indices]
+        other = self._shuffled()
+        return [
+            dict(zip(CONTROLS, (trained.nearest(v), trained.middle, trained.farthest(v), own[k]), strict=True))
+            for v, k in zip(own, other, strict=True)
+        ]
+
+    def _shuffled(self) -> list[int]:
+        """Number of the scene from which each scene has its shuffled values, of the same group of parameters."""
+        dealt = [parameter_values(self.spec, UNSEEN, k) for k in self._indices]
+        other, rng = np.arange(len(dealt)), np.random.default_rng(0)
+        for group in dict.fromkeys(group for _, group in dealt):
+            own = np.array([k for k, (_, of) in enumerate(dealt) if of == group])
+            drawn = [rng.permutation(own) for _ in range(MOST_DRAWS)]
+            other[own] = min(drawn, key=lambda order: sum(dealt[a][0] == dealt[b][0] for a, b in zip(own, order, strict=True)))
+        return [int(k) for k in other]
+
+    @property
+    def _indices(self) -> range:
+        count = self.spec.num_test_unseen
+        return range(count if self.num_trajectories is None else min(count, self.num_trajectories))
+
+    @cached_property
+    def _runs(self) -> ControlRuns:
+        return ControlRuns(self.root, self.spec, TrainedValues(self.trained), UNSEEN, self.start_frame)
+
+
+def _changed(start: Start, values: Values) -> Start:
+    state = start.state
+    params = with_values(state.material_params, state.node_type, start.metadata.param_names, values)
+    return replace(start, state=replace(state, material_params=params))

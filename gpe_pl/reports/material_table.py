@@ -1,0 +1,154 @@
+"""Table and figure that show whether models read the material parameter (see ``evaluation.material_controls``).
+
+A model reads the material if its error with a scene's own, unseen parameters is smaller than with the nearest trained ones: the 95 % interval of the ratio of
+both errors is below 1. Scenes are those with interpolated parameters, because evaluation usually clamps parameters outside the trained range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, label_of
+from gpe_pl.evaluation.rollouts import LEARNED
+from gpe_pl.files.markdown import table_row
+from gpe_pl.metrics import Interval, bootstrap_ratio, median_of_means
+from gpe_pl.reports.finished_runs import Run, Values, rollout_errors, shared_table, shared_trajectories, values_by_seed
+from gpe_pl.reports.parameter_curves import axis_label
+from gpe_pl.viz.saving import save_figure
+
+MATERIALS_FIGURE = "reads_material.png"
+INTERPOLATED = f"{UNSEEN}/interpolated"
+WITHOUT = "none"
+"""Value of ``model.material_embedding`` of models without the parameter."""
+EMBEDDING = "model.material_embedding"
+
+Groups = Mapping[tuple[str, str], Sequence[Run]]
+"""Runs that differ in their seeds only, by domain and label."""
+
+
+def reads_material(runs: Sequence[Run]) -> tuple[bool, Interval, int] | None:
+    """Return whether a model reads the material, the ratio behind it, and the number of scenes; None if its runs have no controls.
+
+    The ratio is that of the errors with own and with nearest trained parameters: means over scenes, median over seeds, with the bootstrap interval over both.
+    """
+    own, nearest = _errors(runs, LEARNED), _errors(runs, label_of(LEARNED, "nearest"))
+    scenes = shared_trajectories(own, nearest)
+    if not scenes or len(own) != len(nearest):
+        return None
+    tables = shared_table(own, scenes), shared_table(nearest, scenes)
+    ratio = bootstrap_ratio(*tables, statistic=median_of_means, is_paired=True)
+    return ratio.high < 1, ratio, len(scenes)
+
+
+def verdict(runs: Sequence[Run]) -> str:
+    """Return ``reads_material`` in words; empty if the runs have no controls."""
+    found = reads_material(runs)
+    if found is None:
+        return ""
+    reads, ratio, count = found
+    return (
+        f"reads the material: {'yes' if reads else 'no'} (error with own parameters over that with the nearest trained ones: {_ratio(ratio)}, 95 % interval, "
+        f"{count} scenes with interpolated parameters)"
+    )
+
+
+def material_lines(groups: Groups) -> list[str]:
+    """Return the table of all models with controls in Markdown; empty if there is none."""
+    shown = {key: runs for key, runs in groups.items() if reads_material(runs) is not None}
+    if not shown:
+        return []
+    header = [
+        "domain", "model", "own", *CONTROLS, "without the parameter", "solver, nearest", "effect", "own / nearest", "reads the material", "own / effect",
+    ]  # fmt: skip
+    lines = [table_row(header), "|" + "---|" * len(header)]
+    for (domain, label), runs in shown.items():
+        own, effect = _mean(_errors(runs, LEARNED)), _mean(_solver(runs, SOLVER_ENDS))
+        others = [_mean(_errors(runs, label_of(LEARNED, control))) for control in CONTROLS]
+        means = [own, *others, _mean(_errors(_without(groups, domain, runs), LEARNED)), _mean(_solver(runs, SOLVER_NEAREST)), effect]
+        found = reads_material(runs)
+        assert found is not None
+        reads, ratio, _ = found
+        share = f"{own / effect:.2f}" if effect > 0 else "–"
+        lines.append(table_row([domain, label, *map(_text, means), _ratio(ratio), "yes" if reads else "no", share]))
+    note = (
+        "Does the model read the material parameter? Rollout MSE ×1e-3 [m²] over all frames, mean over scenes with interpolated parameters, median over seeds: "
+        "with a scene's own parameters, and the same model with the nearest, the middle and the farthest trained ones and with those of another scene; a model "
+        "trained without the parameter; the solver with the nearest trained parameters; effect: the solver with the lowest against the highest trained "
+        "parameters. A model reads the material if own / nearest has a 95 % interval below 1, over the same scenes and seeds. A rollout that had to be stopped "
+        "has failed, and counts as ballistic flight in the same scene."
+    )
+    return [*lines, "", note]
+
+
+def write_material_figure(path: Path, groups: Groups) -> None:
+    """Draw the errors of each group with controls against the parameter, with the controls; nothing is written if there is no group."""
+    from gpe_pl.viz.comparison import parameter_figure
+
+    curves: dict[str, dict[str, dict[float, list[float]]]] = {}
+    seen: dict[str, list[float]] = {}
+    axes: dict[str, str] = {}
+    for (domain, label), runs in groups.items():
+        if reads_material(runs) is None:
+            continue
+        title = f"{domain}, {label}"
+        curves[title] = {"own value": _points(runs, LEARNED)}
+        curves[title] |= {f"{control} value": _points(runs, label_of(LEARNED, control)) for control in CONTROLS}
+        curves[title]["without the parameter"] = _points(_without(groups, domain, runs), LEARNED)
+        curves[title] |= {name: _points(runs, name) for name in (SOLVER_NEAREST, SOLVER_ENDS)}
+        rows = runs[0].rows
+        trained = [value for key, value in runs[0].config.items() if key.startswith("data.parameters.") and key.endswith(".seen")]
+        seen[title] = _numbers(trained[0]) if len(trained) == 1 else rows[rows["parameter_group"] == "seen"]["parameter"].unique().tolist()
+        axes[title] = axis_label(runs[0])
+    if curves:
+        figure = parameter_figure(curves, seen, "rollout MSE [m²]", axes, references=(SOLVER_NEAREST, SOLVER_ENDS))
+        save_figure(figure, path, dpi=150)
+
+
+def _numbers(text: object) -> list[float]:
+    import json
+
+    return [float(value) for value in json.loads(str(text))]
+
+
+def _points(runs: Sequence[Run], label: str) -> dict[float, list[float]]:
+    """Errors in all scenes with unseen parameters, by value of the parameter."""
+    points: dict[float, list[float]] = {}
+    for run in runs:
+        rows = run.rows
+        rows = rows[(rows["model"] == label) & (rows["split"] == UNSEEN) & (rows["metric"] == "rollout_mse") & (rows["horizon"] == "full")]
+        for seed in rollout_errors([run], UNSEEN, "full", label):
+            for trajectory, parameter in zip(rows["trajectory"], rows["parameter"], strict=True):
+                if np.isfinite(parameter):
+                    points.setdefault(float(parameter), []).append(seed[int(trajectory)])
+    return points
+
+
+def _without(groups: Groups, domain: str, runs: Sequence[Run]) -> list[Run]:
+    """Runs of the same model in the same domain that were trained without the parameter."""
+    model = runs[0].config.get("model._target_")
+    others = [run for (d, _), members in groups.items() if d == domain for run in members if run.config.get("model._target_") == model]
+    return [run for run in others if run.config.get(EMBEDDING) == WITHOUT]
+
+
+def _errors(runs: Sequence[Run], label: str) -> Values:
+    return rollout_errors(list(runs), INTERPOLATED, "full", label)
+
+
+def _solver(runs: Sequence[Run], label: str) -> Values:
+    """Values of the solver, which are the same in all runs of a domain."""
+    return values_by_seed(list(runs[:1]), label, INTERPOLATED, "rollout_mse", "full")
+
+
+def _mean(values: Values) -> float:
+    return float(median_of_means(shared_table(values), axis=(-2, -1))) if values else float("nan")
+
+
+def _text(value: float) -> str:
+    return f"{1e3 * value:.3g}" if not np.isnan(value) else "–"
+
+
+def _ratio(ratio: Interval) -> str:
+    return f"{ratio.estimate:.2f} [{ratio.low:.2f}, {ratio.high:.2f}]"

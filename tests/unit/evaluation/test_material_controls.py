@@ -1,0 +1,90 @@
+"""Rollouts with other material parameters: a model that ignores the parameter has equal errors, one that reads it has not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gpe_pl.config.datasets import dataset_spec
+from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, ControlError, MaterialControls, label_of
+from gpe_pl.evaluation.rollouts import EvaluationSettings, Row, evaluate
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
+from gpe_pl.trajectory.store import iter_trajectories
+from tests.runs import DATA, compose
+
+SETTINGS = EvaluationSettings(splits=["test", "test_unseen"], horizons=[5], num_pictures=0, num_uncontained=0, material_controls=True)
+
+
+@pytest.fixture(scope="module")
+def controls(tiny_data: Path, tmp_path_factory: pytest.TempPathFactory) -> MaterialControls:
+    spec = dataset_spec(compose("simulate", *DATA))
+    root = tmp_path_factory.mktemp("controls") / "sand" / "tiny"
+    root.parent.mkdir()
+    root.symlink_to(tiny_data / "sand" / "tiny")
+    made = MaterialControls(root, spec, replace(spec, num_train=10), 2)
+    made.prepare()
+    return made
+
+
+def simulator(root: Path, embedding: str) -> LearnedSimulator:
+    builder = GraphBuilder(GraphConfig(history=2), next(iter_trajectories(root, "test")).metadata)
+    torch.manual_seed(0)
+    model = GPE(builder.spec, material_embedding=embedding, num_message_passing_steps=1, hidden_channels=8)  # type: ignore[arg-type]
+    made = LearnedSimulator(model, builder).eval()
+    made.get_buffer("trained_sand")[:, 0] = torch.tensor([20.0, 42.5])
+    return made
+
+
+def errors(rows: list[Row], model: str, split: str = UNSEEN) -> list[float]:
+    return [r.value for r in rows if (r.model, r.split, r.metric, r.horizon) == (model, split, "rollout_mse", "full")]
+
+
+@pytest.mark.parametrize("embedding", ["affine", "none"])
+def test_controls_change_what_reads_the_parameter(embedding: str, controls: MaterialControls, tmp_path: Path) -> None:
+    learned = simulator(controls.root, embedding)
+    rows = evaluate(learned, controls.root, SETTINGS, tmp_path, controls=controls)
+    own = errors(rows, "learned")
+    assert own == errors(evaluate(learned, controls.root, replace(SETTINGS, material_controls=False), tmp_path / "plain"), "learned")
+    for control in CONTROLS:
+        other = errors(rows, label_of("learned", control))
+        assert len(other) == len(own) == 2 and not errors(rows, label_of("learned", control), "test")
+        if embedding == "none":
+            assert other == own
+    if embedding == "affine":
+        nearest, far = (errors(rows, label_of("learned", control)) for control in ("nearest", "far"))
+        assert nearest[0] != own[0] and far[0] not in (nearest[0], own[0])
+        assert nearest[1] == own[1]  # extrapolated, so clamped to the nearest trained value
+    for solver in (SOLVER_NEAREST, SOLVER_ENDS):
+        assert len(errors(rows, solver)) == 2 and np.isfinite(errors(rows, solver)).all()
+
+
+def test_shuffled_values_are_those_of_another_scene_of_the_group(controls: MaterialControls) -> None:
+    many = replace(controls, spec=replace(controls.spec, num_test_unseen=20))
+    values = [scene["shuffled"]["sand"]["friction_angle"] for scene in many.values]
+    own = [21.0, 26.0, 31.0, 36.0, 41.0] * 2, [15.0, 17.5, 45.0, 47.5] * 3
+    for shuffled, group in ((values[::2], own[0]), (values[1::2], own[1][:10])):
+        assert sorted(shuffled) == sorted(group)
+        assert sum(a == b for a, b in zip(shuffled, group, strict=True)) <= 1
+
+
+def test_data_that_the_solver_does_not_reproduce_are_refused(controls: MaterialControls) -> None:
+    truth = next(iter_trajectories(controls.root, UNSEEN)).frames(2)
+    assert controls.solver_runs(0, truth)[SOLVER_NEAREST][1] is truth
+    moved = replace(truth, pos=truth.pos + np.float32(0.01 * truth.metadata.spacing))
+    other = replace(truth, metadata=replace(truth.metadata, seed=1))
+    for wrong in (moved, other):
+        with pytest.raises(ControlError, match="the solver does not reproduce trajectory 0 of test_unseen; generate the data again, or"):
+            controls.solver_runs(0, wrong)
+
+
+def test_data_without_unseen_scenes_are_refused(controls: MaterialControls) -> None:
+    for spec in (replace(controls.spec, num_test_unseen=0), replace(controls.spec, num_frames=3)):
+        with pytest.raises(ControlError, match="evaluation.material_controls=true: sand has . trajectories of .* frames in test_unseen"):
+            replace(controls, spec=spec).prepare()
