@@ -1,7 +1,7 @@
 """How far two solutions of a solver come apart whose starts differ a little: no model can be expected to do better from a start known no better.
 
 ``python docs/predictability.py FILE data=elastomer size=small`` writes the mean squared difference [m²] over nodes, axes and the first frames, as in
-``rollout_mse``, for scenes with unseen material parameters as comparisons are judged on: all nodes moved by the same small way, or all
+``rollout_mse``, for scenes with unseen material parameters as comparisons use: all nodes moved by the same small way, or all
 started with a slightly other velocity.
 """
 

@@ -1,4 +1,4 @@
-"""Make a trained run one of the models that come with the package.
+"""Add a trained run to the shipped models.
 
 ``python docs/ship_model.py RUN_FOLDER NAME COMMIT 'COMMAND'`` writes weights without the optimiser's state, and a model card whose numbers are the run's
 own, to ``gpe_pl/learned/pretrained``. COMMAND is what trained it, with the code of COMMIT.
@@ -15,7 +15,7 @@ import numpy as np
 from gpe_pl.evaluation.rollouts import LEARNED, Row, read_rows
 from gpe_pl.learned.pretrained import FOLDER
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.reports.domain_table import JUDGED, NOT_LEARNED
+from gpe_pl.reports.domain_table import EVALUATED, NOT_LEARNED
 from gpe_pl.reports.finished_runs import groups_of
 from gpe_pl.reports.sweep_table import summary
 
@@ -52,10 +52,10 @@ def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows
 
 def _against_ballistic(rows: list[Row]) -> str:
     """What comparisons ask before they say that a model has learned something."""
-    wanted = [r for r in rows if (r.metric, r.horizon) == ("rollout_mse", "full") and JUDGED in groups_of(r)]
+    wanted = [r for r in rows if (r.metric, r.horizon) == ("rollout_mse", "full") and EVALUATED in groups_of(r)]
     learned, ballistic = (np.mean([r.value for r in wanted if r.model == name]) for name in (LEARNED, "ballistic"))
     verdict = "" if learned * NOT_LEARNED <= ballistic else ": comparisons would call it *not learned*"
-    return f"Whole rollouts of `{JUDGED}` have {100 * learned / ballistic:.2g} % of the mean error of ballistic flight{verdict}."
+    return f"Whole rollouts of `{EVALUATED}` have {100 * learned / ballistic:.2g} % of the mean error of ballistic flight{verdict}."
 
 
 def main(arguments: list[str]) -> int:

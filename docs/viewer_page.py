@@ -1,6 +1,6 @@
-"""``python docs/viewer_page.py``: the viewer that the guide embeds, ``docs/_static/viewer.html``, of a model that comes with the package.
+"""``python docs/viewer_page.py`` writes ``docs/_static/viewer.html``, the viewer of the shipped sand model that the guide embeds.
 
-Takes half a minute. Run it again when the viewer or the shipped sand model changes.
+This takes half a minute. Run it again when the viewer or the shipped sand model changes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Learned simulators of particles and meshes: the Graph-based Physics Engine and its baselines.
+"""Learned simulators of particles and meshes: the Graph-based Physics Engine (GPE) and its baselines.
 
 Import the most common names from here. This example compares a trained model with the ground truth in a scene with a parameter that training did not have::
 

@@ -1,4 +1,4 @@
-"""Run a benchmark suite: ``python -m gpe_pl.benchmark suite=speed``; results in ``{paths.runs}/benchmark/{suite}/``."""
+"""Command ``python -m gpe_pl.benchmark suite=speed``: run a benchmark suite. Results go to ``{paths.runs}/benchmark/{suite}/``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NAMED = 5
 
 
 def without_folder(value: Any, runs: str) -> Any:
-    """Settings with ``paths.runs`` in place of the results folder ``runs``, so that they can be published."""
+    """Replace the results folder ``runs`` in settings by the text ``paths.runs``, so that published settings name no folder of this machine."""
     if isinstance(value, dict):
         return {key: without_folder(item, runs) for key, item in value.items()}
     if isinstance(value, list):
@@ -32,18 +32,18 @@ def without_folder(value: Any, runs: str) -> Any:
 
 
 def _suite(name: str) -> Any:
-    """Module of a suite: ``benchmarks.{name}``, or ``benchmarks.{name}.suite`` if that is a package."""
+    """Import the module of a suite: ``benchmarks.{name}``, or ``benchmarks.{name}.suite`` if ``benchmarks.{name}`` is a package."""
     package = importlib.import_module(f"gpe_pl.benchmarks.{name}")
     return importlib.import_module(f"{package.__name__}.suite") if hasattr(package, "__path__") else package
 
 
 def benchmark(cfg: DictConfig) -> None:
-    """Run one suite and write ``results.json``, ``table.md`` and its figures. The exit status is 1 if the suite's ``failures`` names any."""
+    """Run one suite and write ``results.json``, ``table.md`` and its figures. The exit status is 1 if the suite's function ``failures`` returns any."""
     import torch
     from omegaconf import OmegaConf
 
     from gpe_pl.config.datasets import dataset
-    from gpe_pl.system.locks import held
+    from gpe_pl.system.locks import locked
     from gpe_pl.system.machine import environment, keep_freed_memory
     from gpe_pl.system.provenance import recorded
     from gpe_pl.training.run import TrainerSettings
@@ -61,7 +61,7 @@ def benchmark(cfg: DictConfig) -> None:
     keep_freed_memory()  # as trainings and evaluations do
     cases = getattr(settings, "cases", None)  # data sets by name, in suites that need some
     folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name
-    with held(folder), recorded(folder, "benchmark", sys.argv[1:], cfg.paths.runs):
+    with locked(folder), recorded(folder, "benchmark", sys.argv[1:], cfg.paths.runs):
         records, table = suite.run(settings) if cases is None else suite.run(settings, {k: dataset(*c.overrides) for k, c in cases.items()})
         for name, figure in getattr(suite, "figures", lambda _: {})(records).items():
             save_figure(figure, folder / f"{name}.png", dpi=150)

@@ -1,4 +1,4 @@
-"""Import data of other projects, or your own arrays: ``python -m gpe_pl.convert format=lagrangebench source=FOLDER name=NAME``.
+"""Command ``python -m gpe_pl.convert format=lagrangebench source=FOLDER name=NAME``: import data of other projects, or your own arrays.
 
 The command writes a data set in this package's store. Train on it with ``python -m gpe_pl.fit data=imported data.name=NAME``. The modules of
 ``gpe_pl.data.importers`` describe the formats; ``--help`` lists the settings. Read the report: trajectories that cannot be used are left out, each with the

@@ -1,4 +1,4 @@
-"""Evaluate a checkpoint: ``python -m gpe_pl.evaluate checkpoint=… split=test_unseen``."""
+"""Command ``python -m gpe_pl.evaluate checkpoint=… split=test_unseen``: evaluate a trained model."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     from gpe_pl.learned.simulator import LearnedSimulator
     from gpe_pl.reports.sweep_table import conclusion, report_evaluation
     from gpe_pl.rollout.skips import Skips
-    from gpe_pl.system.locks import held
+    from gpe_pl.system.locks import locked
     from gpe_pl.system.provenance import recorded
     from gpe_pl.training.run import TrainerSettings, set_up
 
@@ -50,7 +50,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
         simulator.check_scene(scene, _own_data(simulator) or "data=… size=…")
     shown = None if cfg.data.get("showcase") is None else _showcase(cfg, simulator)
     folder = Path(cfg.paths.runs) / run_name(cfg.name)
-    with held(folder), recorded(folder, "evaluate", sys.argv[1:], cfg.paths.runs):
+    with locked(folder), recorded(folder, "evaluate", sys.argv[1:], cfg.paths.runs):
         root = ensure_split(evaluated, cfg.split)
         claim(folder, _identity(evaluated, root), results=["*"])
         with without_orphans(folder):
@@ -67,7 +67,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
 
 
 def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
-    """Settings and checksums on which the metrics of an evaluation depend. An evaluation with others needs another folder."""
+    """Return the settings and checksums on which the metrics of an evaluation depend. If one of them differs, the evaluation needs another folder."""
     from omegaconf import OmegaConf
 
     from gpe_pl.data.checksum import split_checksum
@@ -87,7 +87,7 @@ def _identity(cfg: DictConfig, root: Path) -> dict[str, Any]:
 
 
 def _own_data(simulator: LearnedSimulator) -> str:
-    """Overrides that choose data like those of the training; empty if there are none."""
+    """Return the overrides that choose data like the training data, for a message; empty if no data set fits."""
     from gpe_pl.config.datasets import IMPORTED, dataset
     from gpe_pl.data.ground_truth import trajectory_metadata
 
@@ -103,7 +103,7 @@ def _own_data(simulator: LearnedSimulator) -> str:
 
 
 def _showcase(cfg: DictConfig, simulator: LearnedSimulator) -> Callable[[Path], None]:
-    """Build the showcase's scene, and return a function that rolls the simulator out in it and writes results into a folder.
+    """Build the scene of the showcase. Return a function that rolls the simulator out in it and writes the results into a folder.
 
     The scene is built first so that errors in its settings are reported before the evaluation.
 

@@ -1,4 +1,4 @@
-"""Train and evaluate: ``python -m gpe_pl.fit experiment=…``."""
+"""Command ``python -m gpe_pl.fit experiment=…``: train a model and evaluate it."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ def fit(cfg: DictConfig) -> float:
     from gpe_pl.config.fit_run import FitRun
     from gpe_pl.files.names import data_name, run_name
     from gpe_pl.files.run_folder import without_orphans
-    from gpe_pl.system.locks import held
+    from gpe_pl.system.locks import locked
 
     data_name(cfg.data.name, "data.name")
     if cfg.reuse is not None:
         run_name(cfg.reuse, "reuse")
     folder = output_dir(cfg)
-    with held(folder, num_processes=num_processes(cfg)):
+    with locked(folder, num_processes=num_processes(cfg)):
         run = FitRun(cfg, folder)
         run.prepare_data()
         run.choose_num_steps()

@@ -6,8 +6,8 @@ Three rules apply to every metric of a rollout:
 - A horizon that the ground truth does not reach is left out, never shortened.
 - The error of a rollout is infinite from the frame where it stopped early or has a value that is not finite, so that no failure improves a score.
 
-Velocities of both trajectories are computed from positions (``integrators``). A solver's own velocities are instantaneous, and those of a learned simulator are
-averages over a frame. In free fall they would differ by ``g dt / 2``.
+Velocities of both trajectories are computed from positions (``integrators``). The velocities that a solver stores are instantaneous, while those of a learned
+simulator are averages over a frame. In free fall they would differ by ``g dt / 2``.
 """
 
 import math
@@ -71,16 +71,16 @@ class Interval:
 def displacement(
     pos: Float[np.ndarray, "*axes dim"], reference: Float[np.ndarray, "*axes dim"], metadata: Metadata
 ) -> Float[np.ndarray, "*axes dim"]:
-    """Displacement ``pos - reference`` [m] in float64; the minimum image along periodic axes."""
+    """Return the displacement ``pos - reference`` [m] in float64; the minimum image along periodic axes."""
     return metadata.periodicity.shortest(pos.astype(np.float64) - reference.astype(np.float64))
 
 
 def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.ndarray, "frame"]:
-    """Mean squared position error of every frame [m²], over nodes and dimensions.
+    """Return the mean squared position error of every frame [m²], over nodes and dimensions.
 
     Returns:
-        One value per frame, including frame 0 (zero up to rounding). If the rollout stopped early, the array is as long as the ground truth, with ``inf``
-        from the first missing frame on. If the prediction was meant to be shorter, the array is as long as the prediction.
+        One value per frame, including frame 0 (zero up to rounding). If the rollout stopped early, the array has the length of the ground truth, with ``inf``
+        from the first missing frame on. If the rollout was meant to be shorter, the array has the length of the prediction.
 
     Raises:
         ValueError: the trajectories do not describe the same nodes from the same start.
@@ -140,11 +140,11 @@ def energy_distance(
     mass_a: Float[np.ndarray, "node_a"],
     mass_b: Float[np.ndarray, "node_b"],
 ) -> float:
-    """Energy distance [m] between two clouds of particles with mass: ``2 E|A - B| - E|A - A'| - E|B - B'|``.
+    """Return the energy distance [m] between two clouds of particles with mass: ``2 E|A - B| - E|A - A'| - E|B - B'|``.
 
-    It compares the distributions of material, not single particles. It therefore stays meaningful when chaos has made particle-wise errors meaningless. It is
-    zero only for equal distributions. The value is exact, without the smoothing length and the stopping rule of a Sinkhorn divergence. It takes O(N²) time and
-    O(N) memory.
+    The distance compares distributions of material, not single particles. It therefore stays meaningful after chaotic motion has made errors of single
+    particles meaningless. It is zero only for equal distributions. The value is exact; unlike a Sinkhorn divergence, it needs no smoothing length and no
+    stopping rule. It takes O(N²) time and O(N) memory.
 
     Source: Székely and Rizzo, Energy statistics, J. Stat. Plan. Inference 143 (2013).
     """
@@ -161,7 +161,7 @@ def _mean_distance(a: np.ndarray, b: np.ndarray, mass_a: np.ndarray, mass_b: np.
 
 
 def _cloud_distance(prediction: Trajectory, ground_truth: Trajectory, frame: int) -> float:
-    """Energy distance [m] of each material, averaged by mass, so that materials which swap places count as an error."""
+    """Return the energy distance [m], computed for each material and averaged by mass. Two materials that swap places are then an error."""
     mass, types = ground_truth.mass.astype(np.float64), ground_truth.node_type
     total = 0.0
     for code in np.unique(types):
@@ -172,7 +172,10 @@ def _cloud_distance(prediction: Trajectory, ground_truth: Trajectory, frame: int
 
 
 def _relative_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps: int) -> dict[str, float]:
-    """L2 errors over frames 1 to ``num_steps`` and all nodes, relative to the norm of the ground truth; infinite if that is zero and the error is not."""
+    """Return L2 errors over frames 1 to ``num_steps`` and all nodes, relative to the norm of the ground truth.
+
+    An error is infinite if that norm is zero and the error is not.
+    """
     own, true = prediction.pos[: num_steps + 1], ground_truth.pos[: num_steps + 1]
     metadata = ground_truth.metadata
     steps, true_steps = displacement(own[1:], own[:-1], metadata), displacement(true[1:], true[:-1], metadata)
@@ -188,7 +191,7 @@ def _relative_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps
 
 
 def _stress_error(stress: np.ndarray, reference: np.ndarray, num_steps: int) -> float:
-    """Root mean square error over the first frames, relative to the root mean square of the reference over all frames.
+    """Return the root mean squared error over the first frames, relative to the root mean square of the reference over all frames.
 
     All frames are used for the reference, because there is no stress before an impact.
     """
@@ -197,7 +200,10 @@ def _stress_error(stress: np.ndarray, reference: np.ndarray, num_steps: int) -> 
 
 
 def _whole(stress: np.ndarray) -> np.ndarray:
-    """Stresses [..., component] with weighted shears, so that the sum of squares is that of the tensor, which has every shear twice."""
+    """Return stresses [..., component] with shear components multiplied by √2.
+
+    The sum of squares then equals that of the whole tensor, which contains each shear twice.
+    """
     shears = (1,) if stress.shape[-1] == 4 else (1, 2, 4)
     weight = np.ones(stress.shape[-1])
     weight[[*shears]] = np.sqrt(2)
@@ -227,11 +233,11 @@ def _motion(trajectory: Trajectory, num_steps: int) -> _Motion:
         steps = displacement(pos[1:], pos[:-1], trajectory.metadata)
         pos = np.concatenate([pos[:1], pos[:1] + np.cumsum(steps, axis=0)])
     vel, pos = integrators.velocities(pos, dt), pos[1:]
-    share = trajectory.mass.astype(np.float64) / trajectory.mass.sum(dtype=np.float64)
-    momentum = np.einsum("n,fnd->fd", share, vel)
-    arm = pos - np.einsum("n,fnd->fd", share, pos)[:, None]
-    moment = np.einsum("n,fni,fnj->fij", share, arm, vel)
-    return _Motion(momentum, moment - moment.swapaxes(1, 2), 0.5 * np.einsum("n,fnd,fnd->f", share, vel, vel))
+    fraction = trajectory.mass.astype(np.float64) / trajectory.mass.sum(dtype=np.float64)
+    momentum = np.einsum("n,fnd->fd", fraction, vel)
+    arm = pos - np.einsum("n,fnd->fd", fraction, pos)[:, None]
+    moment = np.einsum("n,fni,fnj->fij", fraction, arm, vel)
+    return _Motion(momentum, moment - moment.swapaxes(1, 2), 0.5 * np.einsum("n,fnd,fnd->f", fraction, vel, vel))
 
 
 def _motion_errors(prediction: Trajectory, ground_truth: Trajectory, num_steps: int) -> dict[str, float]:
@@ -380,7 +386,7 @@ BOTH = (-2, -1)
 
 
 def median_of_means(table: np.ndarray, axis: tuple[int, int]) -> Any:
-    """Median over seeds of means over trajectories; a ``statistic`` for ``bootstrap_interval``."""
+    """Return the median over seeds of means over trajectories; a ``statistic`` for ``bootstrap_interval``."""
     return np.median(table.mean(axis=axis[1], keepdims=True), axis=axis)
 
 
@@ -391,7 +397,7 @@ def bootstrap_interval(
     num_resamples: int = 2000,
     seed: int = 0,
 ) -> Interval:
-    """Percentile interval of a statistic that varies with training seed and test trajectory.
+    """Return a percentile interval of a statistic that varies with training seed and test trajectory.
 
     Seeds and trajectories are resampled independently. All seeds are tested on the same trajectories, and a hard trajectory is hard for all of them, so
     resampling trajectories within each seed would make the interval too narrow. With fewer than about five seeds, any bootstrap underestimates the spread
@@ -431,7 +437,7 @@ def bootstrap_ratio(
     seed: int = 0,
     is_paired: bool = False,
 ) -> Interval:
-    """Percentile interval of the ratio of a statistic between two models on the same trajectories.
+    """Return a percentile interval of the ratio of a statistic between two models on the same trajectories.
 
     Trajectories are resampled together for both models. The other arguments are those of ``bootstrap_interval``.
 
@@ -466,7 +472,7 @@ def _drawn(num_resamples: int, rng: np.random.Generator, *counts: int) -> list[n
 
 
 def _resampled(table: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Resampled tables [resample, seed, trajectory]."""
+    """Return resampled tables [resample, seed, trajectory]."""
     return table[rows[:, :, None], columns[:, None, :]]
 
 

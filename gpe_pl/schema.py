@@ -41,7 +41,7 @@ class MaterialParameter:
         return "positive and finite" if self.scale == "log" else "finite and not negative"
 
     def accepts(self, values: Any) -> Any:
-        """Mask of the values of an array or tensor that follow the rule; for a number, whether it does."""
+        """Return a mask of the values of an array or tensor that follow the rule; for a number, whether it does."""
         return ((values > 0.0) if self.scale == "log" else (values >= 0.0)) & (values < LARGEST)
 
 
@@ -74,17 +74,17 @@ ParameterGroup = Literal["seen", "interpolated", "extrapolated"]
 
 
 def grid(level: int) -> str:
-    """Node type of the virtual nodes of a level. Level 1 is the first level above the mesh nodes."""
+    """Return the node type of the virtual nodes of a level. Level 1 is the first level above the mesh nodes."""
     return f"grid_{level}"
 
 
 def level_of(node_type: str) -> int:
-    """Level of the virtual nodes of a node type."""
+    """Return the level of the virtual nodes of a node type."""
     return int(node_type.removeprefix("grid_"))
 
 
 def role(node_type: str) -> str:
-    """Role of a node type. Types with one role share statistics and weights.
+    """Return the role of a node type. Types with the same role use the same statistics and weights.
 
     Virtual nodes of all levels have one role; every other node type has its own.
     """
@@ -92,23 +92,23 @@ def role(node_type: str) -> str:
 
 
 def is_symmetric(relation: EdgeType) -> bool:
-    """Whether the ends of an edge can be swapped: they have one type, and neither is the parent of the other."""
+    """Whether the ends of an edge can be swapped: they have the same type, and neither is the parent of the other."""
     source, name, target = relation
     return source == target and name != DOWN
 
 
 def node_code(name: str) -> int:
-    """Integer code of a node type, as stored in ``node_type``."""
+    """Return the integer code of a node type, as stored in ``node_type``."""
     return NODE_TYPES.index(name)
 
 
 def param_names(materials: tuple[str, ...]) -> tuple[str, ...]:
-    """Column names of ``material_params`` for a data set with these materials, without repetition, in schema order."""
+    """Return column names of ``material_params`` for a data set with these materials, without repetition, in schema order."""
     return tuple(dict.fromkeys(MATERIALS[m].name for m in MATERIALS if m in materials))
 
 
 def radius_relations(materials: tuple[str, ...]) -> tuple[EdgeType, ...]:
-    """All ``radius`` relations of a data set with these materials.
+    """Return all ``radius`` relations of a data set with these materials.
 
     Each unordered pair of node types appears once. ``boundary`` is always the source and has no relation with itself.
     """
@@ -118,7 +118,7 @@ def radius_relations(materials: tuple[str, ...]) -> tuple[EdgeType, ...]:
 
 
 def mesh_relations(materials: tuple[str, ...], num_levels: int) -> tuple[EdgeType, ...]:
-    """Relations of meshes: along cells, between virtual nodes of each level, and from virtual nodes to their children."""
+    """Return relations of meshes: along cells, between virtual nodes of each level, and from virtual nodes to their children."""
     meshes = [m for m in MESH_MATERIALS if m in materials]
     if not meshes:
         return ()

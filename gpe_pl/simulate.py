@@ -1,6 +1,6 @@
-"""Generate ground truth: ``python -m gpe_pl.simulate data=sand size=tiny``.
+"""Command ``python -m gpe_pl.simulate data=sand size=tiny``: generate ground truth.
 
-The same command resumes a run that was killed. It reads all existing shards, and generates those again whose checksums do not match.
+The same command resumes a killed run. It reads all existing shards and generates a shard again if its checksums do not match.
 """
 
 from __future__ import annotations

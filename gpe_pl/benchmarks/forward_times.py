@@ -20,10 +20,12 @@ NUM_NODES, NUM_EDGES = 600, 6000
 
 
 def measure_forward_times(folder: Path, runs: list[Run], num_rounds: int = 30) -> None:
-    """Write the forward time of one model per variant over that of the first variant: the median of paired ratios on one graph.
+    """Write the forward time of each variant, divided by that of the first variant.
 
-    All models use only PyTorch's operations, which all variants share. Nothing is measured if the runs have several models or domains, if there is one variant,
-    if models know other materials than sand, or if the variants were measured before.
+    One model per variant is timed on the same graph; the value is the median of paired ratios.
+
+    Only PyTorch's operations are used, because fused passes exist for some variants only. Nothing is measured in these cases: the runs have several models or
+    domains, there is only one variant, models have other materials than sand, or the variants were measured before.
 
     Args:
         folder: folder of the sweep, where ``forward_times.json`` is written.

@@ -34,7 +34,7 @@ NUM_WARM_UPS = 3
 
 
 class ParallelError(GpeError, ValueError):
-    """This number of processes cannot share this machine or these batches."""
+    """Raised when there are too many processes for this machine or for these batches."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,11 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
     """Return records of step times [s], throughput [nodes/s] and speed-ups, and a Markdown table."""
     most = max(settings.num_processes)
     if most > settings.num_graphs:
-        raise ParallelError(f"suite.num_graphs={settings.num_graphs}: too few for {most} processes, each of which takes at least one")
+        raise ParallelError(
+            f"suite.num_graphs={settings.num_graphs}: too few for {most} processes, each of which takes at least one; raise it"
+        )
     if settings.accelerator == "gpu" and most > torch.cuda.device_count():
-        raise ParallelError(f"suite.num_processes={settings.num_processes}: this machine has {torch.cuda.device_count()} GPUs")
+        raise ParallelError(f"suite.num_processes={settings.num_processes}: this machine has {torch.cuda.device_count()} GPUs; lower it")
     records, lines = [], []
     for number in settings.num_processes:
         step, exchange = np.median(np.array(step_times(settings, number)), axis=0).tolist()
@@ -90,7 +92,7 @@ def _ms(*times: float) -> list[str]:
 
 
 def step_times(settings: Settings, num_processes: int) -> list[tuple[float, float]]:
-    """Return seconds of each step, and of its exchange of gradients, as measured by the first process of a new group of processes."""
+    """Return the time of each step and of its exchange of gradients [s], as measured by the first process of a new group."""
     with tempfile.TemporaryDirectory() as folder, ProcessPoolExecutor(num_processes, multiprocessing.get_context("spawn")) as pool:
         meeting = (Path(folder) / "rendezvous").as_uri()
         futures = [pool.submit(_times_on_rank, settings, rank, num_processes, meeting) for rank in range(num_processes)]

@@ -1,8 +1,8 @@
-"""Run time against error for solvers and learned models on the same axes: accuracy at equal cost, and cost at equal accuracy.
+"""Run time against error of solvers and learned models: accuracy at equal cost, and cost at equal accuracy.
 
-The reference is the solver at half the spacing between nodes, and thus with substeps at most half as long; its observed order of convergence is reported.
-Everything is compared with it, including the solver that made the training data, whose error is the floor of what can be learned from them. The protocol
-follows McGreivy and Hakim 2024 (arXiv 2407.07218): a solver can always run at a lower resolution, so only equal cost or equal accuracy may be compared.
+The reference is the solver at half the spacing between nodes, with substeps at most half as long. Its observed order of convergence is reported. Everything is
+compared with the reference, also the solver that made the training data. No model can be expected to have a smaller error than that solver. The protocol
+follows McGreivy and Hakim 2024 (arXiv 2407.07218): a solver can always run at a lower resolution, so a fair comparison is at equal cost or at equal accuracy.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ Frame = tuple[np.ndarray, np.ndarray]
 DATA = "solver, as for the data"
 SPACING, STEPS = "spacing × ", "steps × "
 BALLISTIC = "ballistic"
-HELD = ", held predictions"
+REPEATED = ", repeated predictions"
 
 
 class ComparisonError(GpeError, ValueError):
-    """The comparison lacks something; the message says what."""
+    """Raised when a model or a reference solution is missing; the message says which."""
 
 
 @dataclass(frozen=True)
@@ -142,8 +142,8 @@ def _models(runs: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[
         seconds = training_seconds(run)
         found[label] = simulator.to(settings.device), seconds
         for hold in settings.holds:
-            holding = simulator.configured(skips=replace(simulator.skips, hold=hold))
-            found[f"{label}{HELD} × {hold}"] = holding, seconds
+            repeating = simulator.configured(skips=replace(simulator.skips, hold=hold))
+            found[f"{label}{REPEATED} × {hold}"] = repeating, seconds
     return found
 
 
@@ -187,7 +187,7 @@ def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]]
 
 @dataclass(frozen=True)
 class _Restricted:
-    """Start state of a simulator, the map from its nodes' positions to those of the scene, and the number of frames per step."""
+    """Start of a simulator: its state, the map from its positions to those of the scene's nodes, and the number of frames per step."""
 
     resolved: Resolved
     from_start: bool
@@ -202,7 +202,7 @@ def _simulators(
     history: int,
     settings: Settings,
 ) -> Iterator[tuple[str, Family, Simulator, _Restricted]]:
-    """Yield the simulators: solvers start with the scene, the others at the frame where learned models have the history they need."""
+    """Yield the simulators. Solvers start at frame 0, all others at the first frame with enough history for learned models."""
     same = Resolved(start, lambda pos: pos)
     yield DATA, "solver", spec.solver, _Restricted(same, True)
     for factor in settings.factors:
@@ -227,7 +227,7 @@ def _simulators(
 
 
 def _solver(spec: DatasetSpec, factor: float) -> Any | None:
-    """Return the solver for a node spacing ``factor`` times as large, with a grid as much coarser, if any; None if it does not fit the domain."""
+    """Return the solver for ``factor`` times the node spacing and grid spacing; None if that grid does not fit the domain."""
     solver: Any = spec.solver
     spacing = getattr(solver, "grid_spacing", None)
     if spacing is None:
@@ -242,7 +242,7 @@ def _solver(spec: DatasetSpec, factor: float) -> Any | None:
 
 
 def _with_longer_steps(spec: DatasetSpec, factor: int) -> Any | None:
-    """Return the solver with frames and (by its criterion) substeps ``factor`` times as long, up to one cell.
+    """Return the solver with frames ``factor`` times as long. Its substeps may grow as much, up to a distance of one cell per substep.
 
     Return None for a solver without a grid, whose substeps are already as long as is stable.
     """
@@ -262,7 +262,7 @@ def _reference(spec: DatasetSpec, start: State, data: Trajectory) -> Trajectory:
 
 
 def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Trajectory, num_frames: int = 20) -> float:
-    """Return P = log₂ |u_h − u_{h/2}| / |u_2h − u_h| over the first frames, while solutions are still close; NaN if 2h does not fit."""
+    """Return the observed order P = log₂ (|u_2h − u_h| / |u_h − u_{h/2}|) over the first frames; NaN if the grid of spacing 2h does not fit."""
     solver = _solver(spec, 2.0)
     try:
         resolved = coarser(start, spec.scene.spacing, 2.0)
@@ -311,8 +311,8 @@ def _timed(simulator: Any, at: _Restricted, data: Trajectory, history: int) -> t
     return trajectory, seconds / max(1, num_steps) / (every * dt)
 
 
-def _between(before: Frame, after: Frame, share: float) -> Frame:
-    return before[0] + share * (after[0] - before[0]), before[1] + share * (after[1] - before[1])
+def _between(before: Frame, after: Frame, fraction: float) -> Frame:
+    return before[0] + fraction * (after[0] - before[0]), before[1] + fraction * (after[1] - before[1])
 
 
 def _numpy(state: State) -> Frame:
@@ -464,7 +464,7 @@ def _pays_off(seconds: float) -> str:
 
 
 def _against(point: Point, solvers: Sequence[Point], horizon: str) -> str:
-    """Return a model's table cell; below 1 the model loses."""
+    """Return the table cell that compares a model with the solvers at equal error; below 1 the model is slower."""
     needed = cost_at_error(solvers, point.error(horizon), horizon)
     if needed <= point.cost:
         return f"{needed / point.cost:.2g}"
@@ -476,7 +476,7 @@ def _against(point: Point, solvers: Sequence[Point], horizon: str) -> str:
 
 
 def verdicts(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:
-    """Tell for every horizon whether a learned model lies below the solvers' front; if none does, what the nearest one lacks."""
+    """Yield one line per horizon: whether a learned model lies below the solvers' front, or what the nearest model lacks."""
     solvers = [p for p in points if p.family == "solver"]
     learned = [p for p in points if p.family == "learned"]
     for horizon in horizons:
@@ -535,7 +535,7 @@ def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
                         if others not in point.name:
                             lines[label].append(place)
                 elif point.family == "learned":
-                    marks.setdefault(point.name.partition(" ")[0] + (HELD if HELD in point.name else ""), []).append(place)
+                    marks.setdefault(point.name.partition(" ")[0] + (", repeated" if REPEATED in point.name else ""), []).append(place)
             levels = {p.name: p.error(horizon) for p in points if p.family == "trivial"}
             panels[f"frames 1 – {horizon}" if horizon != "full" else "all frames"] = CostAndError(
                 {label: places for label, places in lines.items() if len(places) > 1}, marks, levels

@@ -156,7 +156,7 @@ def _sorted_time_ratio(settings: Settings, num_nodes: int, dim: int) -> float:
 
 
 def _fastest(function: Callable[[], Any], budget: float) -> float:
-    """Return the seconds of the fastest call; there is at least one timed call, after one that does not count."""
+    """Return the time of the fastest call [s]. One call is made before the timing starts, and at least one is timed."""
     function()
     times: list[float] = []
     while not times or sum(times) < budget:

@@ -1,4 +1,7 @@
-"""Benchmark of skipping: the cost of a step when a scene grows by irrelevant parts: distant walls, falling particles, absent materials, piles at rest."""
+"""Benchmark of skipping: the cost of a step when irrelevant parts are added to a scene.
+
+Such parts are distant walls, falling particles, materials without particles, and piles at rest.
+"""
 
 from __future__ import annotations
 
@@ -65,7 +68,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Growth:
-    """A grown scene.
+    """A scene with an added part.
 
     Attributes:
         metric: name of the metric: the fraction by which a step takes longer.
@@ -211,14 +214,16 @@ def _hold_time_ratio(settings: Settings, edge_state: EdgeState, builder: GraphBu
 
         return synchronized(call, settings.device)
 
-    times = paired_times({"held": frames(Skips(hold=hold)), "exact": frames(Skips())}, settings.num_rounds)
-    return paired_ratio(times, "held", "exact")
+    times = paired_times({"repeated": frames(Skips(hold=hold)), "exact": frames(Skips())}, settings.num_rounds)
+    return paired_ratio(times, "repeated", "exact")
 
 
 def _table(settings: Settings, num_edges: int, lines: list[str], records: list[dict[str, Any]]) -> str:
     calls = {(r["metric"], r["case"]): r["value"] for r in records if r["metric"].endswith("_calls")}
-    shares = [f"{r['case']} {100 * r['value']:.0f} %" for r in records if r["metric"] == "hold_time_ratio"]
-    held = f" Repeated predictions, another approximate level, take these fractions of the time: {', '.join(shares)}." if shares else ""
+    fractions = [f"{r['case']} {100 * r['value']:.0f} %" for r in records if r["metric"] == "hold_time_ratio"]
+    repeated = (
+        f" Repeated predictions, another approximate level, take these fractions of the time: {', '.join(fractions)}." if fractions else ""
+    )
     header = ["edge state", "added", "without it [ms]", "level on [ms]", "longer by", "level off [ms]", "longer by"]
     return "\n".join(
         [
@@ -233,7 +238,7 @@ def _table(settings: Settings, num_edges: int, lines: list[str], records: list[d
             f"{calls['falling_message_passing_calls', 'off']} with the level off. A step without snow and liquid calls "
             f"{calls['absent_material_calls', 'on']} of their modules, or {calls['absent_material_calls', 'off']} with the level off. Settled piles are at "
             "perfect rest here, without gravity and with tiny accelerations. Their level is approximate; evaluation measures its error. All other levels "
-            f"are exact.{held}",
+            f"are exact.{repeated}",
         ]
     )
 

@@ -20,7 +20,7 @@ from gpe_pl.trajectory.store import array_bytes, write_shard
 
 
 class BenchmarkError(GpeError):
-    """A case could not be timed; the message names it."""
+    """Raised when a case cannot be timed; the message names it."""
 
 
 @dataclass(frozen=True)

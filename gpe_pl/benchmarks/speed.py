@@ -1,7 +1,9 @@
-"""Benchmark of speed: time of a forward pass and a training step for every interaction, plain and fast, and the baselines, on the same graph and size.
+"""Benchmark of speed: times of a forward pass and of a training step of all models on the same graph.
 
-The floor of a case is the time of its matrix products, counted operation by operation, at the machine's measured rate. The second floor is the time of moving
-every edge state in and out once per layer.
+The models are GPE with every interaction, with and without fused passes, and the baselines.
+
+Two lower bounds (floors) are reported for each case. The first is the time of its matrix products at the machine's measured rate. The second is the time for
+moving every edge state in and out of memory once per layer.
 """
 
 from __future__ import annotations
@@ -141,7 +143,10 @@ def flop(model: Model, graph: HeteroData) -> int:
 
 
 def edge_bytes(case: Case, spec: FeatureSpec, graph: HeteroData, settings: Settings) -> int:
-    """Return the least bytes of edge states that a forward pass of GPE moves: latent states in and out in all layers but the last, which only reads."""
+    """Return a lower bound of the bytes of edge states that a forward pass of GPE moves.
+
+    Latent states are written by the encoder and by every layer except the last, and read by every layer. Edge features (``geometry``) are only read.
+    """
     edges = sum(graph[r].edge_index.shape[1] * (2 if case.interaction == "directed" else 1) for r in spec.relations)
     if case.edge_state == "geometry":
         channels = next(spec.odd_channels[r] + spec.even_channels[r] for r in spec.relations)

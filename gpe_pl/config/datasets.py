@@ -29,7 +29,7 @@ TABLES = ("sizes", "dimensions", "default_dimension", "variant", "suffix", "boun
 
 
 def dataset_spec(cfg: DictConfig) -> DatasetSpec:
-    """Return the specification of a config's data set; raises ``ConfigError`` that names key and value."""
+    """Return the specification of a config's data set. A ``ConfigError`` names the key and the value."""
     from omegaconf import OmegaConf
 
     from gpe_pl.data.ground_truth import DatasetSpec

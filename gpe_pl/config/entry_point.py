@@ -81,7 +81,7 @@ class Paths:
 
 
 def construct(target: Callable[..., T], settings: Mapping[str, Any], path: str, **given: Any) -> T:
-    """Call ``target(**settings, **given)`` after checking ``settings`` against the types and ranges of its signature.
+    """Call ``target(**settings, **given)`` after checking ``settings`` against the types and ranges in the signature of ``target``.
 
     Args:
         target: class or function with annotated parameters; ranges are annotated as ``Annotated[int, pydantic.Field(ge=1)]``.
@@ -242,7 +242,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 
 
 def quoted(argument: str) -> str:
-    """Quote the value of an override if it is an existing path that contains ``=``. Folders of sweeps do, and Hydra requires quotes then."""
+    """Quote the value of an override if it is an existing path that contains ``=``, as folders of sweeps do. Hydra requires the quotes."""
     key, _, value = argument.partition("=")
     is_path = "=" in value and value[0] not in "\"'[{" and os.path.exists(value)  # Path.exists fails on names that are too long
     return f'{key}="{value}"' if is_path else argument
@@ -341,7 +341,7 @@ def _groups(config_name: str) -> set[str]:
 
 
 def output_dir(cfg: DictConfig) -> Path:
-    """Return the results folder of the running job. Without a job, as in a notebook, it is the folder of a single run."""
+    """Return the results folder of the running job. Outside a Hydra job, as in a notebook, this is the folder of a single run."""
     return Path(HydraConfig.get().runtime.output_dir) if HydraConfig.initialized() else Path(cfg.paths.runs) / run_name(cfg.name)
 
 
@@ -359,24 +359,24 @@ class Report(Callback):
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         with contextlib.suppress(OmegaConfBaseException):  # a refused name, which Hydra resolves again and reports
-            self._hold(Path(config.hydra.run.dir), config, num_processes(config))
+            self._lock_folder(Path(config.hydra.run.dir), config, num_processes(config))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         with contextlib.suppress(OmegaConfBaseException):
-            self._hold(Path(config.hydra.sweep.dir), config)
+            self._lock_folder(Path(config.hydra.sweep.dir), config)
 
-    def _hold(self, folder: Path, config: DictConfig, num_processes: int = 1) -> None:
+    def _lock_folder(self, folder: Path, config: DictConfig, num_processes: int = 1) -> None:
         """Lock the folder until the process ends, and end the process if the folder cannot be used.
 
         Hydra would turn an exception of a callback into a warning and continue.
         """
-        from gpe_pl.system.locks import held, is_later_process
+        from gpe_pl.system.locks import is_later_process, locked
         from gpe_pl.system.provenance import recorded
 
         _results.append(folder)
         try:
             refuse_links(folder)
-            self._lock.enter_context(held(folder, num_processes=num_processes))
+            self._lock.enter_context(locked(folder, num_processes=num_processes))
             if num_processes == 1 or not is_later_process():
                 self._lock.enter_context(recorded(folder, config.hydra.job.name, sys.argv[1:], str(config.paths.runs)))
         except GpeError as error:

@@ -1,4 +1,4 @@
-"""A run of ``fit``, divided into stages."""
+"""The stages of a run of ``fit``: data, number of steps, folder, training, evaluation."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class FitRun:
             window_counts(open_split(self.evaluated_root, split, cache_bytes=0), self.first_frame)
 
     def finished_model(self) -> Path | None:
-        """Return the best checkpoint of a finished run of the sweep ``reuse`` with the same training, or None."""
+        """Return the best checkpoint of a finished run with the same training in the sweep that ``reuse`` names, or None."""
         best = None if self.cfg.reuse is None else adopt(self.runs / self.cfg.reuse, self._trained, self.folder)
         if best is not None:
             end_later_processes()

@@ -4,8 +4,8 @@
 ``hydra/launcher=ray``        on the machines of a Ray cluster
 ``hydra/launcher=slurm``      as jobs of Slurm, through submitit
 
-A job is the command that would also run it alone, so results do not depend on the launcher. A sweep that is started again, by any launcher, runs only its
-unfinished jobs. The machines must share a disk and have the same environment.
+Each job runs the same command that you would type to run it alone, so results do not depend on the launcher. If you start a sweep again, with any launcher,
+only its unfinished jobs run. All machines must have a common disk and the same environment.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class Job:
 
 
 def end_with_sweep() -> None:
-    """End this run when the sweep that started it has ended for any reason. The pipe on its standard input then closes.
+    """End this run when the sweep that started it has ended. The run notices this because the pipe on its standard input closes.
 
     Otherwise a restarted sweep would find the old run still writing to its folder. A training has ``GRACE_SECONDS`` to save a checkpoint.
     """
@@ -222,7 +222,7 @@ class ProcessLauncher(CommandLauncher):
 
 
 def default_processes(num_threads: int | None, devices: int = 1) -> int:
-    """Return the number of jobs for which this machine has cores."""
+    """Return the number of jobs that this machine has cores for."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // ((num_threads or cores) * devices))
 

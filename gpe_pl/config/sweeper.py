@@ -1,8 +1,8 @@
 """A Hydra sweeper in which Optuna chooses the next trials: ``hydra/sweeper=optuna``.
 
-A sweep is an Optuna study that minimises the value which the command returns. The study is stored in a journal in the sweep's folder. The same command resumes
-it. It first repeats the best trial so far, whose folder returns the same value at once, or says what has changed. Then it continues interrupted trials. Any
-launcher can run the trials.
+A sweep is an Optuna study that minimises the value which the command returns. The study is stored in a journal in the sweep's folder, and the same command
+resumes it. A resumed study first repeats the best trial so far. The folder of that trial returns the same value at once, unless settings or data have changed.
+Then interrupted trials continue. Any launcher can run the trials.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class OptunaSweeper(Sweeper):
     """Sweeper that runs batches of trials proposed by a tree-structured Parzen estimator [Bergstra et al. 2011].
 
     Args:
-        num_trials: total number of trials, including failed ones, ones without a finite result, and ones of earlier starts.
+        num_trials: total number of trials. Failed trials, trials without a finite result and trials of earlier starts count.
         num_at_once: number of trials that are proposed together and run in parallel.
         seed: seed of the proposals.
         params: values by key, in Hydra's syntax: ``interval(1e-4, 1e-2)``, ``tag(log, interval(1e-4, 1e-2))``, ``int(interval(1, 8))``, ``choice(a, b)`` or
@@ -106,7 +106,9 @@ class OptunaSweeper(Sweeper):
         (outcome,) = self.launcher.launch([_overrides(fixed, trial)], initial_job_idx=trial.number)
         value = outcome._return_value
         if outcome.status is JobStatus.FAILED:
-            raise SweepError(f"{folder}: trial {trial.number} of an earlier start cannot be repeated: {value}")
+            raise SweepError(
+                f"{folder}: trial {trial.number} of an earlier start cannot be repeated: {value}; choose another name=… or delete the folder"
+            )
         if value != trial.value:
             raise SweepError(
                 f"{folder}: trial {trial.number} of an earlier start had {trial.value:.6g} and has {value} now, so settings or data have changed; "

@@ -1,4 +1,4 @@
-"""Check that every override has an effect. Overrides that no other setting would use are refused."""
+"""Check that every override has an effect. An override that the run would never read is refused."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gpe_pl.files.run_folder import OFFERED
+from gpe_pl.files.run_folder import LOOKUPS
 
 OF_SWEEPS = "size.comparison.seeds"
 """Key that is read at the start of a sweep, not in its runs."""
@@ -18,8 +18,8 @@ UNREAD: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "training.num_steps": ("training.budget_minutes", lambda minutes: minutes is not None),
     "training.batch_size": ("batching.max_nodes", lambda nodes: nodes is not None),
     "training.warmup_steps": ("training.schedule", lambda schedule: schedule == "exponential"),
-    "training.push_steps": ("training.push_share", lambda share: share == 0),
-    "training.push_correction": ("training.push_share", lambda share: share == 0),
+    "training.push_steps": ("training.push_share", lambda fraction: fraction == 0),
+    "training.push_correction": ("training.push_share", lambda fraction: fraction == 0),
     "training.stress_weight": ("model.stress", lambda stress: stress is False),
     "graph.num_levels": ("graph.mesh", lambda mesh: not mesh),
     "dimension": ("data.size", lambda size: size == "imported"),
@@ -37,7 +37,7 @@ def without_effect(cfg: DictConfig, overrides: Sequence[str]) -> str:
     """
     for override in overrides:
         key, _, value = override.lstrip("+").partition("=")
-        if _is_offer(key) and not key.startswith(OF_SWEEPS) and not _is_read(cfg, key):
+        if _is_in_lookup(key) and not key.startswith(OF_SWEEPS) and not _is_read(cfg, key):
             return f"{key}={value}: has no effect, because no other setting takes its value here; leave it out"
         other, is_unread = UNREAD.get(key, ("", bool))
         if other and value != "0" and is_unread(decides := OmegaConf.select(cfg, other)):
@@ -45,14 +45,14 @@ def without_effect(cfg: DictConfig, overrides: Sequence[str]) -> str:
     return ""
 
 
-def _is_offer(key: str) -> bool:
+def _is_in_lookup(key: str) -> bool:
     """Whether a key belongs to a lookup table."""
     parts = key.split(".")
-    return len(parts) > 2 and parts[0] in ("data", "size") and parts[1] in OFFERED
+    return len(parts) > 2 and parts[0] in ("data", "size") and parts[1] in LOOKUPS
 
 
 def _is_read(cfg: DictConfig, key: str) -> bool:
-    """Whether another setting uses the key's entry of a lookup table. If so, the configuration cannot be resolved without the entry."""
+    """Whether another setting uses this entry of a lookup table. In that case, the configuration cannot be resolved without the entry."""
     without = copy.deepcopy(cfg)
     group, table, entry = key.split(".")[:3]
     OmegaConf.set_struct(without, False)

@@ -1,4 +1,4 @@
-"""Checksums that identify the content of a split, independent of its folder and of how trajectories are spread over shards."""
+"""Checksums of the content of a split. They depend neither on its folder nor on how trajectories are divided among shards."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ LENGTH = 16
 
 
 def split_checksum(root: Path | str, split: str) -> str:
-    """Return the first digits of a SHA-256 over the stored digests and attributes of a split's trajectories, in order.
+    """Return the first digits of a SHA-256 digest of a split: of the stored digests and attributes of its trajectories, in order.
 
     Arrays are not read, so it takes milliseconds per shard. ``read_trajectory(verify=True)`` checks arrays against their digest.
     """

@@ -22,7 +22,7 @@ from gpe_pl.geometry.shapes import ON_SURFACE
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import SimulationError, rollout, steps
 from gpe_pl.schema import MATERIALS, node_code
-from gpe_pl.system.locks import held
+from gpe_pl.system.locks import locked
 from gpe_pl.system.progress import Progress
 from gpe_pl.system.workers import pool, results
 from gpe_pl.trajectory.store import StoreError, read_trajectory, trajectory_names, write_shard
@@ -149,7 +149,7 @@ class ControlRuns:
         """
         if not self._missing(indices):
             return
-        with held(self.folder, "paths.data", waits=True):
+        with locked(self.folder, "paths.data", waits=True):
             missing = self._missing(indices)
             done, total = len(indices) - len(missing), len(indices)
             if on_progress is not None:

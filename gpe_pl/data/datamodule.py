@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 from torch_geometric.data import HeteroData
 
 from gpe_pl.data.checksum import split_checksum
-from gpe_pl.data.dataset import HeldGraphs, StoredTrajectory, WindowDataset, collated, long_enough, open_split, usable
+from gpe_pl.data.dataset import CachedGraphs, StoredTrajectory, WindowDataset, collated, long_enough, open_split, usable
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling, probabilities
 from gpe_pl.data.statistics import acceleration_std
@@ -63,7 +63,7 @@ def data_statistics(root: Path | str) -> dict[str, float]:
 
 
 class TrajectoryDataModule(L.LightningDataModule):
-    """Training windows in an endless, resumable, seeded order, and a fixed sample of validation windows without noise.
+    """Training windows in an endless, seeded order that can be resumed, and a fixed sample of validation windows without noise.
 
     Args:
         root: folder of the data set.
@@ -78,7 +78,8 @@ class TrajectoryDataModule(L.LightningDataModule):
         num_statistics_windows: number of windows from which features are standardised, evenly spread over the ``train`` split.
 
     Attributes:
-        push_forward: settings of the push-forward trick, in whose steps batches are starts of unrolls instead of graphs; None if it is not used.
+        push_forward: settings of the push-forward trick; None if it is not used. In steps with push-forward, batches contain starts of unrolls instead of
+            graphs.
 
     Raises:
         StoreError: a split or its statistics are missing or damaged.
@@ -129,7 +130,8 @@ class TrajectoryDataModule(L.LightningDataModule):
     def _rare_graphs(self, roles: frozenset[str]) -> list[HeteroData]:
         """Sample graphs evenly from the trajectories that have nodes of all these roles.
 
-        The list is empty if the sample of the whole split has enough such trajectories, or if all or no trajectories have these roles.
+        The list is empty in two cases: the sample of the whole split already has enough such trajectories, or either all or none of the trajectories have these
+        roles.
         """
         has = np.array([roles <= own for own in self._roles])
         if has.all() or not has.any():
@@ -143,7 +145,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         return [self.train_set[int(windows[k])] for k in _spread(len(windows), enough)]
 
     def _touching_graphs(self, relation: EdgeType, known: list[HeteroData]) -> list[HeteroData]:
-        """Search random windows for graphs with edges of a relation, if few of the known graphs have any; otherwise return the known ones."""
+        """Return graphs with edges of a relation. If few of the ``known`` graphs have such edges, random windows are searched for more."""
         num_known = sum(graph[relation].edge_index.shape[1] > 0 for graph in known)
         if num_known >= max(1, round(FEW_CONTACTS * self.num_statistics_windows)):
             return known
@@ -172,7 +174,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         return found
 
     def parameter_ranges(self) -> dict[str, torch.Tensor]:
-        """Lowest and highest value [2, 1] of the parameter of each material that occurs in the training trajectories."""
+        """Return the lowest and highest value [2, 1] of the parameter of each material that occurs in the training trajectories."""
         found: dict[str, list[np.ndarray]] = {}
         for stored in self.train_set.trajectories:
             first = stored.window(0, 1)
@@ -184,7 +186,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         return {m: torch.tensor([[np.min(pairs)], [np.max(pairs)]], dtype=torch.float32) for m, pairs in found.items()}
 
     def trained_scene(self) -> np.ndarray:
-        """Ranges of gravity and of boundary nodes over all training trajectories; see ``scene_ranges``."""
+        """Return ranges of gravity and of boundary nodes over all training trajectories; see ``scene_ranges``."""
         return united(map(_scene, self.train_set.trajectories))
 
     def val_trajectories(self, count: int) -> list[Trajectory]:
@@ -207,11 +209,13 @@ class TrajectoryDataModule(L.LightningDataModule):
     def val_dataloader(self) -> DataLoader:
         windows = [int(w) for w in _spread(len(self.val_set), self.num_val_windows)]
         if len(windows) < ranks.num_ranks():
-            raise StoreError(f"{self.root}: split 'val' has {len(windows)} windows, too few for {ranks.num_ranks()} processes")
+            raise StoreError(
+                f"{self.root}: split 'val' has {len(windows)} windows, too few for {ranks.num_ranks()} processes; lower trainer.devices"
+            )
         max_nodes = self.batch_size.max_nodes
         size = BatchSize(NUM_VAL_GRAPHS, None if max_nodes is None else max(1, max_nodes // ranks.num_ranks()))
         batches = size.once(self.val_set, windows[ranks.rank() :: ranks.num_ranks()])
-        return DataLoader(HeldGraphs(self.val_set), batch_sampler=batches, collate_fn=collated)
+        return DataLoader(CachedGraphs(self.val_set), batch_sampler=batches, collate_fn=collated)
 
 
 def _spread(length: int, count: int) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Training samples: short windows of trajectories as graphs with a target acceleration.
 
-A sample is a pure function of split, seed and sample number. Runs therefore resume exactly, with any number of workers. Stored arrays are read-only.
+A sample depends only on split, seed and sample number. Runs therefore resume exactly, with any number of workers. Cached arrays are read-only.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ class StartKey(NamedTuple):
     Attributes:
         sample: sample number.
         window: number of the window at which the unroll starts.
-        own_steps: number of steps of the unroll.
+        num_steps: number of steps of the unroll.
         lane: number of the lane.
         correction: fraction of the velocity's deviation after the unroll that the target removes within one step.
     """
 
     sample: int
     window: int
-    own_steps: int
+    num_steps: int
     lane: int = 0
     correction: float = 1.0
 
@@ -71,14 +71,14 @@ class StoredTrajectory:
         name: name of the trajectory in the shard.
         num_frames: number of frames.
         num_nodes: number of dynamic nodes.
-        held: the trajectory if the split is cached in memory and its values are valid, else None.
+        cached: the trajectory if the split is cached in memory and its values are valid, else None.
     """
 
     path: Path
     name: str
     num_frames: int
     num_nodes: int
-    held: Trajectory | None
+    cached: Trajectory | None
 
     def window(self, start: int, stop: int) -> Trajectory:
         """Return the frames ``start:stop``.
@@ -86,34 +86,34 @@ class StoredTrajectory:
         Raises:
             StoreError: the trajectory cannot be read, or has values that nothing can be learned from.
         """
-        if self.held is not None:
-            return self.held.frames(start, stop)
+        if self.cached is not None:
+            return self.cached.frames(start, stop)
         return read_trajectory(self.path, self.name, frames=slice(start, stop))
 
     def whole(self) -> Trajectory:
-        """Return all frames, checked against their stored digest; raises ``StoreError`` as ``window`` does."""
-        return read_trajectory(self.path, self.name, verify=True) if self.held is None else self.held
+        """Return all frames after comparing them with their stored digest. Errors are those of ``window``."""
+        return read_trajectory(self.path, self.name, verify=True) if self.cached is None else self.cached
 
 
 def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> list[StoredTrajectory]:
     """Index all trajectories of a split, and cache them in memory if the split is small enough."""
     paths = shards(root, split)
-    hold = 2 * sum(p.stat().st_size for p in paths) <= cache_bytes
+    fits = 2 * sum(p.stat().st_size for p in paths) <= cache_bytes
     stored = []
     for path in paths:
         with open_shard(path) as file:
             shapes = {name: open_field(open_group(file, name), "pos").shape[:2] for name in sorted(file)}
         for name, (num_frames, num_nodes) in shapes.items():
-            held = None
-            if hold:
+            cached = None
+            if fits:
                 with suppress(UnsoundError):  # ``usable`` reports it
-                    held = _read_only(read_trajectory(path, name, verify=True))
-            stored.append(StoredTrajectory(path, name, num_frames, num_nodes, held))
+                    cached = _read_only(read_trajectory(path, name, verify=True))
+            stored.append(StoredTrajectory(path, name, num_frames, num_nodes, cached))
     return stored
 
 
 def long_enough(root: Path | str, split: str, history: int) -> Iterator[Trajectory]:
-    """Yield the valid trajectories of a split with at least ``history + 2`` frames; warns of the others.
+    """Yield the valid trajectories of a split that have at least ``history + 2`` frames, and warn of the others.
 
     A model needs ``history`` velocities before a frame and one frame to predict.
     """
@@ -138,10 +138,10 @@ def _warn(path: Path, name: str, fault: str) -> None:
 
 
 def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
-    """Return the trajectories that can be learned from; warns of the others.
+    """Return the trajectories that can be learned from, and warn of the others.
 
     Raises:
-        StoreError: none can be used, or more than one and more than a fraction ``MAX_DAMAGED`` of them cannot.
+        StoreError: no trajectory can be used, or too many cannot: more than one, and more than the fraction ``MAX_DAMAGED``.
     """
     found = []
     for stored in trajectories:
@@ -156,12 +156,14 @@ def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
     num_damaged = len(trajectories) - len(found)
     if not found or num_damaged > max(1, MAX_DAMAGED * len(trajectories)):
         where = trajectories[0].path.parent
-        raise StoreError(f"{where}: {num_damaged} of {len(trajectories)} trajectories cannot be used; see the warnings above")
+        raise StoreError(
+            f"{where}: {num_damaged} of {len(trajectories)} trajectories cannot be used; see the warnings above, then generate or import the data again"
+        )
     return found
 
 
 def damage(trajectory: Trajectory) -> str | None:
-    """Describe why a trajectory with valid values cannot be learned from, with frame and node; None if it can."""
+    """Say why nothing can be learned from a trajectory whose values are valid, with frame and node. None means that it can be used."""
     pos, metadata = trajectory.pos, trajectory.metadata
     if trajectory.num_nodes == 0:
         return "it has no nodes"
@@ -180,7 +182,7 @@ def damage(trajectory: Trajectory) -> str | None:
 def _jump(trajectory: Trajectory) -> str | None:
     """Describe the first node that moves farther than ``MAX_JUMP`` radii between two frames, but hardly moves before or after them.
 
-    A fast node is fast for more than one frame. A corrupt frame would be the largest acceleration of all, and would distort the scale of all others.
+    A node that is really fast is fast for several frames. A single corrupt frame would give the largest acceleration of the data set and distort its scale.
     """
     limit = MAX_JUMP * trajectory.metadata.connectivity_radius
     for start in range(0, trajectory.num_frames - 1, FRAMES_AT_ONCE):
@@ -212,8 +214,8 @@ class Start:
 
     Attributes:
         state: initial state with noise, as float64 tensors.
-        truth: true positions [own_steps + 2, node, dim] in m of the frames from the state's on.
-        stress: true Cauchy stress [own_steps + 1, node, component] in Pa of the frames after the state's, if it is asked for.
+        truth: true positions [num_steps + 2, node, dim] in m of the frames from the state's on.
+        stress: true Cauchy stress [num_steps + 1, node, component] in Pa of the frames after the state's; None if the data set was made without ``stress``.
         position_correction: fraction of the deviation from the true position that the target removes within one step; see ``Noise``.
         velocity_correction: fraction of the deviation from the true velocity that the target removes within one step, after the unroll; as in the key.
         about: numbers of trajectory and frame, and the weight in the loss if there is one.
@@ -230,7 +232,7 @@ class Start:
     lane: int
 
     @property
-    def own_steps(self) -> int:
+    def num_steps(self) -> int:
         """Number of steps of the unroll."""
         return self.truth.shape[0] - 2
 
@@ -250,8 +252,8 @@ class Start:
         if step:  # the velocity noise of the start is removed entirely
             before = integrators.velocities(self.truth[step - 1 : step + 1], dt, where)[0]
             vel = vel + (1 - self.velocity_correction) * (state.vel - before)
-        astray = integrators.velocities(torch.stack([self.truth[step], state.pos]), dt, where)[0]
-        target = integrators.acceleration(vel - self.position_correction * astray, state.vel, dt) - state.gravity
+        deviation = integrators.velocities(torch.stack([self.truth[step], state.pos]), dt, where)[0]
+        target = integrators.acceleration(vel - self.position_correction * deviation, state.vel, dt) - state.gravity
         return training_graph(builder, state, target, None if self.stress is None else self.stress[step], self.about)
 
 
@@ -289,7 +291,7 @@ def window_counts(trajectories: Sequence[StoredTrajectory], history: int) -> lis
         longest = max((t.num_frames for t in trajectories), default=0)
         where = f"{trajectories[0].path.parent}: " if trajectories else ""
         needed = f"{history + 2} frames that a start at frame {history} needs (graph.history, evaluation.start_frame)"
-        raise StoreError(f"{where}no trajectory has the {needed}; the longest has {longest}")
+        raise StoreError(f"{where}no trajectory has the {needed}; the longest has {longest}; choose a smaller frame or longer trajectories")
     return counts
 
 
@@ -343,7 +345,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         return self.trajectories[self.locate(window)[0]].num_nodes
 
     def activity(self) -> np.ndarray:
-        """Root mean square acceleration without gravity of each window [window] in m/s²; reads the whole split."""
+        """Return the root mean square acceleration without gravity of each window [window] in m/s². This reads the whole split."""
         values = []
         for stored in self.trajectories:
             trajectory = stored.window(0, stored.num_frames)
@@ -366,7 +368,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         number, frame = self.locate(window)
         history = self.builder.config.history
         stored = self.trajectories[number]
-        ahead = 0 if start is None else min(start.own_steps, stored.num_frames - 2 - frame)
+        ahead = 0 if start is None else min(start.num_steps, stored.num_frames - 2 - frame)
         trajectory = stored.window(frame - history, frame + 2 + ahead)
         dt = trajectory.metadata.frame_dt
         truth = trajectory.pos.astype(np.float64)
@@ -405,7 +407,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         return training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[-1], about)
 
 
-class HeldGraphs(Dataset[HeteroData]):
+class CachedGraphs(Dataset[HeteroData]):
     """Windows as graphs that are built at first use and then cached.
 
     Args:
@@ -415,14 +417,14 @@ class HeldGraphs(Dataset[HeteroData]):
 
     def __init__(self, windows: WindowDataset, cache_bytes: int = CACHE_BYTES) -> None:
         self.windows, self.free_bytes = windows, cache_bytes
-        self.held: dict[int, HeteroData] = {}
+        self.graphs: dict[int, HeteroData] = {}
 
     def __getitem__(self, window: int) -> HeteroData:
-        if window in self.held:
-            return self.held[window]
+        if window in self.graphs:
+            return self.graphs[window]
         graph = self.windows[window]
         size = sum(value.nbytes for store in graph.stores for value in store.values() if isinstance(value, Tensor))
         if size <= self.free_bytes:
             self.free_bytes -= size
-            self.held[window] = graph
+            self.graphs[window] = graph
         return graph

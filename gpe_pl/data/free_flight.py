@@ -1,7 +1,8 @@
-"""Groups of nodes in free flight. They touch nothing, so their acceleration should be the gravity of the data.
+"""Groups of nodes in free flight. They touch nothing, so their acceleration should equal the gravity of the data.
 
-A group is a connected component of the graph, an island. It is in free flight if no boundary node lies within the neighbour radius of its nodes, in this frame
-and in the frame before (where its nodes may form several islands). Nothing in the graph tells a model to move such a group other than by gravity.
+A group is an island: a connected component of the graph. It is in free flight if no boundary node lies within the neighbour radius of its nodes, neither in
+this frame nor in the frame before. In the frame before, its nodes may belong to several islands. The graph of such a group contains no cause of any
+acceleration except gravity.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Parallel, resumable generation of data sets.
 
-Every trajectory is a pure function (see ``ground_truth``) and every shard appears atomically. A killed run therefore resumes where it stopped and leaves the
-same bytes as an uninterrupted run. A shard that can be opened counts as complete; ``discard_damaged`` checks every byte. Layout::
+Every trajectory depends only on its specification (see ``ground_truth``), and every shard is written atomically. A killed run therefore resumes where it
+stopped, and its files equal those of an uninterrupted run. A shard that can be opened counts as complete; ``discard_damaged`` checks every byte. Layout::
 
     {root}/{name}/{size}/dataset.json            the spec and its checksum, written first
     {root}/{name}/{size}/{split}/shard-00000.h5
@@ -27,14 +27,14 @@ import numpy as np
 
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.ground_truth import DatasetSpec, GenerationError, generate_trajectory, initial_state
-from gpe_pl.data.motion import ROUNDING_SHARE, motion_of, rounding_fault, rounding_of
+from gpe_pl.data.motion import ROUNDING_FRACTION, motion_of, rounding_fault, rounding_of
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.files import sealed
 from gpe_pl.files.atomic import free_bytes, replace_text
 from gpe_pl.files.run_folder import refuse_links, without_orphans
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.solvers.caution import unresolved
-from gpe_pl.system.locks import held
+from gpe_pl.system.locks import locked
 from gpe_pl.system.progress import Progress
 from gpe_pl.system.workers import pool, results
 from gpe_pl.trajectory.store import StoreError, read_trajectory, trajectory_names, write_shard
@@ -50,13 +50,13 @@ SCENES_LOOKED_AT = 8
 """Number of scenes that are checked for meshes that are too thin, because bodies of one data set differ."""
 
 ROUNDING_REFUSED = 0.5
-"""Maximum rounding error of accelerations due to stored positions, as a fraction of the accelerations. Above ``ROUNDING_SHARE`` a warning is logged."""
+"""Maximum rounding error of accelerations due to stored positions, as a fraction of the accelerations. Above ``ROUNDING_FRACTION`` a warning is logged."""
 
 # --- shards --------------------------------------------------------------------------------------------------------------------------------
 
 
 def shard_path(folder: Path, split: str, shard: int) -> Path:
-    """Path of a shard inside the folder of a data set."""
+    """Return the path of a shard inside the folder of a data set."""
     return folder / split / f"shard-{shard:05d}.h5"
 
 
@@ -66,7 +66,7 @@ def _shard_indices(spec: DatasetSpec, split: str, shard: int) -> range:
 
 
 def _shards(spec: DatasetSpec, part: tuple[int, int] = (0, 1)) -> list[tuple[str, int]]:
-    """Return split and number of each shard, or with ``part = (k, n)`` of every n-th shard from the k-th on."""
+    """Return split and number of each shard. With ``part = (k, n)``, return those of every n-th shard from the k-th on."""
     if not 0 <= part[0] < part[1]:
         raise ValueError(f"part must be (k, n) with 0 <= k < n, got {part}")
     every = [(split, k) for split, count in spec.counts.items() for k in range(math.ceil(count / spec.trajectories_per_shard))]
@@ -82,7 +82,7 @@ def _is_complete(spec: DatasetSpec, folder: Path, split: str, shard: int) -> boo
 
 
 def _fault(path: Path) -> tuple[Path, str]:
-    """Return the path of a shard and why it cannot be used, or an empty text if its content agrees with its checksums."""
+    """Return the path of a shard, and the reason why it cannot be used. The reason is empty if its content agrees with its checksums."""
     try:
         for name in trajectory_names(path):
             read_trajectory(path, name, verify=True)
@@ -99,7 +99,10 @@ def _write_shard(spec: DatasetSpec, folder: Path, split: str, shard: int) -> int
 
 
 def _bytes_per_trajectory(spec: DatasetSpec) -> int:
-    """Estimate the uncompressed size of a trajectory [bytes], with the scene's maximum of nodes and cells, and the first scene's boundary nodes."""
+    """Estimate the uncompressed size of a trajectory [bytes].
+
+    The estimate takes the largest number of nodes and cells of a scene, and the number of boundary nodes of the first scene.
+    """
     dim = len(spec.scene.bounds)
     per_frame = 2 * dim * spec.scene.max_nodes
     if spec.solver.stores_stress:
@@ -118,7 +121,7 @@ def dataset_bytes(spec: DatasetSpec) -> int:
 
 @dataclass(frozen=True)
 class Plan:
-    """The missing part of a data set, and the room that it needs.
+    """The missing part of a data set, and the disk space that it needs.
 
     Attributes:
         missing: split and number of each missing shard.
@@ -135,7 +138,7 @@ class Plan:
 
     @property
     def fits(self) -> bool:
-        """Whether the disk has enough room."""
+        """Whether the disk has enough free space."""
         return self.bytes_needed <= 0.95 * self.bytes_free
 
 
@@ -151,7 +154,7 @@ def plan(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1)) ->
 def discard_damaged(root: Path | str, spec: DatasetSpec, num_workers: int = 1, part: tuple[int, int] = (0, 1)) -> None:
     """Delete shards and statistics that do not agree with their checksums, so that ``generate`` creates them again.
 
-    Each deleted file is logged. Reading everything takes about a twentieth of the time to generate it. If nothing is damaged, nothing is written. Arguments and
+    Each deleted file is logged. If nothing is damaged, nothing is written. Reading a data set takes about a twentieth of the time to generate it. Arguments and
     errors are those of ``generate``.
     """
     folder = Path(root) / spec.name / spec.size
@@ -228,16 +231,18 @@ def seconds_per_trajectory(spec: DatasetSpec, budget: float = 10.0) -> float:
 
 
 def check_rounding(spec: DatasetSpec) -> None:
-    """Check that the frame interval is not so short that rounding dominates stored accelerations; warns if it is nearly so short.
+    """Check that the frame interval is long enough for stored accelerations to be precise; warn if it is nearly too short.
 
-    If the bounds alone cannot exclude this, a training trajectory is simulated and measured.
+    Positions are stored in single precision. The error of an acceleration due to rounding grows with the inverse square of the frame interval.
+
+    If the bounds of the domain alone do not show that rounding is small, a training trajectory is simulated and measured.
 
     Raises:
         GenerationError: rounding of float32 positions is more than a fraction ``ROUNDING_REFUSED`` of the accelerations, or the trajectory failed.
     """
     dt = spec.solver.frame_dt
     rounding = float(rounding_of(np.abs(np.array(spec.scene.bounds)).max(axis=1), dt).max())
-    if rounding <= ROUNDING_SHARE * float(np.linalg.norm(spec.scene.gravity)):  # nodes that meet a wall accelerate at least as much
+    if rounding <= ROUNDING_FRACTION * float(np.linalg.norm(spec.scene.gravity)):  # nodes that meet a wall accelerate at least as much
         return
     trajectory = generate_trajectory(spec, "train", 0)
     acceleration = motion_of(trajectory.metadata, trajectory.pos).acceleration
@@ -293,15 +298,15 @@ def generate(
 
 
 def written(root: Path | str, spec: DatasetSpec, part: tuple[int, int] = (0, 1), waits: bool = False) -> AbstractContextManager[None]:
-    """Keep other processes from writing the data set, or the same part of it, inside the block; arguments and errors are those of ``locks.held``."""
+    """Keep other processes from writing the data set, or the same part of it, inside the block. Errors are those of ``locks.locked``."""
     folder = Path(root) / spec.name / spec.size
     if part[1] == 1:
-        return held(folder, "paths.data", waits)
-    return held(folder.with_name(f"{spec.size}-part-{part[0]}-of-{part[1]}"), "paths.data", waits, makes=False)
+        return locked(folder, "paths.data", waits)
+    return locked(folder.with_name(f"{spec.size}-part-{part[0]}-of-{part[1]}"), "paths.data", waits, makes=False)
 
 
 def _generate(folder: Path, to_do: Plan, spec: DatasetSpec, num_workers: int, on_progress: Progress | None, part: tuple[int, int]) -> None:
-    with held(folder, "paths.data", waits=True):  # of parts generated at the same time, one writes the spec
+    with locked(folder, "paths.data", waits=True):  # of parts generated at the same time, one writes the spec
         _claim(folder, spec)
     if not to_do.fits:
         raise GenerationError(
@@ -338,11 +343,11 @@ def _draw_contact_sheet(spec: DatasetSpec, path: Path, workers: Executor | None)
     from gpe_pl.viz.saving import save_figure
 
     rows: dict[str, dict[str, float]] = {}
-    for share in np.linspace(0.0, 1.0, SHEET_ROWS):
+    for fraction in np.linspace(0.0, 1.0, SHEET_ROWS):
         values = {}
         for material, choices in spec.parameters.items():
             every = sorted({*choices.seen, *choices.interpolated, *choices.extrapolated})
-            values[material] = every[round(share * (len(every) - 1))]
+            values[material] = every[round(fraction * (len(every) - 1))]
         rows[row_label(values)] = values
     index = _most_varied_scene(spec)
     arguments = [(spec, index, label, values) for label, values in rows.items()]

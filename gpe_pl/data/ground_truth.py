@@ -1,6 +1,6 @@
 """Specification of generated data sets, and simulation of any of their trajectories.
 
-Every trajectory is a pure function of ``(spec, split, index)``. ``generation`` stores trajectories.
+Every trajectory depends only on ``(spec, split, index)``. The module ``generation`` stores trajectories.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Count = Annotated[int, Field(ge=0, le=MOST)]
 
 
 class GenerationError(GpeError):
-    """Raised when data cannot be generated; names split, index and seed of the trajectory that failed, if there is one."""
+    """Raised when data cannot be generated. If a trajectory failed, the error names its split, index and seed."""
 
     def __init__(self, message: str, split: str = "", index: int = -1, seed: int = -1) -> None:
         super().__init__(message)
@@ -94,7 +94,7 @@ class ParameterValues:
 
 @dataclass(frozen=True, config={"extra": "forbid", "arbitrary_types_allowed": True})
 class DatasetSpec:
-    """Specification of a data set, which determines all its bytes.
+    """Specification of a data set. It determines all bytes of the data set.
 
     Attributes:
         name, size: names of its folders.
@@ -160,7 +160,8 @@ class DatasetSpec:
     def as_dict(self) -> dict[str, Any]:
         """Convert to plain JSON values.
 
-        They include everything else that the bytes depend on: the solver's name, version and largest substep, and checksums of the scene's files.
+        The values include everything else that the bytes of the data depend on: the solver's name, version and largest substep, and checksums of the scene's
+        files.
         """
         files = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in self.scene.input_files.values()}
         return json.loads(json.dumps({**asdict(self), **self.provenance, "input_files": files}))  # type: ignore[call-overload]
@@ -175,8 +176,8 @@ def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:
 def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[str, float], ParameterGroup]:
     """Return the parameter of each material in one trajectory, and the group that these values belong to.
 
-    The values of the first material are used in turn. The values of any other material are also used in turn, but each round has a random order, so that
-    parameters of different materials are independent.
+    The values of the first material are used in turn. The values of each other material are also used in turn, but in a random order in each round. Parameters
+    of different materials are therefore independent.
     """
     group: ParameterGroup = "seen"
     if split == "test_unseen":

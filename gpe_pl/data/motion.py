@@ -4,8 +4,8 @@ Positions that are rounded to multiples of q have the error q/√12 (rms, unifor
 
     q/√12 · √(1 + 4 + 1) / Δt² = q / (√2 Δt²)
 
-Here q is the distance of neighbouring floating-point numbers, which grows with the distance from the origin. If a source has positions on a grid of marks,
-such as the last digit in a text file or the pixels of a camera, q is the distance of these marks.
+For floating-point positions, q is the distance of neighbouring numbers, which grows with the distance from the origin. The positions of some sources are
+multiples of a coarser step, called the distance of marks here: the last digit in a text file, or the pixel of a camera. Then q is that distance.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gpe_pl.trajectory.trajectory import Metadata
 Precision = type[np.float16] | type[np.float32] | type[np.float64]
 PRECISIONS: tuple[Precision, ...] = (np.float16, np.float32, np.float64)
 
-ROUNDING_SHARE = 0.1
+ROUNDING_FRACTION = 0.1
 """Largest acceptable rounding error of accelerations, as a fraction of the accelerations. It is a hundredth of their variance, which no model can learn."""
 
 
@@ -40,12 +40,12 @@ ON_MARKS = 0.99
 
 
 def rounding_to(step: np.ndarray, frame_dt: float) -> np.ndarray:
-    """Rms error of accelerations [dim] in m/s² if positions are rounded to multiples of ``step`` [dim] in m."""
+    """Return the rms error of accelerations [dim] in m/s² if positions are rounded to multiples of ``step`` [dim] in m."""
     return step / (math.sqrt(2) * frame_dt**2)
 
 
 def rounding_of(farthest: np.ndarray, frame_dt: float, precision: Precision = np.float32) -> np.ndarray:
-    """Rms error of accelerations [dim] in m/s² if positions at most ``farthest`` [dim] in m from the origin are rounded to a precision."""
+    """Return the rms error of accelerations [dim] in m/s² if positions at most ``farthest`` [dim] in m from the origin are rounded to a precision."""
     return rounding_to(np.spacing(np.abs(farthest).astype(precision)).astype(np.float64), frame_dt)
 
 
@@ -57,13 +57,13 @@ def rounding_fault(rounding: float, acceleration: float, where: str = "in float3
         acceleration: rms acceleration of the data [m/s²].
         where: how positions are rounded, for the message.
     """
-    if rounding <= ROUNDING_SHARE * acceleration:
+    if rounding <= ROUNDING_FRACTION * acceleration:
         return ""
     return f"positions {where} round accelerations by {rounding:.3g} m/s², those of the data are {acceleration:.3g} m/s² rms"
 
 
 def marks(changes: np.ndarray, rounding: float) -> float:
-    """Distance of the marks on which coordinates lie [m]; 0 if there are no marks, or floating-point numbers explain them.
+    """Return the distance of the marks [m] of which coordinates are multiples; 0 if there are none, or if they are only those of floating-point numbers.
 
     Second differences of coordinates on marks are multiples of the marks' distance and have both signs. Rounding has no direction, unlike gravity.
 
@@ -88,7 +88,7 @@ class MotionSummary:
         low, high: smallest and largest positions [dim] in m.
         frame_dt: time between frames [s].
         precision: coarsest floating-point type that represents all positions exactly, independent of the array's type.
-        marks: distance of the marks on which positions lie [dim] in m; 0 if there are none coarser than ``precision``.
+        marks: distance of the marks of which positions are multiples [dim] in m; 0 if there are none coarser than ``precision``.
         acceleration: rms acceleration without gravity [m/s²].
         mean_acceleration: mean acceleration without gravity [dim] in m/s².
         step: largest displacement of a node between two frames [m].
@@ -108,7 +108,7 @@ class MotionSummary:
     node: int
 
     def rounding(self, precision: Precision, origin: np.ndarray) -> np.ndarray:
-        """Rms error of accelerations [dim] in m/s² if positions are rounded to a precision in coordinates with this origin [dim] in m."""
+        """Return the rms error of accelerations [dim] in m/s² if positions are rounded to a precision in coordinates with this origin [dim] in m."""
         return rounding_of(np.maximum(np.abs(self.low - origin), np.abs(self.high - origin)), self.frame_dt, precision)
 
     @property
@@ -165,7 +165,8 @@ def motion_of(m: Metadata, pos: np.ndarray) -> MotionSummary:
 def better_origin(motions: list[MotionSummary], tolerance: float) -> np.ndarray:
     """Choose the origin [dim] in m that stored positions need so that float32 rounds accelerations by at most ``tolerance`` [m/s²].
 
-    It is a round number near the middle of all positions along axes where this helps, and 0 along other axes. It is 0 unless positions are finer than float32.
+    The origin is 0 unless some positions are finer than float32 and the rounding error at the present origin exceeds the tolerance. It then is a round number
+    near the middle of all positions, along the axes where that halves the largest coordinate.
     """
     low, high = np.min([m.low for m in motions], axis=0), np.max([m.high for m in motions], axis=0)
     nowhere, digits = np.zeros(len(low)), -math.ceil(math.log10((high - low).max()))

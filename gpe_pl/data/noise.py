@@ -4,8 +4,8 @@ A window has positions x[t−H … t+1] [history + 2, node, dim]. Both kinds of 
 the noisy window by the formulas of the integrator.
 
 - Position noise: the same offset on every position, including the target's (paper, section 3.2). It does not change velocities and target.
-- Velocity noise: a random walk over the H velocities, integrated to positions. The next velocity is the true one, so the target corrects the velocity noise
-  entirely and the resulting position noise not at all [Sanchez-Gonzalez et al. 2020, as in their published code].
+- Velocity noise: a random walk over the H velocities, integrated to positions. The next velocity is the true one. The target therefore removes all of the
+  velocity noise, but none of the position noise that follows from it [Sanchez-Gonzalez et al. 2020, as in their published code].
 """
 
 from dataclasses import dataclass
@@ -36,8 +36,8 @@ class Noise:
         position_of_domain: standard deviation of the position noise, as a fraction of the domain's longest side.
         velocity_of_change: standard deviation of the velocity noise in units of one frame's velocity change, which is the root mean square acceleration
             without gravity × frame interval.
-        correction: fraction of the noise on the last position that the target removes within the step [γ of Pfaff et al. 2021, appendix A.2.2]. A model
-            needs some to learn to correct positions; the paper uses none.
+        correction: fraction of the noise on the last position that the target removes within the step [γ of Pfaff et al. 2021, appendix A.2.2]. With a value
+            above 0, a model learns to correct positions. The paper uses 0.
     """
 
     position_of_domain: Annotated[float, Field(ge=0, le=1)] = 0.0

@@ -18,12 +18,12 @@ from gpe_pl.trajectory.store import StoreError
 Sampling = Literal["uniform", "activity"]
 """How often windows are drawn: ``uniform`` draws all equally often, ``activity`` in proportion to their rms acceleration."""
 
-UNIFORM_SHARE = 0.2
+UNIFORM_FRACTION = 0.2
 """Fraction of samples that ``activity`` sampling draws uniformly, which limits the weights to 5."""
 
 
 def probabilities(activity: np.ndarray) -> np.ndarray:
-    """Probability of each window [window] with ``activity`` sampling.
+    """Return the probability of each window [window] with ``activity`` sampling.
 
     The gradient of a squared error grows with the error, and the error grows with the acceleration to predict. Drawing in proportion to the acceleration and
     weighting by the inverse reduces the variance and does not change the expected gradient [importance sampling, Katharopoulos and Fleuret 2018,
@@ -35,7 +35,7 @@ def probabilities(activity: np.ndarray) -> np.ndarray:
     total = activity.sum()
     if not total > 0:
         return np.full(len(activity), 1 / len(activity))
-    return UNIFORM_SHARE / len(activity) + (1 - UNIFORM_SHARE) * activity / total
+    return UNIFORM_FRACTION / len(activity) + (1 - UNIFORM_FRACTION) * activity / total
 
 
 NUM_LANES = 16
@@ -44,7 +44,7 @@ NUM_LANES = 16
 
 @dataclass(frozen=True)
 class PushForward:
-    """Settings of the push-forward trick: late in training, samples are states that the model itself has reached from a true state.
+    """Settings of the push-forward trick: late in training, samples are states that the model has reached by an unroll from a true state.
 
     Such an unroll has up to ``max_steps`` steps, without gradient [Brandstetter et al. 2022, section 3.1].
 
@@ -69,10 +69,10 @@ class PushForward:
         lanes = [next(batches) for _ in range(NUM_LANES)]
         for turn in count():
             for lane in range(NUM_LANES):
-                own_steps = (turn + lane * num_visits // NUM_LANES) % num_visits
-                if turn and not own_steps:
+                num_steps = (turn + lane * num_visits // NUM_LANES) % num_visits
+                if turn and not num_steps:
                     lanes[lane] = next(batches)
-                yield [StartKey(sample, window, own_steps, lane, self.correction) for sample, window in lanes[lane]]
+                yield [StartKey(sample, window, num_steps, lane, self.correction) for sample, window in lanes[lane]]
 
 
 class StepSampler(Sampler[tuple[int, int]]):
@@ -108,8 +108,8 @@ class BatchSize:
 
     Attributes:
         num_graphs: number of samples, unless ``max_nodes`` is given.
-        max_nodes: maximum number of nodes (see ``WindowDataset.num_nodes``). A step then takes the next samples in the order until this limit, and at least
-            one.
+        max_nodes: maximum number of nodes (see ``WindowDataset.num_nodes``). With it, a step takes the next samples in order up to this limit, but at least one
+            sample.
     """
 
     num_graphs: Annotated[int, Field(ge=1)]
@@ -145,7 +145,7 @@ class BatchSize:
 
 
 class BatchSampler(Sampler[list[Key]]):
-    """Samples of this rank in each optimiser step. All ranks follow one order, which is also the order of a single process.
+    """Samples of this rank in each optimiser step. All ranks together follow the order that a single process would follow.
 
     Args:
         data: training windows.
@@ -167,7 +167,9 @@ class BatchSampler(Sampler[list[Key]]):
         if fewest < ranks.num_ranks() > 1:
             what = f"training.batch_size={size.num_graphs}" if size.max_nodes is None else f"batching.max_nodes={size.max_nodes}"
             nodes = "" if size.max_nodes is None else f" of up to {largest} nodes"
-            raise StoreError(f"{what}: too small for {ranks.num_ranks()} processes, each of which takes at least one graph{nodes}")
+            raise StoreError(
+                f"{what}: too small for {ranks.num_ranks()} processes, each of which takes at least one graph{nodes}; raise it, or lower trainer.devices"
+            )
 
     def __iter__(self) -> Iterator[list[Key]]:
         first, push = self.step(), self.push_forward

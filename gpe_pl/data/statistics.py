@@ -21,7 +21,7 @@ FRAMES_AT_ONCE = 2048
 
 
 def shard_moments(path: Path) -> tuple[str, dict[str, Any]]:
-    """Return the path of a shard and the sums over it from which the statistics follow."""
+    """Return the path of a shard, and sums over its trajectories, from which the statistics are computed."""
     sums: dict[str, Any] = {"velocity": [0, 0.0], "acceleration": [0, 0.0], "params": None, "nodes": 0, "frames": 0, "trajectories": 0}
     for name in trajectory_names(path):
         trajectory = read_trajectory(path, name)
@@ -41,7 +41,7 @@ def shard_moments(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def acceleration_std(trajectories: Iterable[Trajectory]) -> float:
-    """Root mean square per component of accelerations without gravity [m/s²]."""
+    """Return the root mean square per component of accelerations without gravity [m/s²]."""
     sums = [(float(np.sum(v * v)), v.size) for t in trajectories for key, v in motion(t) if key == "acceleration"]
     power, count = np.sum(sums, axis=0)
     return math.sqrt(power / max(1, count))
@@ -58,7 +58,7 @@ def motion(trajectory: Trajectory) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _scaled(trajectory: Trajectory) -> np.ndarray:
-    """Material parameters [node, param]; natural logarithms of those with a logarithmic scale."""
+    """Return material parameters [node, param]; natural logarithms of those with a logarithmic scale."""
     scale = {p.name: p.scale for p in MATERIALS.values()}
     columns = trajectory.material_params.astype(np.float64).T
     return np.stack([np.log(c) if scale[n] == "log" else c for n, c in zip(trajectory.metadata.param_names, columns, strict=True)], axis=-1)
@@ -67,8 +67,8 @@ def _scaled(trajectory: Trajectory) -> np.ndarray:
 def combined(moments: list[dict[str, Any]]) -> dict[str, Any]:
     """Combine the sums of shards into statistics.
 
-    They are root mean squares per component of velocities and accelerations, and mean and standard deviation of material parameters on the scale that
-    ``schema`` gives them.
+    The statistics are the root mean squares per component of velocities [m/s] and accelerations [m/s²], and the mean and standard deviation of each material
+    parameter on its scale in ``schema``.
     """
     rms = {}
     for key in ("velocity", "acceleration"):

@@ -155,7 +155,7 @@ class Result:
 
 
 def validate(paths: Iterable[Path | str]) -> Result:
-    """Check shards and folders of shards. No content raises an error."""
+    """Check shards and folders of shards. Faults are returned as violations; no content of a file raises an error."""
     result = Result()
     seen: dict[str, str] = {}  # digest -> place of its first trajectory
     reference: dict[str, tuple[str, Metadata]] = {}  # data set -> place and metadata of its first trajectory
@@ -275,7 +275,7 @@ def _check_metadata(m: Metadata, path: Path) -> Iterator[Finding]:
 
 
 def _offenders(key: str, bad: np.ndarray) -> str | None:
-    """Describe where a check fails: the first place, and the number of further ones; None if it holds."""
+    """Describe where a check fails: the first place, and the number of further places. None means that the check passes."""
     if not bad.any():
         return None
     place = np.argwhere(bad)[0]
@@ -312,7 +312,7 @@ def _check_motion(m: Metadata, arrays: dict[str, np.ndarray]) -> Iterator[Findin
 
 
 def _check_shapes(m: Metadata, arrays: dict[str, np.ndarray], shapes: tuple[Shape, ...], sound: bool) -> Iterator[Finding]:
-    """Check shapes, and if positions are ``sound``, that boundary nodes lie on the shapes."""
+    """Check the shapes of walls and obstacles. If positions are ``sound``, also check that boundary nodes lie on the shapes."""
     pos = arrays["boundary_pos"]
     if (wrong := shapes_fault(shapes, m.periodicity)) is not None:
         yield "shapes", wrong

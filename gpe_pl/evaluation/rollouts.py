@@ -1,4 +1,4 @@
-"""Evaluation: rolls a learned simulator and the trivial baselines out over whole splits, and writes a table of metrics, figures and animations."""
+"""Evaluation: rolls a learned simulator and the trivial baselines out over whole splits. Writes a table of metrics, figures and animations."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ SCENES_AT_ONCE = 16
 
 
 class StartError(GpeError, ValueError):
-    """The start frame of rollouts leaves a model too few frames before it."""
+    """Raised when the start frame of rollouts has fewer frames before it than the model needs."""
 
 
 @dataclass(frozen=True)
@@ -91,18 +91,20 @@ class EvaluationSettings:
     export: list[Export] = field(default_factory=list)
 
     def first_frame(self, history: int) -> int:
-        """Frame at which rollouts of a model with this history [frames] start.
+        """Return the frame at which rollouts of a model with this history [frames] start.
 
         Raises:
             StartError: ``start_frame`` leaves too little history.
         """
         if self.start_frame is not None and self.start_frame < history:
-            raise StartError(f"evaluation.start_frame={self.start_frame}: graph.history={history} needs as many frames before it")
+            raise StartError(
+                f"evaluation.start_frame={self.start_frame}: graph.history={history} needs as many frames before it; choose at least {history}"
+            )
         return history if self.start_frame is None else self.start_frame
 
 
 class ExportError(GpeError):
-    """A requested export cannot be written; the message says what is missing."""
+    """Raised when a requested export cannot be written; the message says what is missing."""
 
 
 @dataclass(frozen=True)
@@ -136,11 +138,11 @@ def evaluate(
     These metrics are computed here:
 
     - ``share_outside_uncontained``: fraction of particle-frames outside with containment off, for the first ``settings.num_uncontained`` rollouts of a split.
-    - ``share_corrected``: fraction of particle-steps that containment corrects. Neither is reported for a boundary that consists of nodes only.
+    - ``share_corrected``: fraction of particle-steps that containment corrects. These two are not reported for a boundary that consists of nodes only.
     - ``skipping_mse`` [m²]: position MSE between the rollouts with and without the approximate levels of ``simulator.skips``, over the frames of both.
     - ``share_asleep``: fraction of particle-steps that the approximate levels did not compute.
-    - ``lost_impulse`` [kg m/s]: momentum that was lost when nodes fell asleep. The last three are reported if there are approximate levels; the rollout without
-      them is then evaluated, too.
+    - ``lost_impulse`` [kg m/s]: momentum that was lost when nodes fell asleep. The last three are reported if approximate levels are on. The rollout without
+      these levels is then evaluated, too.
 
     Args:
         simulator: trained simulator.
@@ -162,7 +164,7 @@ def evaluate(
         raise ExportError(
             "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
         )
-    simulator = simulator.configured(holds_parameters=settings.hold_parameters, static_friction=settings.static_friction)
+    simulator = simulator.configured(clamps_parameters=settings.hold_parameters, static_friction=settings.static_friction)
     run_dir.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     for split in settings.splits:
@@ -253,14 +255,14 @@ def _predict(
 
 
 def _parameter(trajectory: Trajectory) -> float:
-    """Material parameter of a scene; NaN if it has several or none."""
+    """Return the material parameter of a scene; NaN if the scene has several values or none."""
     values = np.unique(np.asarray(trajectory.material_params, dtype=np.float64))
     values = values[np.isfinite(values)]
     return float(values[0]) if len(values) == 1 else float("nan")
 
 
 def _start(simulator: LearnedSimulator, start_frame: int, trajectory: Trajectory, truth: Trajectory) -> Start:
-    """Start of a rollout, with a guard whose limits are far beyond the ground truth."""
+    """Return the start of a rollout, with a guard whose limits are far beyond the ground truth."""
     bounds = truth.metadata.bounds
     size = max(high - low for low, high in bounds)
     across = size / (trajectory.num_frames * truth.metadata.frame_dt)  # the reference where everything rests
@@ -270,7 +272,9 @@ def _start(simulator: LearnedSimulator, start_frame: int, trajectory: Trajectory
 
 
 def _share_outside(prediction: Trajectory, first: int, last: int, tolerance: float) -> float:
-    """Fraction of particle-frames that are inside a wall or obstacle in frames ``first … last``. Frames that a stopped rollout lacks count in full.
+    """Return the fraction of particle-frames that are inside a wall or obstacle in frames ``first … last``.
+
+    All particles of the frames that a stopped rollout lacks count as inside.
 
     Args:
         prediction: rollout; frame 0 is its start.
@@ -282,7 +286,7 @@ def _share_outside(prediction: Trajectory, first: int, last: int, tolerance: flo
 
 
 def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windows: int = ONE_STEP_WINDOWS) -> float:
-    """One-step nMSE without noise, over windows spread evenly over a split: the error relative to predicting free fall."""
+    """Return the normalised one-step error without noise (``metrics.OneStepNMSE``), over windows spread evenly over a split. Predicting free fall gives 1."""
     dataset = WindowDataset(usable(open_split(root, split)), simulator.builder)
     windows = np.unique(np.linspace(0, len(dataset) - 1, min(len(dataset), num_windows)).round().astype(int))
     metric = OneStepNMSE()
@@ -313,7 +317,7 @@ GROUPS = ("", *get_args(ParameterGroup))
 
 
 class MetricsError(GpeError, ValueError):
-    """A ``metrics.csv`` is damaged; the message names the file, and the line if one cannot be read."""
+    """Raised for a damaged ``metrics.csv``. The message names the file, and the line if a line cannot be read."""
 
 
 def read_rows(path: Path) -> Iterator[Row]:
@@ -358,7 +362,7 @@ def _digest_file(path: Path) -> Path:
 
 
 def means(rows: list[Row], label: str = LEARNED) -> dict[str, float]:
-    """Means of a model's metrics over trajectories, by ``split/metric@horizon``."""
+    """Return the means of a model's metrics over trajectories, by ``split/metric@horizon``."""
     values: dict[str, list[float]] = {}
     for row in rows:
         if row.model == label:

@@ -1,6 +1,8 @@
-"""Showcase: a rollout in a scene far larger than those in training, without ground truth. Measures its cost and its plausibility, and draws it.
+"""Showcase: a rollout in a scene far larger than those in training, without ground truth.
 
-Memory does not grow with the length of the rollout, as only the frames of the animation are kept.
+Its cost and some signs of errors are measured, such as particles in walls, and it is drawn.
+
+Memory does not grow with the length of the rollout, because only the frames of the animation are kept.
 """
 
 from __future__ import annotations
@@ -66,7 +68,7 @@ class Record:
 
 
 def start(simulator: LearnedSimulator, scene: Scene, settings: ShowcaseSettings) -> tuple[State, Metadata]:
-    """Initial state of the scene, at rest, for the simulator, and the scene's metadata.
+    """Return the initial state of the scene, at rest, and the scene's metadata.
 
     Raises:
         SceneError: the scene does not fit the simulator.
@@ -195,13 +197,13 @@ def _frames(simulator: Simulator, state: State, num_steps: int, metadata: Metada
 
 
 def _fall_speed(state: State, metadata: Metadata) -> float:
-    """Speed of the fastest node after a free fall through the domain [m/s]."""
+    """Return the speed of the fastest node after a free fall through the domain [m/s]."""
     height = sum((high - low) * abs(g) for (low, high), g in zip(metadata.bounds, metadata.gravity, strict=True))
     return math.sqrt(2 * height + float(state.vel.norm(dim=1).max()) ** 2)
 
 
 def _share_deeper(state: State, depth: float) -> float:
-    """Fraction of nodes deeper than ``depth`` [m] inside a solid."""
+    """Return the fraction of nodes deeper than ``depth`` [m] inside a solid."""
     distance = signed_distance(state.boundary.shapes, state.pos)
     return float(cast(Any, distance < -depth).double().mean())
 
@@ -242,11 +244,11 @@ class _Film:
 
 
 def table(records: list[Record], stopped: str | None) -> str:
-    """Table in Markdown with one row per record, and the reason if the rollout stopped early."""
+    """Return a table in Markdown with one row per record, and the reason if the rollout stopped early."""
     lines = ["| | value | unit |", "|---|---|---|", *(f"| {r.metric.replace('_', ' ')} | {r.value:.6g} | {r.unit} |" for r in records)]
     return "\n".join([*lines, *(["", f"Stopped: {stopped}"] if stopped else []), ""])
 
 
 def summary(records: list[Record]) -> str:
-    """Plain text with one line per record."""
+    """Return plain text with one line per record."""
     return "\n".join(f"showcase  {r.metric:28} {r.value:12.6g} {r.unit}" for r in records)

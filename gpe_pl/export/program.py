@@ -1,4 +1,4 @@
-"""Export of a trained model as a ``torch.export`` program of one frame, which needs PyTorch but not this package.
+"""Export of a trained model as a ``torch.export`` program that advances a scene by one frame. The program needs PyTorch but not this package.
 
 The program takes a scene as a dictionary of tensors and returns the changed tensors. The caller searches for neighbours; the program does everything else. In
 Python::
@@ -62,8 +62,10 @@ class Input:
     doc: str
 
 
-class PortableStep(nn.Module):
-    """Step of a learned simulator on plain tensors: the simulator's own graph features, model and integration, with the topology as an input.
+class ExportedStep(nn.Module):
+    """Step of a learned simulator on plain tensors.
+
+    Graph features, model and integration are those of the simulator. The topology of the graph is an input.
 
     Args:
         simulator: simulator with any model of this package.
@@ -74,7 +76,10 @@ class PortableStep(nn.Module):
         self.simulator = simulator
 
     def forward(self, scene: Scene) -> tuple[Scene, Scene]:
-        """Return next positions and velocity history; and acceleration with gravity [m/s²] and stress [Pa] at nodes for which the model predicts one."""
+        """Return two dictionaries: the changed tensors, and what the model predicts.
+
+        The changed tensors are positions and velocity histories. Predicted are accelerations with gravity [m/s²], and stresses [Pa] of materials that have one.
+        """
         simulator, state, topology = self.simulator, self.state(scene), self.topology(scene)
         graph = simulator.builder.graph(topology, state)
         predicted = simulator(graph)
@@ -92,7 +97,7 @@ class PortableStep(nn.Module):
     def state(self, scene: Scene) -> State:
         """Return the state of a scene, whose nodes are in the order of their materials.
 
-        The state does not repeat: positions are not folded into a periodic domain.
+        The state has no periodic axes, so positions are not wrapped into the domain.
         """
         materials, names = self.simulator.builder.spec.materials, self.simulator.builder.metadata.param_names
 
@@ -116,7 +121,7 @@ class PortableStep(nn.Module):
         )
 
     def topology(self, scene: Scene) -> Topology:
-        """Return the topology of a scene."""
+        """Return the topology of a scene from its tensors of edges, islands and virtual nodes."""
         builder, spec = self.simulator.builder, self.simulator.builder.spec
         rows: Scene = {}
         num_nodes = 0
@@ -129,7 +134,7 @@ class PortableStep(nn.Module):
         return Topology(rows, edges, None, mesh, islands, builder.metadata.periodicity)
 
     def _mesh(self, scene: Scene, rows: dict[str, Tensor], edges: dict[EdgeType, Tensor]) -> MeshTopology:
-        """Return the virtual nodes of a scene; which nodes of meshes lie below each follows from the edges to children."""
+        """Return the virtual nodes of a scene. The edges to children determine which mesh nodes lie below each of them."""
         spec = self.simulator.builder.spec
         sizes = tuple(scene[f"num_nodes.{grid(level)}"].shape[0] for level in range(1, spec.num_levels + 1))
         descent = []
@@ -247,7 +252,7 @@ def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
     path = Path(path)
     if path.suffix != ".pt2":
         raise ValueError(f"{path}: an exported program ends in .pt2")
-    step = PortableStep(copy.deepcopy(simulator).cpu().eval())
+    step = ExportedStep(copy.deepcopy(simulator).cpu().eval())
     step.simulator.skips = EVERYTHING
     inputs = describe(simulator)
     example, sizes = _example(inputs)
@@ -277,7 +282,10 @@ def _description(simulator: LearnedSimulator, inputs: dict[str, Input]) -> dict[
 
 
 def _example(inputs: dict[str, Input]) -> tuple[Scene, dict[str, int]]:
-    """Return an example scene, from which ``torch.export`` traces the operations, and its sizes, all different so that none seems to depend on another."""
+    """Return an example scene and its sizes. ``torch.export`` traces the operations on this scene.
+
+    All sizes are different, so that none seems to depend on another.
+    """
     names = dict.fromkeys(n for i in inputs.values() for n in i.shape if isinstance(n, str))
     sizes = {name: 5 + 2 * k for k, name in enumerate(names)}
     random = torch.Generator().manual_seed(0)

@@ -1,7 +1,8 @@
 """Export of trajectories to other programs: VTK series for ParaView, and NumPy archives.
 
-A series is a file ``NAME.pvd``, which the user opens, and a folder ``NAME`` with an unstructured grid per frame (``.vtu``, zlib-compressed, base64). Format:
-VTK file formats, XML part [Kitware, docs.vtk.org]. Nodes of meshes belong to their cells. Every other node is a cell, so particles appear as points.
+A series is a file ``NAME.pvd``, which the user opens, and a folder ``NAME`` with an unstructured grid per frame (``.vtu``, zlib-compressed, base64). Mesh nodes
+belong to the cells of the mesh. Every other node is a cell of its own, so particles appear as points. The format is the XML part of the VTK file formats
+[Kitware, docs.vtk.org].
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ VTK_TYPES = {"float32": "Float32", "float64": "Float64", "int32": "Int32", "int6
 
 
 def write_npz(path: Path | str, trajectory: Trajectory) -> None:
-    """Write a trajectory as arrays that ``numpy.load`` reads, in the precision of the store; the file appears complete or not at all.
+    """Write a trajectory as arrays that ``numpy.load`` reads, in the precision of the store. The file is written atomically.
 
     Names, shapes and units are those of ``schema.FIELDS``; ``metadata``, ``shapes`` and ``node_types`` are JSON.
 
@@ -61,8 +62,8 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
     have ``displacement`` from rest [m], ``error`` (distance from the ground truth [m]), ``stress`` [Pa] and ``von_mises`` [Pa]. Cells have the last two as
     well, NaN on particles. Moving boundary nodes are points like others; ``boundary.vtu`` has the rest, with ``normal``, ``friction`` and ``restitution``.
 
-    In a periodic domain a mesh is drawn at its first node, so that its cells stay whole at the seam, unless it reaches around the domain. ``displacement``
-    follows the path of the nodes.
+    In a periodic domain, connected nodes of a mesh are written as images that lie beside each other. Cells then stay whole at the seam, unless the mesh reaches
+    around the domain. ``displacement`` follows the path of the nodes across seams.
 
     Args:
         path: file that ends in ``.pvd``.
@@ -72,7 +73,7 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
 
     Raises:
         ValueError: the file type is wrong, the stride is not positive, the ground truth has other nodes, or a cell has no kind in ``schema.CELL_KINDS``.
-        FullDiskError: there is no room; the written part of a new series is removed.
+        FullDiskError: the disk is full; the written part of a new series is removed.
     """
     path = Path(path)
     if path.suffix != ".pvd":
@@ -149,7 +150,10 @@ def _cells(trajectory: Trajectory) -> tuple[_Cells, int]:
 
 
 def _displacements(trajectory: Trajectory, edges: np.ndarray) -> np.ndarray | None:
-    """Return displacements from rest [frame, node, dim] in m; in a periodic domain, sums of shortest steps, with a common start for all nodes of a mesh."""
+    """Return displacements from rest [frame, node, dim] in m.
+
+    In a periodic domain they are sums of the shortest steps between frames. All nodes of a mesh have a common start.
+    """
     if trajectory.rest_pos is None:
         return None
     where = trajectory.metadata.periodicity

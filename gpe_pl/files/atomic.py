@@ -23,7 +23,7 @@ ALMOST_FULL = 2**20
 
 
 class FullDiskError(GpeError):
-    """Raised when there is no room for a file or folder; the message names it."""
+    """Raised when the disk is full; the message names the file or folder that was written."""
 
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(f"{path}: cannot be written, there is no room ({reason}); make some, and run the command again")
@@ -63,9 +63,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def unnamed(error: OSError, folders: Iterable[Path]) -> OSError | FullDiskError:
-    """Turn the error of a full disk that names no file into one that names ``folders``; return other errors unchanged.
+    """Return an error of a full disk that names ``folders``, for an error that names no file. Other errors are returned unchanged.
 
-    Only the folders whose disks are full are named, or all of them if none is.
+    Only the folders whose disks are full are named. If no disk is full, all folders are named.
     """
     if error.errno is None or error.errno not in FULL or error.filename is not None:
         return error
@@ -75,7 +75,7 @@ def unnamed(error: OSError, folders: Iterable[Path]) -> OSError | FullDiskError:
 
 
 def free_bytes(folder: Path) -> int:
-    """Free bytes on the disk of a folder. The folder need not exist yet."""
+    """Return the number of free bytes on the disk of a folder. The folder need not exist yet."""
     return shutil.disk_usage(next(place for place in (folder, *folder.absolute().parents) if place.exists())).free
 
 

@@ -1,4 +1,6 @@
-"""Safe reading of untrusted HDF5 files: only arrays inside the file, and only if reading needs little more memory and time than their size.
+"""Safe reading of untrusted HDF5 files.
+
+An array is read only if it lies inside the file, and if reading needs little more memory and time than its size suggests.
 
 HDF5 takes chunk shapes and filters from the file and always unpacks whole chunks. A small file can therefore unpack to gigabytes.
 """
@@ -62,7 +64,7 @@ def attribute(owner: h5py.HLObject, name: str) -> Any:
 
 
 def most_unpacked(stored: int) -> int:
-    """Maximum number of bytes that ``stored`` bytes may unpack to."""
+    """Return the maximum number of bytes that ``stored`` bytes may unpack to."""
     return min(stored * LARGEST_DEFLATE_RATIO, stored * LARGEST_RATIO + SPARE_UNPACKED)
 
 

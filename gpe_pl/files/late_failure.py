@@ -1,4 +1,4 @@
-"""A file for libraries that crash when writing fails. Data that do not fit on the disk stay in memory, and the owner of the file is told afterwards."""
+"""A file for libraries that crash when writing fails. Data that do not fit on the disk stay in memory, and the error can be raised afterwards."""
 
 from __future__ import annotations
 

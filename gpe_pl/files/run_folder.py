@@ -17,7 +17,7 @@ DATA_CHECKSUMS = "data_sha256"
 """Configuration key with the checksums of the splits that a run used, because data of the same name may be replaced."""
 HYDRA = ".hydra"
 """Subfolder of a run folder that Hydra writes. Hydra follows links in it."""
-OFFERED = ("comparison", "larger")
+LOOKUPS = ("comparison", "larger")
 """Lookup tables of ``data`` and ``size`` from which other configuration keys take their values."""
 
 
@@ -65,13 +65,13 @@ def refuse_links(run_dir: Path) -> None:
 
 @contextlib.contextmanager
 def without_orphans(folder: Path, description: str = CONFIG) -> Iterator[None]:
-    """Remove at the end what the block wrote into a folder after somebody deleted it. No command would continue from such files.
+    """At the end of the block, remove files that were written into a folder after somebody had deleted it. No command would continue from such files.
 
-    A folder is removed only if it is not the one of the beginning and lacks its description, so that nothing else is lost.
+    A folder is removed only if it is another one than at the beginning and has no description. Nothing else is lost then.
 
     Args:
-        folder: of a run or a data set.
-        description: name of the file that says what the folder holds.
+        folder: folder of a run or a data set.
+        description: name of the file that describes the content of the folder.
     """
     with watched(folder) as is_same:
         try:
@@ -83,7 +83,7 @@ def without_orphans(folder: Path, description: str = CONFIG) -> Iterator[None]:
 
 @contextlib.contextmanager
 def watched(folder: Path) -> Iterator[Callable[[], bool]]:
-    """Yield a function that says whether a folder is still the one of the beginning, neither deleted nor replaced."""
+    """Yield a function that tells whether a folder is still the same as at the beginning: neither deleted nor replaced."""
     before, handle = _identity(folder), None
     if before is not None:
         with contextlib.suppress(OSError):  # Windows cannot open folders
@@ -111,13 +111,13 @@ def release(run_dir: Path) -> None:
 
 
 def without_tables(values: dict[str, Any]) -> dict[str, Any]:
-    """Return a configuration without the lookup tables (``OFFERED``) of ``data`` and ``size``.
+    """Return a configuration without the lookup tables (``LOOKUPS``) of ``data`` and ``size``.
 
     The values taken from these tables are kept under graph, model, training and the evaluated scene. The time budget of a comparison stays, because it
     decides the number of steps.
     """
     kept = {
-        name: {key: value for key, value in part.items() if key not in OFFERED}
+        name: {key: value for key, value in part.items() if key not in LOOKUPS}
         for name in ("data", "size")
         if isinstance(part := values.get(name), dict)
     }

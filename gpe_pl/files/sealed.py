@@ -1,4 +1,4 @@
-"""JSON files with a checksum, which the project writes and reads itself.
+"""JSON files with a checksum, for tables that only this package writes and reads.
 
 A file contains a table. Its key ``sha256`` is the checksum of the other keys, so every changed digit is detected. Reading checks size, depth and numbers before
 any value is used. A damaged or hostile file raises ``SealError`` with a one-line message.
@@ -40,7 +40,7 @@ def sealed(values: dict[str, Any]) -> dict[str, Any]:
 
 
 def checksum(values: dict[str, Any]) -> str:
-    """SHA-256 of values, independent of the order of their keys."""
+    """Return the SHA-256 of values, independent of the order of their keys."""
     plain = json.loads(json.dumps(values, allow_nan=False))  # keys become text, so that they can be sorted
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 

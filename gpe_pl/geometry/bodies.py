@@ -20,7 +20,7 @@ def _polar(radius: np.ndarray) -> Loop:
 
 
 def _rounded(corners: np.ndarray, radius: float) -> Loop:
-    """Replace the corners of a counter-clockwise polygon by arcs of this radius, or of the largest radius that the edges allow."""
+    """Replace the corners of a counter-clockwise polygon by arcs of a radius, or of the largest radius that the edges allow if that is smaller."""
     pieces = []
     for before, at, after in zip(np.roll(corners, 1, axis=0), corners, np.roll(corners, -1, axis=0), strict=True):
         a, b = before - at, after - at
@@ -83,7 +83,7 @@ def _gear(rng: np.random.Generator) -> list[Loop]:
 
 
 def _letter(rng: np.random.Generator) -> list[Loop]:
-    """Outline of an L, T, U or plus with arms of random width."""
+    """Return the outline of an L, T, U or plus with arms of random width."""
     t = rng.uniform(0.34, 0.45)
     w, kind = rng.uniform(1.0, 1.4), int(rng.integers(4))
     m, r = w / 2, t / 2
@@ -163,7 +163,7 @@ def _torus(rng: np.random.Generator) -> Distance:
 
 
 def _bend(rng: np.random.Generator) -> Distance:
-    """Signed distance of two arms at a right angle."""
+    """Return the signed distance of two arms at a right angle."""
     arm = rng.uniform(1.0, 1.3)
     a, b = np.array([arm, 0.5, 0.5]), np.array([0.5, arm, 0.5])
 
@@ -175,7 +175,7 @@ def _bend(rng: np.random.Generator) -> Distance:
 
 
 def _dumbbell(rng: np.random.Generator) -> Distance:
-    """Signed distance of two balls on a rod, with smooth transitions."""
+    """Return the signed distance of two balls on a rod, with smooth transitions."""
     span, second = rng.uniform(0.7, 0.9), rng.uniform(0.5, 0.7)
 
     def distance(x: np.ndarray) -> np.ndarray:

@@ -73,13 +73,13 @@ def canyon(seed: int, bounds: Bounds, spacing: float, friction: float = STICKY) 
 
 
 def _rise(start: float, end: float, x: np.ndarray) -> np.ndarray:
-    """Smooth step from 0 at ``start`` to 1 at ``end``."""
+    """Return a smooth step from 0 at ``start`` to 1 at ``end``."""
     t = np.clip((x - start) / (end - start), 0.0, 1.0)
     return np.asarray(t * t * (3 - 2 * t))
 
 
 def _waves(rng: np.random.Generator, x: np.ndarray, y: np.ndarray, frequency: float, number: int = 8) -> np.ndarray:
-    """Random smooth noise of about unit size: a sum of ``number`` waves with at most ``frequency`` periods per unit length."""
+    """Return smooth random noise of about unit size: a sum of ``number`` waves with at most ``frequency`` periods per unit length."""
     total: np.ndarray = np.zeros(np.broadcast_shapes(x.shape, y.shape))
     for _ in range(number):
         angle, phase, k = rng.uniform(0, 2 * math.pi), rng.uniform(0, 2 * math.pi), 2 * math.pi * frequency * rng.uniform(0.3, 1.0)

@@ -40,27 +40,27 @@ def lattice(bounds: Bounds, spacing: float) -> tuple[np.ndarray, tuple[int, ...]
 
 
 def columns_of(low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
-    """Positions [along x, along y, 2] of the grid's vertical lines in m."""
+    """Return positions [along x, along y, 2] of the grid's vertical lines in m."""
     axes = [low[k] + spacing * np.arange(counts[k]) for k in range(2)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
 def below_heights(heights: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
-    """Signed distances [m] to the ground, whose heights [m] are given at the grid's vertical lines."""
+    """Return signed distances [m] to the ground, whose heights [m] are given at the grid's vertical lines."""
     corners = _ground(heights, low, spacing, np.ones((counts[0] - 1, counts[1] - 1), dtype=bool))
     z = low[2] + spacing * np.arange(counts[2])
     return np.where(z < heights[..., None], -1.0, 1.0) * unsigned(corners, low, spacing, counts)
 
 
 def _ground(heights: np.ndarray, low: np.ndarray, spacing: float, cells: np.ndarray) -> np.ndarray:
-    """Corners [triangle, 3, 3] of the ground's triangles, two in each cell of the mask ``cells`` between vertical lines."""
+    """Return corners [triangle, 3, 3] of the ground's triangles, two in each cell of the mask ``cells`` between vertical lines."""
     place = np.concatenate([columns_of(low, spacing, heights.shape), heights[..., None]], axis=-1)
     a, b, c, d = place[:-1, :-1][cells], place[1:, :-1][cells], place[1:, 1:][cells], place[:-1, 1:][cells]
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
 def mesh_distances(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...], solid: Solid) -> np.ndarray:
-    """Signed distances [m] to triangles [triangle, 3, 3].
+    """Return signed distances [m] to triangles [triangle, 3, 3].
 
     Raises:
         ValueError: with ``solid="below"``, no triangle lies over the domain; or there are more than ``MAX_PAIRS`` pairs, which would take minutes.
@@ -89,9 +89,9 @@ def mesh_distances(corners: np.ndarray, low: np.ndarray, spacing: float, counts:
 
 
 def cloud_distances(points: np.ndarray, normals: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
-    """Signed distances [m] to an oriented point cloud: weighted means of the distances to the tangent planes of the nearest points.
+    """Return signed distances [m] to an oriented point cloud: weighted means of the distances to the tangent planes of the nearest points.
 
-    Far from the cloud, tangent planes say little. There it is the distance to the nearest point, with the sign of the weighted mean.
+    Tangent planes are good approximations only near the cloud. Far from it, the result is the distance to the nearest point with the sign of the weighted mean.
     """
     from scipy.spatial import cKDTree
 
@@ -108,7 +108,7 @@ def cloud_distances(points: np.ndarray, normals: np.ndarray, low: np.ndarray, sp
 
 
 def unsigned(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
-    """Unsigned distances [m] of grid nodes to the nearest of the triangles [triangle, 3, 3]."""
+    """Return unsigned distances [m] of grid nodes to the nearest of the triangles [triangle, 3, 3]."""
     triangles = np.ascontiguousarray(corners, dtype=np.float64).reshape(-1, 9)
     distance = np.full(counts, np.inf)
     nearest = np.full(counts, -1, dtype=np.int64)
@@ -119,7 +119,10 @@ def unsigned(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple
 
 
 def _num_pairs(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> float:
-    """Number of pairs of triangle and grid node that ``unsigned`` compares: nodes in the box around each triangle, extended by ``_BAND`` cells."""
+    """Return the number of pairs of a triangle and a grid node that ``unsigned`` compares.
+
+    These are the nodes in the box around each triangle, extended by ``_BAND`` cells.
+    """
     place = (corners - low) / spacing
     last = np.array(counts) - 1.0
     first = np.floor(np.clip(place.min(axis=1) - _BAND, 0.0, last))
@@ -145,7 +148,7 @@ def _crossings(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tup
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _to_edge(px, py, pz, ax, ay, az, bx, by, bz):
-    """Squared distance of p to the segment from a to b."""
+    """Return the squared distance of p to the segment from a to b."""
     ex, ey, ez, wx, wy, wz = bx - ax, by - ay, bz - az, px - ax, py - ay, pz - az
     length = ex * ex + ey * ey + ez * ez
     t = (ex * wx + ey * wy + ez * wz) / length if length > 0.0 else 0.0
@@ -156,7 +159,7 @@ def _to_edge(px, py, pz, ax, ay, az, bx, by, bz):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _to_triangle(px, py, pz, t):
-    """Squared distance of p to a triangle: to its plane if the foot point lies inside, else to the nearest edge."""
+    """Return the squared distance of p to a triangle: to its plane if the foot point lies inside, else to the nearest edge."""
     ux, uy, uz, vx, vy, vz = t[3] - t[0], t[4] - t[1], t[5] - t[2], t[6] - t[0], t[7] - t[1], t[8] - t[2]
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
     wx, wy, wz = px - t[0], py - t[1], pz - t[2]
@@ -175,14 +178,17 @@ def _to_triangle(px, py, pz, t):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _node(x, count):
-    """Index of the node at a place along an axis; clamped to the grid."""
+    """Return the index of the node at a place along an axis; clamped to the grid."""
     return int(min(max(x, 0.0), count - 1.0))
 
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _near(triangles, origin, spacing, band, distance, nearest):
-    """Compute squared distances of the nodes within ``band`` cells of a triangle. A triangle outside the grid counts for the nodes at the rim."""
+    """Compute squared distances of the nodes within ``band`` cells of a triangle.
+
+    A triangle outside the grid is compared with the nodes at the rim of the grid.
+    """
     nx, ny, nz = distance.shape
     for f in range(len(triangles)):
         t = triangles[f]
@@ -201,7 +207,7 @@ def _near(triangles, origin, spacing, band, distance, nearest):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _spread(triangles, origin, spacing, distance, nearest):
-    """Fast sweeping: every node tries the nearest triangles of its neighbours, in two rounds of all eight orders."""
+    """Fast sweeping: compare every node with the nearest triangles of its neighbours, in two rounds of all eight sweeping orders."""
     nx, ny, nz = distance.shape
     for sweep in range(16):
         di, dj, dk = 1 - 2 * (sweep & 1), 1 - (sweep & 2), 1 - (sweep & 4) // 2

@@ -103,7 +103,7 @@ def _resample(loop: Loop, spacing: float, multiple: int = 1) -> Loop:
 
 
 def _inside(points: np.ndarray, loops: list[Loop]) -> np.ndarray:
-    """Mask [point] of the points [point, 2] inside the outer loop and outside all holes, by the even-odd rule."""
+    """Return a mask [point] of the points [point, 2] inside the outer loop and outside all holes, by the even-odd rule."""
     crossings = np.zeros(len(points), dtype=int)
     for loop in loops:
         a, b = loop, np.roll(loop, -1, axis=0)
@@ -114,7 +114,7 @@ def _inside(points: np.ndarray, loops: list[Loop]) -> np.ndarray:
 
 
 def _distance(points: np.ndarray, loops: list[Loop]) -> np.ndarray:
-    """Distances [point] of points [point, 2] to the nearest loop."""
+    """Return distances [point] of points [point, 2] to the nearest loop."""
     nearest = np.full(len(points), math.inf)
     for loop in loops:
         edge = np.roll(loop, -1, axis=0) - loop
@@ -125,7 +125,7 @@ def _distance(points: np.ndarray, loops: list[Loop]) -> np.ndarray:
 
 
 def _lattice(loops: list[Loop], spacing: float, rng: np.random.Generator, hexagonal: bool) -> np.ndarray:
-    """Points [point, 2] of a randomly turned and shifted lattice inside an outline, more than 0.62 spacings away from it."""
+    """Return points [point, 2] of a randomly turned and shifted lattice inside an outline, more than 0.62 spacings away from it."""
     low, high = loops[0].min(axis=0), loops[0].max(axis=0)
     middle, reach = (low + high) / 2, math.ceil(0.5 * float(np.linalg.norm(high - low)) / spacing * 1.2) + 1
     index = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1.0)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -140,7 +140,7 @@ def _lattice(loops: list[Loop], spacing: float, rng: np.random.Generator, hexago
 
 
 def _triangles(loops: list[Loop], inner: np.ndarray, smooth: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Delaunay triangles of the points on the loops, which come first, and of inner points, which are smoothed.
+    """Return Delaunay triangles of the points on the loops, which come first, and of inner points, which are smoothed.
 
     Returns None if the surface of the triangles differs from the loops.
     """
@@ -175,7 +175,7 @@ def _triangles(loops: list[Loop], inner: np.ndarray, smooth: int) -> tuple[np.nd
 
 
 def _is_on_outline(points: np.ndarray, loops: list[Loop]) -> np.ndarray:
-    """Mask [node] of the nodes that lie on the loops, found by position."""
+    """Return a mask [node] of the nodes that lie on the loops, found by position."""
     rim = {point.tobytes() for loop in loops for point in np.ascontiguousarray(loop)}
     return np.array([point.tobytes() in rim for point in np.ascontiguousarray(points)])
 
@@ -280,7 +280,7 @@ def tetrahedralise(distance: Distance, reach: float, spacing: float, rng: np.ran
 
 
 def _cubic_lattice(reach: float, spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Delaunay tetrahedra of a randomly turned and shifted body-centred cubic lattice that covers a cube."""
+    """Return Delaunay tetrahedra of a randomly turned and shifted body-centred cubic lattice that covers a cube."""
     width = spacing / ((8 * math.sqrt(0.75) + 6) / 14)
     count = math.ceil(math.sqrt(3.0) * reach / width) + 1
     index = np.stack(np.meshgrid(*[np.arange(-count, count + 1.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -296,7 +296,7 @@ def _cubic_lattice(reach: float, spacing: float, rng: np.random.Generator) -> tu
 
 
 def _peeled(cells: np.ndarray) -> np.ndarray:
-    """Remove cells with two or more surface faces, which would become flat on a smooth surface."""
+    """Remove cells with two or more surface faces. Such cells would become flat when their nodes move onto a smooth surface."""
     while len(cells):
         faces = np.sort(np.concatenate([np.delete(cells, k, axis=1) for k in range(4)]), axis=1)
         _, which, times = np.unique(faces, axis=0, return_inverse=True, return_counts=True)
@@ -349,7 +349,7 @@ def _pull_to_surface(points: np.ndarray, cells: np.ndarray, surface: np.ndarray,
 
 
 def _gradient(distance: Distance, points: np.ndarray, spacing: float) -> np.ndarray:
-    """Unit vectors [point, 3] away from the body."""
+    """Return unit vectors [point, 3] away from the body."""
     step = 1e-4 * spacing
     slope = np.stack([distance(points + step * e) - distance(points - step * e) for e in np.eye(3)], axis=-1)
     return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-300)
@@ -359,21 +359,21 @@ def _gradient(distance: Distance, points: np.ndarray, spacing: float) -> np.ndar
 
 
 def _signed_volumes(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Volumes (areas in 2D) of simplices [cell], negative for inverted ones."""
+    """Return volumes (areas in 2D) of simplices [cell], negative for inverted ones."""
     dim = points.shape[1]
     corners = points[cells]
     return np.linalg.det(corners[:, 1:] - corners[:, :1]) / math.factorial(dim)
 
 
 def surface_faces(cells: np.ndarray) -> np.ndarray:
-    """Faces [face, corner] that belong to only one of the triangles or tetrahedra ``cells`` [cell, corner]."""
+    """Return faces [face, corner] that belong to only one of the triangles or tetrahedra ``cells`` [cell, corner]."""
     faces = np.concatenate([np.delete(cells, k, axis=1) for k in range(cells.shape[1])])
     _, first, times = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return faces[first[times == 1]]
 
 
 def _simplices(cells: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
-    """Simplices that measure the shapes of cells, and the inverse edge matrix of the ideal simplex.
+    """Return simplices that measure the shapes of cells, and the inverse edge matrix of the ideal simplex.
 
     A quadrilateral is measured by the triangles at its four corners, which are right-angled in the ideal case.
     """
@@ -387,7 +387,7 @@ def _simplices(cells: np.ndarray, dim: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def shape_quality(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Mean ratio of each cell [cell]: 1 for a regular simplex or a square, 0 for a flat cell, negative for an inverted one (Knupp 2001).
+    """Return the mean ratio of each cell [cell]: 1 for a regular simplex or a square, 0 for a flat cell, negative for an inverted one (Knupp 2001).
 
     The mean ratio is ``d det(A)^(2/d) / |A|²`` with A the map from the ideal cell. For a quadrilateral it is the value at the worst corner.
     """
@@ -457,7 +457,7 @@ def optimise_shapes(
 
 
 def _cofactor(matrices: np.ndarray) -> np.ndarray:
-    """Derivatives of determinants with respect to the matrices' entries [matrix, dim, dim]."""
+    """Return derivatives of determinants with respect to the matrices' entries [matrix, dim, dim]."""
     if matrices.shape[-1] == 2:
         return np.stack([matrices[:, 1, ::-1] * [1, -1], matrices[:, 0, ::-1] * [-1, 1]], axis=1)
     a, b, c = matrices[:, 0], matrices[:, 1], matrices[:, 2]

@@ -53,11 +53,11 @@ class Periodicity:
         return np.array([high - low if repeats else 0.0 for (low, high), repeats in zip(self.bounds, self.periodic, strict=True)])
 
     def shortest(self, difference: Array) -> Array:
-        """Minimum images of differences of positions [..., dim] in m; returns the same object if no axis is periodic."""
+        """Return minimum images of differences of positions [..., dim] in m; returns the same object if no axis is periodic."""
         return difference - self._turns(difference, round_down=False) if self else difference
 
     def wrapped(self, pos: Array) -> Array:
-        """Images of positions [..., dim] in m that satisfy ``low <= x < high`` along periodic axes, in the precision of ``pos``.
+        """Return images of positions [..., dim] in m that satisfy ``low <= x < high`` along periodic axes, in the precision of ``pos``.
 
         Positions inside the domain are unchanged to the bit. The same object is returned if no axis is periodic.
         """
@@ -71,14 +71,14 @@ class Periodicity:
         return xp.where(folds, folded, pos)
 
     def from_corner(self, pos: Array) -> Array:
-        """Wrapped positions [..., dim] in m relative to the domain's lower corner, below the period along periodic axes, as a k-d tree needs them."""
+        """Return wrapped positions [..., dim] in m relative to the domain's lower corner, below the period along periodic axes, as a k-d tree needs them."""
         xp = array_namespace(pos)
         low, period = self._row([low for low, _ in self.bounds], pos), self._row(self.period, pos)
         inside = self.wrapped(pos) - low
         return xp.where((period > 0) & (inside >= period), 0.0 * inside, inside)  # the subtraction may round up to the period
 
     def check_radius(self, radius: float) -> None:
-        """Raise ``PeriodicityError`` if a node can have more than one image within the radius [m]."""
+        """Raise ``PeriodicityError`` if a node can have several images within the radius [m]."""
         for axis in self.axes:
             if not 2 * radius < self.period[axis]:
                 raise PeriodicityError(
@@ -87,7 +87,7 @@ class Periodicity:
                 )
 
     def _turns(self, length: Array, round_down: bool) -> Array:
-        """Multiples of the period nearest to lengths along each axis, or below them [m]."""
+        """Return the multiples of the period nearest to lengths along each axis, or the next ones below with ``round_down`` [m]."""
         xp = array_namespace(length)
         period = self._row(self.period, length)
         turns = length / self._row(np.where(self.period > 0, self.period, 1.0), length)

@@ -1,4 +1,4 @@
-"""Shapes in periodic domains. A shape stands for all its images, so an obstacle across a seam continues on the other side."""
+"""Shapes in periodic domains. A shape represents all its periodic images, so an obstacle that crosses a seam continues on the other side."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Repeated:
         return self.shape.extent
 
     def signed_distance(self, points: Array) -> Array:
-        """Signed distance [...] in m to the nearest image."""
+        """Return the signed distance [...] in m to the nearest image."""
         xp, space = array_namespace(points), self.periodicity
         centre = xp.asarray(self._centre, dtype=points.dtype, device=device(points))
         near = centre + space.shortest(points - centre)
@@ -63,7 +63,7 @@ class Repeated:
         return distance
 
     def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-        """Boundary nodes inside the domain and their normals, each node once. Faces where two images join have no nodes."""
+        """Return boundary nodes inside the domain and their normals, each node once. Faces where two images join have no nodes."""
         pos, normal = self.shape.sample(spacing)
         free = ~is_covered(pos, normal, (self.shape,), (self,))
         return self.periodicity.wrapped(pos[free]), normal[free]
@@ -104,7 +104,7 @@ class Repeated:
         return None
 
     def _on_seams(self, corners: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-        """Masks [corner] of the corners at the lower end of a shape and at its upper end."""
+        """Return masks [corner] of the corners at the lower end of a shape and at its upper end."""
         x, close = corners[:, axis], ON_SEAM * self.periodicity.period[axis]
         return x <= x.min() + close, x >= x.max() - close
 
@@ -122,7 +122,7 @@ class Repeated:
 
 
 def is_covered(pos: np.ndarray, normal: np.ndarray, shapes: tuple[Shape, ...], images: tuple[Shape, ...]) -> np.ndarray:
-    """Mask of boundary nodes of ``shapes`` that are covered by one of ``images``, so that there is no free space in front of them.
+    """Return a mask of boundary nodes of ``shapes`` that are covered by one of ``images``, so that there is no free space in front of them.
 
     Args:
         pos: positions of the boundary nodes [node, dim] in m.

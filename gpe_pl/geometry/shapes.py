@@ -1,4 +1,4 @@
-"""Shapes of walls and obstacles with their signed distances, which solvers, containment and pictures share.
+"""Shapes of walls and obstacles with their signed distances. Solvers, containment and pictures use the same shapes.
 
 ``Shape.signed_distance(points)`` is in m, positive in free space and negative inside the wall or obstacle. ``Shape.sample(spacing)`` places boundary nodes on
 the surface. All shapes take NumPy arrays or torch tensors [..., dim].
@@ -57,11 +57,11 @@ class Shape(Protocol):
         ...
 
     def signed_distance(self, points: Array) -> Array:
-        """Signed distances [...] of points [..., dim] in m, negative inside the solid."""
+        """Return signed distances [...] of points [..., dim] in m, negative inside the solid."""
         ...
 
     def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions [node, dim] in m and unit normals [node, dim] into free space of boundary nodes about ``spacing`` [m] apart."""
+        """Return positions [node, dim] in m and unit normals [node, dim] into free space of boundary nodes about ``spacing`` [m] apart."""
         ...
 
 
@@ -80,7 +80,7 @@ def _norm(x: Array) -> Array:
 
 
 def _segment(start: np.ndarray, end: np.ndarray, spacing: float) -> np.ndarray:
-    """Points from ``start`` to ``end``, end excluded, no further apart than ``spacing``."""
+    """Return points from ``start`` to ``end``, end excluded, no further apart than ``spacing``."""
     count = max(1, _count(float(np.linalg.norm(end - start)) / spacing - 1e-9))
     return start + (end - start) * (np.arange(count) / count)[:, None]
 
@@ -95,7 +95,7 @@ def _count(nodes: float | int) -> int:
 
 
 def _grid(low: list[float], high: list[float], spacing: float) -> np.ndarray:
-    """Points [point, len(low)] of a regular grid over an axis-aligned face, corners included."""
+    """Return points [point, len(low)] of a regular grid over an axis-aligned face, corners included."""
     counts = [_count((b - a) / spacing - 1e-9) for a, b in zip(low, high, strict=True)]
     _count(math.prod(counts))
     axes = [np.linspace(a, b, max(2, count + 1)) for a, b, count in zip(low, high, counts, strict=True)]
@@ -103,7 +103,7 @@ def _grid(low: list[float], high: list[float], spacing: float) -> np.ndarray:
 
 
 def _directions(dim: int, radius: float, spacing: float) -> np.ndarray:
-    """Unit vectors [point, dim] to points of a circle or sphere of this ``radius`` [m], which are about ``spacing`` [m] apart."""
+    """Return unit vectors [point, dim] to points of a circle or sphere of this ``radius`` [m], which are about ``spacing`` [m] apart."""
     if dim == 2:
         count = max(6, _count(2 * math.pi * radius / spacing))
         angle: np.ndarray = 2 * math.pi * np.arange(count) / count
@@ -239,7 +239,7 @@ class Box:
 
 
 def _require_simple(vertices: np.ndarray) -> None:
-    """Raise ``ValueError`` if an edge of the outline [vertex, 2] has no length, or two edges touch anywhere but at their common vertex."""
+    """Raise ``ValueError`` if an edge of the outline [vertex, 2] has no length, or if two edges touch at another point than their common vertex."""
     count, shortest = len(vertices), 1e-12 * float(np.max(np.ptp(vertices, axis=0)))
     edges = np.roll(vertices, -1, axis=0) - vertices
     for k in range(count):
@@ -247,7 +247,7 @@ def _require_simple(vertices: np.ndarray) -> None:
             raise ValueError(f"polygon vertices {k} and {(k + 1) % count} coincide at {vertices[k].tolist()}")
 
     def side(k: int, point: np.ndarray) -> float:
-        """Side of edge k on which the point lies: left (1), right (-1) or on its line (0)."""
+        """Return the side of edge k on which the point lies: left (1), right (-1) or on its line (0)."""
         x, y = point - vertices[k]
         return float(np.sign(edges[k, 0] * y - edges[k, 1] * x))
 
@@ -392,7 +392,7 @@ class DistanceGrid:
         return self._interpolate(points)[0]
 
     def _interpolate(self, points: Array) -> tuple[Array, Array]:
-        """Interpolated distance [...] in m and its gradient [..., dim]."""
+        """Return interpolated distance [...] in m and its gradient [..., dim]."""
         xp = array_namespace(points)
         dim, values = len(self.counts), _like(self.values.ravel(), points)
         place = (points - _like(self.origin, points)) / self.spacing
@@ -416,7 +416,7 @@ class DistanceGrid:
         return distance + xp.sum(gradient * (place - nearest), axis=-1), gradient / self.spacing
 
     def sample(self, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes on the part of the surface inside the grid. Every point of it has a node within ``spacing`` [m]."""
+        """Return nodes on the part of the surface inside the grid. Every point of this part has a node within ``spacing`` [m]."""
         points = self._surface(spacing)
         if len(points) == 0:
             return points, points.copy()
@@ -426,7 +426,7 @@ class DistanceGrid:
         return points[keep], np.asarray(outward_normal(self, points[keep], 0.5 * min(spacing, self.spacing)))
 
     def _surface(self, spacing: float) -> np.ndarray:
-        """Points [point, dim] on the surface, at most about a third of ``spacing`` or one grid cell apart."""
+        """Return points [point, dim] on the surface, at most about a third of ``spacing`` or one grid cell apart."""
         dim = len(self.counts)
         corners = [
             self.values[tuple(slice(c, n - 1 + c) for c, n in zip(corner, self.counts, strict=True))]
@@ -472,7 +472,7 @@ def _decode(encoded: str, counts: tuple[int, ...]) -> np.ndarray:
 
 
 def _thin(points: np.ndarray, normals: np.ndarray, distance: float) -> np.ndarray:
-    """Indices of a maximal subset of points that are at least ``distance`` [m] apart, chosen in order.
+    """Return indices of a maximal subset of points that are at least ``distance`` [m] apart, chosen in order.
 
     Points on the other side of a thin sheet, with an opposite normal, do not exclude each other.
     """
@@ -488,7 +488,7 @@ def _thin(points: np.ndarray, normals: np.ndarray, distance: float) -> np.ndarra
 
 
 def signed_distance(shapes: tuple[Shape, ...], points: Array) -> Array:
-    """Signed distance [m] to the nearest of several shapes, negative inside any of them; +inf without shapes."""
+    """Return the signed distance [m] to the nearest of several shapes, negative inside any of them; +inf without shapes."""
     xp = array_namespace(points)
     distance = xp.full(points.shape[:-1], math.inf, dtype=points.dtype, device=device(points))
     for shape in shapes:
@@ -497,12 +497,12 @@ def signed_distance(shapes: tuple[Shape, ...], points: Array) -> Array:
 
 
 def surface_tolerance(shapes: tuple[Shape, ...]) -> float:
-    """Distance [m] below which a point counts as on a surface: ``ON_SURFACE`` times the largest shape's extent, so that units do not matter."""
+    """Return the distance [m] below which a point counts as on a surface: ``ON_SURFACE`` times the largest shape's extent, so that units do not matter."""
     return ON_SURFACE * max((shape.extent for shape in shapes), default=0.0)
 
 
 def thickness(shape: Shape) -> float:
-    """Smallest thickness of a shape [m].
+    """Return the smallest thickness of a shape [m].
 
     It is the diameter of a sphere and the shortest side of a box. In a polygon it is the shortest way through it from the middle of an edge along the inward
     normal. It is infinite for all other shapes.
@@ -535,7 +535,7 @@ def thickness(shape: Shape) -> float:
 
 
 def outward_normal(shape: Shape, points: Array, step: float) -> Array:
-    """Unit vectors [..., dim] into free space: gradients of the signed distance by central differences of ``step`` [m]; zero where undefined."""
+    """Return unit vectors [..., dim] into free space: gradients of the signed distance by central differences of ``step`` [m]; zero where undefined."""
     xp = array_namespace(points)
     columns = []
     for axis in range(points.shape[-1]):

@@ -164,7 +164,7 @@ def _resampled(path: Path, values: np.ndarray, bounds: Bounds, spacing: float, f
 
 
 def _heights_of(path: Path, points: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
-    """Heights [along x, along y] in m of a cloud's surface at the grid's vertical lines.
+    """Return heights [along x, along y] in m of a cloud's surface at the grid's vertical lines.
 
     Heights are interpolated linearly between the points. Outside of them the height of the nearest point is used.
     """

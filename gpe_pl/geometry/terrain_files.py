@@ -74,7 +74,7 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Heights:
-    """A height map on a square lattice.
+    """A height map on a square lattice, in the unit of the file.
 
     Attributes:
         values: heights [along x, along y].
@@ -175,7 +175,7 @@ def _read_mesh(path: Path) -> Mesh | Cloud:
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1)
     faces = np.asarray(mesh.faces, np.int64)[area > 1e-14 * np.max(np.ptp(corners.reshape(-1, 3), axis=0)) ** 2]
     if len(faces) == 0:
-        raise TerrainError(f"{path}: all {len(area)} triangles are without area")
+        raise TerrainError(f"{path}: all {len(area)} triangles are without area; export the surface again")
     return Mesh(np.asarray(mesh.vertices, np.float64), faces, bool(mesh.is_watertight))
 
 

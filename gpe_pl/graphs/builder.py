@@ -1,10 +1,10 @@
-"""``State`` → ``HeteroData``, the same in training, in rollouts and in exported programs: graph = features ∘ topology.
+"""Builder of graphs: ``State`` → ``HeteroData``, as features ∘ topology. Training, rollouts and exported programs use the same builder.
 
 ``GraphBuilder.topology`` searches with NumPy. ``GraphBuilder.graph`` computes features from the indices found and the state, with tensor operations alone, so
 that ``torch.export`` can trace it.
 
-Every graph of a data set carries all its node and edge stores, empty where a frame has none, because PyG's ``Batch`` numbers edges wrongly when a store
-is missing from some graphs. Each undirected edge is stored once. There are no edges between boundary nodes.
+All graphs of a data set have the same node and edge stores. A store is empty if a frame has no such nodes or edges; PyG's ``Batch`` would number edges wrongly
+if it were missing. Each undirected edge is stored once. There are no edges between boundary nodes.
 """
 
 from __future__ import annotations
@@ -52,19 +52,21 @@ LARGEST = 1e100
 class GraphBuilder:
     """Builds the graph of a state.
 
-    Node stores of a material hold ``x``, ``material_params`` (SI), ``mass`` and ``node_id`` (row in the state); ``boundary`` and virtual nodes hold ``x``.
-    Edge stores hold ``edge_index`` (row 0 source, row 1 target), ``odd`` and ``even``. Those of ``radius`` also hold
-    ``offset``: the displacement over the radius, which standardisation leaves as it is.
+    Node stores of a material hold ``x``, ``material_params`` (SI), ``mass`` and ``node_id`` (row in the state); ``boundary`` and virtual nodes hold ``x``. Edge
+    stores contain ``edge_index`` (row 0 source, row 1 target), ``odd`` and ``even``. Those of ``radius`` edges also contain ``offset``: the displacement
+    divided by the radius. Standardisation does not change it.
 
-    With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph ``island_is_free`` [island] and ``num_islands`` [1].
-    ``pos`` counts from the mean of the node's island. In periodic domains the island is kept together; ``pos`` is zero in an island that goes around the
-    period, because it has no lever arms. Nodes of meshes also have ``body``, and the graph ``num_bodies`` [1]: a body is what cells connect, with the nodes of
-    no cell beside it. ``body`` is -1 in a scene without cells.
+    With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph has ``island_is_free`` [island] and ``num_islands`` [1].
+    ``pos`` is relative to the mean position of the node's island. In periodic domains, images are chosen so that an island is in one piece. In an island that
+    wraps around the domain this is impossible, and ``pos`` is zero.
+
+    Nodes of meshes also have ``body``, and the graph has ``num_bodies`` [1]. A body consists of the nodes that cells connect, and of nodes without a cell
+    beside them. ``body`` is -1 in a scene without cells.
 
     Attributes:
         config: settings of the graph.
         metadata: metadata of the data set.
-        skips: what to leave out while building, which changes no graph.
+        skips: computations to leave out. They do not change the graph.
 
     Raises:
         PeriodicityError: the neighbour radius is half a period or more.
@@ -99,8 +101,8 @@ class GraphBuilder:
         """Search for the nodes and edges of the graph of a state of float64 tensors.
 
         Raises:
-            GraphError: the state holds a node type that the data set does not have, lacks velocity history, repeats along other axes, or has cells that
-                do not fit its nodes.
+            GraphError: the state has a node type that the data set does not have, lacks velocity history, has other periodic axes, or has cells that do not fit
+                its nodes.
             SimulationError: a position or velocity is not finite, or so many nodes lie within each other's radius that the material has collapsed.
         """
         self._check(state)
@@ -108,7 +110,9 @@ class GraphBuilder:
         if sum(len(r) for r in rows.values()) != state.num_nodes:
             present = {NODE_TYPES[code] for code in state.node_type.unique().tolist()}
             unknown, known = ", ".join(sorted(present - {*self.spec.materials})), ", ".join(self.spec.materials)
-            raise GraphError(f"state has nodes of {unknown}; the data set {self.metadata.dataset!r} has {known}")
+            raise GraphError(
+                f"state has nodes of {unknown}; the data set {self.metadata.dataset!r} has {known}; take a model that was trained on {unknown}"
+            )
         return find_topology(state, rows, self.config, self.spec, self.scales, self.skips)
 
     def _check(self, state: State) -> None:
@@ -116,10 +120,15 @@ class GraphBuilder:
             raise GraphError(f"positions are {state.pos.dtype}; convert the state with State.to_torch, which makes them float64")
         if state.periodicity.axes != self.metadata.periodicity.axes:
             own, other = (", ".join("xyz"[a] for a in p.axes) or "no axis" for p in (self.metadata.periodicity, state.periodicity))
-            raise GraphError(f"state is periodic along {other}, the data set {self.metadata.dataset!r} along {own}")
+            raise GraphError(
+                f"state is periodic along {other}, the data set {self.metadata.dataset!r} along {own}; make the state with the same periodic axes"
+            )
         history = history_of(state)
         if history.shape[1] != self.config.history:
-            raise GraphError(f"state has a history of {history.shape[1]} velocities, the graph needs {self.config.history}")
+            raise GraphError(
+                f"state has a history of {history.shape[1]} velocities, the graph needs {self.config.history}; "
+                "make the state with initial_state of the simulator"
+            )
         bad = ~(torch.cat([state.pos, history.flatten(1)], dim=1).abs() < LARGEST).all(dim=1)
         if bad.any():
             node = int(bad.nonzero()[0])
@@ -203,9 +212,9 @@ class GraphBuilder:
         return features
 
     def _mesh_features(self, topology: Topology, mesh: MeshTopology, state: State) -> tuple[list[Tensor], dict[EdgeType, EdgeFeatures]]:
-        """Return the features of virtual nodes, by level, and those of the edges of meshes.
+        """Return the features of virtual nodes by level, and the features of mesh edges by relation.
 
-        A virtual node moves as the mass-weighted mean of the mesh nodes below it, which is that of its children.
+        A virtual node has the mass-weighted mean position and velocity of the mesh nodes below it.
         """
         dim, sizes = self.spec.dim, mesh.num_virtual
         pos = state.pos if mesh.shift is None else state.pos + mesh.shift
@@ -243,7 +252,7 @@ def _means_below(mesh: MeshTopology, values: Tensor, mass: Tensor) -> Tensor:
 
 
 def _levels(levels: Iterable[int], counts: Iterable[int], device: torch.device) -> Tensor:
-    """Return each level as often as its count says."""
+    """Return a tensor that repeats each level by its count."""
     parts = [torch.full((n,), level, device=device) for level, n in zip(levels, counts, strict=True)]
     return torch.cat([torch.empty(0, dtype=torch.int64, device=device), *parts])
 

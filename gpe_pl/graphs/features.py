@@ -1,7 +1,8 @@
-"""Node and edge features, made dimensionless with the data set's own scales.
+"""Node and edge features. They are dimensionless: each is divided by a scale of the data set.
 
-``paper``: the relative displacement only (paper, section 2.1). ``contact``: also how a pair moves, how near it is to touching, how it meets a wall, and in a
-mesh how far it is from its rest shape. Odd channels change sign when source and target swap, even channels do not. All are in the double precision of states.
+With ``paper``, edges have the relative displacement only (paper, section 2.1). With ``contact``, they also have the relative velocity, the gap, the direction
+of walls, and in meshes the difference from the rest shape. Odd channels change sign when source and target are swapped; even channels do not. Features have the
+double precision of states.
 """
 
 from dataclasses import dataclass
@@ -34,9 +35,9 @@ Features = Literal["paper", "contact"]
 ParameterScale = Literal["linear"]
 
 GAP_SCALE = 0.2
-"""Gaps are resolved in units of this fraction of the rest spacing, …"""
+"""Unit of gaps in features, as a fraction of the rest spacing."""
 GAP_LIMIT = 6.0
-"""… and clipped here, so that the channel resolves contact and saturates beyond it."""
+"""Largest gap in features, in the unit of gaps. Larger gaps are clipped, so that the channel resolves contacts."""
 TINY = 1e-12
 """Length given to an edge between coincident nodes, in rest spacings or widths of a level."""
 
@@ -47,13 +48,14 @@ class GraphConfig:
 
     Attributes:
         features: edge features, ``paper`` or ``contact``.
-        boundary_condition: boundary nodes have normal, friction and restitution beside their velocity; without it, velocity only (paper).
+        boundary_condition: boundary nodes have velocity, normal, friction and restitution. If false, they have only the velocity (paper).
         history: velocities per node.
         connectivity_spacings: neighbour radius in rest spacings; None takes the data set's radius.
         parameter_scale: ``linear`` gives models the physical value of every material parameter, as the paper does. None takes the scale of each parameter
             in ``schema.MATERIALS``, which is logarithmic where values span decades.
         trim_boundary: leave out boundary nodes without an edge, which cannot influence anything.
-        mesh: connect ``schema.MESH_MATERIALS`` along their cells and put levels of virtual nodes above them; without it they are particles like the others.
+        mesh: connect ``schema.MESH_MATERIALS`` along their cells and add levels of virtual nodes above them. If false, their nodes are particles like all
+            others.
         num_levels: number of levels of virtual nodes; None takes as many as lead to one root in any body of the domain.
         islands: find the connected groups of nodes, and those without an edge to the boundary; see ``nn.island_momentum``.
     """
@@ -71,7 +73,7 @@ class GraphConfig:
 
 @dataclass(frozen=True)
 class Scales:
-    """Physical scales of a data set; everything that a feature is divided by."""
+    """Physical scales of a data set, by which features are divided."""
 
     radius: float
     spacing: float
@@ -134,8 +136,8 @@ def _edge_channels(features: Features, relation: EdgeType, dim: int) -> tuple[in
 def material_features(velocity_history: Float64[Tensor, "node history dim"], gravity: Float64[Tensor, " dim"], scales: Scales) -> Tensor:
     """Return motion and external acceleration of dynamic nodes [node, (history + 1) · dim].
 
-    The history enters as the last velocity and the velocity changes before it. A change is about a tenth of a velocity; on the scale of velocities it would
-    be lost.
+    The velocity history enters as the last velocity and the earlier changes of velocity. A change is about a tenth of a velocity, so it would hardly be visible
+    in the earlier velocities.
     """
     n = velocity_history.shape[0]
     changes = velocity_history[:, 1:] - velocity_history[:, :-1]
@@ -193,7 +195,10 @@ def edge_features(
 def virtual_features(
     velocity_history: Float64[Tensor, "node history dim"], level: Int64[Tensor, " node"], gravity: Float64[Tensor, " dim"], scales: Scales
 ) -> Tensor:
-    """Return features of virtual nodes [node, (history + 1) · dim + 1]: those of material nodes, and the level, log₂ of width over rest spacing."""
+    """Return features of virtual nodes [node, (history + 1) · dim + 1].
+
+    They are the features of material nodes and the level, which is log₂ of the node's width over the rest spacing.
+    """
     return torch.cat([material_features(velocity_history, gravity, scales), level[:, None].double()], dim=1)
 
 
@@ -205,10 +210,12 @@ def mesh_features(
     level: Int64[Tensor, " edge"] | None,
     scales: Scales,
 ) -> tuple[Float[Tensor, "edge odd"], Float[Tensor, "edge even"]]:
-    """Return odd and even channels of the edges of meshes, in units of the level's width, so that all levels of a uniformly strained body look alike.
+    """Return odd and even channels of mesh edges.
 
-    With x the displacement, X that at rest and x̂ = x/|x|: odd are x, the relative velocity, X and (|x| − |X|) x̂, along which a spring pulls; even are
-    |x| − |X|, the velocity along x̂ and |X|, and between virtual nodes the level.
+    Lengths are in units of the width of the level, so that all levels of a uniformly strained body have similar features.
+
+    Let x be the displacement, X the displacement at rest and x̂ = x/|x|. Odd channels are x, the relative velocity, X and (|x| − |X|) x̂, which has the
+    direction of a spring force. Even channels are |x| − |X|, the relative velocity along x̂ and |X|. Edges between virtual nodes also have the level.
 
     Args:
         features: ``paper`` or ``contact``.
@@ -234,7 +241,7 @@ def mesh_features(
 
 
 def _without_rounding(displacement: Tensor) -> Tensor:
-    """Return displacements with rounding errors of mean positions set to zero, so that virtual nodes above a lattice lie exactly in rows."""
+    """Return displacements in which components as small as rounding errors are zero. Virtual nodes above a lattice then lie exactly in rows."""
     return torch.where(displacement.abs() < 1e-9, 0.0, displacement)
 
 
@@ -246,5 +253,5 @@ def from_centre(pos: Float64[Tensor, "node dim"], island: Int64[Tensor, " node"]
 
 
 def history_of(state: State) -> Float64[Tensor, "node history dim"]:
-    """Return the velocity history of a state, or its velocity alone."""
+    """Return the velocity history of a state [m/s], or its velocity if there is no history."""
     return state.vel[:, None] if state.velocity_history is None else state.velocity_history

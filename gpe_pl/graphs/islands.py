@@ -1,4 +1,4 @@
-"""Islands: connected components of the dynamic nodes. An island without an edge to the boundary can only fall freely."""
+"""Islands: connected components of the graph of dynamic nodes. An island without an edge to the boundary can only fall freely."""
 
 from __future__ import annotations
 
@@ -82,7 +82,10 @@ def islands_within(
     mesh_edges: Int64[np.ndarray, "2 edge"],
     periodicity: Periodicity = NOWHERE,
 ) -> Islands:
-    """Return the islands that a radius [m] or a mesh connects; free ones have no boundary node, given by position or search tree, within the radius."""
+    """Return the islands of nodes that lie within a radius [m] of each other or that mesh edges connect.
+
+    An island is free if no boundary node lies within the radius. ``boundary`` is the positions of boundary nodes [m], or a search tree of them.
+    """
     touches = np.zeros(len(pos), dtype=bool)
     touches[radius_between(boundary, pos, radius, periodicity)[1]] = True
     return find_islands(len(pos), np.concatenate([radius_pairs(pos, radius, periodicity), mesh_edges], axis=1), touches)
@@ -91,7 +94,10 @@ def islands_within(
 def unwrapped(
     pos: Float64[np.ndarray, "node dim"], edge_index: Int64[np.ndarray, "2 edge"], periodicity: Periodicity
 ) -> tuple[Float64[np.ndarray, "node dim"], Bool[np.ndarray, "node"]]:
-    """Return images of nodes that lie beside their neighbours, and the nodes for which no such images exist; see ``image_shifts``."""
+    """Return positions [m] of images such that connected nodes lie beside each other, and a mask of the nodes without such images.
+
+    See ``image_shifts``.
+    """
     if not periodicity:
         return pos, np.zeros(len(pos), dtype=bool)
     shift, goes_around = image_shifts(pos, edge_index, periodicity)
@@ -101,9 +107,9 @@ def unwrapped(
 def image_shifts(
     pos: Float64[np.ndarray, "node dim"], edge_index: Int64[np.ndarray, "2 edge"], periodicity: Periodicity
 ) -> tuple[Float64[np.ndarray, "node dim"], Bool[np.ndarray, "node"]]:
-    """Return whole periods [m] that move each node beside its neighbours, and a mask of the nodes whose component goes around the period.
+    """Return multiples of the period [m] that move each node beside its neighbours, and a mask of the nodes whose component wraps around the domain.
 
-    A component that goes around the period has no images that lie side by side.
+    No images of a component that wraps around the domain lie side by side.
 
     Args:
         pos: positions [m].
@@ -120,7 +126,10 @@ def image_shifts(
 @njit(cache=True)
 @no_type_check
 def _images(num_nodes, edge_index, turns):
-    """Return the periods that move each node so that edge k, shifted by ``turns[k]`` at its target, is short; and a mask of nodes for which none exist."""
+    """Return the number of periods by which each node moves, and a mask of the nodes without a solution.
+
+    After the moves, every edge k is short if its target is shifted by ``turns[k]`` periods.
+    """
     num_edges, dim = turns.shape
     first = np.zeros(num_nodes + 1, np.int64)  # of a node's entries in ``edge``
     for k in range(num_edges):
@@ -167,7 +176,7 @@ def _images(num_nodes, edge_index, turns):
 def free_since(before: Islands, now: Islands) -> Bool[np.ndarray, "island"]:
     """Return a mask of the islands that are free now and whose nodes were free in the frame before, in one or several islands.
 
-    An island that touched something or lost a part since then still carries that push in its last velocity.
+    If an island touched something in the frame before, its last velocity still contains the effect of that contact.
     """
     together = np.zeros((len(before.is_free), len(now.is_free)), dtype=bool)
     together[before.label, now.label] = True

@@ -1,9 +1,11 @@
-"""The multi-scale graph of meshes: cell edges, and above every connected body virtual nodes that merge 2×2(×2) level by level (paper, section 2.2).
+"""The multi-scale graph of meshes: cell edges, and levels of virtual nodes above every connected body (paper, section 2.2).
 
-A virtual node of level l stands for the mesh nodes in a box of rest space, 2^l rest spacings wide: a quadtree or octree, which works on any mesh and merges
-exactly 2×2(×2) on a lattice. The body lies in the middle of its root's box, so that siblings are of similar size. Only the positions of virtual nodes change
-with time, so the graph of a mesh is built once and then found by the content of its arrays: a rollout, the windows of a trajectory and copies of a state
-share it.
+A virtual node of level l represents the mesh nodes in a box of the rest configuration that is 2^l rest spacings wide. The boxes form a quadtree or octree. This
+works for any mesh, and on a lattice every virtual node has exactly 2×2(×2) children. The body lies in the middle of its root's box, so that siblings are of
+similar size.
+
+Only the positions of virtual nodes change with time. The graph of a mesh is therefore built once and cached by the content of its arrays. All frames of a
+rollout and all windows of a trajectory use the same object.
 """
 
 from __future__ import annotations
@@ -25,29 +27,32 @@ from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.graphs.islands import unwrapped
 
 SNAP = 1e-3
-"""Nodes this near (in rest spacings) below the face of a box count as on it, so that rounding does not tear the rows of a lattice apart."""
+"""Nodes this near below the face of a box count as on it [rest spacings]. Rounding then does not divide a row of a lattice between two boxes."""
 
-MESHES_HELD = 1024
+MAX_CACHED = 1024
 """Largest number of multi-scale graphs kept in memory; a graph of a thousand nodes takes about 0.2 MB."""
 
 REACH = 2.0
-"""Distance within which a node of no cell is part of a body, in rest spacings; longer than the diagonal of a cubic cell."""
+"""Distance within which a node without a cell belongs to a body [rest spacings]. It is longer than the diagonal of a cubic cell."""
 
 
 class MeshError(GpeError, ValueError):
-    """Cells and rest positions do not make a mesh; names the cell or node."""
+    """Raised when cells and rest positions do not form a mesh; the message names the cell or node."""
 
 
 @dataclass(frozen=True, eq=False)
 class MultiscaleGraph:
-    """Part of a mesh's graph that does not change with time. Points are the nodes of the state, followed by the virtual nodes in the order of their levels.
+    """The part of a mesh's graph that does not change with time.
+
+    Points are the nodes of the state, followed by the virtual nodes in the order of their levels.
 
     Attributes:
         rest_pos: undeformed positions of the nodes of the state [m]; in a periodic domain the images that keep bodies together.
-        body: connected body of each point; a node of no cell is a body of its own.
+        body: connected body of each point; a node without a cell is a body of its own.
         level: level of each point, 0 for the nodes of the state.
-        parent: virtual node one level up, or -1: roots, nodes of no cell, and the top of bodies that are deeper than the levels asked for.
-        cell_edges: pairs of nodes that share a cell, first node lower.
+        parent: virtual node one level up. It is -1 for roots, for nodes without a cell, and at the highest level of bodies that would have more levels than
+            ``num_levels``.
+        cell_edges: pairs of nodes with a common cell, the lower node first.
         same_edges: pairs of neighbouring virtual nodes of one level and body, by level.
         down_edges: pairs of a virtual node and each of its children, by level.
         descent: pairs of a virtual node and each mesh node below it.
@@ -70,8 +75,8 @@ class MultiscaleGraph:
     def moving_bodies(self, kind: Int64[np.ndarray, " node"], spacing: float) -> Int64[np.ndarray, " node"]:
         """Return the body that each node of the state moves with.
 
-        A node of no cell moves with the body of its kind that it lies beside at rest, within ``REACH`` spacings, directly or by other such nodes. Where
-        there is none it is a body of its own.
+        A node without a cell moves with the body of its kind that lies within ``REACH`` spacings at rest, directly or through other nodes without a cell. If
+        there is no such body, the node is a body of its own.
 
         Args:
             kind: node types.
@@ -80,9 +85,10 @@ class MultiscaleGraph:
         return _moving_bodies(self, kind.tobytes(), spacing)
 
     def are_in_contact(self, pairs: Int64[np.ndarray, "2 edge"], radius: float) -> Bool[np.ndarray, " edge"]:
-        """Return a mask of the near pairs of nodes that are contacts.
+        """Return a mask of the pairs of nodes that are contacts. All pairs are nearer than the radius now.
 
-        Two bodies touch where they are near. A body touches itself where nodes are near that are more than two radii [m] apart at rest and share no cell.
+        A pair of nodes of two bodies is a contact. A pair within one body is a contact if its nodes are more than two radii [m] apart at rest and have no
+        common cell.
         """
         j, i = pairs
         contact = self.body[j] != self.body[i]
@@ -111,7 +117,7 @@ def multiscale_graph(
         rest_pos: undeformed positions [m].
         cells: nodes of each cell.
         spacing: rest spacing [m].
-        num_levels: largest number of levels of virtual nodes; a body ends at its root or here.
+        num_levels: largest number of levels of virtual nodes. A body has fewer levels if its root is lower.
         periodicity: axes along which space repeats.
 
     Raises:
@@ -121,7 +127,7 @@ def multiscale_graph(
     return _cached(rest_pos.tobytes(), rest_pos.shape, cells.tobytes(), cells.shape, spacing, num_levels, periodicity)
 
 
-@lru_cache(maxsize=MESHES_HELD)
+@lru_cache(maxsize=MAX_CACHED)
 def _cached(
     rest_pos: bytes,
     rest_shape: tuple[int, ...],
@@ -139,7 +145,7 @@ def _cached(
     return graph
 
 
-@lru_cache(maxsize=MESHES_HELD)
+@lru_cache(maxsize=MAX_CACHED)
 def _moving_bodies(graph: MultiscaleGraph, kind: bytes, spacing: float) -> Int64[np.ndarray, " node"]:
     body, kinds = graph.body[: graph.num_nodes].copy(), np.frombuffer(kind, np.int64)
     is_placed = np.zeros(graph.num_nodes, dtype=bool)
@@ -157,7 +163,7 @@ def _moving_bodies(graph: MultiscaleGraph, kind: bytes, spacing: float) -> Int64
 
 
 def build(rest_pos: np.ndarray, cells: np.ndarray, spacing: float, num_levels: int, periodicity: Periodicity = NOWHERE) -> MultiscaleGraph:
-    """Return ``multiscale_graph`` without looking for an earlier result."""
+    """Return ``multiscale_graph`` without using the cache."""
     num_nodes = len(rest_pos)
     bad = np.flatnonzero(((cells < 0) | (cells >= num_nodes)).any(axis=1))
     if len(bad):
@@ -210,7 +216,7 @@ def build(rest_pos: np.ndarray, cells: np.ndarray, spacing: float, num_levels: i
 def _smallest_boxes(
     rest_pos: np.ndarray, nodes: np.ndarray, body: np.ndarray, num_bodies: int, spacing: float
 ) -> tuple[Int64[np.ndarray, "node dim"], Int64[np.ndarray, "body dim"]]:
-    """Return the integer coordinates of each node in its body, in rest spacings, and the halvings along each axis until all are zero."""
+    """Return the integer coordinates of each node in its body [rest spacings], and how often they can be halved along each axis until all are zero."""
     box, low = np.zeros(rest_pos.shape, dtype=np.int64), np.full((num_bodies, rest_pos.shape[1]), np.inf)
     np.minimum.at(low, body[nodes], rest_pos[nodes])
     box[nodes] = np.floor((rest_pos[nodes] - low[body[nodes]]) / spacing + SNAP)
@@ -223,7 +229,7 @@ def _smallest_boxes(
 
 
 def cell_edges(cells: Int64[np.ndarray, "cell corner"], num_nodes: int) -> Int64[np.ndarray, "2 edge"]:
-    """Return the pairs of nodes that share a cell, each once, the lower node first."""
+    """Return the pairs of nodes with a common cell, each once, the lower node first."""
     pairs = [cells[:, [a, b]].T for a, b in itertools.combinations(range(cells.shape[1]), 2)]
     both = np.concatenate([np.empty((2, 0), dtype=np.int64), *pairs], axis=1)
     return _unique_pairs(both[:, both[0] != both[1]], num_nodes)  # a cell may name a node twice: a triangle among quadrilaterals

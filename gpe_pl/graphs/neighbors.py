@@ -1,7 +1,7 @@
 """Exact neighbour search: every pair within the radius, each once, none dropped.
 
-A k-d tree on the CPU [Maneewongvatana & Mount 1999, as in SciPy]; at a few per cent of a model step it is not worth a skin there. Along periodic axes
-the distance of two nodes is that of their nearest images, and the radius must be below half the period.
+The search uses a k-d tree on the CPU [Maneewongvatana & Mount 1999, as in SciPy]. It takes a few per cent of a model step, so neighbour lists are not kept
+between steps. Along periodic axes, the distance of two nodes is that of their nearest images. The radius must be below half the period.
 """
 
 import numpy as np
@@ -26,12 +26,13 @@ def pairs_at_rest(num_nodes: int, radius: float, spacing: float, dim: int) -> fl
 
 
 def check_crowding(pos: Float64[np.ndarray, "node dim"], radius: float, spacing: float, periodicity: Periodicity = NOWHERE) -> None:
-    """Refuse a cloud that has collapsed.
+    """Raise an error if a cloud of nodes has collapsed.
 
-    Pairs are counted before they are listed, which takes time but no memory. Clouds whose nodes per box rule out a collapse are not counted.
+    Pairs are counted before they are listed, because counting needs no memory. If no box contains enough nodes for a collapse, counting is skipped.
 
     Raises:
-        SimulationError: ``CROWDING_LIMIT`` times as many pairs within the radius [m] as at rest; names the most crowded node. Reason ``clustering``.
+        SimulationError: with reason ``clustering``, if ``CROWDING_LIMIT`` times as many pairs lie within the radius [m] as at rest; names the most crowded
+            node.
     """
     num_nodes, dim = pos.shape
     if num_nodes < 2:

@@ -37,10 +37,10 @@ def find_topology(state: State, rows: Rows, config: GraphConfig, spec: FeatureSp
         config: settings of the graph.
         spec: node types and relations of the graph.
         scales: neighbour radius and rest spacing.
-        skips: whether to search between absent node types, and whether to keep the search tree of the boundary.
+        skips: tell whether to search between absent node types, and whether to keep the search tree of the boundary.
 
     Raises:
-        GraphError: the cells do not fit the nodes, or a mesh goes around a periodic domain.
+        GraphError: the cells do not fit the nodes, or a mesh wraps around a periodic domain.
         SimulationError: there are more neighbours than memory can hold.
     """
     multiscale = _multiscale(state, spec, scales)
@@ -60,7 +60,7 @@ def find_topology(state: State, rows: Rows, config: GraphConfig, spec: FeatureSp
 def _radius_edges(
     state: State, rows: Rows, mesh: MultiscaleGraph | None, spec: FeatureSpec, scales: Scales, skips: Skips
 ) -> dict[EdgeType, Tensor]:
-    """Return the edges of ``radius`` relations; boundary nodes count as in the state. Relations of absent node types are missing."""
+    """Return the edges of ``radius`` relations, without relations of absent node types. Boundary nodes are numbered as in the state."""
     walls: Any = state.boundary.tree(state.periodicity) if skips.static_boundary else as_array(state.boundary.pos)
     points = {m: as_array(state.pos[r]) for m, r in rows.items()} | {BOUNDARY: walls}
     present = {m for m, r in rows.items() if len(r)} | ({BOUNDARY} if len(state.boundary.pos) else set())
@@ -96,7 +96,7 @@ def _trimmed(edges: dict[EdgeType, Tensor], num_boundary: int, device: torch.dev
 
 
 def _multiscale(state: State, spec: FeatureSpec, scales: Scales) -> MultiscaleGraph | None:
-    """Return the multi-scale graph of a state's cells, or None where there is none."""
+    """Return the multi-scale graph of a state's cells, or None if the state has no mesh."""
     if not spec.meshes or state.cells is None or state.cells.shape[0] == 0:
         return None
     if state.rest_pos is None:
@@ -160,9 +160,10 @@ def _mesh_edges(state: State, rows: Rows, mesh: MultiscaleGraph, spec: FeatureSp
 def _islands(
     state: State, rows: Rows, edges: dict[EdgeType, Tensor], mesh: MultiscaleGraph | None, spec: FeatureSpec, scales: Scales
 ) -> IslandTopology:
-    """Return the groups of nodes that the graph connects, and which of them no edge ties to the boundary.
+    """Return the connected groups of nodes of the graph (islands), and which of them have no edge to the boundary.
 
-    A model cannot see what pushes a body from beyond the radius. A group that it takes for free falls freely, which keeps it stable (docs/results/trials).
+    A model has no input from walls beyond the radius. It therefore lets an island without edges to the boundary fall freely, which improves stability
+    (docs/results/trials).
     """
     device = state.pos.device
     between = [torch.empty(2, 0, dtype=torch.int64, device=device)]

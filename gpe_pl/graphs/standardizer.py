@@ -31,8 +31,8 @@ class StatisticsSample:
 
     Attributes:
         graphs: graphs evenly spread over the split.
-        rare: returns graphs of trajectories with nodes of all given roles (see ``schema.role``) if ``graphs`` has too few of them, else none.
-        touching: takes a relation of contacts and graphs; returns other graphs with such contacts if too few of the given ones have any.
+        rare: function that returns graphs of trajectories with nodes of all given roles (see ``schema.role``) if ``graphs`` has too few of them, else none.
+        touching: function of a relation of contacts and of graphs. It returns other graphs with such contacts if too few of the given graphs have any.
     """
 
     graphs: list[HeteroData]
@@ -50,7 +50,7 @@ class StatisticsSample:
 class GraphStandardizer(nn.Module):
     """Standardises every feature of a graph with training statistics; odd edge channels are only scaled, so they stay odd.
 
-    All levels of virtual nodes share their statistics, so that a graph may have more of them than those in training.
+    All levels of virtual nodes have the same statistics, so a graph may have more levels than the graphs of training.
 
     Args:
         spec: channels of the graphs.
@@ -77,7 +77,10 @@ class GraphStandardizer(nn.Module):
         return self.parameter_scale is None and MATERIALS[material].scale == "log"
 
     def _precision(self, material: str) -> torch.dtype:
-        """Logarithms are in double precision: another unit shifts them, and single precision would round them to other digits."""
+        """Return the precision in which a material's parameter is standardised.
+
+        Logarithms need double precision. In another unit they are shifted, and single precision would round them differently.
+        """
         return torch.float64 if self._is_logarithmic(material) else torch.float32
 
     def _material_scale(self, material: str, params: Tensor) -> Tensor:
@@ -87,7 +90,8 @@ class GraphStandardizer(nn.Module):
         """Set all statistics from graphs of the training split; a ``StatisticsSample`` adds graphs of rare materials and contacts.
 
         Returns:
-            Materials, and contacts between materials that occur, that no graph has. These are not standardised. Relations of meshes are never named.
+            Materials without nodes in any graph, and contacts without edges between materials that occur. These are not standardised. Relations of meshes are
+                never listed.
         """
 
         def fit(module: nn.Module, values: Iterable[Tensor]) -> bool:
@@ -125,7 +129,7 @@ class GraphStandardizer(nn.Module):
         return [*materials, *(r for r in self.spec.relations if cast(Standardize, self.odd[self._key(r)]).is_identity)]
 
     def take_over(self, other: GraphStandardizer) -> None:
-        """Take the statistics of another standardizer where it has any."""
+        """Take the statistics of another standardizer, as far as it has any."""
         own = {name: module for name, module in self.named_modules() if isinstance(module, Standardize)}
         for name, module in other.named_modules():
             if isinstance(module, Standardize) and not module.is_identity:

@@ -17,7 +17,7 @@ from gpe_pl.schema import EdgeType
 
 
 class GraphError(GpeError, ValueError):
-    """A state does not fit the data set whose graphs are built; the message says how."""
+    """Raised when a state does not fit the data set of the builder; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class MeshTopology:
 
     Attributes:
         num_virtual: number of virtual nodes of each level, lowest level first.
-        descent: pairs of a virtual node (row 0, numbered through all levels) and a node of the state below it (row 1). The number after the last virtual node
-            stands for none.
+        descent: pairs of a virtual node (row 0, numbered through all levels) and a node of the state below it (row 1). In row 0, the number after the last
+            virtual node means that there is none.
         rest_pos: undeformed positions of the nodes of the state [m]; in periodic domains the images that keep each body together.
         shift: vector to add to each position so that meshes stay in one piece at the seams of a periodic domain [m]; None stands for zero.
     """
@@ -44,7 +44,7 @@ class IslandTopology:
 
     Attributes:
         label: island of each node of the state.
-        is_free: whether no edge ties an island to the boundary.
+        is_free: whether an island has no edge to the boundary.
         body: for each material of meshes, the index of the body of each node. It is -1 in scenes without cells.
         num_bodies: number of bodies, or an upper bound of it.
         arm: positions relative to the centre of the island [m], for periodic domains. It is zero in an island that wraps around the domain. With None,
@@ -60,7 +60,7 @@ class IslandTopology:
 
 @dataclass(frozen=True)
 class Topology:
-    """Indices of a graph, which a search finds.
+    """Indices of a graph.
 
     Attributes:
         rows: rows of each material's nodes in the state.
@@ -83,7 +83,8 @@ def descent_of(parents: list[Int64[Tensor, " _"]], num_virtual: tuple[int, ...])
     """Return ``MeshTopology.descent`` of nodes whose parents are known level by level.
 
     Args:
-        parents: for each level, the parent of every node of the level below, as a row of its level; the number of virtual nodes of the level for none.
+        parents: for each level, the parent of every node of the level below, as a row of its level. A node without a parent has the number of virtual nodes of
+            the level.
         num_virtual: number of virtual nodes of each level.
     """
     if not parents:

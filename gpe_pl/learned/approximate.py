@@ -1,6 +1,6 @@
-"""Approximate levels of skipping: nodes at rest are not computed, and one prediction is repeated for several frames.
+"""Approximate levels of skipping: nodes at rest are not computed, or one prediction is repeated for several frames.
 
-The data that this needs between steps are in ``State.internal``, so a rollout can stop at any frame and continue.
+What these simulators remember between steps is in ``State.internal``, so a rollout can stop at any frame and continue.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ def approximate(simulator: LearnedSimulator) -> Simulator:
     runner: Simulator = simulator
     if skips.sleep_after is not None:
         runner = Sleeping(simulator)
-    return runner if skips.hold == 1 else Holding(runner, dt, skips.hold)
+    return runner if skips.hold == 1 else Repeating(runner, dt, skips.hold)
 
 
 class Batched(ABC):
-    """Base class that derives ``step`` from ``step_all``."""
+    """Base class of simulators that advance several scenes together. ``step`` is derived from ``step_all``."""
 
     @abstractmethod
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        """Return the states one frame later, or the error of a scene that has none."""
+        """Return the states one frame later. A scene that cannot be advanced has its error instead."""
 
     def step(self, state: State) -> State:
         (after,) = self.step_all([state])
@@ -55,12 +55,14 @@ class _Rest:
 
 
 class Sleeping(Batched):
-    """Simulator in which islands at rest sleep: they stand still and are not computed until a moving node or wall comes within the graph's radius of them.
+    """Simulator in which islands at rest sleep: their nodes keep their positions and are not computed.
 
-    An island (``graphs.islands``, connected by the radius of the graph) sleeps if all its nodes have been at rest in the last ``Skips.sleep_after``
-    predictions, by ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings``. Islands sleep as a whole, so no edge has a sleeping and a moving end.
-    Moving nodes keep their surroundings: the model gets all nodes within its reach. The momentum of an island that falls asleep is lost. New states have the
-    lost momentum (``State.lost_impulse``) and the number of sleeping nodes (``State.num_asleep``).
+    An island wakes up when a moving node or wall comes within the radius of the graph.
+
+    An island (see ``graphs.islands``) falls asleep if all its nodes have been at rest in the last ``Skips.sleep_after`` predictions.
+    ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` define rest. Islands sleep as a whole, so no edge connects a sleeping and a moving
+    node. For moving nodes, the model gets all nodes that can influence them, also sleeping ones. An island that falls asleep loses its momentum. New states
+    contain this loss (``State.lost_impulse``) and the number of sleeping nodes (``State.num_asleep``).
 
     Args:
         simulator: simulator, whose ``skips`` set when islands sleep.
@@ -81,7 +83,7 @@ class Sleeping(Batched):
         return results
 
     def _awake_and_seen(self, state: State) -> tuple[Tensor, Tensor]:
-        """Return masks [node] of the awake nodes, and of the nodes in the graph for their predictions, which include them."""
+        """Return masks [node] of the awake nodes and of all nodes that the graph for their prediction contains."""
         after = self.simulator.skips.sleep_after
         assert after is not None
         is_calm = (_rest_of(state) >= after).cpu().numpy()
@@ -114,7 +116,7 @@ class Sleeping(Batched):
         return near
 
     def _combined(self, state: State, after: State, awake: Tensor, seen: Tensor) -> State:
-        """Return the next state: awake nodes are at their new positions, the others stay."""
+        """Return the next state, in which awake nodes have moved and all others stay."""
         pos, vel = state.pos.clone(), torch.zeros_like(state.vel)
         moved = awake[seen]
         pos[awake], vel[awake] = after.pos[moved], after.vel[moved]
@@ -141,9 +143,9 @@ def _rest_of(state: State) -> Tensor:
 
 def _in_the_same_island(chosen: np.ndarray, label: np.ndarray) -> np.ndarray:
     """Return a mask [node] of all nodes in islands with a chosen node; ``chosen`` is a mask [node]."""
-    holds = np.zeros(label.max(initial=-1) + 1, dtype=bool)
-    holds[label[chosen]] = True
-    return holds[label]
+    has_chosen = np.zeros(label.max(initial=-1) + 1, dtype=bool)
+    has_chosen[label[chosen]] = True
+    return has_chosen[label]
 
 
 def _combined_stress(state: State, after: State, awake: Tensor, moved: Tensor) -> Stress | None:
@@ -155,7 +157,7 @@ def _combined_stress(state: State, after: State, awake: Tensor, moved: Tensor) -
 
 
 @dataclass(frozen=True)
-class _Held:
+class _Repeated:
     """A prediction that is repeated.
 
     Attributes:
@@ -169,7 +171,7 @@ class _Held:
     inner: Any
 
 
-class Holding(Batched):
+class Repeating(Batched):
     """Simulator that predicts once in ``frames`` frames and repeats the accelerations in between. Contacts that begin or end in between have no effect.
 
     Args:
@@ -182,24 +184,26 @@ class Holding(Batched):
         self.simulator, self.dt, self.frames = simulator, dt, frames
 
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        held = [s.internal if isinstance(s.internal, _Held) else None for s in states]
-        asked = [replace(s, internal=h.inner if h else s.internal) for s, h in zip(states, held, strict=True) if h is None or h.frames == 0]
+        repeated = [s.internal if isinstance(s.internal, _Repeated) else None for s in states]
+        asked = [
+            replace(s, internal=h.inner if h else s.internal) for s, h in zip(states, repeated, strict=True) if h is None or h.frames == 0
+        ]
         answers = iter(step_all(self.simulator, asked))
         results: list[State | SimulationError] = []
-        for state, h in zip(states, held, strict=True):
+        for state, h in zip(states, repeated, strict=True):
             if h is not None and h.frames > 0:
-                results.append(self._go_on(state, h))
+                results.append(self._repeat(state, h))
                 continue
             after = next(answers)
-            results.append(after if isinstance(after, SimulationError) else self._hold(state, after))
+            results.append(after if isinstance(after, SimulationError) else self._with_repetition(state, after))
         return results
 
-    def _hold(self, state: State, after: State) -> State:
+    def _with_repetition(self, state: State, after: State) -> State:
         acceleration = integrators.acceleration(after.vel, state.vel, self.dt)
         stopped = (after.vel == 0).all(dim=1, keepdim=True)  # sleeping nodes, for example: the stop must not be repeated
-        return replace(after, internal=_Held(torch.where(stopped, 0.0, acceleration), self.frames - 1, after.internal))
+        return replace(after, internal=_Repeated(torch.where(stopped, 0.0, acceleration), self.frames - 1, after.internal))
 
-    def _go_on(self, state: State, held: _Held) -> State:
-        pos, vel = integrators.advance(state.pos, state.vel, held.acceleration, self.dt)
-        internal = replace(held, frames=held.frames - 1)
+    def _repeat(self, state: State, repeated: _Repeated) -> State:
+        pos, vel = integrators.advance(state.pos, state.vel, repeated.acceleration, self.dt)
+        internal = replace(repeated, frames=repeated.frames - 1)
         return state.later(self.dt, pos, vel, stress=state.stress, num_asleep=state.num_asleep, internal=internal)

@@ -1,7 +1,7 @@
 """Checks of PyTorch archives from unknown sources, made before their pickle is read.
 
-PyTorch's safe loading runs no code. A few bytes in a file can still make it use gigabytes or run for hours. Such files have members that unpack to far more
-than is stored, members that share their bytes, empty arrays of any length, or keys of tables that are tuples of tuples.
+PyTorch's safe loading runs no code. A few bytes in a file can still make it use gigabytes of memory or run for hours. Such files have members that unpack to
+far more than is stored, members that overlap in the file, empty arrays of any length, or nested tuples as keys of tables.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _MARK = (-1, "")
 
 
 def check_archive(path: Path) -> None:
-    """Check that an archive is like those that ``torch.save`` writes, and that its checksums match.
+    """Check that an archive has the structure that ``torch.save`` writes, and that its checksums match.
 
     Raises:
         ValueError: the archive has other contents; the message names them.

@@ -1,7 +1,7 @@
 """A learned model as a ``Simulator``: builder ∘ standardisation ∘ model ∘ integrator.
 
-Everything that a rollout needs travels in one checkpoint: the model's settings and weights, the statistics of the training data, the graph's settings and
-the data set's metadata.
+A checkpoint contains everything that a rollout needs: settings and weights of the model, statistics of the training data, settings of the graphs, and metadata
+of the data set.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from gpe_pl.learned.checkpoint_archive import check_archive, check_values
 from gpe_pl.learned.pretrained import checkpoint_path, names
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.lookup import model_class
-from gpe_pl.nn.static_friction import is_held, supported
+from gpe_pl.nn.static_friction import keeps_position, supported
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, MATERIALS, EdgeType, node_code
@@ -54,15 +54,15 @@ MASS_FACTOR = 2.0
 
 
 class CheckpointError(GpeError, ValueError):
-    """A checkpoint is missing, damaged, or not one of gpe_pl; the message names the file and what to do."""
+    """Raised when a checkpoint is missing, damaged, or not one of gpe_pl; the message names the file and says what to do."""
 
 
 class SceneError(GpeError, ValueError):
-    """A scene does not fit a trained simulator, or holds values that are not finite."""
+    """Raised when a scene does not fit a trained simulator, or has invalid values."""
 
 
 class LearnedSimulator(nn.Module):
-    """Advances a state by one frame with a learned acceleration.
+    """A simulator that advances a state by one frame with the acceleration that a model predicts.
 
     Args:
         model: the network; its ``settings`` rebuild it from a checkpoint.
@@ -70,11 +70,11 @@ class LearnedSimulator(nn.Module):
 
     Attributes:
         skips: levels of skipping.
-        holds_parameters: clamp material parameters outside the range of training to the nearest trained value. A network is less reliable outside this range.
-        static_friction: nodes on a wall keep their positions if they are slower than this fraction of the speed that gravity gives in one frame (see
-            ``nn.static_friction``); 0 switches it off.
+        clamps_parameters: clamp material parameters outside the range of training to the nearest trained value. A network is less reliable outside this range.
+        static_friction: fraction of the speed that gravity gives in one frame. Nodes on a wall that are slower keep their positions (see
+            ``nn.static_friction``). 0 switches this off.
 
-    You may change these attributes at any time. A checkpoint that ``save`` writes keeps ``static_friction`` only.
+    You may change these attributes at any time. Of these three, ``save`` stores only ``static_friction``.
     """
 
     model: Model
@@ -82,7 +82,7 @@ class LearnedSimulator(nn.Module):
     stress_std: Tensor
     trained_scene: Tensor
     trained_mass: Tensor
-    holds_parameters: bool = True
+    clamps_parameters: bool = True
 
     def __init__(self, model: Model, builder: GraphBuilder) -> None:
         super().__init__()
@@ -117,15 +117,15 @@ class LearnedSimulator(nn.Module):
         self.model.skips = skips
 
     def configured(
-        self, *, skips: Skips | None = None, holds_parameters: bool | None = None, static_friction: float | None = None
+        self, *, skips: Skips | None = None, clamps_parameters: bool | None = None, static_friction: float | None = None
     ) -> LearnedSimulator:
         """Return a copy with other settings; None keeps a setting. The copy shares the weights and leaves this simulator unchanged."""
         other = copy.copy(self)
         other._modules = {**self._modules, "model": copy.copy(self.model)}
         if skips is not None:
             other.skips = skips
-        if holds_parameters is not None:
-            other.holds_parameters = holds_parameters
+        if clamps_parameters is not None:
+            other.clamps_parameters = clamps_parameters
         if static_friction is not None:
             other.static_friction = static_friction
         return other
@@ -135,12 +135,12 @@ class LearnedSimulator(nn.Module):
         return self._static_friction
 
     @static_friction.setter
-    def static_friction(self, share: Any) -> None:
-        if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
-            raise ValueError(f"static_friction={share!r}: must be a number from 0 to less than 1, a fraction of gravity")
-        if share and not self.builder.spec.islands:
-            raise SceneError(f"static_friction={share:g}: needs a model that was trained with graph.islands=true; 0 turns it off")
-        self._static_friction = float(share)
+    def static_friction(self, fraction: Any) -> None:
+        if isinstance(fraction, bool) or not isinstance(fraction, int | float) or not 0 <= fraction < 1:
+            raise ValueError(f"static_friction={fraction!r}: must be a number from 0 to less than 1, a fraction of gravity")
+        if fraction and not self.builder.spec.islands:
+            raise SceneError(f"static_friction={fraction:g}: needs a model that was trained with graph.islands=true; 0 turns it off")
+        self._static_friction = float(fraction)
 
     @property
     def num_hops(self) -> int:
@@ -151,7 +151,7 @@ class LearnedSimulator(nn.Module):
     def fit_statistics(
         self, graphs: Iterable[HeteroData], parameter_ranges: Mapping[str, Tensor] | None = None, trained_scene: np.ndarray | None = None
     ) -> None:
-        """Set feature statistics, the range of material parameters, and the scales of acceleration and stress from training graphs with ``target``.
+        """Set the statistics of features, the trained ranges, and the scales of acceleration and stress from training graphs with ``target``.
 
         Each scale is one scalar for all axes or components and all materials; no mean is subtracted. A warning names materials and relations without
         statistics.
@@ -173,7 +173,9 @@ class LearnedSimulator(nn.Module):
         target = torch.cat([g[m].target for g in sample for m in self.builder.spec.materials]).double()
         rms = target.square().mean().sqrt()
         if not torch.isfinite(rms) or rms == 0:
-            raise ValueError(f"the training data's accelerations without gravity have rms {float(rms)}; nothing to learn from")
+            raise ValueError(
+                f"the training data's accelerations without gravity have rms {float(rms)}; nothing to learn from: check positions, gravity and frame_dt"
+            )
         self.acceleration_std.copy_(rms)
         stress = [g[m].stress_target for m in self.builder.spec.stress_channels for g in sample.of(m) if "stress_target" in g[m]]
         if stress:
@@ -194,11 +196,11 @@ class LearnedSimulator(nn.Module):
 
     @torch.no_grad()
     def start_from(self, trained: LearnedSimulator) -> None:
-        """Copy the weights and statistics of another simulator. Statistics that it lacks are kept. Trained ranges then cover both trainings.
+        """Copy the weights and statistics of another simulator. Statistics that the other lacks are kept. Trained ranges then cover both trainings.
 
         Raises:
             SceneError: the other simulator was trained with another frame interval, spacing, dimension or materials.
-            CheckpointError: the other simulator has another model or other graphs; names the settings to choose.
+            CheckpointError: the other simulator has another model or other graphs; the message names the settings to choose.
         """
         trained.check_scene(self.builder.metadata)
         there, now = trained._choices(), self._choices()
@@ -224,7 +226,7 @@ class LearnedSimulator(nn.Module):
         self.trained_mass[1] = torch.maximum(mass[1], self.trained_mass[1])
 
     def _choices(self) -> dict[str, str]:
-        """Return the overrides that choose this model and these graphs. The radius is given in spacings, even if it is the data set's."""
+        """Return the overrides that choose this model and these graphs. The radius is given in spacings, also if it is the default of the data set."""
         own = self.description()
         spacings = {"connectivity_spacings": float(f"{self.builder.scales.radius / self.builder.scales.spacing:.6g}")}
         parts = {"model": {"_target_": own["model"], **own["settings"]}, "graph": own["graph"] | spacings}
@@ -282,13 +284,14 @@ class LearnedSimulator(nn.Module):
 
     def forward(self, data: HeteroData) -> Prediction:
         """Return accelerations without gravity per material, in units of ``acceleration_std``."""
-        limits = dict(self.trained_ranges()) if self.holds_parameters else None
+        limits = dict(self.trained_ranges()) if self.clamps_parameters else None
         return self.model(self.standardizer(data, self.skips.absent_types, limits))
 
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
         """Return the state at a frame with the velocity history that the graph needs, on this model's device.
 
-        A warning names material parameters, gravity and boundary nodes outside the range of training, and another version of the solver, once per kind.
+        Warnings name material parameters, gravity and boundary nodes outside the range of training, and a version of the solver other than in training. Each
+        kind of warning appears once.
 
         Raises:
             IndexError: there are too few frames before ``frame``.
@@ -303,7 +306,7 @@ class LearnedSimulator(nn.Module):
         return self._checked(state, f"frame {frame}")
 
     def standing(self, state: State, scene: Metadata) -> State:
-        """Return the start of a rollout without earlier frames, on this model's device: all velocities of the history are the present one.
+        """Return the start of a rollout without earlier frames, on this model's device. All velocities of the history equal the present velocity.
 
         Raises:
             SceneError: as ``initial_state``.
@@ -320,7 +323,7 @@ class LearnedSimulator(nn.Module):
         return same_scales and scene.dim == own.dim and scene.param_names == own.param_names
 
     def check_scene(self, scene: Metadata, choice: str = "data=… size=…") -> None:
-        """Refuse a scene that does not fit; the message recommends a ``choice`` of the data set.
+        """Raise an error for a scene that does not fit. The message recommends a ``choice`` of the data set.
 
         Raises:
             SceneError: another frame interval, spacing, dimension or materials than in training.
@@ -337,11 +340,13 @@ class LearnedSimulator(nn.Module):
         for name, values in (("pos", state.pos), ("velocity", history_of(state))):
             bad = ~torch.isfinite(values).flatten(1).all(dim=1)
             if bad.any():
-                raise SceneError(f"{where}: node {int(bad.nonzero()[0])} has a {name} that is not finite")
+                raise SceneError(
+                    f"{where}: node {int(bad.nonzero()[0])} has a {name} that is not finite; correct it, or start at another frame"
+                )
         bad = ~(torch.isfinite(state.mass) & (state.mass > 0))
         if bad.any():
             node = int(bad.nonzero()[0])
-            raise SceneError(f"node {node} has a mass of {float(state.mass[node]):g} kg")
+            raise SceneError(f"node {node} has a mass of {float(state.mass[node]):g} kg; give every node a positive and finite mass")
         for material, spec in MATERIALS.items():
             if material in self.builder.metadata.materials:
                 rows = torch.nonzero(state.node_type == node_code(material)).flatten()
@@ -350,8 +355,8 @@ class LearnedSimulator(nn.Module):
                 if wrong.any():
                     node, value = int(rows[wrong][0]), float(column[wrong][0])
                     raise SceneError(f"node {node} ({material}): {spec.name} is {value:g} {spec.unit}, must be {spec.rule}")
-        held = "; clamped to the nearest trained value" if self.holds_parameters else ""
-        found = [(kind, line + held) for kind, line in self._outside_parameters(state)]
+        clamped = "; clamped to the nearest trained value" if self.clamps_parameters else ""
+        found = [(kind, line + clamped) for kind, line in self._outside_parameters(state)]
         for kind, line in (*found, *self._outside_scene(state)):
             self._warn_once(kind, line)
         return state
@@ -367,11 +372,11 @@ class LearnedSimulator(nn.Module):
 
     @torch.inference_mode()
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
-        """Return ``step`` of several scenes from one pass of the model; a scene whose graph cannot be built gives the reason."""
+        """Advance several scenes by one pass of the model. A scene whose graph cannot be built has its error instead of a state."""
         return self.next_states(states)
 
     def next_states(self, states: list[State]) -> list[State | SimulationError]:
-        """Return ``step_all`` with tensors that may take part in training."""
+        """Return the result of ``step_all`` as tensors that autograd can use in training."""
         graphs = [self._graph(state) for state in states]
         sound = [k for k, graph in enumerate(graphs) if not isinstance(graph, SimulationError)]
         new: list[Any] = list(graphs)
@@ -387,7 +392,7 @@ class LearnedSimulator(nn.Module):
             return error
 
     def _warn_of_unknown(self, graphs: list[HeteroData]) -> None:
-        """Warn once of each node type and relation of a scene that has no statistics of training."""
+        """Warn, once each, of node types and relations of a scene that have no statistics from training."""
         if self._unknown is None:
             self._unknown = self.standardizer.unknown()
         for kind in [*self._unknown]:
@@ -408,7 +413,7 @@ class LearnedSimulator(nn.Module):
         return [self.integrated(*parts) for parts in zip(states, graphs, acc, strict=True)]
 
     def accelerations(self, states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor]) -> list[Tensor]:
-        """Return the accelerations [node, dim] of each state in m/s², gravity included.
+        """Return the accelerations [node, dim] of each state in m/s², including gravity.
 
         Args:
             states: states of the scenes of a batch.
@@ -421,17 +426,17 @@ class LearnedSimulator(nn.Module):
         return acc
 
     def integrated(self, state: State, graph: HeteroData, acc: Tensor) -> State:
-        """Return the next state under an acceleration [node, dim] in m/s², gravity included; static friction keeps slow nodes in place."""
+        """Return the next state under an acceleration [node, dim] in m/s² that includes gravity. Static friction keeps slow nodes in place."""
         new = self.advance(state, acc)
-        return self._held(state, new, graph) if self.static_friction else new
+        return self._with_static_friction(state, new, graph) if self.static_friction else new
 
-    def _held(self, state: State, new: State, graph: HeteroData) -> State:
-        """Return the new state with the old positions of the nodes that static friction keeps in place."""
+    def _with_static_friction(self, state: State, new: State, graph: HeteroData) -> State:
+        """Return the new state, in which nodes that static friction keeps in place have their old positions and zero velocity."""
         island = torch.empty(state.num_nodes, dtype=torch.int64, device=state.pos.device)
         for material in self.builder.spec.materials:
             island[graph[material].node_id] = graph[material].island
-        held = is_held(state.vel, new.vel, island, self.supported(graph), self.slowest(state.gravity))[:, None]
-        return new.corrected(torch.where(held, state.pos, new.pos), torch.where(held, 0.0, new.vel))
+        stays = keeps_position(state.vel, new.vel, island, self.supported(graph), self.slowest(state.gravity))[:, None]
+        return new.corrected(torch.where(stays, state.pos, new.pos), torch.where(stays, 0.0, new.vel))
 
     def slowest(self, gravity: Tensor) -> Tensor:
         """Return the speed [m/s] below which static friction keeps nodes in place."""
@@ -456,13 +461,13 @@ class LearnedSimulator(nn.Module):
         ]
 
     def advance(self, state: State, acc: Tensor) -> State:
-        """Return the next state under an acceleration [node, dim] in m/s², gravity included."""
+        """Return the next state under an acceleration [node, dim] in m/s² that includes gravity, without static friction."""
         dt = self.builder.metadata.frame_dt
         return state.later(dt, *integrators.advance(state.pos, state.vel, acc, dt))
 
     @classmethod
     def _check_size(cls, description: dict[str, Any], weights: dict[str, Tensor]) -> None:
-        """Raise ``ValueError`` if weights do not have the names, shapes and types of a description. This allocates no memory for the model."""
+        """Raise ``ValueError`` if weights do not have the names, shapes and types that follow from a description. No memory is allocated for the model."""
         try:
             with torch.device("meta"):
                 expected = cls.from_description(description).state_dict()
@@ -489,17 +494,17 @@ class LearnedSimulator(nn.Module):
                 raise ValueError(f"{name} has values that are not positive")
         for material, trained in self.trained_ranges():
             if not bool((trained[0] <= trained[1]).all()):
-                raise ValueError(f"trained_{material} ends before it begins")
+                raise ValueError(f"the lowest value of trained_{material} is above the highest")
         low, high = self.trained_scene
         if not bool(((low <= high) | (low.isposinf() & high.isneginf())).all()):
-            raise ValueError("trained_scene ends before it begins")
+            raise ValueError("the lowest value of trained_scene is above the highest")
         if not bool((self.trained_mass[0] <= self.trained_mass[1]).all()):
-            raise ValueError("trained_mass ends before it begins")
+            raise ValueError("the lowest value of trained_mass is above the highest")
 
     # --- checkpoints ----------------------------------------------------------------------------------------------------------------------
 
     def description(self) -> dict[str, Any]:
-        """Plain values from which ``from_description`` rebuilds this simulator, weights excluded."""
+        """Return plain values from which ``from_description`` rebuilds this simulator, weights excluded."""
         cls = type(self.model)
         return {
             "format": CHECKPOINT_FORMAT,
@@ -537,7 +542,7 @@ class LearnedSimulator(nn.Module):
 
     @classmethod
     def from_checkpoint(cls, path: Path | str, device: Any = "cpu") -> LearnedSimulator:
-        """Return the simulator of a checkpoint, in evaluation mode. If the run averaged its weights, it has the averages.
+        """Return the simulator of a checkpoint, in evaluation mode. If the run averaged its weights, the simulator has the averages.
 
         Only tensors and plain values are unpickled.
 
@@ -546,7 +551,7 @@ class LearnedSimulator(nn.Module):
             device: device of the simulator.
 
         Raises:
-            CheckpointError: the file is damaged, not a checkpoint of gpe_pl, or one of another model.
+            CheckpointError: the file is missing, damaged, not a checkpoint of gpe_pl, or one of another model.
         """
         path = checkpoint_path(path)
         checkpoint = load_checkpoint(path, device)
@@ -559,12 +564,16 @@ class LearnedSimulator(nn.Module):
             simulator.load_state_dict(weights)
             simulator._check_values()
         except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-            raise CheckpointError(f"{path}: not a checkpoint of gpe_pl or one of another model ({reason(error)})") from None
+            raise CheckpointError(
+                f"{path}: not a checkpoint of gpe_pl or one of another model ({reason(error)}); take another one of the run, such as last.ckpt"
+            ) from None
         return simulator.to(device).eval()
 
 
 def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:
-    """Return the content of a checkpoint. Only tensors and plain values are unpickled. The checksums of the archive are compared first; PyTorch does not do so.
+    """Return the content of a checkpoint. Only tensors and plain values are unpickled.
+
+    The checksums of the archive are compared first, because PyTorch does not compare them.
 
     Raises:
         CheckpointError: the file does not exist, is damaged, or has any other content.

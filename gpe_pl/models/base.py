@@ -26,7 +26,9 @@ class Prediction:
 
 
 class Model(nn.Module, ABC):
-    """Network whose constructor takes a ``FeatureSpec`` first and annotated keyword settings after it, and passes all of them on to this one.
+    """Base class of networks.
+
+    The constructor of a subclass takes a ``FeatureSpec`` first and annotated keyword settings after it, and passes all of them to the constructor of ``Model``.
 
     A subclass calls ``super().__init__(spec, width=width, …)`` before it makes its layers, so that ``type(model)(spec, **model.settings)`` rebuilds it.
 
@@ -37,7 +39,7 @@ class Model(nn.Module, ABC):
     Attributes:
         spec: channels of the graphs.
         settings: keyword arguments that rebuild the model; a checkpoint stores them.
-        skips: what ``forward`` may leave out in evaluation mode; a model may ignore it.
+        skips: computations that ``forward`` may leave out in evaluation mode; a model may ignore them.
     """
 
     spec: FeatureSpec
@@ -61,9 +63,9 @@ class Model(nn.Module, ABC):
 
     @property
     def is_fused(self) -> bool:
-        """Whether the model has fused passes for CPUs, where ``torch.compile`` then gains nothing."""
+        """Whether the model has fused passes for CPUs. If so, ``torch.compile`` makes it no faster on a CPU."""
         return False
 
     @abstractmethod
     def forward(self, data: HeteroData) -> Prediction:
-        """Return the prediction for a graph, or a batch of graphs, with standardised features, without changing the stores of the graph."""
+        """Return the prediction for a graph, or a batch of graphs, with standardised features. The graph is not changed."""

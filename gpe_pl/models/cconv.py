@@ -5,14 +5,14 @@ Layers of the paper, with features f of particles and g of boundary nodes, ReLU 
 
     f¹ = [conv(g), conv(f), dense(f)]            f^{k+1} = conv(φ(f^k)) + dense(φ(f^k)) (+ f^k where the widths agree)
 
-Filters have 4^d points and the radius of the graph. A particle is no neighbour of itself; the dense layers take that role.
+Filters have 4^d points and the radius of the graph. A particle is not a neighbour of itself; the dense layers process its own features.
 
 Differences from the paper, because all models here share graphs, inputs and targets:
 
 - The output is the acceleration without gravity in units of its standard deviation. The paper's is 1/128 of a position correction after a step with gravity.
-- Particles carry the standardised features of the graph (velocity history, gravity, material parameter) and one column per material, which is the paper's
-  constant 1 if there is one material. Boundary nodes carry velocity, normal and boundary condition; the paper's carry the normal.
-- All materials share filters. Edges join all pairs within the radius, which is 4.5 particle radii in the paper.
+- Particles have the standardised features of the graph (velocity history, gravity, material parameter) and one column per material. With one material this
+  column is the constant 1 of the paper. Boundary nodes have velocity, normal and boundary condition; in the paper they have the normal only.
+- All materials use the same filters. Edges connect all pairs within the radius, which is 4.5 particle radii in the paper.
 """
 
 import itertools
@@ -35,7 +35,7 @@ Offsets = dict[EdgeType, tuple[Tensor, Tensor]]
 
 
 class NotAParticleGraphError(GpeError, ValueError):
-    """The graph has relations that cannot be convolved."""
+    """Raised for graphs with relations that have no convolution, such as those of meshes."""
 
 
 class ContinuousConvNet(Model):
@@ -44,7 +44,7 @@ class ContinuousConvNet(Model):
     Args:
         spec: channels of the graphs, which have ``radius`` relations only.
         num_convolutions: number of layers, the first and the last included; 4 in the paper.
-        hidden_channels: width between layers; each of the three parts of the first layer has half of it; 64 in the paper.
+        hidden_channels: width between layers; 64 in the paper. Each of the three parts of the first layer has half this width.
         kernel_size: filter points per axis; 4 in the paper.
         material_embedding: ``feature``: the material parameter is a feature of nodes like the others; ``none`` leaves it out, as a control.
 

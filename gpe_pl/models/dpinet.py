@@ -16,11 +16,11 @@ A graph without virtual nodes has only the first stage, like the paper's fluids.
 
 Differences from the paper, because all models here share graphs, inputs and targets:
 
-- The model predicts the acceleration without gravity. The paper's predicts the velocity, and the motion of rigid bodies through a rigid motion.
-- Particles carry the standardised features of the graph and a one-hot type, and relations its edge features. These replace absolute positions and a flag, so
-  that the result does not depend on the position of the scene. There are no edges from a particle to itself.
-- Virtual nodes are the multi-scale grid of the mesh instead of clusters of k-means, and those of one level have edges to their grid neighbours instead of all
-  others. All levels share the weights of a stage, so that a mesh deeper than in training still runs.
+- The model predicts the acceleration without gravity. The model of the paper predicts the velocity, and for rigid bodies a rigid motion.
+- Particles have the standardised features of the graph and a one-hot type; relations have the edge features of the graph. They replace the absolute positions
+  and the flag of the paper, so that the result does not depend on the position of the scene. There are no edges from a particle to itself.
+- Virtual nodes are those of the multi-scale graph instead of clusters from k-means. Virtual nodes of one level have edges to their neighbours, in the paper to
+  all others. All levels use the same weights of a stage, so a mesh may have more levels than in training.
 """
 
 from typing import Annotated, cast
@@ -53,9 +53,9 @@ class Stage(nn.Module):
         self.particle_propagator = nn.Linear(2 * hidden, hidden)
 
     def forward(self, x: Tensor, h: Tensor, index: Tensor, features: Tensor, receivers: slice, num_steps: int) -> Tensor:
-        """Return the effects [node, hidden] after ``num_steps`` propagations along directed edges into the rows ``receivers``; other rows do not change.
+        """Return the effects [node, hidden] after ``num_steps`` propagations along directed edges. Only the rows ``receivers`` change.
 
-        Products with codes are the same in every step, so each is computed once.
+        Products with the encoded inputs are the same in every step, so they are computed once.
         """
         codes = self.relation_encoder_out(self.relation_encoder_in(features, x, index))
         of_relation = self.relation_propagator.edges(codes)

@@ -1,8 +1,8 @@
 """GNS, the Graph Network-based Simulator [Sanchez-Gonzalez et al. 2020, "Learning to Simulate Complex Physics with Graph Networks", section 4 and
 supplement B; code: github.com/google-deepmind/deepmind-research, ``learning_to_simulate``].
 
-The model encodes, processes and decodes on one graph of all particles, and all types share every function. MLPs have two hidden layers with ReLU, and a
-LayerNorm after each MLP but the decoder::
+The model has an encoder, a processor and a decoder on one graph of all particles. All types use the same functions. MLPs have two hidden layers with ReLU, and
+a LayerNorm after each MLP except the decoder::
 
     h_i  = MLP([features, embedding of the type])       e_ij = MLP([displacement, its length])       both directions of every edge
     e'   = MLP([e_ij, h_i, h_j])                        h'   = MLP([h_i, Σ_j e'])
@@ -11,10 +11,10 @@ LayerNorm after each MLP but the decoder::
 
 Differences from the paper, because all models here share graphs, inputs and targets:
 
-- Edges carry the channels that ``graph.features`` selects, and the length of the standardised displacement. Relations of meshes, if any, carry their features
-  (``graph.mesh=false`` gives the paper's topology).
-- Walls are boundary nodes with velocity, normal and boundary condition, as in the other models, instead of distances to the box. They have no edges among
-  themselves.
+- Edges have the channels that ``graph.features`` selects, and the length of the standardised displacement. Edges of meshes have their own features
+  (``graph.mesh=false`` gives the topology of the paper).
+- Walls are boundary nodes with velocity, normal and boundary condition, as in the other models. The paper has distances to the box instead. Boundary nodes have
+  no edges among themselves.
 - Gravity and the material parameter are inputs, and the target is the acceleration without gravity.
 """
 

@@ -7,7 +7,7 @@ The model is an encoder, processor and decoder over typed nodes and relations, w
     h_i  += f_v(Σ_j m_ij)                                e_ij += m_ij
     a_i   = f_d(h_i)                                     or a sum of antisymmetric pair forces over the true mass, or both (``contact``)
 
-Virtual nodes above meshes are nodes of separate types and carry hidden messages only. A message climbs one level per step.
+Virtual nodes above meshes are nodes of separate types. They pass messages, and nothing is decoded from them. A message moves up one level per step.
 """
 
 from collections.abc import Iterable
@@ -35,11 +35,11 @@ NodeNorm = Literal["none", "layer"]
 
 
 class StressError(GpeError, ValueError):
-    """A stress decoder was requested, but the data set stores no stress."""
+    """Raised when the model should decode a stress but the data set stores none."""
 
 
 class IslandError(GpeError, ValueError):
-    """Islands or bodies should move as a whole, but the graphs do not contain them."""
+    """Raised when islands or bodies should move as a whole but the graphs do not contain them, or when momentum would not be conserved."""
 
 
 class Decoded(NamedTuple):
@@ -57,9 +57,10 @@ class Decoded(NamedTuple):
 
 
 class MaterialEmbedding(nn.Module):
-    """Θ(v) of the paper, section 2.1; ``affine`` satisfies Θ(λv₁ + (1−λ)v₂) = λΘ(v₁) + (1−λ)Θ(v₂), ``mlp`` serves for comparison.
+    """Embedding Θ(v) of material parameters (paper, section 2.1).
 
-    The rule holds for the values that the graphs give: logarithms of some parameters, or physical values with ``graph.parameter_scale=linear``.
+    ``affine`` satisfies Θ(λv₁ + (1−λ)v₂) = λΘ(v₁) + (1−λ)Θ(v₂). ``mlp`` does not and serves for comparison. Here v are the values that graphs have:
+    logarithms of some parameters, or physical values with ``graph.parameter_scale=linear``.
     """
 
     def __init__(self, param_channels: int, hidden_channels: int, kind: MaterialEmbeddingKind, is_fused: bool) -> None:
@@ -74,7 +75,10 @@ class MaterialEmbedding(nn.Module):
 
 
 class OddEncoder(nn.Module):
-    """Encoder of the odd edge state: C (φ(W o + S s + b) − φ(−W o + S s + b)) of odd features o and even features s; no outer bias, so it stays odd."""
+    """Encoder of the odd edge state.
+
+    It computes C (φ(W o + S s + b) − φ(−W o + S s + b)) from odd features o and even features s. C has no bias, so the result is odd.
+    """
 
     def __init__(self, odd_channels: int, even_channels: int, hidden_channels: int) -> None:
         super().__init__()
@@ -92,7 +96,9 @@ class OddEncoder(nn.Module):
 
 
 class PairForce(nn.Module):
-    """Decoder of one force per edge from the final node states: antisymmetric within a type, negated across types, so Σ F = 0 to rounding.
+    """Decoder of one force per edge from the final node states.
+
+    Forces are antisymmetric within a type and negated between types, so their sum is zero up to rounding.
 
     F_ij = C (φ(z_ij) − φ(z_ji)) with z_ij = A h_i + B h_j + W o_ij + S s_ij + b.
     """
@@ -110,7 +116,7 @@ class PairForce(nn.Module):
     def forward(
         self, h_source: Tensor, h_target: Tensor, edge_index: Tensor, odd: Tensor, even: Tensor, chunk: int | None = None
     ) -> Float[Tensor, "edge dim"]:
-        """Return the force on the target of every edge, for ``chunk`` edges at a time; the source feels the opposite force."""
+        """Return the force on the target of every edge; the opposite force acts on the source. Forces are computed for ``chunk`` edges at a time."""
         a, b = self.lin_target(h_target), self.lin_source(h_source)
         if chunk is None:
             return self._force(a, b, edge_index, odd, even)
@@ -128,7 +134,7 @@ class PairForce(nn.Module):
 
 
 def _merge_levels(x: dict[str, Tensor], edges: Edges) -> tuple[dict[str, Tensor], Edges]:
-    """Merge all levels of virtual nodes into one node type, for weights that all levels share: the same messages in fewer calls."""
+    """Merge all levels of virtual nodes into one node type. The messages are the same, because all levels have the same weights, but fewer calls are needed."""
     first: dict[str, int] = {}
     nodes: dict[str, list[Tensor]] = {}
     for node_type, value in x.items():
@@ -161,25 +167,25 @@ class GPE(Model):
         spec: channels of the graphs.
         interaction: relation between a message and its reverse; see ``nn.momentum_conv``.
         decoder: ``node`` decodes an acceleration per node (paper). ``pair`` decodes an antisymmetric force per edge, divided by the node's mass. ``contact``
-            decodes both in meshes: the forces of a body's ``radius`` edges to others, which exist where it touches something, move and rotate it as a whole,
-            and each node adds only its deformation. Nodes without a cell belong to the body beside them. Forces between bodies sum to zero. Materials
-            without a mesh have an acceleration per node; beside a mesh they need ``island_momentum`` to conserve the sum of momentum.
+            decodes both in meshes: forces on a body's ``radius`` edges to other bodies and walls move and rotate the body as a whole, and accelerations of its
+            nodes only deform it. Such edges exist only at contacts. Nodes without a cell belong to the body beside them. Forces between bodies sum to zero.
+            Materials without a mesh have an acceleration per node; beside meshes they need ``island_momentum``, so that the total momentum is conserved.
         edge_state: ``latent`` updates a hidden state per edge (Algorithm 1); ``geometry`` feeds the raw edge features to every layer.
         material_embedding: ``affine`` (the paper's interpolation rule) or ``mlp``; ``none`` leaves the parameter out, as a control.
         num_message_passing_steps: number of processor layers; 12 in the paper.
         hidden_channels: width of all hidden states and layers; 128 in the paper.
         implementation: ``factored`` or ``plain``; both compute the same function of the same parameters.
-        level_weights: one set of weights for all levels of virtual nodes, which then serves any number of levels, or one set per level (paper).
+        level_weights: one set of weights for all levels of virtual nodes, which allows any number of levels, or one set per level (paper).
         stress: also decode the stress of materials that have one.
-        node_norm: ``layer`` normalises the encoded state of every node, and the update of each step, as GNS does. Accelerations then stay bounded however far
-            a rollout deviates. ``none`` follows the paper.
+        node_norm: ``layer`` normalises the encoded state of every node and the update of each step, as GNS does. Accelerations then stay bounded in any
+            rollout. ``none`` follows the paper.
         island_momentum: conserve the ``linear``, or also the ``angular``, momentum of freely flying islands exactly (see ``nn.island_momentum``); or
             ``ignored``.
 
     Raises:
         StressError: ``stress`` without a material that has a stress.
-        IslandError: ``island_momentum``, or the ``contact`` decoder with meshes, with graphs that do not contain islands and bodies; or the ``contact``
-            decoder with meshes beside other materials, and nothing that conserves the sum of momentum.
+        IslandError: graphs do not contain islands and bodies, which ``island_momentum`` and the ``contact`` decoder with meshes need; or the ``contact``
+            decoder is used with meshes beside other materials and without ``island_momentum``.
     """
 
     def __init__(
@@ -342,7 +348,7 @@ class GPE(Model):
     def _compute_in_order(
         self, x: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], body: dict[str, Tensor], edges: Edges
     ) -> Decoded:
-        """Run ``compute`` with nodes in the order of their edges; in large scenes, data of neighbours then stay in the cache."""
+        """Run ``compute`` with nodes in the order of their edges. In large scenes, the data of neighbours are then more often in the cache."""
         limit = None if self.training else self.skips.sorted_from
         if limit is None or sum(values.shape[0] for values in x.values()) < limit:
             return self.compute(x, params, mass, body, edges)
@@ -383,7 +389,7 @@ class GPE(Model):
         return whole
 
     def _isolated(self, material: str, x: Tensor, params: Tensor | None) -> tuple[Tensor, Tensor | None, Tensor | None]:
-        """Return the entries of ``Decoded`` for nodes of a material without edges; every step applies the update of an empty sum of messages."""
+        """Return the entries of ``Decoded`` for nodes of a material without edges. Their sum of messages is zero in every step."""
         falls_freely, with_stress = self.decoder == "pair", self._decodes_stress(material)
         nothing = x.new_zeros(x.shape[0], self.spec.dim)
         if falls_freely and not with_stress:
@@ -467,7 +473,10 @@ class GPE(Model):
     def _pair_accelerations(
         self, h: dict[str, Tensor], mass: dict[str, Tensor], body: dict[str, Tensor], edges: Edges, chunk: int | None
     ) -> dict[str, Tensor]:
-        """Return accelerations by pair forces of the materials in ``mass``, without forces within a ``body``: they are not central, so they could turn it."""
+        """Return accelerations by pair forces of the materials in ``mass``.
+
+        Forces within a ``body`` are left out. They are not central, so they could rotate the body.
+        """
         force = {m: h[m].new_zeros(h[m].shape[0], self.spec.dim) for m in mass}
         for relation, (edge_index, odd, even) in edges.items():
             if self.key(relation) not in self.pair_decoder:

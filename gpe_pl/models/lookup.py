@@ -23,7 +23,7 @@ PACKAGE = "gpe_pl.models"
 
 
 class UnknownModelError(GpeError, ValueError):
-    """A dotted name that is no model of this package or of an installed one."""
+    """Raised for a dotted name that is not a model of this package or of an installed package."""
 
 
 def model_class(target: Any) -> type[Model]:

@@ -1,4 +1,4 @@
-"""Small building blocks that all models share."""
+"""Small building blocks that several models use."""
 
 from collections.abc import Iterable
 from typing import cast
@@ -13,7 +13,7 @@ from gpe_pl.nn.fused_mlp import fused_mlp
 
 
 class MLP(nn.Sequential):
-    """Two linear layers with a PReLU between them, then an optional LayerNorm: the form of every function of the paper (section 3.2).
+    """Two linear layers with a PReLU between them, then an optional LayerNorm. All functions of GPE have this form (paper, section 3.2).
 
     Args:
         is_fused: on a CPU, use ``nn.fused_mlp``, which computes the same function of the same parameters.
@@ -97,7 +97,7 @@ class Standardize(nn.Module):
         return bool((self.mean == 0).all()) and bool((self.std == 1).all())
 
     def fit(self, batches: Iterable[Float[Tensor, "row channel"]]) -> bool:
-        """Set the statistics from data, in float64, ignoring rows that are not finite; return whether there were any rows, else keep the identity."""
+        """Set the statistics from data, computed in float64. Return whether there were any finite rows; without any, the identity is kept."""
         rows = [b.double() for b in batches if b.shape[0]]
         if not rows:
             return False

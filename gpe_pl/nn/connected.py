@@ -1,4 +1,4 @@
-"""Nodes that edges touch, and their order in memory.
+"""Nodes with edges, and their order in memory.
 
 Nodes without an edge take no part in message passing, and nodes of one edge should be near each other in memory.
 """

@@ -53,7 +53,7 @@ def _length(u: Tensor) -> Tensor:
 
 
 def interpolate(u: Float[Tensor, "edge dim"], kernel_size: int) -> tuple[Int64[Tensor, "edge corner"], Float[Tensor, "edge corner"]]:
-    """Return the filter cells around Λ(u) and their weights, windowed by (1 − |u|²)³. Layers with the same edges share the result.
+    """Return the filter cells around Λ(u) and their weights, multiplied by the window (1 − |u|²)³. All layers with the same edges can use the result.
 
     Cells are numbered with the last axis fastest; each edge has 2^d corners.
     """
@@ -77,10 +77,10 @@ def interpolate(u: Float[Tensor, "edge dim"], kernel_size: int) -> tuple[Int64[T
 class ContinuousConv(nn.Module):
     """One layer of the convolution above; neighbours are given as edges with their interpolation.
 
-    There are two orders of evaluation. Either the inputs are summed into each target's K^d filter cells and one product gives the outputs, or one product
-    gives every cell's output at the source and these are interpolated per edge. The layer chooses the order with narrower features at the edges. The product
-    takes 2 N K^d C_in C_out floating-point operations instead of the 2 E 2^d C_in C_out of a matrix per edge. With N nodes and E = 19 N directed edges in
-    2D and K = 4, this is 4.75 times fewer.
+    There are two orders of evaluation. In the first, inputs are summed into the K^d filter cells of each target, and one product gives the outputs. In the
+    second, one product gives the output of every cell at the source, and these outputs are interpolated per edge. The layer chooses the order with fewer
+    channels at the edges. The product takes 2 N K^d C_in C_out floating-point operations; a matrix per edge would take 2 E 2^d C_in C_out. With N nodes, E = 19
+    N directed edges in 2D and K = 4, this is 4.75 times fewer.
 
     Weights start uniform in ±0.05 and biases at zero, as in the authors' layer.
     """

@@ -27,7 +27,7 @@ def unfused() -> Iterator[None]:
 
 
 def works_on(*tensors: Tensor) -> bool:
-    """Tell whether these passes can take the tensors in the present context."""
+    """Tell whether the fused passes can process these tensors in the present context."""
     if torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu") or not _is_wanted.get():
         return False
     first = tensors[0]
@@ -53,7 +53,7 @@ def plain_gradients(
 
     Args:
         plain: function that returns the same results from the same inputs with PyTorch's operations.
-        inputs: inputs as they were saved, so that second derivatives reach them.
+        inputs: the saved inputs, to which second derivatives are propagated.
         grads: gradients of the results.
     """
     own = [t.view_as(t) if t is not None and t.requires_grad else t for t in inputs]  # one input may depend on another

@@ -136,7 +136,7 @@ def _backward_odd(a, b, w, u, slope, source, target, first, count, g, even, grad
 
 
 class _Layer:
-    """Data that all blocks share: rows a and b, edge states and features, the first linear map, and buffers for W e, V s and x of one block."""
+    """Data for all blocks: rows a and b, edge states and features, the first linear map, and buffers for W e, V s and x of one block."""
 
     def __init__(
         self, a: Tensor, b: Tensor, e: Tensor, s: Tensor | None, weight: Tensor, even_weight: Tensor, slope: Tensor, edge_index: Tensor

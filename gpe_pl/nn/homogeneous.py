@@ -1,7 +1,8 @@
-"""A typed graph as a graph of one node type, for models whose layers are shared by all particles and which distinguish types by their input.
+"""Conversion of a typed graph to a graph of one node type, for models that use the same layers for all types and distinguish types by their input.
 
-Nodes are ordered by type, in the order of ``FeatureSpec.node_types``. Features of different meaning have separate columns, which are zero for nodes or edges
-without them: motion of materials, boundary nodes, virtual nodes, one block for the parameters of each material, and one block for each relation.
+Nodes are ordered by type, in the order of ``FeatureSpec.node_types``. Features of different meaning have separate blocks of columns. For nodes these are the
+motion of materials, boundary nodes, virtual nodes, and the parameters of each material; for edges there is one block per relation. A block is zero for nodes or
+edges that do not have its features.
 """
 
 from collections.abc import Iterable
@@ -31,7 +32,7 @@ class Homogeneous:
         material_embedding: how the material parameter enters.
 
     Attributes:
-        kind: number of each node type in the model; virtual nodes of all levels share one.
+        kind: number of each node type in the model; virtual nodes of all levels have the same number.
         num_kinds: number of different kinds.
         node_channels: number of columns of ``nodes``.
         edge_channels: number of columns of ``edges``.
@@ -95,7 +96,7 @@ class Homogeneous:
 
 
 def present(data: HeteroData, spec: FeatureSpec) -> tuple[dict[str, Tensor], dict[str, Tensor], Edges]:
-    """Return what a graph contains: features of its node types, parameters of its materials, and its relations, each only if not empty."""
+    """Return the features of node types, the parameters of materials and the relations of a graph, without those that are empty."""
     x = {t: data[t].x for t in spec.node_types if data[t].x.shape[0]}
     params = {m: data[m].material_params for m in spec.materials if m in x}
     return x, params, {r: (data[r].edge_index, data[r].odd, data[r].even) for r in spec.relations if data[r].edge_index.shape[1]}

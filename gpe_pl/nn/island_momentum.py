@@ -1,4 +1,4 @@
-"""Momentum of islands in free flight, which is conserved exactly for any network, and of bodies, which forces move as a whole.
+"""Exact conservation of momentum for islands in free flight, with any network, and the rigid part of the accelerations of bodies.
 
 An island without edges to anything outside keeps its linear and angular momentum. With a the accelerations without gravity of its nodes, m their masses and r
 their positions relative to the island's centre of mass::
@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 IslandMomentum = Literal["ignored", "linear", "angular"]
-SMALLEST_PRINCIPAL_SHARE = 1e-4
+SMALLEST_PRINCIPAL_FRACTION = 1e-4
 """Fraction of the largest principal moment of inertia below which an island has no defined rotation about an axis (a single node, nodes in a row)."""
 
 
@@ -87,5 +87,5 @@ def _rotation(a: Tensor, m: Tensor, r: Tensor, label: Tensor, count: int) -> Ten
     moment = _sum(m * torch.linalg.cross(r, a), label, count)
     squares = r.square().sum(dim=1)[:, None, None] * torch.eye(3, dtype=r.dtype, device=r.device) - r[:, :, None] * r[:, None, :]
     inertia = _sum(m[:, :, None] * squares, label, count)
-    alpha = torch.linalg.pinv(inertia, rtol=SMALLEST_PRINCIPAL_SHARE, hermitian=True) @ moment[:, :, None]
+    alpha = torch.linalg.pinv(inertia, rtol=SMALLEST_PRINCIPAL_FRACTION, hermitian=True) @ moment[:, :, None]
     return torch.linalg.cross(alpha[label, :, 0], r)

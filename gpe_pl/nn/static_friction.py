@@ -1,9 +1,9 @@
 """Static friction: nodes that rest on a wall and hardly move keep their positions.
 
-A network is never exact, and its errors at rest add up over frames, so that a heap creeps. A node is therefore kept in place if it is slower, before and after
-a step, than a fraction of the speed that gravity gives in one frame. A resting node starts to move when the unbalanced part of gravity exceeds this fraction.
-Unsupported nodes feel all of gravity and fall. Only nodes with edges to a wall at rest, directly or through other nodes, and with none to a moving wall, are
-kept in place.
+The errors of a network at rest add up over frames, so that a heap creeps. A node is therefore kept in place if it is slower, before and after a step, than a
+fraction of the speed that gravity gives in one frame. A resting node starts to move when the unbalanced part of gravity exceeds this fraction. Unsupported
+nodes are accelerated by all of gravity and fall. Nodes are kept in place only if they have edges to a wall at rest, directly or through other nodes, and no
+edges to a moving wall.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def supported(is_free: Bool[Tensor, " island"], contacts: Iterable[tuple[Tensor,
     return ~is_free & (pushes == 0)
 
 
-def is_held(
+def keeps_position(
     before: Float[Tensor, "node dim"],
     after: Float[Tensor, "node dim"],
     island: Int64[Tensor, " node"],

@@ -1,8 +1,8 @@
 """Table 1 of the paper from a sweep over domains, models and seeds, as CSV and Markdown, and two figures.
 
-Models are compared by the rollout MSE over all frames: the mean over a domain's trajectories with unseen material parameters, the median over seeds. A failed
-rollout counts as ballistic flight in the same scene (``finished_runs.rollout_errors``), in all domains. A separate column has the ratio if the error of a
-failed rollout is infinite instead.
+Models are compared by the rollout MSE over all frames. It is averaged over a domain's trajectories with unseen material parameters; then the median over seeds
+is taken. In all domains, a failed rollout counts as ballistic flight in the same scene (``finished_runs.rollout_errors``). A separate column gives the ratio
+with an infinite error for failed rollouts.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ PAPER = {
 }
 """Average MSE ×1e-3 of Yang et al. 2022, table 1. The units of the paper are not ours, so only ratios can be compared."""
 
-JUDGED = "test_unseen"
+EVALUATED = "test_unseen"
 """Split that is evaluated in every domain: all scenes with material parameters that training did not have, between the trained values and outside. The paper
 names its test parameters for solids only, and does the same there (trained on 1–4 MPa, tested on 0.5–10 MPa)."""
 
@@ -70,7 +70,7 @@ SAME_IN_A_ROW = ("data.", "evaluation.data.", "evaluation.containment", "evaluat
 
 
 class TableError(GpeError, ValueError):
-    """Runs do not belong into one table. The message names them and says what to do."""
+    """Raised when runs do not belong in one table. The message names them and says what to do."""
 
 
 @dataclass(frozen=True)
@@ -139,12 +139,12 @@ def report_domains(folder: Path, runs: list[Run]) -> None:
 
 
 def domain_of(run: Run) -> str:
-    """Name of the data set that a run was trained on."""
+    """Return the name of the data set that a run was trained on."""
     return str(run.config["data.name"])
 
 
 def model_of(run: Run) -> str:
-    """Class name of a run's model."""
+    """Return the class name of a run's model."""
     return str(run.config["model._target_"]).rpartition(".")[2]
 
 
@@ -180,13 +180,13 @@ def _first_frame(run: Run) -> int | None:
 
 
 def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, Cell]]:
-    """Two cells for each model of a domain: failed rollouts count as ballistic flight in the first, and as infinite errors in the second.
+    """Return two cells for each model of a domain. Failed rollouts count as ballistic flight in the first cell, and as infinite errors in the second.
 
-    Both use the trajectories that all runs of the domain have evaluated.
+    Both cells use the trajectories that all runs of the domain have evaluated.
     """
     found = {}
     for model, runs in by_model.items():
-        values = {name: values_by_seed(runs, name, JUDGED, "rollout_mse", "full") for name in (LEARNED, *BASELINES)}
+        values = {name: values_by_seed(runs, name, EVALUATED, "rollout_mse", "full") for name in (LEARNED, *BASELINES)}
         if values[LEARNED] and values[STAND_IN]:
             found[model] = {name: table for name, table in values.items() if table}
     trajectories = shared_trajectories(*(table for values in found.values() for table in values.values()))
@@ -198,10 +198,10 @@ def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, C
     row = {}
     for model, values in found.items():
         errors = shared_table(values.pop(LEARNED), trajectories)
-        judged = shared_table(rollout_errors(by_model[model], JUDGED, "full"), trajectories)
+        counted = shared_table(rollout_errors(by_model[model], EVALUATED, "full"), trajectories)
         trivial = {name: float(shared_table(table[:1], trajectories).mean()) for name, table in values.items()}
         num_failed = int((~np.isfinite(errors)).sum())
-        row[model] = Cell(judged, num_failed, trivial), Cell(errors, num_failed, trivial)
+        row[model] = Cell(counted, num_failed, trivial), Cell(errors, num_failed, trivial)
     return row
 
 
@@ -260,7 +260,10 @@ def _markdown(
 def _ratios(
     domains: list[str], cells: dict[tuple[str, str], Cell], strict: dict[tuple[str, str], Cell], by_cell: dict[tuple[str, str], list[Run]]
 ) -> list[dict[str, str]]:
-    """Ratios of each domain by column: with failed rollouts as ballistic flight, with infinite errors, and the paper's ratio if its scenes were evaluated."""
+    """Return the ratios of each domain by column: failed rollouts as ballistic flight, failed rollouts as infinite errors, and the ratio in the paper.
+
+    The last column is left out if models were evaluated in other scenes than those of the paper.
+    """
     other_scenes = any(key.startswith("evaluation.data.scene") for runs in by_cell.values() for run in runs for key in run.config)
     rows = []
     for domain in domains:
@@ -275,7 +278,7 @@ def _lines(header: list[str], rows: list[list[str]]) -> list[str]:
 
 
 def _medians(domains: list[str], models: list[str], cells: dict[tuple[str, str], Cell]) -> list[str]:
-    """Table of median errors. They describe the typical scene; the mean depends on a few scenes with large errors."""
+    """Return a table of median errors. They describe the typical scene; the mean depends on a few scenes with large errors."""
     header = ["domain", *models, f"{OWN} / best baseline"]
     lines = [table_row(header), "|" + "---|" * len(header)]
     for domain in domains:
@@ -283,7 +286,7 @@ def _medians(domains: list[str], models: list[str], cells: dict[tuple[str, str],
         others = [value for m, value in own.items() if m != OWN]
         ratio = f"{own[OWN] / min(others):.2f}" if OWN in own and others else "–"
         lines.append(table_row([domain, *(f"{1e3 * own[m]:.3g}" if m in own else "–" for m in models), ratio]))
-    return ["", "The median over trajectories and seeds instead; it judges nothing.", "", *lines]
+    return ["", "The median over trajectories and seeds instead; no comparison uses it.", "", *lines]
 
 
 def _text(cell: Cell | None) -> str:
@@ -297,7 +300,7 @@ def _text(cell: Cell | None) -> str:
 
 
 def _ratio(cells: dict[str, Cell]) -> str:
-    """Ratio of GPE's error to that of the best baseline that has learned, with its interval; bold if the interval excludes 1."""
+    """Return the ratio of GPE's error to that of the best baseline that has learned, with its interval; bold if the interval excludes 1."""
     own, others = cells.get(OWN), [c for m, c in cells.items() if m != OWN]
     baselines = [c for c in others if c.is_learned]
     if own is None or not others:

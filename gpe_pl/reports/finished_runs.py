@@ -1,4 +1,4 @@
-"""Finished training runs: their configuration and metrics, and selections of values across several runs."""
+"""Finished training runs: reads their configurations and metrics, and selects values of several runs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Run:
 
     Attributes:
         folder: folder of the run; for an archived run, the folder before archiving.
-        config: flat configuration: values by keys such as ``training.num_steps``.
+        config: values of the configuration by keys such as ``training.num_steps``.
         rows: metrics: a table with the fields of ``evaluation.rollouts.Row`` as columns.
         data: checksums of the data, by key of the configuration.
         curve: validation curve of an archived run; None if it is in the run's folder (see ``validation_curve``).
@@ -55,7 +55,7 @@ TRAINED = {"data.name": str, "model._target_": str, "training.num_steps": int}
 
 
 def table_of(rows: Iterable[Row]) -> pd.DataFrame:
-    """Table with one line per row of ``metrics.csv``."""
+    """Return a table with one line per row of ``metrics.csv``."""
     return pd.DataFrame([[*vars(row).values()] for row in rows], columns=run_archive.COLUMNS)
 
 
@@ -81,7 +81,7 @@ CURVE = ("validation_steps", "validation_losses")
 
 
 def run_name(run: Run, root: Path) -> str:
-    """Path of a run relative to the folder of its sweep."""
+    """Return the path of a run relative to the folder of its sweep."""
     return run.folder.relative_to(root).as_posix()
 
 
@@ -96,7 +96,7 @@ def _archived(folder: Path) -> list[Run]:
 
 
 def finished_runs(folder: Path) -> list[Run]:
-    """All finished training runs below a folder, in order of their paths, or those of an archive in it.
+    """Return all finished training runs below a folder, in order of their paths, or those of an archive in it.
 
     Folders that ``evaluate`` has written are not training runs.
 
@@ -141,13 +141,13 @@ def _warn_of_replaced_data(runs: list[Run]) -> None:
 
 
 def replaced_data(runs: list[Run]) -> list[str]:
-    """Keys of data for which runs have different checksums. A run without a checksum is not compared."""
+    """Return keys of data for which runs have different checksums. A run without a checksum is not compared."""
     keys = sorted({key for run in runs for key in run.data})
     return [key for key in keys if len({run.data[key] for run in runs if key in run.data}) > 1]
 
 
 def distinct_runs(runs: list[Run]) -> list[Run]:
-    """Runs with different configurations; of equal ones, the first."""
+    """Return the runs without repetitions: of runs with the same configuration, only the first."""
     first: dict[str, Run] = {}
     for run in runs:
         kept = first.setdefault(json.dumps(run.config, sort_keys=True), run)
@@ -165,25 +165,25 @@ def _flatten(value: Any, path: str = "") -> Iterable[tuple[str, Any]]:
 
 
 def axes_of(runs: list[Run]) -> list[str]:
-    """Configuration keys whose values differ between runs, ``seed`` last."""
+    """Return configuration keys whose values differ between runs, ``seed`` last."""
     keys = sorted({k for r in runs for k in r.config})
     different = [k for k in keys if len({json.dumps(r.config.get(k)) for r in runs}) > 1]
     return sorted(different, key=lambda k: (k == "seed", k))
 
 
 def with_groups(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows with those of unseen parameters repeated under the split ``split/group``, where the group is in ``UNSEEN_GROUPS``."""
+    """Return the rows, and the rows of unseen parameters a second time under the name ``split/group`` with a group in ``UNSEEN_GROUPS``."""
     unseen = rows[rows["parameter_group"].isin(UNSEEN_GROUPS)]
     return pd.concat([rows, unseen.assign(split=unseen["split"] + "/" + unseen["parameter_group"])], ignore_index=True)
 
 
 def splits_of(run: Run) -> list[str]:
-    """Splits on which a run was evaluated, including ``split/group`` for groups of unseen parameters."""
+    """Return splits on which a run was evaluated, including ``split/group`` for groups of unseen parameters."""
     return sorted(with_groups(run.rows)["split"].unique())
 
 
 def validation_curve(run: Run) -> Curve:
-    """Validation curve of a run, over all its starts.
+    """Return the validation curve of a run, over all its starts.
 
     Raises:
         MetricsError: a log is damaged.
@@ -212,7 +212,7 @@ Values = list[dict[int, float]]
 
 
 def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon: str) -> Values:
-    """Values of a metric for each run, in order of trajectories.
+    """Return values of a metric for each run, in order of trajectories.
 
     Args:
         runs: runs that differ in their seeds only.
@@ -237,7 +237,7 @@ STAND_IN = "ballistic"
 
 
 def rollout_errors(runs: list[Run], split: str, horizon: str, model: str = LEARNED) -> Values:
-    """Rollout MSE [m²] of learned models, as in tables: a failed rollout gets the error of ballistic flight in the same scene over the same frames.
+    """Return rollout MSE [m²] of a model as tables show it: a failed rollout has the error of ballistic flight in the same scene over the same frames.
 
     The error stays infinite if ballistic flight was not evaluated. ``values_by_seed`` returns the errors without this replacement.
     """
@@ -250,12 +250,12 @@ def rollout_errors(runs: list[Run], split: str, horizon: str, model: str = LEARN
 
 
 def shared_trajectories(*values: Values) -> list[int]:
-    """Numbers of the trajectories that all seeds in all of ``values`` have evaluated."""
+    """Return the numbers of the trajectories that all seeds in all of ``values`` have evaluated."""
     seeds = [set(seed) for table in values for seed in table]
     return sorted(set.intersection(*seeds)) if seeds else []
 
 
 def shared_table(values: Values, trajectories: list[int] | None = None) -> np.ndarray:
-    """Values as an array [seed, trajectory]. Without ``trajectories``, it has those that all seeds have evaluated."""
+    """Return values as an array [seed, trajectory]. Without ``trajectories``, the array has those that all seeds have evaluated."""
     chosen = shared_trajectories(values) if trajectories is None else trajectories
     return np.array([[seed[k] for k in chosen] for seed in values]).reshape(len(values), len(chosen))

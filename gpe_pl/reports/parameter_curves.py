@@ -17,7 +17,7 @@ PARAMETER_FIGURE = "error_by_parameter.png"
 
 
 def parameter_curves(by_domain: dict[str, dict[str, list[Run]]]) -> Figure:
-    """Figure of the rollout MSE over all frames against the material parameter. Failed rollouts count as in ``rollout_errors``.
+    """Return a figure of the rollout MSE over all frames against the material parameter. Failed rollouts count as in ``rollout_errors``.
 
     Args:
         by_domain: runs by domain and label of the curve.

@@ -31,7 +31,7 @@ CONTENT = "rollouts_sha256"
 
 
 class ArchiveError(GpeError, ValueError):
-    """An archive is damaged; the message names the file."""
+    """Raised for a damaged archive; the message names the file."""
 
 
 def write_archive(folder: Path, runs: dict[str, dict[str, Any]], rows: dict[str, pd.DataFrame]) -> None:
@@ -55,7 +55,7 @@ def write_archive(folder: Path, runs: dict[str, dict[str, Any]], rows: dict[str,
 
 
 def read_archive(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, pd.DataFrame]]:
-    """Arguments ``runs`` and ``rows`` of ``write_archive``, with values to nine digits.
+    """Read an archive. Returns the arguments ``runs`` and ``rows`` of ``write_archive``, with values to nine digits.
 
     Raises:
         ArchiveError: a file is damaged or does not belong to the other.
@@ -80,7 +80,7 @@ def read_archive(folder: Path) -> tuple[dict[str, dict[str, Any]], dict[str, pd.
 
 
 def _long(wide: pd.DataFrame) -> pd.DataFrame:
-    """Rows of one run with ``COLUMNS``, made from its lines of the archive; empty cells become no row."""
+    """Return the rows of one run with ``COLUMNS``, made from its lines of the archive. Empty cells are left out."""
     long = wide.melt(id_vars=KEYS, value_vars=[name for name in wide.columns if "@" in name], var_name="column")
     long = long[long["value"] != ""]
     long[["metric", "horizon"]] = long.pop("column").str.rsplit("@", n=1, expand=True)

@@ -62,7 +62,7 @@ def report(folder: Path) -> None:
 
 
 def variants_of(runs: list[Run]) -> tuple[list[str], dict[Variant, list[Run]]]:
-    """Configuration keys, other than the seed, in which runs differ, and the runs by their values of these keys."""
+    """Return the configuration keys in which runs differ, without the seed, and the runs by their values of these keys."""
     axes = [axis for axis in axes_of(runs) if axis != "seed"]
     variants: dict[Variant, list[Run]] = defaultdict(list)
     for run in runs:
@@ -102,7 +102,7 @@ def report_evaluation(folder: Path) -> None:
 
 
 def conclusion(folder: Path) -> str:
-    """Last output of a command: the metrics of the run or evaluation in a folder, whether the model reads the material, and the viewers to open."""
+    """Return the last output of a command: the metrics of the run or evaluation in a folder, whether the model reads the material, and the viewers to open."""
     viewers = sorted(folder.glob("rollout_*_00.html"))
     rows = table_of(read_rows(folder / "metrics.csv"))
     reads = [line for line in [verdict([Run(folder, {}, rows)])] if line]
@@ -110,9 +110,9 @@ def conclusion(folder: Path) -> str:
 
 
 def summary(rows: pd.DataFrame) -> str:
-    """Means over trajectories as plain text: one line per split, metric and model, one column per horizon.
+    """Return means over trajectories as plain text: one line per split, metric and model, one column per horizon.
 
-    Trivial models and controls show their rollout MSE only.
+    For trivial models and controls, only the rollout MSE is shown.
     """
     shown = with_groups(rows[rows["model"].isin([LEARNED, EXACT]) | (rows["metric"] == "rollout_mse")])
     groups: dict[tuple[str, str, str], dict[str, float]] = defaultdict(dict)
@@ -150,7 +150,7 @@ def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
 
 
 def _interval(values: Values, scale: float = 1.0) -> str:
-    """Mean with its bootstrap interval; where rollouts failed, which makes the mean infinite, their number and the median."""
+    """Format a mean with its bootstrap interval. If rollouts failed, the mean is infinite; then the number of failures and the median are shown."""
     if not values:
         return "–"
     table = shared_table(values) * scale
@@ -162,7 +162,7 @@ def _interval(values: Values, scale: float = 1.0) -> str:
 
 
 def forward_time_ratios(folder: Path, variants: dict[Variant, list[Run]]) -> dict[Variant, float]:
-    """Forward time of each variant's model over that of the first, as ``benchmarks.forward_times`` measured them; empty where it did not."""
+    """Return the forward time of each variant divided by that of the first, as measured by ``benchmarks.forward_times``; empty if it was not measured."""
     path = folder / FORWARD_TIMES
     if not path.exists():
         return {}
@@ -216,7 +216,7 @@ def _training_table(names: list[str], variants: dict[Variant, list[Run]], ratios
     note = (
         "Validation loss: last value, mean over seeds (range). Forward time: trained models on one graph, by PyTorch's operations alone, "
         "median of paired ratios to the first row. "
-        "Outside: share of particle-frames inside a wall or obstacle when containment is off; corrected: share of particle-steps that containment moves."
+        "Outside: fraction of particle-frames inside a wall or obstacle when containment is off; corrected: fraction of particle-steps that containment moves."
     )
     return [*lines, *rows, "", note]
 
@@ -258,7 +258,7 @@ def _horizons(run: Run) -> list[str]:
 
 
 def _stress_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[str]:
-    """Table of the errors of displacement, velocity and stress for models that decode a stress; empty if none does."""
+    """Return a table of the errors of displacement, velocity and stress for models that decode a stress; empty if none does."""
     stressed = {key: runs for key, runs in variants.items() if runs[0].rows["metric"].isin(STRESS_METRICS).any()}
     if not stressed:
         return []

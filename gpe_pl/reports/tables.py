@@ -1,4 +1,4 @@
-"""Writes tables and figures of the finished runs in a folder. The command ``python -m gpe_pl.reports FOLDER`` does so from stored results alone."""
+"""Writes tables and figures of the finished runs in a folder. The command ``python -m gpe_pl.reports FOLDER`` writes them again from stored results."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from gpe_pl.reports.domain_table import TABLE_MD, compares_models, report_domain
 from gpe_pl.reports.finished_runs import Run, finished_runs
 from gpe_pl.reports.sweep_table import SWEEP_MD, report_sweep
 from gpe_pl.reports.trial_table import TRIALS_MD, compares_settings, report_trials
-from gpe_pl.system.locks import held
+from gpe_pl.system.locks import locked
 
 
 def write_tables(folder: Path, runs: list[Run]) -> Path:
-    """Write tables and figures into the folder of a sweep. Which ones depends on the settings in which its runs differ.
+    """Write tables and figures into the folder of a sweep. The settings in which its runs differ decide which tables are written.
 
     Returns:
         Path of the table in Markdown. It does not exist if no run has finished.
@@ -41,8 +41,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         runs = finished_runs(folder)
         if not runs:
-            raise RunError(f"{folder}: contains no finished run (a folder with config.json and metrics.csv)")
-        with held(folder):
+            raise RunError(
+                f"{folder}: contains no finished run (a folder with config.json and metrics.csv); give the folder of a sweep or run"
+            )
+        with locked(folder):
             print(write_tables(folder, runs).read_text(encoding="utf-8"))
     except GpeError as error:
         print(f"error: {one_line(str(error))}", file=sys.stderr)

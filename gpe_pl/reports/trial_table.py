@@ -1,7 +1,7 @@
 """Table of trials: for each model and domain, compares several settings and marks the best.
 
-Settings are compared by the rollout MSE over all frames: the mean over the trajectories of a split, the median over seeds. Failed rollouts count as in
-``finished_runs.rollout_errors``.
+Settings are compared by the rollout MSE over all frames. It is averaged over the trajectories of a split; then the median over seeds is taken. Failed rollouts
+count as in ``finished_runs.rollout_errors``.
 """
 
 from __future__ import annotations
@@ -25,10 +25,9 @@ log = logging.getLogger(__name__)
 
 TRIALS_CSV, TRIALS_MD = "trials.csv", "trials.md"
 CONSEQUENCES = ("training.val_interval", "seed")
-"""Keys that may differ between trials but are not on trial. The validation interval follows from the number of steps; the seed is chance."""
+"""Keys that may differ between trials but are not compared: the validation interval, which follows from the number of steps, and the seed."""
 NUM_STEPS = "training.num_steps"
-"""Key of the number of steps. It is a setting on trial only if it differs between runs with equal other settings and seed; else it follows from a time
-budget."""
+"""Key of the number of steps. It is compared only if it differs between runs with equal other settings and seed; else it follows from a time budget."""
 
 
 def compares_settings(runs: list[Run]) -> bool:
@@ -84,7 +83,7 @@ def _by_model(runs: list[Run]) -> dict[tuple[str, str], list[Run]]:
 
 
 def _settings(runs: list[Run]) -> list[str]:
-    """Configuration keys of the settings on trial."""
+    """Return the configuration keys of the settings that trials compare."""
     keys = [key for key in axes_of(runs) if key not in (*CONSEQUENCES, NUM_STEPS)]
     steps: dict[tuple[str, ...], set[Any]] = defaultdict(set)
     for run in runs:

@@ -1,4 +1,4 @@
-"""Trivial baselines: simulators without learning, which a learned model has to beat."""
+"""Trivial baselines: simulators that learn nothing. A learned model is useful only if it has smaller errors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

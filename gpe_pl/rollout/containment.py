@@ -13,10 +13,10 @@ from gpe_pl.trajectory.state import State
 
 
 def contain(state: State, dt: float) -> tuple[State, Array]:
-    """Move nodes that are deeper than ``geometry.shapes.surface_tolerance`` in a shape of the boundary along the normal back to its surface.
+    """Move nodes inside a wall or obstacle back to its surface, along the normal. Depths up to ``geometry.shapes.surface_tolerance`` are allowed.
 
-    If surfaces meet so narrowly that a node is still inside, it returns to its position before the step. Velocities, and the last entry of the velocity
-    history, change by displacement / ``dt``, so that they remain differences of positions.
+    In a narrow gap between surfaces, a node may still be inside afterwards; it then returns to its position before the step. Velocities and the last entry of
+    the velocity history change by displacement / ``dt``, so that they remain differences of positions.
 
     Args:
         state: state after a step.

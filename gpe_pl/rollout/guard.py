@@ -35,7 +35,7 @@ class Guard:
     Attributes:
         max_speed: maximum speed of nodes [m/s].
         bounds: ``(low, high)`` per axis of the domain [m].
-        margin: distance [m] by which nodes may leave the bounds, and depth [m] that they may have in a wall or obstacle; a depth limit of 0 is none.
+        margin: distance [m] by which nodes may leave the bounds, and depth [m] that they may have in a wall or obstacle. 0 switches the limit of the depth off.
         spacing: rest spacing of nodes [m]. It is needed to detect clouds that collapse, nodes that pass through an obstacle within one frame, and nodes too
             deep in one; 0 switches these checks off.
         max_crowding: maximum number of nodes in a cell of side ``spacing``.
@@ -98,7 +98,7 @@ class Guard:
         return Termination("clustering", frame, node, text)
 
     def _tunnelling(self, before: State | None, state: State, frame: int) -> Termination | None:
-        """Find nodes deeper than ``margin`` in a wall or obstacle, and nodes that were outside all shapes in both frames but not in between."""
+        """Find nodes deeper than ``margin`` in a wall or obstacle, and nodes that passed through one: outside in both frames, but inside on the way."""
         shapes, end = state.boundary.shapes, as_numpy(state.pos)
         if not shapes:
             return None
@@ -117,8 +117,8 @@ class Guard:
         deepest = np.zeros(len(end))
         for some in np.array_split(suspects, max(1, len(suspects) // SUSPECTS_AT_ONCE)):
             count = min(MAX_PATH_SAMPLES, math.ceil(float(length[some].max(initial=0.0)) / (0.5 * tolerance)))
-            for share in np.arange(1, count) / max(1, count):
-                deepest[some] = np.maximum(deepest[some], -signed_distance(shapes, start[some] + share * way[some]))
+            for fraction in np.arange(1, count) / max(1, count):
+                deepest[some] = np.maximum(deepest[some], -signed_distance(shapes, start[some] + fraction * way[some]))
         node = int(np.argmax(deepest))
         if not deepest[node] > tolerance:
             return None

@@ -23,24 +23,24 @@ from gpe_pl.trajectory.trajectory import Metadata, Termination, Trajectory
 
 @runtime_checkable
 class Simulator(Protocol):
-    """Anything that advances a state by one frame of ``Metadata.frame_dt``."""
+    """Protocol of solvers and learned models: anything that advances a state by one frame of ``Metadata.frame_dt``."""
 
     def step(self, state: State) -> State: ...
 
 
 @runtime_checkable
 class BatchSimulator(Simulator, Protocol):
-    """A simulator that advances several scenes together, which takes less time than one after the other."""
+    """A simulator that can advance several scenes together, which is faster than one after the other."""
 
     def step_all(self, states: list[State]) -> list[State | SimulationError]: ...
 
 
 class SimulationError(GpeError, RuntimeError):
-    """A simulator cannot compute the next state.
+    """Raised when a simulator cannot compute the next state.
 
     Attributes:
         reason: reason code.
-        node: node that shows the failure, -1 if it is no single one.
+        node: node that shows the failure, or -1 if no single node does.
     """
 
     def __init__(self, message: str, *, reason: str = "solver", node: int = -1) -> None:
@@ -50,7 +50,7 @@ class SimulationError(GpeError, RuntimeError):
 
 @dataclass(frozen=True)
 class Replay:
-    """A simulator that steps through a stored trajectory; the oracle."""
+    """A simulator that returns the frames of a stored trajectory."""
 
     trajectory: Trajectory
 
@@ -77,7 +77,10 @@ def _step(simulator: Simulator, state: State) -> State | SimulationError:
 
 @runtime_checkable
 class GroundTruth(Protocol):
-    """A ground-truth solver. Other simulators do not have the name and version under which results are stored, and the scenes that can be computed."""
+    """Protocol of ground-truth solvers.
+
+    Unlike other simulators, they have a name and version, which are stored with results, and they know which scenes they can compute.
+    """
 
     name: ClassVar[str]
     version: ClassVar[str]
@@ -90,7 +93,7 @@ class GroundTruth(Protocol):
 
 
 def unfit(simulator: Simulator, metadata: Metadata) -> Termination | None:
-    """Return the reason if a solver has another frame interval or other materials than the metadata describe; else None."""
+    """Return the reason why a solver cannot compute a scene: another frame interval, or other materials than its metadata. None means that it can."""
     if not isinstance(simulator, GroundTruth):
         return None
     solver, wrong = f"the solver {simulator.name}", ""
@@ -109,8 +112,8 @@ class Start:
         state: initial state, which becomes frame 0.
         num_steps: number of frames to add.
         metadata: metadata of the scene, which also describe the result.
-        guard: stops the rollout at the first state that it rejects; frame 0 of a termination is the initial state. Initial values that break the rules of
-            ``schema.FIELDS`` stop a rollout without a guard, too.
+        guard: stops the rollout at the first state that it rejects. A termination at frame 0 concerns the initial state. Initial values that break the rules of
+            ``schema.FIELDS`` also stop a rollout that has no guard.
     """
 
     state: State
@@ -120,7 +123,10 @@ class Start:
 
 
 def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int, int, State | Termination]]:
-    """Advance all scenes together. Yields (scene, frame, new state), or a ``Termination`` as a scene's last item. Keeps one state per scene in memory."""
+    """Advance all scenes together. Yields (scene, frame, new state); the last item of a stopped scene has a ``Termination`` instead of a state.
+
+    Only one state per scene is kept in memory.
+    """
     live, num_steps, guards = dict[int, State](), dict[int, int](), dict[int, Guard]()
     for scene, start in enumerate(starts):
         guard = None if start.guard is None else start.guard.of(start.state)
@@ -153,7 +159,7 @@ def steps(simulator: Simulator, state: State, num_steps: int) -> Iterator[State]
 def step_scenes(
     simulator: Simulator, states: Mapping[int, State], num_steps: Mapping[int, int], guards: Mapping[int, Guard] | None = None
 ) -> Iterator[tuple[int, int, State | Termination]]:
-    """Yield the items of ``frames`` for scenes whose start needs no check. This is the only time loop: everything that advances scenes calls it.
+    """Yield the items of ``frames`` without checking the initial states. This is the only time loop: everything that advances scenes calls it.
 
     Args:
         simulator: simulator, which advances all scenes together if it can.
@@ -274,7 +280,7 @@ def rollout(
 
 
 def share_outside(trajectory: Trajectory, tolerance: float = 0.0) -> float:
-    """Fraction of particle-frames more than ``tolerance`` [m] inside a wall or obstacle."""
+    """Return the fraction of particle-frames more than ``tolerance`` [m] inside a wall or obstacle."""
     if not trajectory.boundary.shapes or trajectory.pos.size == 0:
         return 0.0
     distance = signed_distance(trajectory.boundary.shapes, trajectory.pos.astype(np.float64))

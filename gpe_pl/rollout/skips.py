@@ -20,11 +20,11 @@ class Skips:
         absent_types: exact. Skip the code of node types and relations that the scene does not have.
         static_boundary: exact. Build the search tree of the boundary once, not in every step.
         isolated_nodes: exact. Leave nodes without an edge out of message passing.
-        edges_at_once: exact. Number of edges for which features and messages are computed at a time, which limits the memory; None takes all.
-        sorted_from: exact. Number of nodes from which graphs are sorted so that neighbours are near each other in memory; None never sorts.
+        edges_at_once: exact. Number of edges for which features and messages are computed at a time. This limits the memory; None takes all edges at once.
+        sorted_from: exact. Graphs with at least this number of nodes are sorted so that neighbours are near each other in memory. None never sorts.
         stress: exact for the motion. Do not decode the stress.
-        sleep_after: approximate. Number of frames at rest after which a group of connected nodes stands still, until something moves within its reach; None
-            stands for never. Choose more frames than a body that turns in flight is this slow.
+        sleep_after: approximate. Number of frames at rest after which an island sleeps: it stands still until something moves near it. None switches this off.
+            A body that is thrown upward is slow at the top of its flight; choose more frames than this takes.
         rest_step_spacings: a node at rest moves less than this distance in a frame [rest spacings]. Learned models make steps of 0.01 to 0.03 spacings where
             the ground truth rests.
         rest_step_change_spacings: the step of a node at rest differs from the step before by less than this distance [rest spacings].

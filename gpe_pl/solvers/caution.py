@@ -1,4 +1,4 @@
-"""Warnings of what a solver does not resolve, given before data are made; ``docs/results/convergence.md`` has measurements."""
+"""Warnings of scenes and parameters that a solver does not resolve. They appear before data are generated; ``docs/results/convergence.md`` has measurements."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gpe_pl.trajectory.state import State
 CELLS_ACROSS = 4
 """Number of cells that a body should have across; a body two triangles thick is half again as stiff in bending."""
 
-THIN_SHARE = 0.1
+THIN_FRACTION = 0.1
 """Fraction of the nodes of a mesh that may be thin without a warning."""
 
 
@@ -29,17 +29,17 @@ def unresolved(solver: Any, parameters: Mapping[str, Sequence[float]], scenes: I
                 "adds, so such trajectories differ little; choose a smaller grid_spacing, or leave these values out"
             )
     if solver.stores_stress:
-        shares = [float(np.mean(thin_nodes(np.asarray(s.cells), s.num_nodes, s.dim))) for s in scenes if s.cells is not None]
-        thin = [share for share in shares if share > THIN_SHARE]
+        fractions = [float(np.mean(thin_nodes(np.asarray(s.cells), s.num_nodes, s.dim))) for s in scenes if s.cells is not None]
+        thin = [fraction for fraction in fractions if fraction > THIN_FRACTION]
         if thin:
             yield (
-                f"in {len(thin)} of the first {len(shares)} scenes, up to {100 * max(thin):.0f} % of the nodes lie where the mesh has fewer than "
+                f"in {len(thin)} of the first {len(fractions)} scenes, up to {100 * max(thin):.0f} % of the nodes lie where the mesh has fewer than "
                 f"{CELLS_ACROSS} cells across and is too stiff in bending; choose more cells (data.scene.num_cells=…)"
             )
 
 
 def thin_nodes(cells: np.ndarray, num_nodes: int, dim: int) -> np.ndarray:
-    """Return a mask [node] of the nodes outside every part of a mesh that is ``CELLS_ACROSS`` cells thick; cells [cell, corner] of one kind.
+    """Return a mask [node] of the nodes in thin parts of a mesh, which are fewer than ``CELLS_ACROSS`` cells thick; cells [cell, corner] are of one kind.
 
     This is a morphological opening along the edges: half of ``CELLS_ACROSS`` steps from the surface inward, then as many outward.
     """

@@ -161,8 +161,8 @@ def _bowl(config: FluidScene, rng: np.random.Generator) -> Sampled:
     room = {2: math.pi, 3: 4 / 3 * math.pi}[config.dim] * max(0.0, radius - config.spacing) ** config.dim
     for _ in range(MAX_ATTEMPTS if config.num_particles * config.spacing**config.dim < room else 0):
         number = int(rng.integers(1, config.max_bodies + 1))
-        share = rng.dirichlet(np.full(number, 4.0))
-        counts = np.diff(np.round(np.concatenate([[0.0], np.cumsum(share)]) * config.num_particles)).astype(int)
+        fraction = rng.dirichlet(np.full(number, 4.0))
+        counts = np.diff(np.round(np.concatenate([[0.0], np.cumsum(fraction)]) * config.num_particles)).astype(int)
         bodies = [_body(int(count), config, rng) for count in counts[counts > 0]]
         placed = _placed(bodies, bowl, config, rng)
         if placed is not None:
@@ -258,10 +258,10 @@ def _obstacles(config: FluidScene, start: float, rng: np.random.Generator) -> li
         size = np.maximum(gap, rng.uniform(0.1, 0.25, config.dim) * np.min(high - low))
         corner = np.array([start + gap, *(low[1:] + gap)])
         room = high - gap - size - corner
-        share = rng.random(config.dim)
+        fraction = rng.random(config.dim)
         if np.any(room < 0):
             continue
-        corner = corner + share * room
+        corner = corner + fraction * room
         corner[-1], size[-1] = low[-1] - gap, size[-1] + gap  # extends below the floor, so that no water gets under it
         if any(np.all(corner < np.array(b.high) + gap) and np.all(corner + size > np.array(b.low) - gap) for b in boxes):
             continue

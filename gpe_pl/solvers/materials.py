@@ -216,9 +216,9 @@ class Elastomer:
 
 @dataclass(frozen=True, config={"extra": "forbid"})
 class Fluid:
-    """Liquid in scenes with other materials: weakly compressible, viscous and without tension, like sand without friction.
+    """Liquid in scenes with other materials. It is weakly compressible, viscous and cannot bear tension, like sand without friction.
 
-    The material parameter is the kinematic viscosity [m²/s]. The solver ``flip`` computes liquids alone, as incompressible.
+    The material parameter is the kinematic viscosity [m²/s]. For scenes of liquid alone, use the solver ``flip``, which is incompressible.
 
     Attributes:
         bulk_modulus: bulk modulus [Pa]. It is a numerical choice: a column of height H is compressed by the fraction ρ g H / bulk_modulus at its foot.

@@ -1,4 +1,4 @@
-"""Scenes from the first frame of a recording that another solver made.
+"""Scenes made from the first frame of a recording by another solver.
 
 A scene has the recorded ground and either the recorded liquid or a flood. It is scaled to the particle spacing of a trained model. Gravity cannot be scaled,
 so a scene that is s times as long stays similar at an equal Froude number v²/(g l)::
@@ -47,7 +47,7 @@ UPSTREAM = 1 / 3
 
 
 class RecordingError(GpeError, ValueError):
-    """A recording cannot be used; the message names the file and what to do."""
+    """Raised when a recording cannot be used; the message names the file and says what is wrong."""
 
 
 @plain_dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Scenes at another resolution, and the map back to the original nodes, for studies of a solver's convergence.
+"""Scenes at another resolution, for studies of a solver's convergence, with a map back to the original nodes.
 
 Particles are divided into 2^dim children, or merged with their neighbours; mass is conserved. Meshes get divided cells, or their outline is meshed again with
 longer edges. ``Resolved.restrict`` returns the positions of the original nodes.

@@ -33,10 +33,10 @@ CLEARANCE = 0.25
 """Smallest initial distance between a liquid particle and a solid, in spacings; a jittered lattice beside a wall just satisfies it."""
 
 JITTER = 0.25
-"""Largest displacement from the seeding lattice along each axis, in spacings; a regular lattice would crack along its rows when it spreads."""
+"""Largest displacement from the initial lattice along each axis [spacings]. A regular lattice would separate along its rows when the material spreads."""
 
 MESHED = ("elastomer",)
-"""Materials whose particles keep their neighbours: they start on a regular lattice and carry its cells."""
+"""Materials whose particles keep their neighbours. Their particles start on a regular lattice, whose cells form their mesh."""
 
 
 @runtime_checkable
@@ -337,7 +337,7 @@ def _obstacles(config: BodyScene, rng: np.random.Generator) -> tuple[Shape, ...]
     gap = 2.0 * config.grid_spacing  # the grid does not resolve narrower gaps
     for _ in range(rng.integers(config.max_obstacles + 1)):
         radius, angle, sides = rng.uniform(*config.obstacle_radius), rng.uniform(0, 2 * math.pi), int(rng.integers(3, 7))
-        kind, friction, share = rng.integers(3 if config.dim == 2 else 2), draw_friction(config, rng), rng.uniform(0.3, 0.7)
+        kind, friction, fraction = rng.integers(3 if config.dim == 2 else 2), draw_friction(config, rng), rng.uniform(0.3, 0.7)
         room_low, room_high = low + radius + gap, high - radius - gap
         if np.any(room_low > room_high):
             continue
@@ -348,7 +348,7 @@ def _obstacles(config: BodyScene, rng: np.random.Generator) -> tuple[Shape, ...]
         if config.obstacle_shapes == "angular":
             obstacles.append(angular_obstacle(center, radius, friction, rng))
         elif kind == 0:
-            half = radius * np.array([math.cos(share * math.pi / 2), math.sin(share * math.pi / 2), 0.5][: config.dim])
+            half = radius * np.array([math.cos(fraction * math.pi / 2), math.sin(fraction * math.pi / 2), 0.5][: config.dim])
             obstacles.append(Box(floats(center - half), floats(center + half), friction))
         elif kind == 1:
             obstacles.append(Sphere(floats(center), float(radius), friction))
@@ -384,8 +384,8 @@ def _bodies(config: BodyScene, shapes: tuple[Shape, ...], rng: np.random.Generat
     several = len(config.materials) > 1  # a scene then has bodies of at least two materials
     number = int(rng.integers(min(2, config.max_bodies) if several else 1, config.max_bodies + 1))
     order = rng.permutation(len(config.materials)) if several else np.zeros(1, dtype=int)
-    share = rng.dirichlet(np.full(number, 4.0))
-    counts = np.diff(np.round(np.concatenate([[0.0], np.cumsum(share)]) * config.num_particles)).astype(int)
+    fraction = rng.dirichlet(np.full(number, 4.0))
+    counts = np.diff(np.round(np.concatenate([[0.0], np.cumsum(fraction)]) * config.num_particles)).astype(int)
     up = np.eye(config.dim)[-1]
     clearance = 0.5 * config.spacing
     boxes: list[tuple[np.ndarray, np.ndarray]] = []

@@ -10,7 +10,7 @@ from gpe_pl.trajectory.state import State
 
 
 def check_surroundings(state: State, solver: str) -> None:
-    """Refuse surroundings that a solver would otherwise ignore silently.
+    """Raise an error for surroundings that a solver would otherwise ignore silently.
 
     Raises:
         SimulationError: with reason ``input``; names the solver and what it does not compute.

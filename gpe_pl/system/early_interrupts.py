@@ -27,7 +27,7 @@ def begin() -> None:
 
 
 def catch() -> None:
-    """Let Ctrl-C end the process with one line from now on, unless Ctrl-C is ignored or already has another handler."""
+    """Let Ctrl-C end the process with one line from now on. Nothing changes if Ctrl-C is ignored or already has another handler."""
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _end_process)
 

@@ -1,8 +1,8 @@
 """Locks that let only one command at a time write to a folder.
 
 The lock of ``FOLDER`` is the file ``.FOLDER.lock`` in the same parent folder. The operating system holds it and releases it however the process ends.
-``.FOLDER.holder`` says which process has the lock. Some disks have no such locks; there the existence of the file is the lock. A file left by an ended
-process is then removed on the same machine, and on another machine the message says which file to delete. Readers need no lock.
+``.FOLDER.holder`` names the process that has the lock. On disks without such locks, the existence of the file is the lock. If a process has ended and left its
+file there, the next command on the same machine removes it; on another machine, a message names the file to delete. Readers need no lock.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ WITHOUT_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOTSUP}
 RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
 """Environment variables that number the processes of one run, as Lightning reads them."""
 
-_held: set[Path] = set()
+_locked: set[Path] = set()
 """Locks that this process holds."""
 
 
@@ -58,7 +58,7 @@ class Holder:
 
 
 @contextlib.contextmanager
-def held(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bool = True, num_processes: int = 1) -> Iterator[None]:
+def locked(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bool = True, num_processes: int = 1) -> Iterator[None]:
     """Keep other commands from writing to a folder inside the block.
 
     A process that already holds the lock may take it again.
@@ -77,20 +77,20 @@ def held(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bool
     if num_processes > 1 and is_later_process():
         yield
         return
-    if path in _held:
+    if path in _locked:
         with _same(folder):
             yield
         return
     made = _make(folder if makes else folder.parent, key)
     lock = _acquired(folder, path, waits)
-    _held.add(path)
+    _locked.add(path)
     holder = _beside(folder, "holder")
     try:
         replace_text(holder, json.dumps(asdict(_this_process())))
         with _same(folder):
             yield
     finally:
-        _held.discard(path)
+        _locked.discard(path)
         with contextlib.suppress(OSError):
             holder.unlink(missing_ok=True)
         if not isinstance(lock, SoftFileLock):
@@ -120,7 +120,7 @@ def _acquired(folder: Path, path: Path, waits: bool) -> BaseFileLock:
         except OSError as error:
             if isinstance(error, Timeout) or error.errno not in WITHOUT_LOCKS:
                 raise FolderError(f"{path}: cannot be locked ({error.strerror or error}); choose a folder that can be written") from None
-    raise FolderError(f"{path}: the disk has no locks; choose a folder on another")
+    raise FolderError(f"{path}: the disk has no locks; choose a folder on another disk")
 
 
 def _beside(folder: Path, suffix: str) -> Path:

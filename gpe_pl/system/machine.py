@@ -1,4 +1,4 @@
-"""The machine: its description, its peak rates and the memory that functions need.
+"""The machine: its description, its peak rates of computation and copying, and the memory that functions need.
 
 The rates of matrix products and copies give lower bounds of run times.
 """
@@ -111,7 +111,7 @@ def best_time(function: Callable[[], Any], device: str, num_rounds: int = 10) ->
 
 
 def gemm_rate(rows: int, channels: int, device: str) -> float:
-    """Rate of the product of a matrix [rows, channels] with a square one [FLOP/s].
+    """Return the rate of the product of a matrix [rows, channels] with a square one [FLOP/s].
 
     The product is computed in one piece and in blocks that fit the cache; the faster counts.
     """
@@ -139,14 +139,14 @@ def reduces_precision(device: str) -> bool:
 
 
 def copy_rate(device: str, num_bytes: int = 2**28) -> float:
-    """Rate of copying an array that is too large for caches, reads and writes together [bytes/s]."""
+    """Return the rate of copying an array that is too large for caches, reads and writes together [bytes/s]."""
     source = torch.zeros(num_bytes // 4, device=device)
     target = torch.empty_like(source)
     return 2 * num_bytes / best_time(lambda: target.copy_(source), device, 5)
 
 
 def peak_on_gpu(function: Callable[[], Any]) -> int:
-    """GPU memory that a call needs in addition to the memory allocated before it [bytes]."""
+    """Return GPU memory that a call needs in addition to the memory allocated before it [bytes]."""
     function()
     torch.cuda.synchronize()
     before = torch.cuda.memory_allocated()
@@ -156,7 +156,7 @@ def peak_on_gpu(function: Callable[[], Any]) -> int:
 
 
 def peak_memory(function: Callable[..., Callable[[], Any]], *arguments: Any) -> int:
-    """Memory that a function needs in addition to the memory in use when it is called [bytes], measured in a separate process.
+    """Return the memory that a function needs in addition to the memory in use when it is called [bytes], measured in a separate process.
 
     On a GPU use ``peak_on_gpu`` instead.
 
@@ -189,9 +189,9 @@ def _peak_memory(sender: Any, function: Callable[..., Callable[[], Any]], argume
 
 
 def _resident() -> int:
-    """Memory in use [bytes], after resetting the peak on Linux.
+    """Return the memory of this process in use [bytes], after resetting the recorded peak on Linux.
 
-    Other systems cannot reset it. There the result is the peak so far, and a smaller need is not visible.
+    Other systems cannot reset the peak. There the result is the peak so far, and a function that needs less memory than that peak seems to need none.
     """
     if not CLEAR_REFS.exists():
         return peak_resident()
@@ -200,7 +200,7 @@ def _resident() -> int:
 
 
 def peak_resident() -> int:
-    """Peak memory of this process so far [bytes]."""
+    """Return the peak memory of this process so far [bytes]."""
     if CLEAR_REFS.exists():
         return _status("VmHWM")
     if hasattr(usage := psutil.Process().memory_info(), "peak_wset"):  # Windows
@@ -216,5 +216,5 @@ def _status(key: str) -> int:
 
 
 def resident_bytes() -> int:
-    """Memory of this process in use now [bytes]."""
+    """Return the memory of this process in use now [bytes]."""
     return int(psutil.Process().memory_info().rss)

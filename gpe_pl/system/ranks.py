@@ -15,7 +15,7 @@ def _is_parallel() -> bool:
 
 
 def rank() -> int:
-    """Rank of this process, counted from 0."""
+    """Return the rank of this process, counted from 0."""
     return dist.get_rank() if _is_parallel() else 0
 
 

@@ -57,8 +57,8 @@ def paired_ratio(times: Mapping[str, np.ndarray], name: str, reference: str) -> 
 def apart(factories: Mapping[str, Callable[[], Callable[[], Any]]]) -> Iterator[dict[str, Callable[[], None]]]:
     """Run functions in separate processes. A call waits until the function has run there, and returns nothing.
 
-    Functions with large arrays disturb each other through the heap of a shared process, which can cost a third of their time. Returning memory to the system
-    can cost as much. Here each function has its own heap, which keeps its memory (with glibc).
+    Functions with large arrays in one process slow each other down through its heap, by up to a third. Returning memory to the system can be as slow. Here each
+    function has a process and heap of its own, which keeps freed memory (with glibc).
 
     Args:
         factories: picklable functions that are called in the new processes and return the functions to run.

@@ -35,7 +35,7 @@ log = logging.getLogger(__name__)
 WARM_UP_STEPS = NUM_LANES
 MEASURED_STEPS = 25
 ROUNDS = 5
-SHARE_TO_MEASURE = 0.5
+FRACTION_TO_MEASURE = 0.5
 """Fraction of the budget after which no further round of measurements begins."""
 TIMES = TypeAdapter(dict[str, Annotated[float, Field(gt=0, strict=True)]])
 RATE = "FLOP/s in products"
@@ -47,7 +47,7 @@ SAME_MACHINE = 1.4
 
 
 def step_time_key(config: dict[str, Any], training: TrainingSettings, trainer: TrainerSettings, data: str | None = None) -> str:
-    """Key of a step time: a text that differs where the time of a training step can differ.
+    """Return the key of a step time: a text that differs between runs whose step times can differ.
 
     Args:
         config: resolved configuration of the run without its lookup tables of data and sizes (``run_folder.without_tables``). Entries for other data must not
@@ -72,8 +72,8 @@ class BudgetError(GpeError, ValueError):
 
 
 def mean_step_time(module: TrainingModule, data: WindowDataset, size: BatchSize, settings: TrainingSettings) -> float:
-    """Mean time per optimiser step [s] over a whole run: without push-forward at first, with it in the last ``push_share`` of the steps."""
-    limit = math.inf if settings.budget_minutes is None else SHARE_TO_MEASURE * 60 * settings.budget_minutes
+    """Return the mean time per optimiser step [s] over a whole run. The fraction ``push_share`` of the steps, at the end, uses push-forward."""
+    limit = math.inf if settings.budget_minutes is None else FRACTION_TO_MEASURE * 60 * settings.budget_minutes
     if not settings.push_share:
         return step_time(module, data, size, settings.gradient_clip, limit=limit)
     plain = step_time(module, data, size, settings.gradient_clip, limit=limit / 2)
@@ -91,8 +91,8 @@ def step_time(
 ) -> float:
     """Time per optimiser step [s], including the building of its graphs: the fastest of several rounds.
 
-    The time is processor time on a CPU and wall time on a GPU. The fastest round counts because other processes can only lengthen a step: even processor time
-    grows when they share caches and memory. After ``limit`` seconds of rounds no further one begins; the first always runs.
+    The time is processor time on a CPU and wall time on a GPU. The fastest round is taken because other processes can only slow a step down; even processor
+    time grows when they use the same caches and memory. No further round begins after ``limit`` seconds; the first always runs.
     """
     on_gpu = next(module.parameters()).is_cuda
     clock = time.perf_counter if on_gpu else time.process_time
@@ -126,7 +126,7 @@ def _on(device: torch.device, samples: Samples) -> Samples:
 def within_budget(
     settings: TrainingSettings, path: Path, key: str, measure: Callable[[TrainingSettings], float], device: str = "cpu"
 ) -> TrainingSettings:
-    """Settings with the number of steps that fits into ``settings.budget_minutes``, and as many validations as before.
+    """Return settings with the number of steps that fits into ``settings.budget_minutes``. The number of validations does not change.
 
     The budget does not include the time of compilation.
 
@@ -135,7 +135,7 @@ def within_budget(
         path: JSON file of step times [s]. The runs of a sweep share it, and their trainings pause during a measurement (``PauseForMeasurements``).
         key: key of the step time in that file (``step_time_key``).
         measure: measures the step time [s] under given settings; called if the file does not have it yet.
-        device: device to compute on. A warning says if it is faster or slower than the one on which the file's first time was measured.
+        device: device to compute on. A warning is logged if it is faster or slower than the device on which the first time in the file was measured.
 
     Raises:
         BudgetError: the file is damaged.
@@ -156,7 +156,7 @@ def within_budget(
 
 
 def _measured(settings: TrainingSettings, measure: Callable[[TrainingSettings], float]) -> float:
-    """Step time [s] with or without compilation, as in the run itself: with ``compile: auto`` that depends on the number of steps."""
+    """Return the step time [s] with or without compilation, as in the run itself. With ``compile: auto``, the number of steps decides."""
     assert settings.budget_minutes is not None
     if settings.compile != "auto":
         return measure(settings)
@@ -166,7 +166,7 @@ def _measured(settings: TrainingSettings, measure: Callable[[TrainingSettings], 
 
 
 def _check_machine(times: dict[str, float], path: Path, key: str, device: str) -> None:
-    """Warn if the stored times come from another machine, as equal budgets on both are not equal work. Into empty ``times``, add this machine's rate."""
+    """Warn if the stored times come from another machine, because equal budgets are then not equal work. If ``times`` is empty, add this machine's rate."""
     rate = gemm_rate(*PRODUCTS, device)
     before = times.get(RATE, rate) if times else times.setdefault(RATE, rate)
     if not 1 / SAME_MACHINE < rate / before < SAME_MACHINE:
@@ -212,7 +212,7 @@ def _announcement(path: Path) -> Path:
 
 
 def read_times(path: Path) -> dict[str, float]:
-    """Step times [s] by key, and the machine's rate under ``RATE``; empty if there is no file.
+    """Return step times [s] by key, and the machine's rate under ``RATE``; empty if there is no file.
 
     Raises:
         BudgetError: the file is damaged.

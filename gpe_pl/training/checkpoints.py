@@ -26,7 +26,7 @@ SCORE = "val/rollout_mse"
 
 
 class Checkpoints(Checkpoint):
-    """Saves ``last.ckpt`` regularly, and ``best.ckpt`` after each validation that is better than all before it.
+    """Saves ``last.ckpt`` regularly, and ``best.ckpt`` after each validation with the best score so far.
 
     ``last.ckpt`` is saved after every validation, every ``seconds`` between validations, and when training is interrupted. A checkpoint stores the best score
     and its step but no path, so a run's folder can be moved. All ranks save and stop together.
@@ -53,7 +53,7 @@ class Checkpoints(Checkpoint):
         self._saved_at = time.monotonic()
 
     def where_saved(self) -> str | None:
-        """Path and step of ``last.ckpt``, for messages; None if there is none."""
+        """Return the path and step of ``last.ckpt``, for messages; None if there is none."""
         if not self.last.exists():
             return None
         return str(self.last) if self.saved_step is None else f"{self.last}, step {self.saved_step}"
@@ -91,7 +91,7 @@ class Checkpoints(Checkpoint):
 
     @staticmethod
     def _agreed(module: L.LightningModule, *wishes: bool) -> list[bool]:
-        """For each wish, whether any rank has it; all ranks get the same answer."""
+        """For each wish, return whether any rank has it. All ranks get the same answer."""
         if ranks.num_ranks() == 1:
             return list(wishes)
         return [bool(count) for count in ranks.summed(torch.tensor(wishes, dtype=torch.int64, device=module.device)).tolist()]
@@ -142,7 +142,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
         replace_bytes(Path(path), content.getbuffer())
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = True) -> dict[str, Any]:
-        """Content of a checkpoint. Unpickles only tensors and plain values, whatever ``weights_only`` says.
+        """Return the content of a checkpoint. Only tensors and plain values are unpickled, whatever ``weights_only`` is.
 
         Raises:
             CheckpointError: the file is damaged, or not a checkpoint.

@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 
 def clipped_norm(gradient_clip: float | None) -> float:
-    """Largest allowed norm of a gradient. Without clipping it is infinite, so that clipping still computes the norm and changes nothing."""
+    """Return the largest allowed norm of a gradient. Without clipping it is infinite, so that clipping still computes the norm and changes nothing."""
     return math.inf if gradient_clip is None else gradient_clip
 
 
@@ -54,7 +54,7 @@ def _rows(tensor: Tensor) -> int:
 
 
 class TrainingError(GpeError, RuntimeError):
-    """Training cannot continue; the message names step, trajectories and frames."""
+    """Raised when training cannot continue; the message names step, trajectories and frames."""
 
 
 class TrainingModule(L.LightningModule):
@@ -105,7 +105,7 @@ class TrainingModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def learning_rate_factor(self, step: int) -> float:
-        """Learning rate at a step divided by ``learning_rate``."""
+        """Return the learning rate at a step divided by ``learning_rate``."""
         ratio = self.final_learning_rate / self.learning_rate
         if self.schedule == "exponential":
             return ratio ** (min(step, self.num_steps) / self.num_steps)
@@ -156,7 +156,7 @@ class TrainingModule(L.LightningModule):
             del model.compute  # leaves the method of the class
 
     def loss(self, samples: Samples) -> Tensor:
-        """Mean squared error of the normalised accelerations, plus that of the normalised stress if the model decodes one.
+        """Return the mean squared error of the normalised accelerations, plus that of the normalised stress if the model decodes one.
 
         With several ranks, it is this rank's part of the sum. For push-forward samples, the graphs show the states that the unrolls have reached, and the
         predictions advance these unrolls by one step.
@@ -173,27 +173,27 @@ class TrainingModule(L.LightningModule):
         if "weight" in batch:
             acceleration = self._weighted(batch, predicted.acceleration, acceleration)
             stress = self._weighted(batch, predicted.stress, stress)
-        shares = self._shares(acceleration, stress)
-        loss = torch.cat(acceleration).mean() * shares[0]
+        fractions = self._fractions(acceleration, stress)
+        loss = torch.cat(acceleration).mean() * fractions[0]
         if stress:
-            loss = loss + self.stress_weight * torch.cat(stress).mean() * shares[1]
+            loss = loss + self.stress_weight * torch.cat(stress).mean() * fractions[1]
         return loss
 
     @staticmethod
     def _weighted(batch: HeteroData, materials: Iterable[str], errors: list[Tensor]) -> list[Tensor]:
-        """Errors [node, …] of each material, multiplied by the weights of their graphs."""
+        """Return errors [node, …] of each material, multiplied by the weights of their graphs."""
         weight = batch.weight.float()
         return [weight[batch[m].batch][:, None] * error for m, error in zip(materials, errors, strict=True)]
 
-    def _shares(self, *errors: list[Tensor]) -> list[float]:
-        """Fraction of all ranks' errors that is on this rank, for each kind. A rank without errors of a kind takes part in the exchange, too."""
+    def _fractions(self, *errors: list[Tensor]) -> list[float]:
+        """For each kind of error, return the fraction of all ranks' values that is on this rank. Ranks without values also take part in the exchange."""
         if ranks.num_ranks() == 1:
             return [1.0] * len(errors)
         here = torch.tensor([sum(e.numel() for e in kind) for kind in errors], device=self.device)
         return [n / max(1, total) for n, total in zip(here.tolist(), ranks.summed(here).tolist(), strict=True)]
 
     def training_step(self, batch: Samples, batch_idx: int) -> Tensor | None:
-        """Loss of a batch. Without a finite loss the step changes nothing; one process then returns None."""
+        """Return the loss of a batch. If the loss is not finite, the step changes nothing; a run of one process then returns None."""
         loss = self.loss(batch)
         if not loss.requires_grad:  # no node has an edge, so all fall freely by design: nothing to learn from this batch
             loss = loss + 0.0 * torch.stack([p.sum() for p in self.simulator.parameters() if p.requires_grad]).sum()

@@ -1,7 +1,7 @@
 """Push-forward: trains a simulator on states that its own unrolls reach.
 
-A training step predicts the accelerations that the unroll needs for its next step, so the unroll costs no extra pass of the model. Each batch of states is
-trained on, advanced by this prediction, and kept until its lane comes up again.
+A training step predicts the accelerations that the unroll needs for its next step, so the unroll needs no additional pass of the model. The model is trained on
+a batch of states; the prediction then advances these states, which are kept until the next turn of their lane.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Excursions:
         self._loaded.clear()
 
     def state_dict(self) -> Stored:
-        """Unrolls of all ranks: ``steps``, ``time`` and the tensors ``pos``, ``vel``, ``velocity_history`` of each scene. All ranks have to call it."""
+        """Return unrolls of all ranks: ``steps``, ``time`` and the tensors ``pos``, ``vel``, ``velocity_history`` of each scene. All ranks have to call it."""
         own: Stored = {lane: dict(scenes) for lane, scenes in self._loaded.items()}  # loaded from a checkpoint and not used since
         for lane, way in self._lanes.items():
             scenes = zip(way.samples, way.states, way.steps, strict=True)
@@ -79,14 +79,14 @@ class Excursions:
         self._loaded = {lane: dict(scenes) for lane, scenes in stored.items()}
 
     def graphs(self, simulator: LearnedSimulator, starts: Sequence[Start]) -> HeteroData:
-        """Batch of graphs of the states that the unrolls have reached.
+        """Return a batch of graphs of the states that the unrolls have reached.
 
         Scenes whose unroll failed or passed the last ground-truth frame restart.
         """
         samples, lane = [start.sample for start in starts], starts[0].lane
         under_way = self._lanes.get(lane)
         if under_way is None or under_way.samples != samples:
-            under_way = self._taken_up(lane, starts) or Excursion(samples, *walked(simulator, starts), [])
+            under_way = self._taken_up(lane, starts) or Excursion(samples, *unrolled(simulator, starts), [])
         under_way.graphs = []
         for k, start in enumerate(starts):
             if start.state.boundary.motion is not None:  # this start's stretch of the motion may reach further than the last
@@ -101,7 +101,7 @@ class Excursions:
         return batched(under_way.graphs)
 
     def _taken_up(self, lane: int, starts: Sequence[Start]) -> Excursion | None:
-        """Batch of these samples as a checkpoint stored it; None if the checkpoint does not have all of them."""
+        """Return a batch of these samples as a checkpoint stored it; None if the checkpoint does not have all of them."""
         stored = self._loaded.pop(lane, {})
         if not all(start.sample in stored for start in starts):
             return None
@@ -125,7 +125,7 @@ class Excursions:
 
 
 def _graph(simulator: LearnedSimulator, start: Start, state: State, step: int) -> HeteroData | None:
-    if step > start.own_steps:
+    if step > start.num_steps:
         return None
     try:
         return start.graph(simulator.builder, state, step)
@@ -134,7 +134,7 @@ def _graph(simulator: LearnedSimulator, start: Start, state: State, step: int) -
 
 
 def _moved(start: State, scene: dict[str, Any]) -> State:
-    """State of a start with the fields in ``MOVED`` replaced by those of a checkpoint.
+    """Return the state of a start with the fields in ``MOVED`` replaced by those of a checkpoint.
 
     Raises:
         CheckpointError: a field has another shape or type.
@@ -154,7 +154,7 @@ def _moved(start: State, scene: dict[str, Any]) -> State:
 
 @dataclass(frozen=True)
 class _Trainable(Batched):
-    """A learned simulator whose states can be trained on; those of ``LearnedSimulator.step_all`` are for inference only."""
+    """A learned simulator whose states can be used in training. States from ``LearnedSimulator.step_all`` can be used for inference only."""
 
     simulator: LearnedSimulator
 
@@ -163,13 +163,13 @@ class _Trainable(Batched):
 
 
 @torch.no_grad()
-def walked(simulator: LearnedSimulator, starts: Sequence[Start]) -> tuple[list[State], list[int]]:
-    """States after unrolling each start for ``own_steps`` steps, all starts together, and the number of steps of each.
+def unrolled(simulator: LearnedSimulator, starts: Sequence[Start]) -> tuple[list[State], list[int]]:
+    """Return states after unrolling each start for ``num_steps`` steps, all starts together, and the number of steps of each.
 
-    An unroll whose scene has no graph any more ends earlier.
+    An unroll ends earlier if no graph of its scene can be built any more.
     """
     states, steps = [start.state for start in starts], [0] * len(starts)
-    num_steps = {k: start.own_steps for k, start in enumerate(starts)}
+    num_steps = {k: start.num_steps for k, start in enumerate(starts)}
     was_training = simulator.training
     simulator.eval()
     try:

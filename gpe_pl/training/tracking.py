@@ -42,7 +42,7 @@ class LoggerSettings:
     mode: Literal["online", "offline", "disabled"] | None = None
 
     def loggers(self, run_dir: Path, name: str, config: Mapping[str, Any]) -> list[Logger]:
-        """Loggers of a run: CSV under ``run_dir/log``, one version per start of the run, and W&B if configured.
+        """Return loggers of a run: CSV under ``run_dir/log``, one version per start of the run, and W&B if configured.
 
         Args:
             run_dir: folder of the run; it keeps the identifier under which a resumed run continues in W&B.
@@ -77,7 +77,7 @@ class LoggerSettings:
 
 
 class Log(CSVLogger):
-    """CSV logger that replaces its file as a whole. A reader could not tell a number that is cut off from a complete one."""
+    """CSV logger that replaces its file as a whole, so that a reader never sees a number that is cut off."""
 
     @rank_zero_only
     def save(self) -> None:
@@ -101,7 +101,7 @@ class Log(CSVLogger):
 
 
 class TrackingError(GpeError):
-    """W&B refuses a run; the message says why."""
+    """Raised when W&B refuses a run; the message says why."""
 
 
 def has_key() -> bool:
@@ -117,7 +117,7 @@ def has_key() -> bool:
 
 
 def run_id(run_dir: Path) -> str:
-    """Identifier of a run in W&B. It is written to ``RUN_ID`` once, so that a resumed run finds it again.
+    """Return the identifier of a run in W&B. It is written to ``RUN_ID`` once, so that a resumed run finds it again.
 
     Raises:
         TrackingError: the file holds something else, which W&B would use in paths.

@@ -24,7 +24,7 @@ MAX_VISITED = 50_000
 
 
 class ArrayError(GpeError, ValueError):
-    """An array or value does not fit. The message names it, with frame and node if there is one.
+    """Raised when an array or value does not fit. The message names it, with frame and node if a single one is concerned.
 
     Attributes:
         frame: number of the frame, -1 if the fault is not in a single frame.

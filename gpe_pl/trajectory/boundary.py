@@ -168,10 +168,10 @@ class Boundary:
         return replace(first, motion=Motion(inside, vel, normals)).at(0)
 
     def inside(self, periodicity: Periodicity) -> Boundary:
-        """Return this boundary of NumPy arrays as a periodic domain needs it.
+        """Return this boundary of NumPy arrays, prepared for a periodic domain.
 
-        Nodes are folded into the domain. Of nodes that coincide at a seam, one is kept. Nodes inside an image of a shape are left out. Images are added to the
-        shapes.
+        Nodes are wrapped into the domain. If nodes coincide at a seam, only one is kept. Nodes inside an image of a shape are left out. Shapes get their
+        periodic images.
         """
         if not periodicity:
             return self

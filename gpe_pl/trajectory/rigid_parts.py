@@ -4,9 +4,9 @@ Nodes belong to one rigid part if one motion describes them in every frame::
 
     x_n(t) = c(t) + R(t) (x_n(0) − c(0))
 
-R(t) is the rotation that brings the part from the first frame closest to its present position [Kabsch 1976]. Near nodes need not belong to one part: a piston
-that slides over a floor is another part than the floor. Nodes of a membrane that happen to move alike are no part, as most of the nodes connected to them move
-differently.
+R(t) is the rotation that best maps the part from the first frame to its present position [Kabsch 1976]. Nodes that are near each other need not belong to one
+part: a piston that slides over a floor is a part of its own. Nodes of a membrane that happen to move alike are not a rigid part, because most nodes connected
+to them move differently.
 """
 
 from __future__ import annotations
@@ -180,8 +180,8 @@ def _hold_together(paths: _Paths, label: np.ndarray) -> np.ndarray:
         of_part, count = label[nodes] >= 0, np.bincount(label[nodes] + 1)
         own = (label[near] == label[nodes][:, None]).sum(axis=1)
         most = np.minimum(hangs.sum(axis=1), count[label[nodes] + 1] - 1)
-        share, whole = (np.bincount(label[nodes][of_part], values[of_part]) for values in (own, most))
-        accepted = np.flatnonzero((2 * share >= whole) & (count[1:] > 0))
+        fraction, whole = (np.bincount(label[nodes][of_part], values[of_part]) for values in (own, most))
+        accepted = np.flatnonzero((2 * fraction >= whole) & (count[1:] > 0))
         if not len(accepted):
             return is_rigid
         is_rigid |= np.isin(label, accepted)
@@ -285,7 +285,7 @@ def _surroundings(paths: _Paths, nodes: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _local_rotations(paths: _Paths, nodes: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield for every frame the rotation of the surroundings of each of ``nodes`` [node, dim, dim]."""
+    """Yield, for every frame, the rotations [node, dim, dim] of the nodes around each of ``nodes``."""
     near, arms, hangs = _surroundings(paths, nodes)
     arms, dim = np.where(hangs[..., None], arms, 0.0), arms.shape[2]
     extent = np.linalg.svd(np.einsum("nkd,nke->nde", arms, arms), compute_uv=False)

@@ -154,11 +154,12 @@ class State:
     def later(self, dt: float, pos: Array, vel: Array, **values: Any) -> State:
         """Return the state one frame later.
 
-        The velocity history moves on where there is one, a moving boundary moves on, and fields of kind ``STEP`` get their defaults.
+        The new velocity is appended to the velocity history, if there is one, and the oldest is dropped. A moving boundary advances by a frame. Fields of kind
+        ``STEP`` get their defaults.
 
         Args:
             dt: frame interval [s].
-            pos: positions [node, dim] in m; folded into a periodic domain.
+            pos: positions [node, dim] in m. They are wrapped into a periodic domain.
             vel: velocities [node, dim] in m/s.
             values: other fields, by name.
         """

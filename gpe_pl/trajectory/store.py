@@ -35,11 +35,11 @@ from gpe_pl.trajectory.values import faults, size_conflicts
 
 
 class StoreError(GpeError, ValueError):
-    """A file of the store is missing, damaged or of another schema; the message names file, trajectory and field."""
+    """Raised when a file of the store is missing, damaged or of another schema; the message names file, trajectory and field."""
 
 
 class UnsoundError(StoreError):
-    """A stored trajectory can be read, but has invalid values.
+    """Raised when a stored trajectory can be read but has invalid values.
 
     Attributes:
         fault: the fault, without file and trajectory.
@@ -79,6 +79,8 @@ def array_bytes(trajectory: Trajectory) -> int:
     """Return the uncompressed size of a trajectory's stored arrays [bytes]."""
     return sum(array.nbytes for array in stored_arrays(trajectory).values())
 
+
+ADVICE = "delete the shard and generate or import the data again"
 
 PREDICTION = "prediction"
 """Name of an attribute that only predictions have."""
@@ -201,20 +203,20 @@ def open_group(file: h5py.File, name: str) -> h5py.Group:
     if not is_named(file, name):
         raise StoreError(f"{file.filename}: no trajectory {name!r}; it has {len(file)} trajectories")
     if not is_own(file, name) or not isinstance(file[name], h5py.Group):
-        raise StoreError(
-            f"{file.filename}: {name!r} is not a trajectory of this file; delete the shard and generate or import the data again"
-        )
+        raise StoreError(f"{file.filename}: {name!r} is not a trajectory of this file; {ADVICE}")
     return file[name]
 
 
 def read_text(group: h5py.Group, key: str) -> str:
     """Return a text attribute of a trajectory."""
     if key not in group.attrs:
-        raise StoreError(f"{_where(group)}: attribute {key!r} is missing; delete the shard and generate or import the data again")
+        raise StoreError(f"{_where(group)}: attribute {key!r} is missing; {ADVICE}")
     text = attribute(group, key)
     if not isinstance(text, bytes):  # reading text of variable length from a damaged file is not safe
         stored = group.attrs.get_id(key)
-        raise StoreError(f"{_where(group)}: attribute {key!r} is {stored.dtype}{list(stored.shape)}, expected text of fixed length")
+        raise StoreError(
+            f"{_where(group)}: attribute {key!r} is {stored.dtype}{list(stored.shape)}, expected text of fixed length; {ADVICE}"
+        )
     return text.decode()
 
 
@@ -222,14 +224,14 @@ def open_field(group: h5py.Group, key: str) -> h5py.Dataset:
     """Return a stored array after comparing its type and shape with ``schema.FIELDS``; none of its values is read yet."""
     spec, where = FIELDS[key], f"{_where(group)}: field {key!r}"
     if not is_named(group, key):
-        raise StoreError(f"{where} is missing; delete the shard and generate or import the data again")
+        raise StoreError(f"{where} is missing; {ADVICE}")
     dataset = dataset_in(group, key)
     if dataset is None:
-        raise StoreError(f"{where} is not an array inside this file; a shard must not refer to other files")
+        raise StoreError(f"{where} is not an array inside this file; a shard must not refer to other files; {ADVICE}")
     if dataset.shape is None or len(dataset.shape) != len(spec.dims) or dataset.dtype != np.dtype(spec.dtype):
-        raise StoreError(f"{where} is {dataset.dtype}{list(dataset.shape or ())}, expected {spec.dtype} [{', '.join(spec.dims)}]")
+        raise StoreError(f"{where} is {dataset.dtype}{list(dataset.shape or ())}, expected {spec.dtype} [{', '.join(spec.dims)}]; {ADVICE}")
     if (reason := obstacle(dataset)) is not None:
-        raise StoreError(f"{where} {reason}")
+        raise StoreError(f"{where} {reason}; {ADVICE}")
     return dataset
 
 
@@ -241,7 +243,7 @@ def read_field(group: h5py.Group, key: str, frames: slice | None = None) -> np.n
         return dataset[frames] if frames is not None and has_frames else dataset[()]
     except (OSError, RuntimeError):
         where = f"{_where(group)}: field {key!r}"
-        raise StoreError(f"{where} is damaged (checksum mismatch); delete the shard and generate or import the data again") from None
+        raise StoreError(f"{where} is damaged (checksum mismatch); {ADVICE}") from None
 
 
 def trajectory_names(path: Path | str) -> list[str]:
@@ -273,9 +275,9 @@ def metadata_of(group: h5py.Group) -> Metadata:
         raise
     except ValidationError as error:
         wrong = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors(include_url=False)[:5])
-        raise StoreError(f"{_where(group)}: metadata unreadable: {wrong}") from None
+        raise StoreError(f"{_where(group)}: metadata unreadable: {wrong}; {ADVICE}") from None
     except (ValueError, TypeError) as error:
-        raise StoreError(f"{_where(group)}: metadata unreadable: {error}") from None
+        raise StoreError(f"{_where(group)}: metadata unreadable: {error}; {ADVICE}") from None
 
 
 def _parsed_list(group: h5py.Group, key: str) -> list[Any]:
@@ -292,7 +294,7 @@ def shapes_of(group: h5py.Group) -> tuple[Shape, ...]:
     except StoreError:
         raise
     except (ValueError, TypeError, AttributeError, ArithmeticError, LookupError) as error:
-        raise StoreError(f"{_where(group)}: attribute 'shapes' is unreadable: {error}") from None
+        raise StoreError(f"{_where(group)}: attribute 'shapes' is unreadable: {error}; {ADVICE}") from None
 
 
 def start_time_of(group: h5py.Group) -> float:
@@ -306,7 +308,7 @@ def start_time_of(group: h5py.Group) -> float:
     except StoreError:
         raise
     except ValueError as error:
-        raise StoreError(f"{_where(group)}: attribute {START_TIME!r} is unreadable: {error}") from None
+        raise StoreError(f"{_where(group)}: attribute {START_TIME!r} is unreadable: {error}; {ADVICE}") from None
     return float(seconds)
 
 
@@ -317,10 +319,10 @@ def node_types_of(group: h5py.Group) -> tuple[str, ...]:
     except StoreError:
         raise
     except (ValueError, TypeError) as error:
-        raise StoreError(f"{_where(group)}: attribute 'node_types' is unreadable: {error}") from None
+        raise StoreError(f"{_where(group)}: attribute 'node_types' is unreadable: {error}; {ADVICE}") from None
     unknown = [name for name in names if name not in NODE_TYPES]
     if unknown:
-        raise StoreError(f"{_where(group)}: attribute 'node_types' names {unknown}; known: {', '.join(NODE_TYPES)}")
+        raise StoreError(f"{_where(group)}: attribute 'node_types' names {unknown}; known: {', '.join(NODE_TYPES)}; {ADVICE}")
     return names
 
 
@@ -348,13 +350,11 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         if verify:
             attributes = {key: read_text(group, key) for key in (*ATTRIBUTES, START_TIME) if key in (*ATTRIBUTES, *group.attrs)}
             if digest(arrays, attributes) != read_text(group, "sha256"):
-                raise StoreError(
-                    f"{path}:{name}: SHA-256 digest does not match the content; delete the shard and generate or import the data again"
-                )
+                raise StoreError(f"{path}:{name}: SHA-256 digest does not match the content; {ADVICE}")
         if ("node_stress" in arrays) != ("cell_stress" in arrays):
-            raise StoreError(f"{path}:{name}: has only one of the fields 'node_stress' and 'cell_stress'")
+            raise StoreError(f"{path}:{name}: has only one of the fields 'node_stress' and 'cell_stress'; {ADVICE}")
         for conflict in size_conflicts(arrays, metadata.dim, len(metadata.param_names)):
-            raise StoreError(f"{path}:{name}: {conflict}")
+            raise StoreError(f"{path}:{name}: {conflict}; {ADVICE}")
         shapes, names, is_prediction, begins = shapes_of(group), node_types_of(group), PREDICTION in group.attrs, start_time_of(group)
     for key, violation in metadata.violations():
         raise UnsoundError(f"{path}:{name}", f"{key} {violation}")

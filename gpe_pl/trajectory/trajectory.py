@@ -1,4 +1,4 @@
-"""``Trajectory`` and its ``Metadata``. Together with ``State`` they are the only interface between solvers and learned simulators."""
+"""``Trajectory`` and its ``Metadata``. These two classes and ``State`` are the only interface between solvers and learned simulators."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ class Termination:
     Attributes:
         reason: reason code, such as ``nan``.
         frame: first frame that failed.
-        node: node that shows the failure, -1 if it is no single one.
+        node: node that shows the failure, or -1 if no single node does.
         message: explanation for a reader.
     """
 
@@ -196,8 +196,8 @@ class Trajectory:
         ``data.importers.save_dataset`` writes several such trajectories as a data set, on which ``python -m gpe_pl.fit data=imported`` trains.
 
         Args:
-            pos: positions [frame, node, dim] in m of at least 3 frames. Along periodic axes they are folded into the domain. Arrays of other types than float32
-                and float16 stay in double precision until they are stored.
+            pos: positions [frame, node, dim] in m of at least 3 frames. Along periodic axes they are wrapped into the domain. Arrays of float32 and float16 are
+                kept as float32, all others in double precision until they are stored.
             frame_dt: time between frames [s].
             materials: material of all nodes, or of each node; names of ``schema.MATERIALS``.
             params: parameter of each material that occurs, in the unit of ``schema.MATERIALS``: one value, or one per node of the trajectory.
@@ -208,11 +208,11 @@ class Trajectory:
             gravity: external acceleration [dim] in m/s²; None stands for zero. Models then learn gravity like any other force.
             spacing: rest spacing of neighbours [m]; None takes the median distance to the nearest node in the first frame.
             connectivity_radius: neighbour radius [m]; nodes that act on each other should be within it. None takes ``arrays.RADIUS_SPACINGS`` spacings.
-            boundary: walls and obstacles, for example ``Boundary.sample(domain_walls(bounds, friction), spacing, dim)`` or ``Boundary.from_numpy(…)``.
-                In periodic domains its nodes are folded like others, those that coincide at a seam become one, and shapes get images.
+            boundary: walls and obstacles, for example ``Boundary.sample(domain_walls(bounds, friction), spacing, dim)`` or ``Boundary.from_numpy(…)``. In
+                periodic domains, its nodes are wrapped into the domain, nodes that coincide at a seam become one, and shapes get their images.
             cells: nodes of each cell [cell, corner] in meshes of elastomers and solids, or such arrays by kind, ``{"quadrilateral": …, "triangle": …}``. Give
-                them by kind if there are several kinds, and for four corners in 3D, which quadrilaterals and tetrahedra have. Kinds are those of
-                ``schema.CELL_KINDS``, corners in VTK's order.
+                them by kind if there are several kinds, or if cells in 3D have four corners, because both quadrilaterals and tetrahedra do. Kinds are those of
+                ``schema.CELL_KINDS``; the order of corners is that of VTK.
             rest_pos: undeformed positions [node, dim] of meshes in m; None takes those of the first frame.
             dataset, split: names of data set and split; ``save_dataset`` overrides both.
 
@@ -302,7 +302,7 @@ class Trajectory:
     def seen_from(self, origin: np.ndarray) -> Trajectory:
         """Return the trajectory in coordinates whose origin is at ``origin`` [dim] in m.
 
-        Choose an origin near the positions before you store them, as float32 is precise near 0 only.
+        Choose an origin near the positions before you store them: stored positions are float32, which is most precise near 0.
         """
         b, m = self.boundary, self.metadata
         rest_pos = self.rest_pos

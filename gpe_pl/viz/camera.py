@@ -22,7 +22,7 @@ def vertical_axis(trajectory: Trajectory) -> int:
 
 
 class Camera:
-    """Unchanged view of a 2D scene, or oblique parallel projection of a 3D scene from above, so that sizes do not depend on the distance.
+    """View of a scene. A 2D scene is shown unchanged. A 3D scene is seen obliquely from above in a parallel projection, so sizes do not depend on the distance.
 
     Attributes:
         plane: unit vectors to the right and upward in the picture [2, dim].

@@ -15,7 +15,7 @@ from gpe_pl.viz.film_strip import TEXT_WIDTH, new_figure
 
 
 def comparison_figure(intervals: Mapping[str, Mapping[str, Interval]], references: Mapping[str, Mapping[str, float]], label: str) -> Figure:
-    """Draw errors with intervals on a logarithmic axis, a group per domain and a mark per model; a line across each group marks each reference.
+    """Draw errors with intervals on a logarithmic axis, with a group per domain and a mark per model. Lines across a group mark the references.
 
     An interval without an upper end runs to the top of the figure. An infinite mark is a triangle at the top.
 

@@ -12,8 +12,8 @@ DPI = 220
 """Resolution in dots per inch; a sheet is viewed on a screen, and single particles should be visible."""
 
 
-def telling_color(trajectories: Sequence[Trajectory]) -> ColorBy:
-    """Choose stress if a mesh has it, else material if there are several, else the height at the start."""
+def informative_color(trajectories: Sequence[Trajectory]) -> ColorBy:
+    """Choose what to colour by: the stress of a mesh if there is one, else the material if there are several, else the height at the start."""
     if any(trajectory.stress is not None for trajectory in trajectories):
         return "von_mises"
     return "material" if len(trajectories[0].metadata.materials) > 1 else "height"
@@ -34,4 +34,4 @@ def contact_sheet(trajectories: Mapping[str, Trajectory], num_columns: int = 6) 
     trajectories = {label: trajectory.with_moving_boundary() for label, trajectory in trajectories.items()}
     shown = list(trajectories.values())
     frames = evenly_spaced_frames(max(trajectory.num_frames for trajectory in shown), num_columns)
-    return film_strip(list(trajectories.items()), frames, Coloring(telling_color(shown), shown, frames), DPI)
+    return film_strip(list(trajectories.items()), frames, Coloring(informative_color(shown), shown, frames), DPI)

@@ -1,7 +1,7 @@
 """Figures for print: rollouts as film strips, error over time, validation loss over training.
 
-Every function returns a ``Figure`` with its own Agg canvas. Figures do not use pyplot, so they can be made in threads and without a display, and are freed
-like any other object. Save one with ``figure.savefig(path, dpi=300)``.
+Every function returns a ``Figure``. Save it with ``figure.savefig(path, dpi=300)``. Figures have their own Agg canvas and do not use pyplot, so they can be
+made in threads and without a display, and are freed like other objects.
 """
 
 import math

@@ -68,7 +68,7 @@ def polygon_edges(polygons: np.ndarray) -> np.ndarray:
 
 
 def _that_occur_once(groups: np.ndarray) -> np.ndarray:
-    """Return the indices of groups of nodes [group, node] that no other group equals in any order, whichever node a group repeats."""
+    """Return the indices of those groups of nodes [group, node] that contain another set of nodes than all other groups."""
     nodes = np.sort(groups, axis=1).astype(np.int64)
     again = nodes[:, 1:] == nodes[:, :-1]
     nodes[:, 1:][again] = np.broadcast_to(nodes[:, -1:], again.shape)[again]

@@ -1,6 +1,7 @@
 """Walls, obstacles, containers and terrain behind the particles.
 
-In 3D, a surface is shown if its free side faces the viewer. The view goes into a container from outside, and through the near bank of a river.
+In 3D, a surface is shown only if its free side faces the viewer. A viewer outside a container therefore sees its inside, and the near bank of a river is not
+drawn.
 """
 
 from collections.abc import Sequence

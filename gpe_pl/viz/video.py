@@ -27,7 +27,7 @@ DPI = 100
 
 
 class FilmError(GpeError):
-    """A film is incomplete; ffmpeg does not report this to the program that calls it."""
+    """Raised when a film is incomplete. ffmpeg itself does not report this to the program that calls it."""
 
 
 def write_animation(

@@ -32,7 +32,7 @@ from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.camera import AZIMUTH, ELEVATION, vertical_axis
 from gpe_pl.viz.captions import describe, heading, with_heading
 from gpe_pl.viz.coloring import MATERIAL_COLORS, REFERENCE, ColorBy, Coloring, position_error
-from gpe_pl.viz.contact_sheet import telling_color
+from gpe_pl.viz.contact_sheet import informative_color
 from gpe_pl.viz.panel import DOT, drawn_faces, outline, polygon_edges
 from gpe_pl.viz.scenery import BACKDROP, surface_points
 
@@ -60,7 +60,7 @@ SOLID_CELLS = 4
 
 
 class ViewerError(GpeError, ValueError):
-    """Trajectories do not show the same scene."""
+    """Raised when trajectories do not show the same scene."""
 
 
 def write_viewer(
@@ -95,7 +95,8 @@ def write_viewer(
     for name, trajectory in trajectories.items():
         if not np.array_equal(trajectory.node_type, ground_truth.node_type):
             raise ViewerError(
-                f"{name!r} has {trajectory.num_nodes} nodes and the {heading(ground_truth)} {ground_truth.num_nodes}, or their materials differ"
+                f"{name!r} has {trajectory.num_nodes} nodes and the {heading(ground_truth)} {ground_truth.num_nodes}, or their materials differ; "
+                "give rollouts of the same scene"
             )
     about = ground_truth.metadata
     title = title or " ".join(word for word in (about.dataset, about.split) if word)
@@ -194,7 +195,7 @@ def _colors(trajectories: Mapping[str, Trajectory]) -> list[ColorBy]:
         colors.append("von_mises")
     if len(shown) > 1:
         colors.append("error")
-    return sorted(colors, key=lambda by: by != telling_color(shown))
+    return sorted(colors, key=lambda by: by != informative_color(shown))
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch_geometric.data import HeteroData
 
-from gpe_pl.export.program import EVERYTHING, PortableStep, scene_of
+from gpe_pl.export.program import EVERYTHING, ExportedStep, scene_of
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.multiscale import multiscale_graph
@@ -114,7 +114,7 @@ def test_bodies_with_loose_nodes_do_not_push_themselves(skips: Skips) -> None:
         assert isinstance(after, State) and momentum_error(before, after, dt)[0] < 1e-6
     with torch.inference_mode():
         scene = scene_of(simulator, s)
-        moved, _ = PortableStep(simulator)(scene)
+        moved, _ = ExportedStep(simulator)(scene)
     change = moved["velocity_history.elastomer"][:, -1] - scene["velocity_history.elastomer"][:, -1] - s.gravity * dt
     push = scene["mass.elastomer"][:, None] * change
     assert push.sum(dim=0).norm() < 1e-6 * push.norm(dim=1).sum()

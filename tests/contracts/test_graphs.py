@@ -223,7 +223,9 @@ def test_trimming_the_boundary_changes_no_prediction() -> None:
 @pytest.mark.parametrize("missing", ["snow", "fluid"])
 def test_a_material_that_the_data_set_lacks_is_named(missing: str) -> None:
     s = scenes.state(10, ("sand", missing))
-    with pytest.raises(GraphError, match=rf"state has nodes of {missing}; the data set 'test' has sand$"):
+    with pytest.raises(
+        GraphError, match=rf"state has nodes of {missing}; the data set 'test' has sand; take a model that was trained on {missing}$"
+    ):
         builder()(s.to_torch())
 
 

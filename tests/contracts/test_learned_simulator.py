@@ -50,10 +50,10 @@ def silenced(simulator: LearnedSimulator) -> LearnedSimulator:
 
 def test_a_copy_with_other_settings_leaves_the_original_unchanged(new_trajectory: Callable[..., Trajectory]) -> None:
     simulator = learned(builder_of(new_trajectory(), islands=True))
-    other = simulator.configured(skips=replace(simulator.skips, stress=True), holds_parameters=False, static_friction=0.5)
+    other = simulator.configured(skips=replace(simulator.skips, stress=True), clamps_parameters=False, static_friction=0.5)
     own, others = (s.model.skips.stress for s in (simulator, other))
-    assert (other.skips.stress, others, other.holds_parameters, other.static_friction) == (True, True, False, 0.5)
-    assert (simulator.skips.stress, own, simulator.holds_parameters, simulator.static_friction) == (
+    assert (other.skips.stress, others, other.clamps_parameters, other.static_friction) == (True, True, False, 0.5)
+    assert (simulator.skips.stress, own, simulator.clamps_parameters, simulator.static_friction) == (
         False,
         False,
         True,
@@ -199,6 +199,7 @@ def test_targets_that_teach_nothing_are_refused(value: float) -> None:
             lambda t: replace(t, material_params=_with(t.material_params, (4, 0), np.nan)),
             r"node 4 \(sand\): friction_angle is nan deg, must be finite",
         ),
+        (lambda t: replace(t, mass=_with(t.mass, (6,), 0.0)), "node 6 has a mass of 0 kg; give every node a positive and finite mass"),
     ],
 )
 def test_an_initial_state_that_is_not_finite_names_the_node(
@@ -406,7 +407,7 @@ def test_a_description_of_another_model_is_refused(simulator: LearnedSimulator, 
         ("acceleration_std", lambda x: -x, "acceleration_std has values that are not positive"),
         ("acceleration_std", lambda x: x * torch.nan, "acceleration_std has values that are not finite"),
         ("standardizer.node.sand.std", lambda x: 0 * x, "standardizer.node.sand.std has values that are not positive"),
-        ("trained_sand", lambda x: torch.tensor([[40.0], [20.0]]), "trained_sand ends before it begins"),
+        ("trained_sand", lambda x: torch.tensor([[40.0], [20.0]]), "the lowest value of trained_sand is above the highest"),
         ("trained_sand", lambda x: torch.tensor([[20], [40]]), "trained_sand is of type torch.int64"),
         (
             "standardizer.node.sand.std",
@@ -554,8 +555,8 @@ def test_material_parameters_outside_the_training_data_are_taken_for_the_nearest
     within = 0.5 * float(trained.min() + trained.max())
     assert not torch.equal(moved(within), moved(80.0))
     held = moved(80.0)
-    simulator.holds_parameters = False
+    simulator.clamps_parameters = False
     assert not torch.equal(held, moved(80.0))
     free = simulator.step(state).pos
-    simulator.holds_parameters = True
+    simulator.clamps_parameters = True
     assert torch.equal(simulator.step(state).pos, free)  # nothing in this scene lies beyond

@@ -173,7 +173,7 @@ def test_the_range_travels_in_the_checkpoint(tmp_path: Path) -> None:
     assert again.untrained_scene(scene(mass=10.0)) == simulator.untrained_scene(scene(mass=10.0)) != []
     simulator.trained_scene[0, 1] = 3.0
     simulator.save(tmp_path / "b.ckpt")
-    with pytest.raises(CheckpointError, match="trained_scene ends before it begins"):
+    with pytest.raises(CheckpointError, match="the lowest value of trained_scene is above the highest"):
         LearnedSimulator.from_checkpoint(tmp_path / "b.ckpt")
 
 

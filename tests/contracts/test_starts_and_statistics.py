@@ -84,7 +84,7 @@ def test_a_simulator_starts_from_another_ones_weights_and_statistics() -> None:
     low, high = ({m: r[k].clone() for m, r in s.trained_ranges()} for s, k in ((new, 0), (new, 1)))
     state = scenes.state(40, ("sand", "snow"), history=2, seed=2).to_torch()
     graph = trained.builder(state)
-    trained.holds_parameters = new.holds_parameters = False
+    trained.clamps_parameters = new.clamps_parameters = False
     new.start_from(trained)
     for name, value in trained(graph).acceleration.items():
         assert torch.equal(new(graph).acceleration[name], value)

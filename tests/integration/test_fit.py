@@ -287,8 +287,8 @@ def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(
         if self.global_step == 4:  # from now on
             data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
             stored = data.train_set.trajectories[1]
-            params = np.full_like(stored.held.material_params, np.nan)
-            data.train_set.trajectories[1] = replace(stored, held=replace(stored.held, material_params=params))
+            params = np.full_like(stored.cached.material_params, np.nan)
+            data.train_set.trajectories[1] = replace(stored, cached=replace(stored.cached, material_params=params))
         return plain(self, batch, batch_idx)
 
     monkeypatch.setattr(TrainingModule, "training_step", training_step)
@@ -339,11 +339,11 @@ def test_a_position_that_is_not_finite_stops_the_run_and_is_named(tiny_data: Pat
 
     def train_dataloader(self: TrajectoryDataModule) -> Any:
         stored = self.train_set.trajectories[1]
-        assert stored.held is not None
-        pos = stored.held.pos.copy()
+        assert stored.cached is not None
+        pos = stored.cached.pos.copy()
         pos[8, 7] = np.nan
-        write_shard(spoiled, [replace(stored.held, pos=pos)], ["00001"])
-        self.train_set.trajectories[1] = replace(stored, path=spoiled, held=None)
+        write_shard(spoiled, [replace(stored.cached, pos=pos)], ["00001"])
+        self.train_set.trajectories[1] = replace(stored, path=spoiled, cached=None)
         return plain(self)
 
     monkeypatch.setattr(TrajectoryDataModule, "train_dataloader", train_dataloader)

@@ -1,1 +1,1 @@
-"""Fault injection: deliberate damage, hostile input and interruption, and what follows from it."""
+"""Fault injection: damages files, feeds hostile input and interrupts commands, and records how they react."""

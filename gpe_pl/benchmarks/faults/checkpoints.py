@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from gpe_pl.benchmarks.faults.stores import damages
-from gpe_pl.benchmarks.faults.verdict import Fault, Verdict, judge
+from gpe_pl.benchmarks.faults.verdict import Fault, Verdict, verdict_of
 from gpe_pl.learned.simulator import LearnedSimulator
 
 MAX_WEIGHTS = 16
@@ -26,7 +26,7 @@ def load_damaged(sound: Path, damage: Callable[[bytes], bytes], folder: Path) ->
     """Load a checkpoint whose bytes were damaged."""
     path = folder / sound.name
     path.write_bytes(damage(sound.read_bytes()))
-    return judge(lambda: LearnedSimulator.from_checkpoint(path), partial(_has_weights, _weights(sound)))
+    return verdict_of(lambda: LearnedSimulator.from_checkpoint(path), partial(_has_weights, _weights(sound)))
 
 
 @cache
@@ -104,7 +104,7 @@ def load_not_finite(sound: Path, key: str, value: float, folder: Path) -> Verdic
 def _load_saved(content: Any, folder: Path) -> Verdict:
     path = folder / "other.ckpt"
     torch.save(content, path)
-    return judge(lambda: LearnedSimulator.from_checkpoint(path), lambda _: False)
+    return verdict_of(lambda: LearnedSimulator.from_checkpoint(path), lambda _: False)
 
 
 # --- code ---------------------------------------------------------------------------------------------------------------------------------
@@ -163,7 +163,7 @@ def load_hostile(sound: Path, kind: str, place: str, folder: Path) -> Verdict:
     else:
         torch.save(stored, path)
     (folder / TRACE).unlink(missing_ok=True)
-    verdict = judge(lambda: LearnedSimulator.from_checkpoint(path), lambda _: False)
+    verdict = verdict_of(lambda: LearnedSimulator.from_checkpoint(path), lambda _: False)
     return Verdict("executed", f"{kind} in {place}") if (folder / TRACE).exists() else verdict
 
 
@@ -187,6 +187,6 @@ def _others(sound: Path) -> Iterator[tuple[str, str, Callable[[Path], Verdict]]]
 
 
 def faults(sound: Path, num_damages: int, seed: int = 0) -> list[Fault]:
-    """Return damages to the bytes of a sound checkpoint, and other contents of a file with its name."""
+    """Return faults of a checkpoint: damaged bytes of a sound one, and other content in a file of its name."""
     found = [Fault(f"checkpoint, {kind}", name, partial(load_damaged, sound, damage)) for kind, name, damage in damages(num_damages, seed)]
     return found + [Fault(*other) for other in _others(sound)]

@@ -31,7 +31,7 @@ UNBOUNDED = ("training.num_steps", "training.val_interval", "seed", "data.seed",
 
 
 class NoConfigError(GpeError):
-    """A command does not print its configuration; the message contains its output."""
+    """Raised when a command does not print its configuration; the message contains its output."""
 
 
 def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -67,7 +67,7 @@ def mutations(key: str, value: Any) -> Iterator[tuple[str, str, bool]]:
 
 
 def started(command: str, arguments: Sequence[str], override: str, must_fail: bool, limit: float, folder: Path) -> Verdict:
-    """Start a command with one additional override."""
+    """Start a command with one additional override, and return the verdict."""
     ended = run(command, [*arguments, f"paths.runs={folder}", override], limit)
     verdict = ended.verdict("accepted" if must_fail else "harmless")
     if verdict.status in ("refused", "harmless") and list(folder.rglob("*.part*")):

@@ -1,4 +1,4 @@
-"""Faults of stored values: values in arrays that break the rules of their fields, through every way in which data enter."""
+"""Faults of stored values. Values that break the rules of their fields enter by training, evaluation, validation, import and rollout."""
 
 from __future__ import annotations
 
@@ -63,13 +63,13 @@ def spoilt(arrays: dict[str, np.ndarray], key: str, value: Value, seed: int) -> 
 
 
 def train(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
-    """Read as training does; return the message about a trajectory that it leaves out, or about the whole split."""
+    """Read the data as training does. Return the message about a trajectory that is left out, or about the whole split."""
     _store(shard, key, value, seed, folder)
     return _left_out(lambda: [stored.name for stored in usable(open_split(folder, "train"))])
 
 
 def evaluate(shard: Path, key: str, value: Value, seed: int, folder: Path) -> str:
-    """Read as evaluation does; return its message."""
+    """Read the data as evaluation does, and return its message."""
     _store(shard, key, value, seed, folder)
     return _left_out(lambda: [trajectory.metadata.dataset for trajectory in long_enough(folder, "train", 2)])
 
@@ -108,7 +108,7 @@ OF_STATES = ("node_type", "mass", "material_params", "boundary_", "rest_pos", "c
 
 
 def brought_in(way: str, shard: Path, key: str, value: Value, seed: int, folder: Path) -> Verdict:
-    """Enter a wrong value; the message must name the field."""
+    """Let a wrong value enter in one way. The message must name the field."""
     try:
         text = WAYS[way](shard, key, value, seed, folder)
     except GpeError as error:
@@ -122,7 +122,10 @@ def brought_in(way: str, shard: Path, key: str, value: Value, seed: int, folder:
 
 
 def _names(shard: Path, key: str, value: Value) -> tuple[str, ...]:
-    """Return the names of the wrong field in messages: the column for parameters, the velocity for positions, either of two sizes."""
+    """Return the names that a message may give to the wrong field.
+
+    Messages name the column of a material parameter, and may name the velocity instead of the position. Messages about a wrong length contain ``has size``.
+    """
     if value == LONGER:
         return ("has size",)
     return {"material_params": read_trajectory(shard, FIRST).metadata.param_names, "pos": ("pos", "vel")}.get(key, (key,))
@@ -196,7 +199,7 @@ def _last_state(trajectory: Trajectory) -> State:
 
 
 def _applies(way: str, key: str) -> bool:
-    """Tell whether a field enters in a way: a rollout takes no velocities of frames, and neither a rollout nor an import takes the stress."""
+    """Tell whether a field enters in one of the ways. A rollout does not take stored velocities. Neither a rollout nor an import takes the stress."""
     if way == "rollout":
         return key.startswith(OF_STATES) or key == "pos"
     return way != "conversion" or not ("stress" in key or "mises" in key or key == "cell_dim")
@@ -213,7 +216,7 @@ def shards(specs: dict[str, DatasetSpec], folder: Path) -> dict[str, Path]:
 
 
 def faults(sound: dict[str, Path], seed: int = 0) -> list[Fault]:
-    """Return every wrong value in every field of one shard of each data set, in every way."""
+    """Return a fault for every wrong value, field and way of entry, in one shard of each data set."""
     found = []
     for domain, shard in sound.items():
         fields = sorted(_sound(shard)[1])

@@ -1,4 +1,7 @@
-"""Isolated processes for faults and commands, forked from one that has imported everything, so that a hang or crash affects no other and starts are fast."""
+"""Isolated processes for faults and commands, so that a hang or crash affects no other.
+
+They are forked from a process that has imported everything, so they start fast.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +50,7 @@ CANARY = "canary"
 
 
 class IsolationError(GpeError):
-    """This system cannot isolate faults."""
+    """Raised on a system that cannot isolate faults."""
 
 
 def forks() -> Any:
@@ -121,7 +124,7 @@ def _attack(faults: Sequence[Fault], answers: Connection, folder: str) -> None:
 
 
 def _watched(fault: Fault, own: Path, canary: Path) -> Verdict:
-    """Attack in a new folder beside another; a fault that takes too long or changes the other folder gets a verdict for that."""
+    """Attack in a new folder beside another folder. A fault that takes too long, or changes the other folder, gets a verdict for that."""
     own.mkdir()
     shutil.rmtree(canary, ignore_errors=True)
     (canary / "checkpoints").mkdir(parents=True)
@@ -156,7 +159,7 @@ class Ended:
     output: str
 
     def verdict(self, on_success: str = "harmless") -> Verdict:
-        """Return refused if the output is one line of error, and ``on_success`` if the command succeeded."""
+        """Return the verdict: ``refused`` if the output is one line of error, ``on_success`` if the command succeeded."""
         lines = [line for line in self.output.splitlines() if line.strip()]
         last = lines[-1][:MAX_DETAIL] if lines else ""
         if self.code is None:

@@ -1,4 +1,4 @@
-"""Faults that lead outside: names, links and checkpoints that point out of the folders of a command."""
+"""Faults with names, links and checkpoints that point out of the folders of a command."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ STATES: dict[str, Callable[[str], dict[str, Any]]] = {
 
 
 def resumed(command: Command, state: str, path: str, limit: float, folder: Path) -> Verdict:
-    """Interrupt a training, let the states of all callbacks in its checkpoint name a path outside, and repeat the command."""
+    """Interrupt a training, write a path outside its folder into all callback states of its checkpoint, and repeat the command."""
     own = folder / "own"
     own.mkdir()
     last = interrupted(command, limit, own)
@@ -83,7 +83,7 @@ def resumed(command: Command, state: str, path: str, limit: float, folder: Path)
 
 
 def faults(command: Command, sound: Path, keys: Sequence[str], also_files: bool, limit: float) -> list[Fault]:
-    """Return names for each key, optional links in place of all files of a run or data set, and, for trainings, paths in checkpoints."""
+    """Return names for each key, links in place of the files of a run or data set if ``also_files``, and paths in checkpoints of trainings."""
     found = []
     for key in keys:
         for name in LEADING_OUT:

@@ -92,7 +92,7 @@ def deleted(command: Command, part: str, delay: float, expected: Results, limit:
 
 @dataclass(frozen=True)
 class Leaving:
-    """A command, and the results that it leaves in an empty folder."""
+    """A command, and the results that it leaves if it starts in an empty folder."""
 
     command: Command
     results: Results

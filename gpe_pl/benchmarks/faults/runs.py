@@ -1,4 +1,4 @@
-"""Faults of runs: commands that are killed, run out of disk, or find damaged files; and the same command again."""
+"""Faults of runs. Commands are killed, run out of disk space or find damaged files; then the same command runs again."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Command:
     seconds: float = math.inf
 
     def given(self, folder: Path) -> list[str]:
-        """Return the arguments with the folders."""
+        """Return the arguments, including those that name the folders."""
         return [*self.arguments, f"paths.data={self.data or folder / 'data'}", f"paths.runs={folder / 'runs'}"]
 
 
@@ -129,7 +129,7 @@ def _digest(value: Any) -> str:
 
 
 def incomplete(folder: Path) -> list[str]:
-    """Return final files that cannot be read."""
+    """Return the files with final names that cannot be read."""
     found = []
     for path in _final_files(folder):
         try:
@@ -258,14 +258,14 @@ def changed_file(command: Command, sound: Path, name: str, change: Callable[[Pat
         return ended.verdict()
     try:
         expected, found = digests(sound), digests(folder)
-        wrong = sorted(k for k in expected if found.get(k) != expected[k] and not _hold_the_same(sound / k, folder / k))
+        wrong = sorted(k for k in expected if found.get(k) != expected[k] and not _have_equal_content(sound / k, folder / k))
     except GpeError as error:  # the command did not need the file; commands that need it are refused
         return Verdict("refused", str(error)[:MAX_DETAIL])
     return Verdict("accepted", f"no error, but {', '.join(wrong)} differ") if wrong else Verdict("harmless")
 
 
-def _hold_the_same(sound: Path, damaged: Path) -> bool:
-    """Tell whether two files are shards with equal content in different bytes, because some bytes have no meaning."""
+def _have_equal_content(sound: Path, damaged: Path) -> bool:
+    """Tell whether two files are shards of equal content. Their bytes may differ, because some bytes have no meaning."""
     return sound.suffix == ".h5" and damaged.exists() and stores.contents(sound) == stores.contents(damaged)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gpe_pl.benchmarks.faults.verdict import Fault, Verdict, judge
+from gpe_pl.benchmarks.faults.verdict import Fault, Verdict, verdict_of
 from gpe_pl.data.ground_truth import DatasetSpec, initial_state, trajectory_metadata
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.builder import GraphBuilder
@@ -28,7 +28,7 @@ NUM_STEPS = 3
 
 
 class Stopped(GpeError):
-    """A rollout was stopped by its guard; the message has reason, frame and node."""
+    """Raised when a guard stops a rollout; the message has reason, frame and node."""
 
 
 def twice(state: State, offset: np.ndarray) -> State:
@@ -85,7 +85,7 @@ def simulated(spec: DatasetSpec, name: str, learned: bool, seed: int, folder: Pa
     """Run some steps of a changed scene with the data set's solver, or with a model with random weights."""
     state = CHANGES[name](initial_state(spec, "test", seed % spec.counts["test"]), np.random.default_rng(seed))
     metadata = trajectory_metadata(spec, "test", 0)
-    return judge(lambda: _rolled_out(spec, state, metadata, learned), lambda result: name not in WRONG and _is_finite(result))
+    return verdict_of(lambda: _rolled_out(spec, state, metadata, learned), lambda result: name not in WRONG and _is_finite(result))
 
 
 def _rolled_out(spec: DatasetSpec, state: State, metadata: Metadata, learned: bool) -> Trajectory:

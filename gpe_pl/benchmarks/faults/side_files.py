@@ -17,7 +17,7 @@ import numpy as np
 
 from gpe_pl.benchmarks.faults import runs
 from gpe_pl.benchmarks.faults.runs import Command
-from gpe_pl.benchmarks.faults.verdict import MAX_DETAIL, Fault, Verdict, judge
+from gpe_pl.benchmarks.faults.verdict import MAX_DETAIL, Fault, Verdict, verdict_of
 from gpe_pl.data.importers import ImportSettings, import_dataset
 from gpe_pl.errors import GpeError
 from gpe_pl.files import sealed
@@ -157,7 +157,7 @@ def read_changed_times(change: Change, folder: Path) -> Verdict:
     path = folder / "step_times.json"
     shutil.copy(folder / "sound.json", path)
     change(path)
-    return judge(lambda: _steps(path), lambda found: found == _steps(folder / "sound.json"))
+    return verdict_of(lambda: _steps(path), lambda found: found == _steps(folder / "sound.json"))
 
 
 # --- archives of arrays ---------------------------------------------------------------------------------------------------------------------

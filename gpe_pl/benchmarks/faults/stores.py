@@ -12,7 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from gpe_pl.benchmarks.faults.verdict import Fault, Verdict, judge
+from gpe_pl.benchmarks.faults.verdict import Fault, Verdict, verdict_of
 from gpe_pl.schema import FIELDS
 from gpe_pl.trajectory.store import digest, read_trajectory, stored_arrays, stored_attributes, trajectory_names
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -27,7 +27,7 @@ def read_damaged(sound: Path, damage: Callable[[bytes], bytes], folder: Path) ->
     """Read every trajectory of a shard with damaged bytes, as ``fit`` does: with HDF5's checksums, without the digest."""
     path = folder / sound.name
     path.write_bytes(damage(sound.read_bytes()))
-    return judge(lambda: contents(path), lambda found: found == contents(sound))
+    return verdict_of(lambda: contents(path), lambda found: found == contents(sound))
 
 
 def read_rewritten(sound: Path, rewrite: Callable[[Path], None], folder: Path) -> Verdict:
@@ -35,7 +35,7 @@ def read_rewritten(sound: Path, rewrite: Callable[[Path], None], folder: Path) -
     path = folder / sound.name
     path.write_bytes(sound.read_bytes())
     rewrite(path)
-    return judge(lambda: contents(path), lambda found: found == contents(sound))
+    return verdict_of(lambda: contents(path), lambda found: found == contents(sound))
 
 
 def contents(path: Path) -> dict[str, str]:
@@ -46,8 +46,8 @@ def contents(path: Path) -> dict[str, str]:
 # --- damage to bytes ----------------------------------------------------------------------------------------------------------------------
 
 
-def truncated(share: float, data: bytes) -> bytes:
-    return data[: int(len(data) * share)]
+def truncated(fraction: float, data: bytes) -> bytes:
+    return data[: int(len(data) * fraction)]
 
 
 def flipped(seed: int, data: bytes) -> bytes:
@@ -70,8 +70,8 @@ def damages(count: int, seed: int) -> Iterator[tuple[str, str, Callable[[bytes],
     for k in range(count):
         number = int(rng.integers(2**31))
         if k % 4 == 0:
-            share = float(rng.uniform(0, 1) ** 0.5)
-            yield "truncated", f"at {share:.6f}", partial(truncated, share)
+            fraction = float(rng.uniform(0, 1) ** 0.5)
+            yield "truncated", f"at {fraction:.6f}", partial(truncated, fraction)
         elif k % 4 == 1:
             yield "overwritten", f"block {number}", partial(overwritten, number)
         else:

@@ -40,7 +40,7 @@ DELETED = {"simulate": ("data",), "convert": ("data",), "fit": ("data", "runs"),
 
 
 class PreparationError(GpeError):
-    """An undisturbed command failed; the message says how."""
+    """Raised when an undisturbed command fails; the message contains the end of its output."""
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,14 @@ class Attacked:
 
     Attributes:
         module: module in ``python -m gpe_pl.{module}``.
-        arguments: further overrides, which make the command last a second or two; ``{root}`` is the folder with a subfolder for each command.
-        others: further overrides, by name, of commands that run at once in the same folder; the command also runs beside itself.
+        arguments: further overrides, chosen so that the command takes one or two seconds. ``{root}`` stands for the folder with a subfolder for each command.
+        others: overrides of variants of the command, by name. Each variant, and a second copy of the command, runs at the same time in the same folder.
         num_pairs: number of runs of each such pair.
         num_deletions: number of deletions of its folders while it runs.
         num_kills: number of kills at random moments.
         num_configs: number of wrong configurations.
         num_damages: number of damages to its files, each followed by the same command.
-        num_contents: number of other contents of its small files, each followed by the same command.
+        num_contents: number of changes to its small files, each followed by the same command.
         names: keys whose values become names of folders.
         leads_out: also try links, and paths in checkpoints, that lead out of its folder.
         disk_sizes: sizes of disks that fill up [bytes].
@@ -167,7 +167,7 @@ def _timed(command: Command, settings: Settings, root: Path) -> Command:
 
 
 def _faults(settings: Settings, specs: dict[str, DatasetSpec], commands: dict[str, Command], root: Path) -> list[Fault]:
-    """Return all faults but kills."""
+    """Return all faults except kills."""
     found = scenes.faults(specs, settings.num_scenes)
     found += field_values.faults(field_values.shards({name: specs[name] for name in settings.values}, root / "values"), settings.seed)
     found += side_files.faults(root / RAW)

@@ -53,7 +53,7 @@ class Fault:
     seconds: float = 0.0
 
 
-def judge(action: Callable[[], T], is_sound: Callable[[T], bool]) -> Verdict:
+def verdict_of(action: Callable[[], T], is_sound: Callable[[T], bool]) -> Verdict:
     """Run an action that must either be refused with a ``GpeError`` or have a sound result."""
     try:
         result = action()

@@ -17,8 +17,8 @@ def long_horizon_figure(models: Curves) -> Figure:
     """Draw four panels: median energy over its initial value and median momentum per mass against the frame; valid frames and fraction alive.
 
     Args:
-        models: by name: ``energy`` and ``momentum`` at evenly spaced frames up to the last of ``horizons``; ``valid_steps`` and ``steps_to_failure``
-            of each scene, infinite if it did not fail. Infinite values of curves, from scenes that failed, are not drawn.
+        models: curves by name of the model. ``energy`` and ``momentum`` are given at evenly spaced frames up to the last of ``horizons``; infinite values, from
+            failed scenes, are not drawn. ``valid_steps`` and ``steps_to_failure`` are given for each scene, and are infinite if it did not fail.
     """
     figure = new_figure(TEXT_WIDTH, 4.2)
     figure.set_layout_engine("constrained")
@@ -40,8 +40,8 @@ def long_horizon_figure(models: Curves) -> Figure:
     labels = (
         ("frame", "E / E₀, median"),
         ("frame", "|Σ m v| / Σ m [m/s], median"),
-        ("share of scenes", "valid frames"),
-        ("frame", "share of scenes alive"),
+        ("fraction of scenes", "valid frames"),
+        ("frame", "fraction of scenes alive"),
     )
     for panel, (x, y) in zip(axes.flat, labels, strict=True):
         panel.set_xlabel(x, fontsize=7)

@@ -19,7 +19,7 @@ NUM_CROWDED = 20_000
 
 
 def has_finite_gradients(subject: Subject, state: State) -> bool:
-    """Tell whether outputs, and the gradients of their squares by all weights, are finite."""
+    """Tell whether the outputs are finite, and the gradients of their sum of squares with respect to all weights."""
     model = subject.simulator.model
     with torch.enable_grad():
         values = [*subject.simulator(subject.simulator.builder(state)).acceleration.values()]

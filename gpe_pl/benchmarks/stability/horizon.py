@@ -56,7 +56,7 @@ def long_horizon(subject: Subject) -> Outcome:
         num_corrected += state.num_corrected
 
     results = rollouts(Contained(subject.simulator, subject.dt), starts, count)
-    share = num_corrected / max(1, sum((r.num_frames - 1) * r.num_nodes for r in results))
+    fraction = num_corrected / max(1, sum((r.num_frames - 1) * r.num_nodes for r in results))
     energies = [energy(r, subject) for r in results]
     growth = max(float(e.max() / max(e[0], 1e-300)) for e in energies)
     stops = [r.termination for r in results if r.termination is not None]
@@ -66,7 +66,7 @@ def long_horizon(subject: Subject) -> Outcome:
     text = [
         f"alive at {', '.join(f'{f:g}×: {100 * s:.0f} %' for f, s in survived.items())} of {len(results)} scenes",
         f"E ≤ {growth:.3g} E₀",
-        f"{100 * share:.2g} % corrected",
+        f"{100 * fraction:.2g} % corrected",
         f"valid for {np.median(valid):.0f} of {subject.scenes[0].num_frames - 1 - subject.history} frames",
     ]
     text += [f"stopped at frame {s.frame}: {s.reason}" for s in stops[:1]]
@@ -77,7 +77,7 @@ def long_horizon(subject: Subject) -> Outcome:
         "steps_to_failure": [float(r.num_frames) if r.termination is not None else math.inf for r in results],
         "horizons": [float(round(f * (subject.scenes[0].num_frames - 1))) for f in subject.horizon_factors],
     }
-    return Outcome(bool(not stops and growth <= 2 and share <= MAX_CORRECTED), "; ".join(text), curves)
+    return Outcome(bool(not stops and growth <= 2 and fraction <= MAX_CORRECTED), "; ".join(text), curves)
 
 
 def energy(trajectory: Trajectory, subject: Subject) -> np.ndarray:
@@ -128,8 +128,8 @@ def rest(subject: Subject) -> Outcome:
         return outcome
     simulator = copy.deepcopy(subject.simulator)
     simulator.static_friction = STATIC_FRICTION
-    held = stays(replace(subject, simulator=simulator), settled)
-    return replace(outcome, measured=f"{outcome.measured}; with static friction {STATIC_FRICTION:g}: {held.measured}")
+    resting = stays(replace(subject, simulator=simulator), settled)
+    return replace(outcome, measured=f"{outcome.measured}; with static friction {STATIC_FRICTION:g}: {resting.measured}")
 
 
 def stays(subject: Subject, settled: State) -> Outcome:

@@ -39,7 +39,7 @@ def relabelling_error(subject: Subject, dtype: torch.dtype, seed: int) -> float:
 
 
 def turning_error(subject: Subject, dtype: torch.dtype, seed: int, *, turn: bool, shuffle: bool) -> float:
-    """Return the relative change of the output when edges are reversed or shuffled."""
+    """Return the relative change of the output when edges are reversed (``turn``) or shuffled."""
     simulator = in_double(subject.simulator) if dtype == torch.float64 else subject.simulator
     state = subject.state(seed)
     graph = simulator.builder(state)
@@ -68,7 +68,9 @@ def edge_orientation(subject: Subject) -> Outcome:
 @stress_test(3, "edge order", "edges shuffled: change < 1e-6 in float32; no graph has an edge twice or from a node to itself")
 def edge_order(subject: Subject) -> Outcome:
     change = max(turning_error(subject, torch.float32, k, turn=False, shuffle=True) for k in range(NUM_DRAWS))
-    bad = sum(wrong_edges(subject.simulator.builder(subject.state(k, share)), subject) for k in range(NUM_DRAWS) for share in (0.1, 0.9))
+    bad = sum(
+        wrong_edges(subject.simulator.builder(subject.state(k, fraction)), subject) for k in range(NUM_DRAWS) for fraction in (0.1, 0.9)
+    )
     return Outcome(change < 1e-6 and bad == 0, f"{change:.1e}; {bad} such edges (graphs are built, never given, so none can be refused)")
 
 
@@ -142,7 +144,7 @@ def _transformed(state: State, q: Tensor) -> State:
 
 @stress_test(7, "batch and component independence", "alone = in a batch = beside a far copy: change < 1e-6")
 def independence(subject: Subject) -> Outcome:
-    simulator, states = subject.simulator, [subject.state(k, share) for k, share in ((0, 0.2), (1, 0.5), (0, 0.8))]
+    simulator, states = subject.simulator, [subject.state(k, fraction) for k, fraction in ((0, 0.2), (1, 0.5), (0, 0.8))]
     graphs = [simulator.builder(s) for s in states]
     alone = [output(simulator, g, s.num_nodes) for g, s in zip(graphs, states, strict=True)]
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Stress tests of rounding, equal implementations, memory, training under attack, and the guard."""
+"""Stress tests of rounding, of implementations that should agree, of memory, of training on extreme data, and of the guard."""
 
 from __future__ import annotations
 
@@ -86,17 +86,17 @@ def compilations() -> int:
 @stress_test(28, "skipped work", "exact levels: change < 1e-6; sleeping: error after 20 steps ≤ 1.05 times that of computing everything")
 def skipping(subject: Subject) -> Outcome:
     changes = []
-    for share in (0.1, 0.5, 0.9):
-        state = subject.state(0, share)
+    for fraction in (0.1, 0.5, 0.9):
+        state = subject.state(0, fraction)
         everything = acceleration(_skipping(subject, NOTHING), state)
         changes += [relative_change(acceleration(_skipping(subject, skips), state), everything) for skips in EXACT]
         builder = subject.simulator.builder
         other = GraphBuilder(replace(builder.config, trim_boundary=not builder.config.trim_boundary), builder.metadata, NOTHING)
         untrimmed = output(subject.simulator, other(state), state.num_nodes).double() * subject.acceleration_std
         changes.append(relative_change(untrimmed, everything))
-    ratio, speed_up, share = sleeping(subject)
-    slept = f"sleeping {ratio:.3f} times the error, {speed_up:.2f} times as fast, {100 * share:.2g} % asleep"
-    text = f"exact levels {max(changes):.1e}; {slept if share > 0 else 'nothing fell asleep'}"
+    ratio, speed_up, fraction = sleeping(subject)
+    slept = f"sleeping {ratio:.3f} times the error, {speed_up:.2f} times as fast, {100 * fraction:.2g} % asleep"
+    text = f"exact levels {max(changes):.1e}; {slept if fraction > 0 else 'nothing fell asleep'}"
     return Outcome(max(changes) < 1e-6 and ratio <= 1.05, text)
 
 
@@ -116,7 +116,10 @@ def _skipping(subject: Subject, skips: Skips) -> LearnedSimulator:
 
 
 def sleeping(subject: Subject, num_steps: int = 20) -> tuple[float, float, float]:
-    """Measure sleeping: ratio of mean square errors over rollouts that start throughout the scenes, ratio of times, and fraction asleep."""
+    """Compare rollouts with and without sleeping, from starts throughout the scenes.
+
+    Returns the ratio of the mean squared errors, the ratio of the times, and the fraction of particle-steps asleep.
+    """
     runners = {"asleep": approximate(_skipping(subject, ASLEEP)), "awake": subject.simulator}
     errors, seconds, num_asleep, num_steps_of_nodes = dict.fromkeys(runners, 0.0), dict.fromkeys(runners, 0.0), 0, 0
 
@@ -252,7 +255,7 @@ def guard(subject: Subject) -> Outcome:
 
 
 def attacks(subject: Subject, limits: Guard) -> dict[str, Callable[[State, State], State]]:
-    """Return the changes of a new state, by the reason that the guard must give."""
+    """Return functions that spoil a new state, by the reason for which the guard must stop."""
 
     def placed(new: State, rows: slice, to: torch.Tensor) -> State:
         pos = new.pos.clone()

@@ -36,7 +36,7 @@ class Subject:
         scenes: ground truth that was not used in training.
         max_speed: largest speed [m/s] in training trajectories.
         is_gating: whether a failure of this model fails the suite.
-        peers: the simulators of this domain by name, this one included.
+        peers: all simulators of this domain by name, including this one.
         horizon_factors: lengths of long rollouts over the trained horizon, which is the number of frames of a scene.
         num_rest_steps: number of frames over which a pile at rest is observed.
     """
@@ -68,15 +68,15 @@ class Subject:
     def acceleration_std(self) -> float:
         return self.simulator.acceleration_std.item()
 
-    def state(self, scene: int = 0, share: float = 0.5) -> State:
+    def state(self, scene: int = 0, fraction: float = 0.5) -> State:
         """Return the state after a fraction of a scene's frames, in float64."""
         truth = self.scenes[scene % len(self.scenes)]
-        frame = max(self.history, round(share * (truth.num_frames - 1)))
+        frame = max(self.history, round(fraction * (truth.num_frames - 1)))
         return self.simulator.initial_state(truth, frame)
 
-    def free_state(self, scene: int = 0, share: float = 0.5) -> State:
+    def free_state(self, scene: int = 0, fraction: float = 0.5) -> State:
         """Return the same state without gravity and boundary."""
-        state = self.state(scene, share)
+        state = self.state(scene, fraction)
         return replace(state, gravity=torch.zeros_like(state.gravity), boundary=no_boundary(state))
 
     def guard(self) -> Guard:
@@ -91,7 +91,7 @@ class Subject:
 
     @cached_property
     def one_step_rmse(self) -> float:
-        """Root mean square error [m/s²] of one-step accelerations over some frames of all scenes."""
+        """Root mean squared error of one-step accelerations [m/s²], over some frames of all scenes."""
         errors = []
         for number, truth in enumerate(self.scenes):
             for frame in np.linspace(self.history, truth.num_frames - 2, 4).astype(int).tolist():
@@ -195,5 +195,5 @@ def shifted(state: State, offset: Tensor) -> State:
 
 
 def with_velocities(state: State, history: Tensor) -> State:
-    """Return the state with another velocity history [node, history, dim]."""
+    """Return the state with another velocity history [node, history, dim] in m/s."""
     return replace(state, vel=history[:, -1], velocity_history=history)

@@ -1,4 +1,7 @@
-"""The suite of stress tests for trained models, each in the domain of its training: thirty criteria, fixed before measurement, and one table."""
+"""The suite of stress tests for trained models. Each model is tested in the domain of its training.
+
+The criteria were fixed before the measurements.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +45,7 @@ GROUPS = {
 
 
 class NothingToTestError(GpeError, ValueError):
-    """There is no model for a data set, or several with one name; the message says where models were searched for."""
+    """Raised when a data set has no model, or two models of one name; the message says where models were searched for."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Conversion of a source to a data set of the store: two passes, checks across trajectories, statistics and the report."""
+"""Conversion of a source to a stored data set: two passes over the source, checks across trajectories, statistics and the report."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
 from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
-from gpe_pl.data.motion import ROUNDING_SHARE, MotionSummary, better_origin, motion_of, rounding_fault
+from gpe_pl.data.motion import ROUNDING_FRACTION, MotionSummary, better_origin, motion_of, rounding_fault
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.errors import GpeError
 from gpe_pl.files import sealed
@@ -26,7 +26,7 @@ from gpe_pl.files.names import NameRefused, data_name
 from gpe_pl.geometry.periodicity import PeriodicityError
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.schema import HISTORY, MATERIALS, NODE_TYPES, SPLITS, ParameterGroup, node_code, param_names
-from gpe_pl.system.locks import held
+from gpe_pl.system.locks import locked
 from gpe_pl.system.progress import Progress
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.arrays import ArrayError, nearest_distances
@@ -181,9 +181,9 @@ class _Survey:
         bounds: bounds of each trajectory, ``(low, high)`` per axis [m].
         spacings, distances, radii: spacing, median distance to the nearest node, and connectivity radius of each sampled trajectory [m].
         velocity_ratios: mean displacement over mean velocity × frame interval, of each sampled trajectory.
-        scenes: name of each trajectory, by the digest of its positions.
+        scenes: names of trajectories by the digest of their positions.
         motions: split, name and motion of each trajectory.
-        assumes_gravity: whether the gravity of each trajectory is the usual one of the format.
+        assumes_gravity: for each trajectory, whether its gravity is only assumed to be the usual one of the format.
         suspects: warnings about trajectories.
         num_bytes: size of all arrays.
         flights: of each sampled trajectory, whether its gravity is assumed, and its groups in free flight.
@@ -223,7 +223,7 @@ class _Conversion:
 
     def run(self, contact_sheet: bool = False) -> Report:
         """Run both passes; the folder appears with its complete content."""
-        with held(self.folder, "paths.data", makes=False):
+        with locked(self.folder, "paths.data", makes=False):
             _check_free(self.folder)  # again, because another command may just have written it
             self._look()
             self._decide()
@@ -407,11 +407,11 @@ class _Conversion:
             )
 
     def _compare_with_rounding(self) -> None:
-        """Choose the origin that float32 needs, and warn of trajectories with a large rounding error even so."""
+        """Choose the origin at which float32 is precise enough, and warn of trajectories whose rounding error is still large."""
         report, suspects, motions = self.report, self.survey.suspects, self.survey.motions
         typical = float(np.median([motion.acceleration for _, _, motion in motions]))
         nowhere = np.zeros_like(motions[0][2].low)
-        self.origin = better_origin([motion for _, _, motion in motions], ROUNDING_SHARE * typical)
+        self.origin = better_origin([motion for _, _, motion in motions], ROUNDING_FRACTION * typical)
         if self.origin.any():
             lost = max(motion.rounding(np.float32, nowhere).max() for _, _, motion in motions)
             where = ", ".join(f"{x:.12g}" for x in self.origin)
@@ -494,7 +494,7 @@ class _Conversion:
         return replace(trajectory, metadata=metadata, material_params=columns)
 
     def _parameter_group(self, columns: np.ndarray, names: tuple[str, ...]) -> ParameterGroup:
-        """Whether parameters of ``test_unseen`` lie inside or outside the range of the training values."""
+        """Return whether parameters of ``test_unseen`` lie inside or outside the range of the training values."""
         for column, name in zip(columns.T, names, strict=True):
             low, high = self.trained.get(name, (np.inf, -np.inf))
             if (column < low).any() or (column > high).any():
@@ -531,7 +531,10 @@ class _Conversion:
         report = self.report
         report.velocity_std, report.acceleration_std = statistics["velocity_std"], statistics["acceleration_std"]
         if report.acceleration_std == 0:
-            raise ImportFailure(f"{report.source}: nothing accelerates other than by gravity, so there is nothing to learn")
+            raise ImportFailure(
+                f"{report.source}: nothing accelerates other than by gravity, so there is nothing to learn; check frame_dt and gravity, "
+                "or add scenes in which nodes touch something"
+            )
         sample = list(islice(iter_trajectories(folder, split), NUM_SAMPLED))
         degrees = [degree for trajectory in sample for degree in _degrees(trajectory)]
         among, boundary = (np.concatenate(part) for part in zip(*degrees, strict=True))
@@ -562,7 +565,7 @@ class _Conversion:
 
 
 def _faults(m: Metadata, arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
-    """Yield reasons why the store could not read a trajectory again."""
+    """Yield the reasons why the store would refuse to read a trajectory."""
     yield from (f"{key} {violation}" for key, violation in m.violations())
     yield from size_conflicts(arrays, m.dim, len(m.param_names))
     yield from map(str, faults(arrays, NODE_TYPES, m.materials, m.param_names))
@@ -578,7 +581,7 @@ def _free_flight(trajectory: Trajectory) -> FreeFlight:
 
 
 def _degrees(trajectory: Trajectory) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the numbers of dynamic and of boundary neighbours of each dynamic node [node], for some frames."""
+    """Yield two arrays for each of some frames: the number of dynamic neighbours and of boundary neighbours of each dynamic node [node]."""
     m, count = trajectory.metadata, trajectory.num_nodes
     walls = np.ascontiguousarray(trajectory.boundary.pos, dtype=np.float64)
     for frame in np.unique(np.linspace(0, trajectory.num_frames - 1, FRAMES_SAMPLED).astype(int)):

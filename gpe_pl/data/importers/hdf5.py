@@ -20,7 +20,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
     Raises:
         ImportFailure: the file does not exist.
-        Refusal: the file is damaged; replaces the various errors of HDF5.
+        Refusal: the file is damaged. This replaces the various errors that HDF5 raises.
     """
     if not path.is_file():
         raise ImportFailure(f"{path}: no such file")
@@ -65,7 +65,7 @@ def array(group: h5py.Group, name: str, axes: str, kinds: str = "fiu") -> np.nda
     Args:
         group: file or group.
         name: name of the array in the group.
-        axes: names of the axes, separated by commas. The array must have as many axes.
+        axes: names of the axes, separated by commas. The array must have this number of axes.
         kinds: NumPy's letters for the allowed types.
 
     Raises:

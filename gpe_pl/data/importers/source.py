@@ -1,4 +1,4 @@
-"""Interface of importers, and functions that they share.
+"""Interface of importers, and functions that several of them use.
 
 An importer provides the facts of a data set, and its trajectories one by one. Each trajectory can be refused.
 """
@@ -154,7 +154,7 @@ class Facts:
 
 @dataclass(frozen=True)
 class Repair:
-    """A change to a trajectory so that it could be stored; ``frame`` is the first changed frame, -1 for all or none in particular."""
+    """A change that was necessary to store a trajectory. ``frame`` is the first changed frame, or -1 if the change does not concern a particular frame."""
 
     what: str
     frame: int = -1
@@ -376,9 +376,9 @@ def joined(dim: int, *parts: Boundary) -> Boundary:
 
 
 def _sliding(pos: np.ndarray, facts: Facts, repairs: list[Repair]) -> tuple[np.ndarray, np.ndarray]:
-    """Return velocities of boundary nodes [boundary_node, dim] in m/s, and a mask [boundary_node] of the nodes that move otherwise.
+    """Return velocities of boundary nodes [boundary_node, dim] in m/s, and a mask [boundary_node] of the nodes with another motion.
 
-    A node without the mask is still, or slides steadily along a periodic axis, like a lid.
+    Nodes outside the mask are at rest, or slide at constant velocity along a periodic axis, like a lid.
 
     Args:
         pos: positions of boundary nodes [frame, boundary_node, dim] in m.
@@ -480,7 +480,7 @@ def count_in(values: Mapping[str, Any], key: str, path: Path) -> int | None:
 
 
 def natural(name: str) -> tuple[Any, ...]:
-    """Sorting key that puts ``traj2`` before ``traj10``."""
+    """Return a sorting key that puts ``traj2`` before ``traj10``."""
     parts = re.split(r"([0-9]+)", name)  # text and digits in turn; digits compare by length first, so that no number is too long
     return tuple((len(digits := part.lstrip("0")), digits) if k % 2 else part for k, part in enumerate(parts)), name
 

@@ -66,7 +66,7 @@ def _crc32c(data, table):
 
 
 def masked_crc(data: bytes) -> int:
-    """Checksum of a record's length or data."""
+    """Return the checksum of a record's length or data."""
     crc = int(_crc32c(np.frombuffer(data, np.uint8), _TABLE))
     return ((crc >> 15 | crc << 17) + _MASK) & 0xFFFFFFFF
 
@@ -79,7 +79,7 @@ class Record:
         path: file.
         start: position of the data in the file [bytes].
         size: size of the data [bytes].
-        fault: why this record and all that follow cannot be read; empty if it can.
+        fault: reason why this record and all later ones cannot be read; empty if it can be read.
     """
 
     path: Path
@@ -100,7 +100,7 @@ class Record:
 
 
 def records(path: Path) -> list[Record]:
-    """Find all records of a file. If its structure is damaged, the last record has a ``fault``; later records cannot be found.
+    """Find all records of a file. If the structure of the file is damaged, the last record found has a ``fault``.
 
     Raises:
         ImportFailure: the file cannot be read, or has too many records.
@@ -242,7 +242,7 @@ class Frames:
         return (self[frame] for frame in range(len(self)))
 
     def strings(self, size: int) -> np.ndarray:
-        """Return the bytes [frame, byte] of the frames before the first one that is not a single string of ``size`` bytes."""
+        """Return the bytes [frame, byte] of the leading frames, each of which is a single string of ``size`` bytes."""
         return np.asarray(_strings(self._data, self._rows, size))
 
 
@@ -264,7 +264,7 @@ def _whole(data: bytes) -> _Message:
 @njit(cache=True)
 @no_type_check
 def _varint(data, place, stop):
-    """Return a value modulo 2⁶⁴ as int64, and the place after it; the second is a negative fault if there is one."""
+    """Return a value modulo 2⁶⁴ as int64, and the position after it. A negative position is the code of a fault."""
     value = np.int64(0)
     for k in range(10):
         if place >= stop:
@@ -280,7 +280,7 @@ def _varint(data, place, stop):
 @njit(cache=True)
 @no_type_check
 def _field(data, place, stop):
-    """Return number, wire type, start, size or value of a field, and the place after it; the last is a negative fault if there is one."""
+    """Return number, wire type, start, and size or value of a field, and the position after it. A negative position is the code of a fault."""
     key, place = _varint(data, place, stop)
     number, wire, value = (key >> 3) & 0x1FFFFFFFFFFFFFFF, key & 7, np.int64(0)
     if place < 0:
@@ -307,7 +307,7 @@ def _field(data, place, stop):
 @njit(cache=True)
 @no_type_check
 def _fields(data, start, stop, wanted):
-    """Return the rows of ``_Message.fields``, a fault (0: none), and a value and a place that explain the fault."""
+    """Return the rows of ``_Message.fields``, the code of a fault (0: none), and the value and position of the fault."""
     count, place = 0, start
     rows, detail = np.empty((0, 3), np.int64), np.zeros(2, np.int64)
     while place < stop:
@@ -343,7 +343,7 @@ def _joined(data, rows):
 @njit(cache=True)
 @no_type_check
 def _integers(data, rows):
-    """Return the integers in fields, which have one or many each, and whether all were complete."""
+    """Return the integers in fields, and whether all were complete. A field contains one or several integers."""
     count = 0
     for k in range(len(rows)):
         if rows[k, 0] == _VARINT:
@@ -370,16 +370,16 @@ def _integers(data, rows):
 @njit(cache=True)
 @no_type_check
 def _strings(data, rows, size):
-    """Return the bytes [frame, byte] of the frames in fields, up to the first that is not a single string of ``size`` bytes in the usual encoding."""
+    """Return the bytes [frame, byte] of the leading frames in fields, each of which is a single string of ``size`` bytes in the usual encoding."""
     starts = np.empty(len(rows), np.int64)
     count = 0
     for k in range(len(rows)):
         stop = rows[k, 1] + rows[k, 2]
-        number, wire, start, held, place = _field(data, rows[k, 1], stop)
+        number, wire, start, num_bytes, place = _field(data, rows[k, 1], stop)
         if rows[k, 0] != _BYTES or number != 1 or wire != _BYTES or place != stop:
             break
-        number, wire, start, held, place = _field(data, start, stop)
-        if number != 1 or wire != _BYTES or held != size or place != stop:
+        number, wire, start, num_bytes, place = _field(data, start, stop)
+        if number != 1 or wire != _BYTES or num_bytes != size or place != stop:
             break
         starts[k] = start
         count += 1

@@ -14,7 +14,7 @@ BEST = Path("checkpoints") / f"best{SUFFIX}"
 
 
 def names() -> list[str]:
-    """Return the names of the shipped models, which can be given instead of a checkpoint's path."""
+    """Return the names of the shipped models. Where a checkpoint's path is expected, you can give such a name."""
     return sorted(path.stem for path in FOLDER.glob(f"*{SUFFIX}"))
 
 
@@ -27,7 +27,7 @@ def checkpoint_path(checkpoint: Path | str) -> Path:
 
 
 def fingerprint(checkpoint: Path | str) -> str:
-    """Return the text that identifies a checkpoint in configurations, independent of its folder: the file's name and the beginning of its checksum."""
+    """Return the text that identifies a checkpoint in configurations: the file's name and the beginning of its checksum, without its folder."""
     path = checkpoint_path(checkpoint)
     return f"{path.name} (sha256 {sha256(path.read_bytes()).hexdigest()[:12]})"
 

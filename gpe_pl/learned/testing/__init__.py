@@ -1,1 +1,1 @@
-"""Checks that a model has to pass, for tests of this package and of others."""
+"""Contract checks that every model has to pass, for the tests of this package and of packages with models of their own."""

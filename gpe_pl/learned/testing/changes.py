@@ -1,4 +1,4 @@
-"""Changes of states and graphs that change a prediction in a known way, or not at all."""
+"""Changes of states and graphs whose effect on a prediction is known, or that have no effect."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gpe_pl.trajectory.state import State
 
 
 def permuted(state: State, order: Any) -> State:
-    """Return the state with its nodes in another order, or with some of them (then without its mesh)."""
+    """Return the state with its nodes in another order, or with only some of them. A state with some of its nodes has no mesh."""
     taken = state.take(order)
     return taken if len(order) == state.num_nodes else replace(taken, cells=None, rest_pos=None)
 
@@ -31,7 +31,7 @@ def to_dtype(data: HeteroData, dtype: torch.dtype) -> HeteroData:
 
 
 def turned(data: HeteroData, spec: FeatureSpec, seed: int = 0, *, turn: bool = True, shuffle: bool = True) -> HeteroData:
-    """Return the graph with half of the reversible edges reversed, and with shuffled edges."""
+    """Return the graph with half of its reversible edges reversed (``turn``), and with its edges in random order (``shuffle``)."""
     out = data.clone()
     random = torch.Generator().manual_seed(seed)
     for relation in spec.relations:

@@ -1,4 +1,4 @@
-"""The contract of every model: symmetries, independence, degenerate input, gradients, settings. A check raises ``AssertionError`` where a model breaks it.
+"""The contract of every model: symmetries, independence of bodies, degenerate input, gradients, settings. A check raises ``AssertionError`` if a model fails.
 
 In a test of another package::
 
@@ -8,7 +8,7 @@ In a test of another package::
     def test_contract(check):
         check(factory(Net, hidden_channels=16))
 
-``MESH_CHECKS`` are for models of graphs with meshes. Models compute in double precision here, features are made in single precision.
+``MESH_CHECKS`` are for models of graphs with meshes. In all checks, features are made in single precision and models compute in double precision.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def check_relabelling(make: Factory, materials: tuple[str, ...]) -> None:
 
 
 def check_edge_orientation(make: Factory) -> None:
-    """The order and the orientation of the edges do not matter."""
+    """Check that the order and the orientation of the edges do not matter."""
     build = scenes.builder(TWO)
     data = _graph(build, scenes.state(materials=TWO))
     model = make(build.spec)
@@ -73,7 +73,7 @@ def check_edge_orientation(make: Factory) -> None:
 
 
 def check_translation(make: Factory) -> None:
-    """The position of the scene does not matter."""
+    """Check that the position of the scene does not matter."""
     build, state = scenes.builder(), scenes.state().to_torch()
     offset = torch.tensor([3.0, -2.0], dtype=torch.float64)
     moved = replace(state, pos=state.pos + offset, boundary=replace(state.boundary, pos=state.boundary.pos + offset))
@@ -83,7 +83,7 @@ def check_translation(make: Factory) -> None:
 
 
 def check_batches(make: Factory) -> None:
-    """A batch gives what its graphs give alone, whatever types are present."""
+    """Check that a batch gives the same predictions as its graphs alone, also if graphs lack some node types."""
     build = scenes.builder(TWO)
     states = [
         scenes.state(30, ("sand",), seed=1),
@@ -97,7 +97,7 @@ def check_batches(make: Factory) -> None:
 
 
 def check_bodies_out_of_reach(make: Factory) -> None:
-    """Bodies that have no edges between them do not feel each other."""
+    """Check that bodies without edges between them do not influence each other."""
     build = scenes.builder()
     near, far = scenes.state(20, walls=False, seed=1), scenes.state(15, walls=False, seed=2)
     far = replace(far, pos=far.pos + 10.0)
@@ -107,7 +107,7 @@ def check_bodies_out_of_reach(make: Factory) -> None:
 
 
 def check_degenerate_geometry(make: Factory, case: str) -> None:
-    """Predictions and gradients are finite for coincident, isolated, single and resting nodes; there is none without nodes."""
+    """Check that predictions and gradients are finite for coincident, isolated, single and resting nodes. Without nodes, there is no prediction."""
     build = scenes.builder()
     state = scenes.state({"one": 1, "two coincident at rest": 2, "none": 0}.get(case, 12), walls=case != "one")
     assert state.velocity_history is not None
@@ -133,7 +133,7 @@ def check_degenerate_geometry(make: Factory, case: str) -> None:
 
 
 def check_gradients(make: Factory) -> None:
-    """Gradients by features of nodes and edges equal finite differences."""
+    """Check that gradients with respect to features of nodes and edges equal finite differences."""
     build = scenes.builder()
     data = _graph(build, scenes.state(5, high=0.2, seed=3))
     model = make(build.spec)
@@ -151,7 +151,7 @@ def check_gradients(make: Factory) -> None:
 
 
 def check_every_parameter_is_used(make: Factory, may_be_unused: Collection[str] = ()) -> None:
-    """Every parameter has a gradient, apart from those with one of the given texts in their name."""
+    """Check that every parameter has a gradient, apart from those with one of the given texts in their name."""
     build = scenes.builder(TWO)
     model = make(build.spec)
     predicted = model(_graph(build, scenes.state(60, TWO))).acceleration
@@ -161,7 +161,7 @@ def check_every_parameter_is_used(make: Factory, may_be_unused: Collection[str] 
 
 
 def check_settings(make: Factory) -> None:
-    """The settings rebuild the model, and its weights fit."""
+    """``Model.settings`` rebuild the model, and its weights fit the rebuilt model."""
     build = scenes.builder(TWO)
     model = make(build.spec)
     again = type(model)(build.spec, **model.settings).double()
@@ -171,12 +171,12 @@ def check_settings(make: Factory) -> None:
 
 
 def check_order_of_calls(make: Factory) -> None:
-    """A step does not depend on the steps before."""
+    """Check that a step does not depend on the steps before."""
     _check_order_of_calls(make, scenes.builder(), scenes.state(), scenes.state(seed=7))
 
 
 def check_features(make: Factory, features: str, history: int) -> None:
-    """The model takes its channel counts from the specification of the graphs."""
+    """Check that the model takes its channel counts from the specification of the graphs."""
     build = scenes.builder(features=features, history=history)
     data = _graph(build, scenes.state(history=history))
     standardizer = GraphStandardizer(build.spec).double()
@@ -199,7 +199,7 @@ def check_mesh(make: Factory) -> None:
 
 
 def check_batches_of_meshes(make: Factory) -> None:
-    """A batch of scenes with and without a mesh gives what its graphs give alone."""
+    """Check that a batch of scenes with and without a mesh gives the same predictions as its graphs alone."""
     build = scenes.builder(WITH_MESH, mesh=True)
     states = [
         scenes.mesh_state(materials=WITH_MESH),
@@ -210,7 +210,7 @@ def check_batches_of_meshes(make: Factory) -> None:
 
 
 def check_order_of_calls_with_meshes(make: Factory) -> None:
-    """A step of a mesh does not depend on the steps before."""
+    """Check that a step of a mesh does not depend on the steps before."""
     first, other = scenes.mesh_state(materials=WITH_MESH), scenes.mesh_state("lattice", WITH_MESH, seed=7)
     _check_order_of_calls(make, scenes.builder(WITH_MESH, mesh=True), first, other)
 

@@ -20,7 +20,7 @@ SPACING = 0.05
 
 
 def metadata(materials: tuple[str, ...] = ("sand",), dim: int = 2, radius: float = 0.12) -> Metadata:
-    """Return metadata of a unit box with these materials."""
+    """Return metadata of a unit box with these materials and this neighbour radius [m]."""
     return Metadata(
         dataset="test",
         materials=materials,
@@ -87,7 +87,10 @@ def mesh_state(
     seed: int = 0,
     walls: bool = True,
 ) -> State:
-    """Return strained, moving bodies of ``mesh`` side by side, ``gap`` spacings apart, and clouds of the scene's other materials, in random order."""
+    """Return a state of strained, moving bodies of ``mesh`` and clouds of all other materials, with nodes in random order.
+
+    The bodies stand side by side, ``gap`` spacings apart.
+    """
     dim, rng = 3 if kind == "tetrahedra" else 2, np.random.default_rng(seed)
     meshes = [m for m in materials if m in MESH_MATERIALS]
     points, cells, edge = [np.empty((0, dim))], [], 1.0

@@ -53,9 +53,9 @@ class FEM:
         frame_dt: time between frames [s].
         materials: ``("solid",)``.
         poisson_ratio: Poisson's ratio, below 0.5; linear triangles and tetrahedra stiffen from about 0.45 on.
-        damping: viscosity as a fraction of the critical damping of the fastest mode of the mesh; a mode n times slower gets 1/n of it.
-        cfl: fraction of the largest certainly stable substep.
-        max_substeps: largest number of substeps per frame; needing more counts as an explosion.
+        damping: viscosity, as a fraction of the critical damping of the fastest mode of the mesh. A mode that is n times slower has 1/n of this fraction.
+        cfl: substep as a fraction of the largest substep that is proven to be stable.
+        max_substeps: largest number of substeps per frame. If a frame needs more, the step fails as an explosion.
     """
 
     bounds: tuple[tuple[float, float], ...]
@@ -81,7 +81,7 @@ class FEM:
         return self.frame_dt
 
     def substep(self, state: State) -> float:
-        """Return the largest substep in s that the solver takes from this state if it is at rest; raise the errors of ``step``."""
+        """Return the largest substep in s that the solver takes from this state if the state is at rest. Errors are those of ``step``."""
         mesh, lam, mu, eta, _ = self._prepare(state)
         pos = _three_dimensional(state.pos)
         stiffest, most_viscous = _add_forces(
@@ -203,7 +203,7 @@ def _require(good: np.ndarray, message: str, reason: str = "input") -> None:
 
 
 def _three_dimensional(values: np.ndarray) -> np.ndarray:
-    """Return a copy [..., 3]; the third component is zero in 2D."""
+    """Return a copy [..., 3] of vectors; the third component is zero in 2D."""
     values = np.asarray(values, dtype=np.float64)
     result = np.zeros((*values.shape[:-1], 3))
     result[..., : values.shape[-1]] = values

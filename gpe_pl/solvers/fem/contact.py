@@ -353,7 +353,10 @@ def _facing_edge(x, y, pos, edges, reach):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def resist_corners(pos, vel, mass, edges, box, reach, h, corners, touched, gaps):
-    """Slow down mesh edges that obstacle corners would cross; write the edge in reach (-1: none) and its gap to ``touched`` and ``gaps`` [corner]."""
+    """Slow down mesh edges that obstacle corners would cross.
+
+    For each corner, the edge within reach (-1: none) and its gap are written to ``touched`` and ``gaps`` [corner].
+    """
     for k in range(corners.shape[0]):
         touched[k] = -1
         x, y = corners[k, 0], corners[k, 1]
@@ -378,7 +381,7 @@ def resist_corners(pos, vel, mass, edges, box, reach, h, corners, touched, gaps)
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def push_out_corners(pos, mass, edges, corners, touched, gaps):
-    """Move edges that a corner has crossed, by turning or stretching, back onto it; keep a corner that was inside before at its depth.
+    """Move edges back onto a corner that has crossed them because they rotated or stretched. A corner that was inside before keeps its depth.
 
     Pushing such a corner out would store energy in the cells around it.
     """

@@ -4,8 +4,8 @@ Energy per reference volume, first Piola-Kirchhoff and Cauchy stress (Bonet & Wo
 
     Ψ = μ/2 (tr FᵀF - 3) - μ log J + λ/2 (log J)²,   P = μ F + (λ log J - μ)/J cof F,   σ = P Fᵀ / J
 
-Below ``J = SMALLEST_RATIO`` the tangent of the logarithm replaces it, so a finite, conservative force pushes a crushed or inverted cell back. An optional
-viscous stress ``2η F Ė`` is added to P, with E the Green-Lagrange strain. It is objective and never a source of energy.
+Below ``J = SMALLEST_RATIO`` the logarithm is replaced by its tangent, so a finite, conservative force acts on a crushed or inverted cell. An optional viscous
+stress ``2η F Ė`` is added to P, with E the Green-Lagrange strain. It is objective and never adds energy.
 
 A substep is stable while ``h² ω² + 2 h Γ <= 4``, with ω the highest frequency and Γ the highest damping rate of the mesh. The stiffness matrix is
 ``Σ V Gᵀ (∂P/∂F) G`` over the quadrature points, with G the gradient, so ``ω² <= s A`` and ``Γ <= s 2η |F|²``. The rest configuration fixes s, the largest

@@ -1,8 +1,8 @@
 """The staggered grid, and the space that rigid boundaries leave open in it.
 
 Cells are numbered in C order. One index addresses a cell, its lower face along each axis, its lower edge in each plane of axes and its lowest node. Every
-quantity is therefore an array over cells, and a neighbour is one stride away. Velocity components live on the faces, pressure and density at cell centres,
-shear stress at edges (nodes in 2D), signed distances of solids at nodes. Lengths are in cells.
+quantity is therefore an array over cells, and a neighbour is one stride away. Velocity components are defined on the faces, pressure and density at cell
+centres, shear stress at edges (nodes in 2D), and signed distances of solids at nodes. Lengths are in cells.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Connected bodies of liquid (islands): which of them fly freely, and which fill a closed space."""
+"""Connected bodies of liquid (islands). Some fly freely, and some fill a closed space."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-SMALLEST_SHARE = 0.01
+SMALLEST_FRACTION = 0.01
 """Lower limit of θ."""
 
 
@@ -33,8 +33,8 @@ def surface_distance(density):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _drop(inside, outside):
-    """Return 1/θ of the face between a liquid and an empty cell."""
-    return 1.0 / max(SMALLEST_SHARE, inside / (inside - outside))
+    """Return 1/θ of the face between a liquid and an empty cell, from the signed distances inside and outside."""
+    return 1.0 / max(SMALLEST_FRACTION, inside / (inside - outside))
 
 
 @njit(cache=True, error_model="numpy")
@@ -53,10 +53,10 @@ def reach_into_solids(active, strides, area, cell_room, half, density, touched):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def extend_into_solids(active, strides, area, cell_room, half, density, viscous):
-    """Add liquid to cells with a solid centre: the amount in ``half`` a cell of their open neighbours.
+    """Add liquid to cells with a solid centre: as much as the volume ``half`` of their open neighbours contains.
 
-    Too few particles measure their density otherwise: liquid that seems empty would draw in its surroundings. The cell's own mass counts too; otherwise
-    particles would gather in it.
+    Such cells contain few particles, so their density would be too low, and the correction of the density would draw liquid into them. The mass in the cell
+    itself is counted too; otherwise particles would gather in it.
     """
     for c in active:
         if cell_room[c] >= half:
@@ -65,10 +65,10 @@ def extend_into_solids(active, strides, area, cell_room, half, density, viscous)
         for k in range(2 * strides.shape[0]):
             other = c + strides[k // 2] if k % 2 == 0 else c - strides[k // 2]
             if cell_room[other] >= half:
-                share = area[k // 2, max(c, other)]
-                opening += share
-                total += share * density[other]
-                total_viscous += share * viscous[other]
+                part = area[k // 2, max(c, other)]
+                opening += part
+                total += part * density[other]
+                total_viscous += part * viscous[other]
         if opening > 0.0:
             density[c] = (density[c] + half * total / opening) / (cell_room[c] + half)
             viscous[c] = (viscous[c] + half * total_viscous / opening) / (cell_room[c] + half)

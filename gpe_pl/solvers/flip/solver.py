@@ -26,7 +26,7 @@ MATERIAL = "fluid"
 TOUCH = 1e-30
 """Weight of faces whose velocity is known although no particle reaches them."""
 
-SHARE_TIME = 0.01
+REFERENCE_TIME = 0.01
 """Time in s to which the fractions ``pic`` and ``evening`` refer, for any length of frames and substeps."""
 
 MODIFIED = 0.97
@@ -113,9 +113,9 @@ class FLIP:
     with no slip, for any friction coefficient; at a small viscosity the layer at rest has its physical thickness. Bodies of liquid that touch no solid follow
     a parabola exactly. Obstacles and gaps should be at least two cells wide.
 
-    The fraction ``pic`` acts like an additional kinematic viscosity ``Δ²/(6τ)`` with ``τ = -10 ms / ln(1 - pic)``, for any length of substeps, because a
-    transfer to the grid and back spreads momentum with the variance Δ²/3 along each axis. ``numerical_viscosity`` gives its value. Below this value, the
-    viscosity of the liquid has little effect.
+    The fraction ``pic`` acts like an additional kinematic viscosity ``Δ²/(6τ)`` with ``τ = -10 ms / ln(1 - pic)``, for any length of substeps: a transfer to
+    the grid and back spreads momentum with the variance Δ²/3 along each axis. ``numerical_viscosity`` returns this value. A smaller viscosity of the liquid has
+    little effect.
 
     Attributes:
         bounds: ``(low, high)`` of the domain along each of two or three axes [m]; each extent is a whole multiple of the grid spacing.
@@ -126,7 +126,7 @@ class FLIP:
         pic: fraction of the grid's velocity in a particle's velocity after 10 ms, which damps motion that the grid does not resolve.
         evening: fraction of the error of the particle density that is corrected in 10 ms, except in bodies that fly freely.
         cfl: number of cells that a particle may cross in one substep.
-        max_substeps: largest number of substeps per frame; needing more counts as an explosion.
+        max_substeps: largest number of substeps per frame. If a frame needs more, the step fails as an explosion.
         pressure_tolerance: largest relative change of a liquid cell's volume in a substep.
         viscosity_tolerance: largest residual of the viscous system over the largest speed.
         max_iterations: largest number of iterations of each linear solver.
@@ -161,8 +161,8 @@ class FLIP:
 
     @property
     def numerical_viscosity(self) -> float:
-        """Kinematic viscosity in m²/s that ``pic`` adds to that of the liquid; infinite for ``pic = 1``, which acts once per substep."""
-        rate = math.inf if self.pic == 1 else -math.log1p(-self.pic) / SHARE_TIME
+        """Kinematic viscosity in m²/s that ``pic`` adds to the viscosity of the liquid; infinite for ``pic = 1``, which acts once per substep."""
+        rate = math.inf if self.pic == 1 else -math.log1p(-self.pic) / REFERENCE_TIME
         return rate * self.grid_spacing**2 / 6.0
 
     @property
@@ -256,9 +256,9 @@ class FLIP:
         if np.all(liquid.is_free):
             return
         excess = pressure.excess_density(liquid.cells, fields.liquid, self.grid.strides, solids.is_open, fields.density, LARGEST_EXCESS)
-        share = _share(self.evening, h) * self.grid_spacing
-        right = np.where(liquid.is_free, 0.0, share * solids.cell_room[liquid.cells] * excess)
-        self._correct("density", liquid, right, DENSITY_TOLERANCE * share, solids, fields, fields.shift)
+        fraction = _in_substep(self.evening, h) * self.grid_spacing
+        right = np.where(liquid.is_free, 0.0, fraction * solids.cell_room[liquid.cells] * excess)
+        self._correct("density", liquid, right, DENSITY_TOLERANCE * fraction, solids, fields, fields.shift)
 
     def _correct(
         self, what: str, liquid: Liquid, right: np.ndarray, tolerance: float, solids: Solids, fields: Fields, target: np.ndarray
@@ -273,7 +273,7 @@ class FLIP:
         return x
 
     def liquid(self, active: np.ndarray, solids: Solids, fields: Fields) -> tuple[Liquid, np.ndarray]:
-        """Number the liquid cells; the second result tells for each label of ``fields.island`` whether that island touches no solid."""
+        """Number the liquid cells. The second result tells, for each label of ``fields.island``, whether that island touches no solid."""
         strides = self.grid.strides
         cells = pressure.liquid_cells(active, solids.is_open, fields.density, fields.liquid)
         is_free, is_closed = islands.find_islands(active, strides, solids.area, fields.density, fields.weight, fields.liquid, fields.island)
@@ -318,7 +318,7 @@ class FLIP:
         flying = islands.Flying.select(fields.island[self._cell(pos)], is_free, pos, vel, mass)
         transfer.gather(
             pos, vel, grid.origin, grid.spacing, grid.strides, grid.counts, grid.corners, fields.old, fields.velocity, fields.shift,
-            fields.weight, _share(self.pic, h), h,
+            fields.weight, _in_substep(self.pic, h), h,
         )  # fmt: skip
         flying.balance(pos, vel, gravity, h)
         transfer.push_out(pos, vel, grid.origin, grid.spacing, grid.strides, grid.counts, grid.corners, solids.distance)
@@ -413,9 +413,9 @@ class FLIP:
         return np.ascontiguousarray(values)
 
 
-def _share(share: float, h: float) -> float:
-    """Convert a fraction per ``SHARE_TIME`` to a fraction per time h [s]."""
-    return float(1.0 - (1.0 - share) ** (h / SHARE_TIME))
+def _in_substep(fraction: float, h: float) -> float:
+    """Convert a fraction per ``REFERENCE_TIME`` to a fraction per time h [s]."""
+    return float(1.0 - (1.0 - fraction) ** (h / REFERENCE_TIME))
 
 
 def _require(good: np.ndarray, message: str, reason: str = "input") -> None:

@@ -4,10 +4,10 @@ The velocities after a time h minimise, over all faces f and stress samples s (B
 
     Σ_f m_f (u_f - u*_f)² / 2  +  h Σ_s w_s ν_s ε_s : ε_s,     ε = (∇u + ∇uᵀ) / 2
 
-The free surface thus needs no condition, and velocities without strain, such as rigid rotations, do not change. Masses m and weights w are the densities that
-the particles give to the grid, so momentum is conserved. Normal strains are sampled at cell centres, shear strains at edges. Where a difference quotient
-meets a face with a solid centre, the surface of the solid replaces it. Velocity is then 0 at the fraction θ of the distance, and the weight is multiplied by
-θ, which gives the finite-volume flux to a wall at that distance.
+The free surface therefore needs no condition, and velocities without strain, such as rigid rotations, do not change. Masses m and weights w are the densities
+that the particles give to the grid, so momentum is conserved. Normal strains are sampled at cell centres, shear strains at edges. If one of the two faces in a
+difference quotient has a solid centre, the surface of the solid is used instead of that face: velocity is 0 at the fraction θ of the distance. The weight is
+multiplied by θ, which gives the finite-volume flux to a wall at that distance.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-SMALLEST_SHARE = 0.1
+SMALLEST_FRACTION = 0.1
 """Lower limit of θ."""
 
 SMALLEST_MASS = 1e-6
@@ -51,7 +51,7 @@ def _theta(a, upper, lower, unknown, face_distance):
     if unknown[a, upper] > 0 or unknown[a, lower] > 0:
         liquid, solid = (upper, lower) if unknown[a, upper] > 0 else (lower, upper)
         inside, outside = face_distance[a, liquid], face_distance[a, solid]
-        return min(1.0, max(SMALLEST_SHARE, inside / (inside - outside)))
+        return min(1.0, max(SMALLEST_FRACTION, inside / (inside - outside)))
     if face_distance[a, upper] > 0.0 or face_distance[a, lower] > 0.0:
         return 0.0
     return -1.0
@@ -106,9 +106,9 @@ def viscosity_system(axes, cells, unknown, strides, is_open, face_distance, weig
                 theta_b = _theta(b, edge, edge - sa, unknown, face_distance)
                 if not total > 0.0 or theta_a == 0.0 or theta_b == 0.0:
                     continue
-                share = min(theta_a, theta_b) if theta_b > 0.0 else theta_a
+                fraction = min(theta_a, theta_b) if theta_b > 0.0 else theta_a
                 mine = (1.0 if side == 0 else -1.0) / theta_a
-                k = step * total / count * share * mine
+                k = step * total / count * fraction * mine
                 diagonal[i] += k * mine
                 j = unknown[a, edge - sb if side == 0 else edge] - 1
                 if 0 <= j < i:

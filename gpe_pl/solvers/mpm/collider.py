@@ -64,11 +64,11 @@ def collider(shapes: tuple[Shape, ...], origin: tuple[float, ...], spacing: floa
     tolerance = 1e-9 * spacing  # a node on a wall belongs to the wall despite rounding
     inside = [_distance(shape, nodes) <= tolerance for shape in shapes]
     depth = np.sum(inside, axis=0) if shapes else np.zeros(len(nodes), dtype=np.int64)
-    held = np.nonzero(depth)[0]
+    touched = np.nonzero(depth)[0]
     row = np.full(len(nodes), -1, dtype=np.int64)
-    row[held] = np.arange(len(held))
-    conditions = np.full((len(held), max(1, int(depth.max())), dim + 1), -1.0)
-    filled = np.zeros(len(held), dtype=np.int64)
+    row[touched] = np.arange(len(touched))
+    conditions = np.full((len(touched), max(1, int(depth.max())), dim + 1), -1.0)
+    filled = np.zeros(len(touched), dtype=np.int64)
     planes, balls, boxes, sampled = [], [], [], []
     vertices: list[tuple[float, float]] = []
     first_vertex = [0]

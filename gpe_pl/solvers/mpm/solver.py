@@ -75,7 +75,7 @@ class MPM:
         materials: every material of the data set; they determine the columns of ``State.material_params``.
         sand, snow, elastomer, fluid: constants of each material; None selects the defaults of liquid. The density gives the volume of a particle of given mass.
         cfl: fraction of a cell that a wave or a particle may cross in one substep.
-        max_substeps: largest number of substeps per frame; needing more counts as an explosion.
+        max_substeps: largest number of substeps per frame. If a frame needs more, the step fails as an explosion.
     """
 
     bounds: tuple[tuple[float, float], ...]
@@ -107,7 +107,7 @@ class MPM:
 
     @property
     def numerical_viscosity(self) -> float:
-        """Kinematic viscosity in m²/s that the transfers add to a liquid's own in waves of 16 cells, ``Δ²/(256 (τ + h))``.
+        """Kinematic viscosity in m²/s that the transfers add to the viscosity of a liquid, for waves of 16 cells: ``Δ²/(256 (τ + h))``.
 
         τ is the time for which particles keep a velocity that the grid does not represent, and h a substep. Longer waves get less.
         """

@@ -162,8 +162,8 @@ def test_every_model_also_holds_its_predictions(monkeypatch: pytest.MonkeyPatch)
     models = _models([], dataset_spec(compose("simulate", *OVERRIDES)), Settings({}, [], holds=[2, 4]))
     assert {label: (s.skips.hold, seconds) for label, (s, seconds) in models.items()} == {
         "GNS": (1, 120.0),
-        "GNS, held predictions × 2": (2, 120.0),
-        "GNS, held predictions × 4": (4, 120.0),
+        "GNS, repeated predictions × 2": (2, 120.0),
+        "GNS, repeated predictions × 4": (4, 120.0),
     }
     weights = [*simulator.model.parameters()]
     assert all(own is shared for s, _ in models.values() for own, shared in zip(s.model.parameters(), weights, strict=True))

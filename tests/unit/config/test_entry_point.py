@@ -318,6 +318,11 @@ def test_a_bug_keeps_its_traceback(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
         call(monkeypatch, tmp_path, task)
 
 
+@pytest.mark.parametrize("command", ["fit", "simulate", "evaluate", "benchmark", "convert"])
+def test_the_log_of_a_command_has_its_name(command: str) -> None:
+    assert OmegaConf.load(Path(CONF) / f"{command}.yaml").hydra.job.name == command
+
+
 def test_results_do_not_say_where_they_lay(tmp_path: Path) -> None:
     runs = str(tmp_path / "runs")
     settings = {

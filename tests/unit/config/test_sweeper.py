@@ -89,7 +89,7 @@ def test_a_sweep_that_was_killed_goes_on(tmp_path: Path) -> None:
             Launcher(other={"gpe": 0.25}),
             r"trial \d of an earlier start had [\d.]+ and has 0.25 now, so settings or data have changed; choose",
         ),
-        (Launcher(failing="gpe"), r"trial \d of an earlier start cannot be repeated: no$"),
+        (Launcher(failing="gpe"), r"trial \d of an earlier start cannot be repeated: no; choose another name=… or delete the folder$"),
     ],
 )
 def test_numbers_of_other_settings_or_data_are_not_compared(tmp_path: Path, changed: Launcher, message: str) -> None:

@@ -16,7 +16,7 @@ import torch
 
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
-from gpe_pl.data.dataset import HeldGraphs, WindowDataset
+from gpe_pl.data.dataset import CachedGraphs, WindowDataset
 from gpe_pl.data.importers import save_dataset
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
@@ -119,7 +119,7 @@ def test_validation_graphs_are_built_when_asked_for_and_held_within_a_limit(root
     assert built == [0, 1, 2] and torch.equal(first[0]["sand"].x, again[0]["sand"].x)
     size = sum(v.nbytes for s in module.val_set[0].stores for v in s.values() if isinstance(v, torch.Tensor))
     built.clear()
-    graphs = HeldGraphs(module.val_set, cache_bytes=size + size // 2)  # room for one of about this size
+    graphs = CachedGraphs(module.val_set, cache_bytes=size + size // 2)  # room for one of about this size
     for _ in range(2):
         for window in (0, 1):
             assert torch.equal(graphs[window]["sand"].x, first[0]["sand"].x[12 * window : 12 * window + 12])

@@ -22,7 +22,7 @@ import torch
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.dataset import CACHE_BYTES, StartKey, StoredTrajectory, WindowDataset, collated, long_enough, open_split, usable
 from gpe_pl.data.noise import Noise
-from gpe_pl.data.sampling import NUM_LANES, UNIFORM_SHARE, BatchSampler, BatchSize, PushForward, StepSampler, probabilities
+from gpe_pl.data.sampling import NUM_LANES, UNIFORM_FRACTION, BatchSampler, BatchSize, PushForward, StepSampler, probabilities
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.trajectory import integrators
@@ -50,7 +50,7 @@ def test_an_epoch_with_noise_changes_nothing_that_is_stored(store: Path, noise: 
         return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(store.rglob("*")) if p.is_file()}
 
     data = dataset(store, noise=noise, cache_bytes=cache_bytes)
-    held = [t.held for t in data.trajectories if t.held is not None]
+    held = [t.cached for t in data.trajectories if t.cached is not None]
     assert len(held) == (2 if cache_bytes else 0)
     on_disk, in_memory = files(), copy.deepcopy([arrays_of(t) for t in held])
     for sample, window in itertools.islice(StepSampler(len(data), 0), len(data)):
@@ -66,8 +66,8 @@ def test_an_epoch_with_noise_changes_nothing_that_is_stored(store: Path, noise: 
 
 def test_held_arrays_cannot_be_written(store: Path) -> None:
     for stored in open_split(store, "train"):
-        assert stored.held is not None
-        arrays = arrays_of(stored.held)
+        assert stored.cached is not None
+        arrays = arrays_of(stored.cached)
         assert {"pos", "vel", "mass", "boundary.pos", "boundary.friction"} <= set(arrays)
         for key, value in {**arrays, "window": stored.window(1, 3).pos}.items():
             with pytest.raises(ValueError, match="read-only"):
@@ -123,7 +123,7 @@ def test_with_noise_graph_and_target_belong_to_the_same_window(store: Path) -> N
 def test_windows_read_from_disk_equal_held_ones(store: Path) -> None:
     held, read = dataset(store), dataset(store, cache_bytes=0)
     assert len(held) == len(read)
-    assert all(t.held is None for t in read.trajectories)
+    assert all(t.cached is None for t in read.trajectories)
     for k in range(len(held)):
         assert_equal_graphs(held[k + 5, k], read[k + 5, k])
 
@@ -217,7 +217,7 @@ def test_a_split_that_is_not_held_takes_the_memory_of_a_window(tmp_path: Path, n
     tracemalloc.stop()
     assert peak < size
     data = dataset(tmp_path)  # held: reading it takes more, which the test could not see otherwise
-    assert sum(t.held.pos.nbytes for t in data.trajectories if t.held is not None) == size
+    assert sum(t.cached.pos.nbytes for t in data.trajectories if t.cached is not None) == size
 
 
 # --- what is drawn, and where samples start ---------------------------------------------------------------------------------------------
@@ -241,7 +241,7 @@ def test_windows_are_drawn_by_their_probability_and_weighed_by_its_inverse(store
     assert share == pytest.approx(data.probability, abs=0.02)
     weights = np.array([data[0, k].weight for k in range(len(data))])
     assert (data.probability * weights).sum() == pytest.approx(1)
-    assert weights.max() <= 1 / UNIFORM_SHARE
+    assert weights.max() <= 1 / UNIFORM_FRACTION
     later = list(itertools.islice(BatchSize(4).batches(data, seed=0, step=3), 20))
     assert later == list(itertools.islice(BatchSize(4).batches(data, seed=0, step=0), 23))[3:]
 
@@ -251,10 +251,10 @@ def test_where_nothing_happens_all_windows_are_drawn_alike() -> None:
 
 
 @pytest.mark.parametrize("noise", [None, Noise(0.0, 0.5, 0.3), Noise(0.01, 0.0), Noise(0.01, 0.5, 0.3)])
-def test_a_start_without_own_steps_is_the_usual_sample(store: Path, noise: Noise | None) -> None:
+def test_a_start_without_unroll_is_the_usual_sample(store: Path, noise: Noise | None) -> None:
     data = dataset(store, noise=noise)
     start = data[StartKey(5, 1, 0)]
-    assert start.own_steps == 0
+    assert start.num_steps == 0
     graph, usual = start.graph(data.builder, start.state, 0), data[5, 1]
     assert torch.allclose(graph["sand"].target, usual["sand"].target, rtol=1e-5, atol=1e-3)
     graph["sand"].target = usual["sand"].target
@@ -262,11 +262,11 @@ def test_a_start_without_own_steps_is_the_usual_sample(store: Path, noise: Noise
 
 
 @pytest.mark.parametrize("correction", [0.2, 1.0])
-def test_the_target_after_own_steps_leads_back(store: Path, correction: float) -> None:
+def test_the_target_after_an_unroll_leads_back(store: Path, correction: float) -> None:
     """The target removes the given fractions of the deviations from the true velocity and position of its frame."""
     data = dataset(store, noise=Noise(0.0, 0.5, 0.25))
     start, dt = data[StartKey(5, 0, 2, correction=correction)], data.builder.metadata.frame_dt
-    assert start.own_steps == 2 == data[StartKey(5, 0, 9)].own_steps  # the trajectory ends there
+    assert start.num_steps == 2 == data[StartKey(5, 0, 9)].num_steps  # the trajectory ends there
     before, truth = (start.truth[2] - start.truth[1]) / dt, (start.truth[3] - start.truth[2]) / dt
     astray = replace(start.state, pos=start.truth[2] + 0.01, vel=before + 1.0)
     target = start.graph(data.builder, astray, 2)["sand"].target.double()
@@ -274,7 +274,7 @@ def test_the_target_after_own_steps_leads_back(store: Path, correction: float) -
     assert torch.allclose(next_vel, truth + (1 - correction) - 0.25 * 0.01 / dt, atol=1e-5)
 
 
-def test_late_batches_ask_for_own_steps(store: Path) -> None:
+def test_late_batches_ask_for_unrolls(store: Path) -> None:
     data = dataset(store)
     push = PushForward(3, 4, correction=0.3)
     keys = list(itertools.islice(BatchSampler(data, BatchSize(2), 0, lambda: 0, push), 3 + 6 * NUM_LANES))
@@ -283,14 +283,14 @@ def test_late_batches_ask_for_own_steps(store: Path) -> None:
     late = cast(list[list[StartKey]], keys[3:])
     assert [[key[:2] for key in batch] for batch in late[:NUM_LANES]] == plain[3 : 3 + NUM_LANES]
     assert {key.correction for batch in late for key in batch} == {0.3}
-    assert collections.Counter(batch[0].own_steps for batch in late[: 5 * NUM_LANES]) == dict.fromkeys(range(5), NUM_LANES)
+    assert collections.Counter(batch[0].num_steps for batch in late[: 5 * NUM_LANES]) == dict.fromkeys(range(5), NUM_LANES)
     following = iter(cast(list[tuple[int, int]], batch) for batch in plain[3 + NUM_LANES :])
     for before, after in zip(late, late[NUM_LANES:], strict=False):  # of the same lane
         assert {key.lane for key in (*before, *after)} == {before[0].lane}
-        if before[0].own_steps == push.max_steps:
+        if before[0].num_steps == push.max_steps:
             assert [key[:3] for key in after] == [(sample, window, 0) for sample, window in next(following)]
         else:
-            assert after == [key._replace(own_steps=key.own_steps + 1) for key in before]
+            assert after == [key._replace(num_steps=key.num_steps + 1) for key in before]
     for first in (2, 3, 4, 17, 60):
         resumed = BatchSampler(data, BatchSize(2), 0, functools.partial(int, first), push)
         assert list(itertools.islice(resumed, 10)) == keys[first : first + 10]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl.export.program import DESCRIPTION, PortableStep, export_model, scene_of
+from gpe_pl.export.program import DESCRIPTION, ExportedStep, export_model, scene_of
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -79,7 +79,7 @@ def at_the_seam(state: State, learned: LearnedSimulator) -> State:
 @pytest.mark.parametrize("model", SMALL)
 def test_particles(model: Any, features: str, dim: int) -> None:
     learned = simulator(model, ("sand", "snow"), dim, {"features": features, "history": 3})
-    assert_same_step(PortableStep(learned), learned, scenes.state(materials=("sand", "snow"), history=3, dim=dim).to_torch())
+    assert_same_step(ExportedStep(learned), learned, scenes.state(materials=("sand", "snow"), history=3, dim=dim).to_torch())
 
 
 @pytest.mark.parametrize("kind", ["triangles", "lattice", "tetrahedra"])
@@ -90,7 +90,7 @@ def test_meshes(model: Any, kind: Any) -> None:
         {"stress": True, "level_weights": "separate", "decoder": "contact", "island_momentum": "linear"} if model is GPE else {}
     )
     learned = simulator(model, materials, dim, {"mesh": True, "num_levels": 3, "islands": model is GPE}, **settings)
-    assert_same_step(PortableStep(learned), learned, scenes.mesh_state(kind, materials, num_bodies=3).to_torch())
+    assert_same_step(ExportedStep(learned), learned, scenes.mesh_state(kind, materials, num_bodies=3).to_torch())
 
 
 @pytest.mark.parametrize("kind", ["particles", "triangles", "lattice", "tetrahedra"])
@@ -100,7 +100,7 @@ def test_graphs_of_programs_are_those_of_the_builder(kind: str) -> None:
     learned = simulator(GPE, materials, dim, {"mesh": True, "num_levels": 3, "islands": True, "trim_boundary": False, "history": 2})
     shuffled = scenes.state(materials=materials, history=2) if kind == "particles" else scenes.mesh_state(kind, materials, 3, history=2)
     state = scenes.permuted(shuffled, np.argsort(shuffled.node_type, kind="stable")).to_torch()
-    step, scene, expected = PortableStep(learned), scene_of(learned, state), learned.builder(state)
+    step, scene, expected = ExportedStep(learned), scene_of(learned, state), learned.builder(state)
     graph = learned.builder.graph(step.topology(scene), step.state(scene))
     assert int(graph.num_bodies) >= int(expected.num_bodies)
     graph.num_bodies = expected.num_bodies  # an upper bound in programs
@@ -116,7 +116,7 @@ def test_descent_follows_from_parents(loose: bool) -> None:
     learned = simulator(GPE, ("elastomer",), 2, {"mesh": True, "num_levels": 4})
     changed = replace(state, cells=cells).to_torch()
     expected = learned.builder.topology(changed).mesh
-    found = PortableStep(learned).topology(scene_of(learned, changed)).mesh
+    found = ExportedStep(learned).topology(scene_of(learned, changed)).mesh
     assert expected is not None and found is not None and found.num_virtual == expected.num_virtual
     pairs = {*zip(*found.descent.tolist(), strict=True)}
     without = {(above, node) for above, node in pairs if above == sum(found.num_virtual)}
@@ -127,7 +127,7 @@ def test_descent_follows_from_parents(loose: bool) -> None:
 @pytest.mark.parametrize("dim", [2, 3])
 def test_islands_keep_their_momentum(dim: int) -> None:
     learned = simulator(dim=dim, config={"islands": True}, island_momentum="angular")
-    assert_same_step(PortableStep(learned), learned, scenes.state(materials=("sand",), dim=dim, low=0.1, high=0.9).to_torch())
+    assert_same_step(ExportedStep(learned), learned, scenes.state(materials=("sand",), dim=dim, low=0.1, high=0.9).to_torch())
 
 
 @pytest.mark.parametrize("push", [0.0, 0.3])
@@ -143,7 +143,7 @@ def test_static_friction(push: float) -> None:
     learned.static_friction = 0.99
     held = (learned.step(slow).pos == slow.pos).all(dim=1)
     assert 0 < held.sum() < len(held)
-    assert_same_step(PortableStep(learned), learned, slow)
+    assert_same_step(ExportedStep(learned), learned, slow)
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -152,7 +152,7 @@ def test_periodic_clouds(model: Any, dim: int) -> None:
     settings: dict[str, Any] = {"island_momentum": "angular"} if model is GPE else {}
     learned = simulator(model, ("sand", "snow"), dim, {"islands": model is GPE}, (True, True, False)[-dim:], **settings)
     state = at_the_seam(scenes.state(materials=("sand", "snow"), dim=dim, walls=False), learned)
-    assert_same_step(PortableStep(learned), learned, state.to_torch())
+    assert_same_step(ExportedStep(learned), learned, state.to_torch())
 
 
 @pytest.mark.parametrize("kind", ["triangles", "lattice", "tetrahedra"])
@@ -161,7 +161,7 @@ def test_periodic_meshes(kind: Any) -> None:
     config = {"mesh": True, "num_levels": 2, "islands": True}
     learned = simulator(GPE, materials, dim, config, (True,) * dim, stress=True, island_momentum="angular", decoder="contact")
     state = at_the_seam(scenes.mesh_state(kind, materials, walls=False), learned)
-    assert_same_step(PortableStep(learned), learned, state.to_torch())
+    assert_same_step(ExportedStep(learned), learned, state.to_torch())
 
 
 def test_what_a_file_cannot_be_is_refused(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import torch
 
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned.approximate import Holding, Sleeping, approximate
+from gpe_pl.learned.approximate import Repeating, Sleeping, approximate
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
@@ -171,7 +171,7 @@ def test_what_is_at_rest_sleeps_in_any_unit(length: float, time: float) -> None:
 def test_a_rollout_that_is_taken_up_again_is_the_same() -> None:
     simulated = simulator(scenes.builder(), hold=2, rest_step_spacings=0.05, rest_step_change_spacings=5.0)
     runner, state = approximate(simulated), two_heaps(speed=0.3).to_torch()
-    assert isinstance(runner, Holding)
+    assert isinstance(runner, Repeating)
     through = state
     for _ in range(6):
         through = runner.step(through)

@@ -10,7 +10,7 @@ import pytest
 
 from gpe_pl.reports import domain_table
 from gpe_pl.reports.tables import main
-from gpe_pl.system.locks import held
+from gpe_pl.system.locks import locked
 from tests.unit.reports.test_domain_table import write_run
 
 
@@ -36,7 +36,10 @@ def test_tables_follow_the_runs_that_are_there(sweep: Path, capsys: pytest.Captu
 def test_a_folder_without_runs_is_refused_and_left_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "table1.md").write_text("of runs that are gone")
     assert main([str(tmp_path)]) == 2
-    assert capsys.readouterr().err == f"error: {tmp_path}: contains no finished run (a folder with config.json and metrics.csv)\n"
+    assert (
+        capsys.readouterr().err
+        == f"error: {tmp_path}: contains no finished run (a folder with config.json and metrics.csv); give the folder of a sweep or run\n"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["table1.md"]
 
 
@@ -51,6 +54,6 @@ def test_models_on_different_data_of_one_name_do_not_compare(sweep: Path, capsys
 @pytest.mark.slow
 def test_it_is_a_command(sweep: Path) -> None:
     command = [sys.executable, "-m", "gpe_pl.reports", str(sweep)]
-    with held(sweep):
+    with locked(sweep):
         result = subprocess.run(command, capture_output=True, text=True, timeout=100)
     assert result.returncode == 2 and result.stderr.startswith("error: ") and result.stderr.count("\n") == 1

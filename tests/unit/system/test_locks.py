@@ -22,7 +22,7 @@ from gpe_pl import save_dataset
 from gpe_pl.config.entry_point import Report
 from gpe_pl.simulate import simulate
 from gpe_pl.system import locks
-from gpe_pl.system.locks import FolderError, held
+from gpe_pl.system.locks import FolderError, locked
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests.runs import DATA, compose, generate_tiny
 
@@ -30,8 +30,8 @@ ROOT = Path(__file__).parents[3]
 OTHER = """
 import sys
 from pathlib import Path
-from gpe_pl.system.locks import held
-with held(Path(sys.argv[1])):
+from gpe_pl.system.locks import locked
+with locked(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
 """
@@ -52,14 +52,14 @@ def held_elsewhere(folder: Path) -> Iterator[subprocess.Popen[str]]:
 
 def test_a_folder_is_made_held_by_one_process_and_nothing_stays(tmp_path: Path) -> None:
     folder = tmp_path / "runs" / "sand"
-    with held(folder):
-        with held(folder):  # the same process again
+    with locked(folder):
+        with locked(folder):  # the same process again
             pass
         holder = json.loads((tmp_path / "runs" / ".sand.holder").read_text(encoding="utf-8"))
         assert holder["pid"] == os.getpid() and set(holder) == {"pid", "host", "command", "since"}
         (folder / "result").touch()
     assert sorted(p.name for p in tmp_path.rglob("*")) == ["result", "runs", "sand"]
-    with held(tmp_path / "new" / "empty"):
+    with locked(tmp_path / "new" / "empty"):
         pass
     assert not (tmp_path / "new").exists()
 
@@ -67,12 +67,12 @@ def test_a_folder_is_made_held_by_one_process_and_nothing_stays(tmp_path: Path) 
 def test_a_second_command_is_told_who_holds_the_folder(tmp_path: Path) -> None:
     with held_elsewhere(tmp_path / "a") as process:
         with pytest.raises(FolderError, match=rf"a: another command writes to it \(process {process.pid} on .*, since 20.*\); wait"):
-            held(tmp_path / "a").__enter__()
-        with held(tmp_path / "b"):
+            locked(tmp_path / "a").__enter__()
+        with locked(tmp_path / "b"):
             pass
         (tmp_path / "link").symlink_to(tmp_path / "a")
         with pytest.raises(FolderError, match="another command writes to it"):
-            held(tmp_path / "link").__enter__()
+            locked(tmp_path / "link").__enter__()
 
 
 def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_a_killed_process_holds_nothing(tmp_path: Path) -> None:
         process.kill()
         process.wait()
         assert (tmp_path / ".a.lock").exists()
-        with held(tmp_path / "a"):
+        with locked(tmp_path / "a"):
             pass
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
 
@@ -89,7 +89,7 @@ def test_who_waits_says_so_and_goes_on(tmp_path: Path, caplog: pytest.LogCapture
     with held_elsewhere(tmp_path / "a") as process:
         assert process.stdin is not None
         threading.Timer(0.5, process.stdin.close).start()
-        with held(tmp_path / "a", waits=True):
+        with locked(tmp_path / "a", waits=True):
             assert process.wait() == 0
     assert f"waiting until another command has written it (process {process.pid} on " in caplog.text
 
@@ -100,11 +100,11 @@ def test_processes_of_one_run_share_its_folder(tmp_path: Path, monkeypatch: pyte
         monkeypatch.delenv(other, raising=False)
     with held_elsewhere(tmp_path / "a"):
         monkeypatch.setenv(key, "1")
-        with held(tmp_path / "a", num_processes=2):
+        with locked(tmp_path / "a", num_processes=2):
             pass
         monkeypatch.setenv(key, "0")
         with pytest.raises(FolderError, match="another command writes to it"):
-            held(tmp_path / "a", num_processes=2).__enter__()
+            locked(tmp_path / "a", num_processes=2).__enter__()
 
 
 def test_hydra_lets_later_processes_of_a_training_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,22 +129,22 @@ def test_disks_without_locks_have_lock_files(tmp_path: Path, monkeypatch: pytest
 
     monkeypatch.setattr(UnixFileLock, "_acquire", has_none)
     lock = tmp_path / ".a.lock"
-    with held(tmp_path / "a"):
+    with locked(tmp_path / "a"):
         assert str(os.getpid()) in lock.read_text(encoding="utf-8")
     assert not lock.exists()
     lock.write_text(f"{2**22 + 1}\n{locks.platform.node()}\n", encoding="utf-8")  # no such process
-    with held(tmp_path / "a"):
+    with locked(tmp_path / "a"):
         pass
     lock.write_text("1\nanother-host\n", encoding="utf-8")
     with pytest.raises(FolderError, match=r"; if that process is gone, delete .*\.a\.lock$"):
-        held(tmp_path / "a").__enter__()
+        locked(tmp_path / "a").__enter__()
 
 
 @pytest.mark.parametrize("ends_with", [None, FileNotFoundError])
 def test_a_folder_that_was_deleted_meanwhile_is_an_error(tmp_path: Path, ends_with: type[OSError] | None) -> None:
     with (
         pytest.raises(FolderError, match="a: was deleted or replaced while this command wrote to it; run the command again"),
-        held(tmp_path / "a"),
+        locked(tmp_path / "a"),
     ):
         shutil.rmtree(tmp_path / "a")
         if ends_with:
@@ -157,7 +157,7 @@ def test_a_folder_that_was_deleted_meanwhile_is_an_error(tmp_path: Path, ends_wi
 def test_a_deleted_folder_is_an_error_also_where_the_process_holds_it_already(tmp_path: Path, ends_with: type[OSError] | None) -> None:
     """In a training, Hydra's callback holds the folder, too. The inner block raises the error, and the end of the callback raises no other."""
     lost = "a: was deleted or replaced while this command wrote to it"
-    with pytest.raises(FolderError, match=lost), held(tmp_path / "a"), pytest.raises(FolderError, match=lost), held(tmp_path / "a"):
+    with pytest.raises(FolderError, match=lost), locked(tmp_path / "a"), pytest.raises(FolderError, match=lost), locked(tmp_path / "a"):
         shutil.rmtree(tmp_path / "a")
         if ends_with:
             raise ends_with
@@ -165,7 +165,7 @@ def test_a_deleted_folder_is_an_error_also_where_the_process_holds_it_already(tm
 
 def test_a_command_that_removes_its_empty_folder_keeps_its_own_error(tmp_path: Path) -> None:
     """For example, ``evaluate`` does so if the disk of the compile cache is full."""
-    with pytest.raises(OSError, match="No space left on device"), held(tmp_path / "a"):
+    with pytest.raises(OSError, match="No space left on device"), locked(tmp_path / "a"):
         (tmp_path / "a").rmdir()
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -186,16 +186,16 @@ def test_a_command_whose_folder_was_deleted_does_not_succeed(tmp_path: Path, cap
 
 
 def test_other_errors_stay_what_they_are(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="mine"), held(tmp_path / "a"):
+    with pytest.raises(ValueError, match="mine"), locked(tmp_path / "a"):
         raise ValueError("mine")
-    with pytest.raises(PermissionError), held(tmp_path / "a"):
+    with pytest.raises(PermissionError), locked(tmp_path / "a"):
         raise PermissionError
 
 
 def test_a_folder_that_cannot_be_made_names_the_key(tmp_path: Path) -> None:
     (tmp_path / "runs").write_text("a file", encoding="utf-8")
     with pytest.raises(FolderError, match=r"runs/a: cannot be made \(Not a directory\); choose another folder with paths\.data=…"):
-        held(tmp_path / "runs" / "a", "paths.data").__enter__()
+        locked(tmp_path / "runs" / "a", "paths.data").__enter__()
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_imports_refuse_a_data_set_that_another_writes(
 ) -> None:
     monkeypatch.setenv("SLURM_PROCID", number)
     (tmp_path / "mine").mkdir()
-    other = f"from pathlib import Path\nfrom gpe_pl.system.locks import held\nwith held(Path({str(tmp_path / 'mine' / 'imported')!r}), makes=False):"
+    other = f"from pathlib import Path\nfrom gpe_pl.system.locks import locked\nwith locked(Path({str(tmp_path / 'mine' / 'imported')!r}), makes=False):"
     code = f"{other}\n    print('held', flush=True); input()"
     with subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)}
@@ -293,7 +293,7 @@ def test_what_is_damaged_is_deleted_by_one_process_only(tiny_data: Path, tmp_pat
 
 
 def test_long_names_have_locks_too(tmp_path: Path) -> None:
-    with held(tmp_path / ("x" * 255)):
+    with locked(tmp_path / ("x" * 255)):
         assert len(list(tmp_path.glob(".*.lock"))) == 1
 
 
@@ -302,4 +302,4 @@ def test_a_damaged_note_about_the_holder_is_no_obstacle(tmp_path: Path) -> None:
         for text in ("[" * 10**5, '{"pid": 1e999}', "3", "\x00"):
             (tmp_path / ".a.holder").write_text(text, encoding="utf-8")
             with pytest.raises(FolderError, match=r"another command writes to it \(which has just begun\)"):
-                held(tmp_path / "a").__enter__()
+                locked(tmp_path / "a").__enter__()

@@ -219,7 +219,7 @@ def test_no_round_begins_after_the_limit(
     assert len(counted) == num_steps
 
 
-def test_own_steps_weigh_as_they_occur_and_share_the_time_to_measure(
+def test_steps_with_unrolls_weigh_as_they_occur_and_divide_the_time_to_measure(
     measurable: tuple[TrainingModule, WindowDataset], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module, data = measurable

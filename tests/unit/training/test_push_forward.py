@@ -21,7 +21,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.training.module import TrainingModule
-from gpe_pl.training.push_forward import walked
+from gpe_pl.training.push_forward import unrolled
 from gpe_pl.training.run import TrainingSettings
 from gpe_pl.trajectory.boundary import Motion
 from gpe_pl.trajectory.state import State
@@ -45,11 +45,11 @@ def simulator(data: WindowDataset) -> LearnedSimulator:
 def test_a_walk_is_the_simulators_own_rollout(data: WindowDataset, simulator: LearnedSimulator) -> None:
     starts = [data[StartKey(0, 0, 2)], data[StartKey(1, 3, 1)]]
     simulator.train()
-    states, steps = walked(simulator, starts)
+    states, steps = unrolled(simulator, starts)
     assert steps == [2, 1] and simulator.training
     for start, state in zip(starts, states, strict=True):
         expected = start.state
-        for _ in range(start.own_steps):
+        for _ in range(start.num_steps):
             expected = simulator.step(expected)
         assert torch.allclose(state.pos, expected.pos, rtol=0, atol=1e-9)
 
@@ -63,7 +63,7 @@ def test_a_scene_that_falls_apart_on_the_way_ends_where_it_was_whole(
         return [SimulationError("no") if state.time > first.state.time else new for state, new in zip(states, usual(states), strict=True)]
 
     monkeypatch.setattr(simulator, "next_states", fails_later)
-    (state,), steps = walked(simulator, [first])
+    (state,), steps = unrolled(simulator, [first])
     assert steps == [1] and torch.equal(state.pos, simulator.step(first.state).pos)
 
 
@@ -79,7 +79,7 @@ def test_steps_of_training_move_the_states_on(data: WindowDataset, simulator: Le
         for turn in lanes:
             excursions = copy.deepcopy(module._excursions)
             graph = excursions.graphs(simulator, turn[step])
-            states, steps = walked(simulator, turn[step])
+            states, steps = unrolled(simulator, turn[step])
             assert steps == [step, step]
             expected = [start.graph(data.builder, state, step) for start, state in zip(turn[step], states, strict=True)]
             assert_equal_graphs(graph, batched(expected), rtol=1e-4, atol=1e-4)
@@ -91,7 +91,7 @@ def test_at_the_end_of_the_truth_and_after_falling_apart_a_sample_is_at_its_star
 ) -> None:
     module, last = TrainingModule(simulator, num_steps=10), len(data) - 2
     turns = visits(data, [(0, last)], 0, 4)
-    assert turns[3][0].own_steps == 1  # as far as the trajectory goes
+    assert turns[3][0].num_steps == 1  # as far as the trajectory goes
     usual = batched([turns[0][0].graph(data.builder, turns[0][0].state, 0)])
     for starts in turns[:2]:
         module.loss(starts)
@@ -117,7 +117,7 @@ def test_a_validation_ends_all_excursions(data: WindowDataset, simulator: Learne
     optimizer = torch.optim.SGD(module.parameters(), lr=1e-3)
     module.loss(turns[1]).backward()
     optimizer.step()
-    (state,), _ = walked(simulator, turns[2])
+    (state,), _ = unrolled(simulator, turns[2])
     expected = batched([turns[2][0].graph(data.builder, state, 2)])
     going_on = copy.deepcopy(module._excursions).graphs(simulator, turns[2])
     assert not torch.equal(going_on["sand"].target, expected["sand"].target)
@@ -125,7 +125,7 @@ def test_a_validation_ends_all_excursions(data: WindowDataset, simulator: Learne
     assert_equal_graphs(module._excursions.graphs(simulator, turns[2]), expected)
 
 
-def test_own_steps_get_no_gradient(data: WindowDataset, simulator: LearnedSimulator) -> None:
+def test_an_unroll_gets_no_gradient(data: WindowDataset, simulator: LearnedSimulator) -> None:
     module = TrainingModule(simulator, num_steps=10)
     starts = [data[StartKey(0, 0, 2)]]
     graph = module._excursions.graphs(simulator, starts)
@@ -151,7 +151,7 @@ def test_weights_of_graphs_weigh_their_nodes(data: WindowDataset, simulator: Lea
 def test_a_start_can_be_moved(data: WindowDataset) -> None:
     start = data[StartKey(0, 0, 2)]
     moved = start.to("cpu")
-    assert moved.own_steps == 2 and torch.equal(moved.truth, start.truth)
+    assert moved.num_steps == 2 and torch.equal(moved.truth, start.truth)
 
 
 def test_the_last_steps_are_unrolled() -> None:

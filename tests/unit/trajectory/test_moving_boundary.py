@@ -13,12 +13,12 @@ from gpe_pl.data.dataset import WindowDataset, open_split
 from gpe_pl.data.importers import save_dataset
 from gpe_pl.data.sampling import StartKey
 from gpe_pl.data.validate import validate
-from gpe_pl.export.program import PortableStep, scene_of
+from gpe_pl.export.program import ExportedStep, scene_of
 from gpe_pl.export.trajectories import write_vtk
 from gpe_pl.geometry.periodicity import Periodicity
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned.approximate import Holding, Sleeping, _Rest
+from gpe_pl.learned.approximate import Repeating, Sleeping, _Rest
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.baselines import Ballistic, ConstantVelocity
@@ -184,7 +184,7 @@ def test_every_simulator_takes_the_wall_along(truth: Trajectory, simulator: Lear
     start = simulator.initial_state(truth, 2)
     sleepy = LearnedSimulator(simulator.model, simulator.builder).eval()
     sleepy.skips = Skips(sleep_after=2)
-    for runner in (simulator, Ballistic(DT), ConstantVelocity(DT), Sleeping(sleepy), Holding(simulator, DT, 3)):
+    for runner in (simulator, Ballistic(DT), ConstantVelocity(DT), Sleeping(sleepy), Repeating(simulator, DT, 3)):
         state = start
         for frame in range(3, 7):
             state = runner.step(state)
@@ -208,7 +208,7 @@ def test_a_wall_that_comes_wakes_what_sleeps(truth: Trajectory, simulator: Learn
 
 def test_an_exported_step_is_told_where_the_wall_is(truth: Trajectory, simulator: LearnedSimulator) -> None:
     state = simulator.step(simulator.initial_state(truth, 2))
-    moved, _ = PortableStep(simulator)(scene_of(simulator, state))
+    moved, _ = ExportedStep(simulator)(scene_of(simulator, state))
     torch.testing.assert_close(moved["pos.fluid"], simulator.step(state).pos, rtol=0, atol=1e-9)
 
 

@@ -21,7 +21,7 @@ import torch
 from gpe_pl.benchmarks.faults import checkpoints, configs, field_values, isolation, pairs, runs, scenes, side_files, stores, suite
 from gpe_pl.benchmarks.faults.isolation import CANARY, Ended, verdicts
 from gpe_pl.benchmarks.faults.suite import report
-from gpe_pl.benchmarks.faults.verdict import GOOD, Fault, Verdict, judge
+from gpe_pl.benchmarks.faults.verdict import GOOD, Fault, Verdict, verdict_of
 from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.errors import GpeError
@@ -111,15 +111,15 @@ def test_a_refused_command_releases_its_folder(tmp_path: Path) -> None:
     assert runs.leftovers(tmp_path) == []
 
 
-def test_judges_tell_what_came_of_it() -> None:
+def test_a_verdict_tells_what_came_of_an_action() -> None:
     def fails(error: Exception) -> None:
         raise error
 
-    assert judge(lambda: 1, lambda x: x == 1).status == "harmless"
-    assert judge(lambda: 2, lambda x: x == 1).status == "accepted"
-    assert judge(lambda: fails(GpeError("file, reason")), lambda _: True) == Verdict("refused", "file, reason")
-    assert judge(lambda: fails(GpeError("")), lambda _: True).status == "traceback"
-    assert judge(lambda: fails(KeyError("x")), lambda _: True) == Verdict("traceback", "KeyError: 'x'")
+    assert verdict_of(lambda: 1, lambda x: x == 1).status == "harmless"
+    assert verdict_of(lambda: 2, lambda x: x == 1).status == "accepted"
+    assert verdict_of(lambda: fails(GpeError("file, reason")), lambda _: True) == Verdict("refused", "file, reason")
+    assert verdict_of(lambda: fails(GpeError("")), lambda _: True).status == "traceback"
+    assert verdict_of(lambda: fails(KeyError("x")), lambda _: True) == Verdict("traceback", "KeyError: 'x'")
 
 
 def test_a_changed_value_with_a_fitting_checksum_is_accepted(shard: Path, tmp_path: Path) -> None:
@@ -136,9 +136,9 @@ def test_bytes_without_meaning_may_change(shard: Path, tmp_path: Path) -> None:
     shutil.copy(shard, other)
     with h5py.File(other, "r+") as file:
         file["00000"]["pos"][0, 0, 0] += 0.5
-    assert runs._hold_the_same(shard, same)
-    assert not runs._hold_the_same(shard, other)
-    assert not runs._hold_the_same(shard, tmp_path / "missing.h5")
+    assert runs._have_equal_content(shard, same)
+    assert not runs._have_equal_content(shard, other)
+    assert not runs._have_equal_content(shard, tmp_path / "missing.h5")
 
 
 def test_payloads_work_where_they_are_let(tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_payloads_work_where_they_are_let(tmp_path: Path) -> None:
         (None, "", "hung"),
     ],
 )
-def test_a_command_is_judged_by_its_last_words(code: int | None, output: str, status: str) -> None:
+def test_the_verdict_of_a_command_follows_from_its_last_words(code: int | None, output: str, status: str) -> None:
     assert Ended(code, output).verdict().status == status
 
 
@@ -276,7 +276,7 @@ COMMANDS = [runs.Command(name, "fit", ()) for name in ("one", "other")]
         ((2, 0), HELD.replace("fit)", f"fit {'x' * 400})"), "second", "refused"),
     ],
 )
-def test_two_commands_are_judged_by_what_they_leave(
+def test_the_verdict_of_two_commands_follows_from_what_they_leave(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, codes: tuple[int, int], said: str, left: str, status: str
 ) -> None:
     expected = ({"a": "1", "b": "2"}, {"a": "1", "c": "3"})
