@@ -9,7 +9,15 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from gpe_pl.config.datasets import IMPORTED, check_material_controls, ensure_data, evaluated_config, material_controls, scene_metadata
+from gpe_pl.config.datasets import (
+    IMPORTED,
+    check_material_controls,
+    dataset_spec,
+    ensure_data,
+    evaluated_config,
+    material_controls,
+    scene_metadata,
+)
 from gpe_pl.config.entry_point import ConfigError, bind, construct
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
@@ -22,6 +30,7 @@ from gpe_pl.learned.pretrained import fingerprint
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.lookup import model_class
 from gpe_pl.reports.finished_runs import Run, rollout_errors, table_of
+from gpe_pl.rollout.loop import Restartable
 from gpe_pl.training.budget import PauseForMeasurements, mean_step_time, step_time_key, within_budget
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.parallel import end_later_processes
@@ -171,7 +180,23 @@ class FitRun:
             self.trainer.num_workers,
             stress=bool(self.cfg.model.get("stress", False)),
             sampling=self.training.sampling,
+            solver=self._solver,
         )
+
+    @property
+    def _solver(self) -> Restartable | None:
+        """Solver that gives training targets, if ``training.targets`` asks for it."""
+        if self.training.targets == "trajectory":
+            return None
+        if self.cfg.data.size == IMPORTED:
+            raise ConfigError("training.targets=solver: imported data have no solver; choose training.targets=trajectory")
+        solver = dataset_spec(self.cfg).solver
+        if not (isinstance(solver, Restartable) and solver.can_restart):
+            raise ConfigError(
+                f"training.targets=solver: the solver {solver.name} cannot continue {', '.join(solver.materials)} from positions; "
+                "choose training.targets=trajectory"
+            )
+        return solver
 
     def _new_module(self, training: TrainingSettings) -> TrainingModule:
         seed(self.cfg.seed)

@@ -22,6 +22,7 @@ from gpe_pl.files import sealed
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.standardizer import StatisticsSample
+from gpe_pl.rollout.loop import Restartable
 from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES, EdgeType, grid, node_code, role
 from gpe_pl.system import ranks
 from gpe_pl.trajectory.scene_ranges import scene_range, united
@@ -75,6 +76,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         num_val_windows: number of windows of the one-step validation loss, evenly spread over the ``val`` split.
         stress: add the stress to samples; see ``WindowDataset``.
         sampling: how often each training window is drawn.
+        solver: gives the targets of noisy and unrolled states; see ``WindowDataset``.
         num_statistics_windows: number of windows from which features are standardised, evenly spread over the ``train`` split.
 
     Attributes:
@@ -98,6 +100,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         stress: bool = False,
         sampling: Sampling = "uniform",
         num_statistics_windows: int = 256,
+        solver: Restartable | None = None,
     ) -> None:
         super().__init__()
         self.root, self.noise, self.batch_size, self.seed = Path(root), noise, batch_size, seed
@@ -114,7 +117,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         std = statistics["acceleration_std"] if whole else acceleration_std(t.window(0, t.num_frames) for t in train)
         unit = std * self.metadata.frame_dt
         noise.check(self.metadata, unit)
-        self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress)
+        self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress, solver)
         self.val_set = WindowDataset(val, self.builder, stress=stress)
         if sampling == "activity":
             self.train_set.probability = probabilities(self.train_set.activity())

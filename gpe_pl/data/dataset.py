@@ -19,9 +19,11 @@ from torch.utils.data import Dataset
 from torch_geometric.data import HeteroData
 
 from gpe_pl.data.noise import Noise
+from gpe_pl.data.solver_targets import SolverTargets
 from gpe_pl.data.statistics import FRAMES_AT_ONCE
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.rollout.loop import Restartable
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import StoreError, UnsoundError, open_field, open_group, open_shard, read_trajectory, shards, trajectory_names
@@ -220,6 +222,7 @@ class Start:
         velocity_correction: fraction of the deviation from the true velocity that the target removes within one step, after the unroll; as in the key.
         about: numbers of trajectory and frame, and the weight in the loss if there is one.
         sample, lane: as in the key.
+        solver_targets: the targets of the solver, which replace the corrections; None without them.
     """
 
     state: State
@@ -230,6 +233,7 @@ class Start:
     about: dict[str, Any]
     sample: int
     lane: int
+    solver_targets: SolverTargets | None = None
 
     @property
     def num_steps(self) -> int:
@@ -245,8 +249,11 @@ class Start:
         """Create the training graph of the state that the model has reached after ``step`` steps.
 
         The target velocity is the next true velocity, plus the part of the velocity's deviation that remains, minus the part of the position's deviation that
-        is removed.
+        is removed. With ``solver_targets``, the target is the solver's step from the state instead, unless the solver refuses the state.
         """
+        if self.solver_targets is not None and (found := self.solver_targets.target(state, step)) is not None:
+            acceleration, stress = found
+            return training_graph(builder, state, acceleration, None if self.stress is None else stress, self.about)
         dt, where = builder.metadata.frame_dt, state.periodicity
         vel = integrators.velocities(self.truth[step : step + 2], dt, where)[0]
         if step:  # the velocity noise of the start is removed entirely
@@ -307,6 +314,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         noise: noise on inputs; None for evaluation.
         velocity_unit: root mean square acceleration × frame interval [m/s], the unit of velocity noise.
         seed: seed of the noise.
+        solver: gives the targets of noisy and unrolled states; None takes those that lead back to the trajectory.
         stress: also give the Cauchy stress at t+1 of materials that have one, as ``stress_target`` [node, component] in Pa.
 
     Attributes:
@@ -325,8 +333,9 @@ class WindowDataset(Dataset[HeteroData | Start]):
         velocity_unit: float = 0.0,
         seed: int = 0,
         stress: bool = False,
+        solver: Restartable | None = None,
     ) -> None:
-        self.trajectories, self.builder, self.noise, self.stress = trajectories, builder, noise, stress
+        self.trajectories, self.builder, self.noise, self.stress, self.solver = trajectories, builder, noise, stress, solver
         self.velocity_unit, self.seed = velocity_unit, seed
         self.probability: np.ndarray | None = None
         self.ends = np.cumsum(window_counts(trajectories, builder.config.history))
@@ -400,9 +409,13 @@ class WindowDataset(Dataset[HeteroData | Start]):
         about: dict[str, Any] = {"trajectory": number, "frame": frame}
         if self.probability is not None:
             about["weight"] = 1 / (len(self) * float(self.probability[window]))
-        if start is not None:
+        deviates = start is not None or (self.noise is not None and self.noise.is_any)
+        targets = None if self.solver is None or not deviates else SolverTargets.of(self.solver, trajectory, history)
+        if start is not None or targets is not None:
             correction = 0.0 if self.noise is None else self.noise.correction
-            return Start(state, torch.from_numpy(truth[history:]), stress, correction, start.correction, about, sample, start.lane)
+            key = start or StartKey(sample, window, 0)
+            unroll = Start(state, torch.from_numpy(truth[history:]), stress, correction, key.correction, about, sample, key.lane, targets)
+            return unroll if start else unroll.graph(self.builder, state, 0)
         target = integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity
         return training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[-1], about)
 

@@ -44,6 +44,11 @@ class Noise:
     velocity_of_change: Annotated[float, Field(ge=0, le=100)] = 0.3
     correction: Annotated[float, Field(ge=0, le=1)] = 0.0
 
+    @property
+    def is_any(self) -> bool:
+        """Whether there is any noise."""
+        return self.position_of_domain > 0 or self.velocity_of_change > 0
+
     def check(self, metadata: Metadata, velocity_unit: float = 0.0) -> None:
         """Check that the noise is not too large for the spacing of a data set.
 
@@ -82,7 +87,7 @@ class Noise:
             frame_dt: frame interval [s].
             rng: source of randomness.
         """
-        if self.position_of_domain == self.velocity_of_change == 0:
+        if not self.is_any:
             return window
         offset = np.zeros_like(window)
         if self.position_of_domain:

@@ -35,6 +35,24 @@ class BatchSimulator(Simulator, Protocol):
     def step_all(self, states: list[State]) -> list[State | SimulationError]: ...
 
 
+@runtime_checkable
+class Restartable(Simulator, Protocol):
+    """A solver that can continue from the positions and velocities of a frame, without what it remembers besides."""
+
+    @property
+    def can_restart(self) -> bool:
+        """Whether all its materials can be restarted."""
+        ...
+
+    def restarted(self, state: State) -> State:
+        """Return the state from which ``step`` continues, given one with positions and velocities of any frame of a scene.
+
+        Raises:
+            SimulationError: a material of the state cannot be restarted, or positions do not make sense.
+        """
+        ...
+
+
 class SimulationError(GpeError, RuntimeError):
     """Raised when a simulator cannot compute the next state.
 

@@ -34,6 +34,9 @@ from gpe_pl.training.parallel import SummedGradients
 
 log = logging.getLogger(__name__)
 
+Targets = Literal["trajectory", "solver"]
+"""Where the targets of noisy and unrolled states lead: ``trajectory``, back to the true one; ``solver``, where the solver goes from them."""
+
 
 @dataclass(frozen=True)
 class TrainingSettings:
@@ -45,7 +48,8 @@ class TrainingSettings:
         ema_decay: decay of the moving average of the weights; None switches averaging off.
         push_share: fraction of the steps, at the end of training, that use push-forward.
         push_steps: maximum number of steps of an unroll.
-        push_correction: fraction of the velocity's deviation after an unroll that the target removes within one step.
+        push_correction: fraction of the velocity's deviation after an unroll that the target removes within one step, with ``targets=trajectory``.
+        targets: where the targets of noisy and unrolled states lead; see ``data.solver_targets``.
         val_containment: put particles that cross a wall back on its surface in the validation rollouts, which choose the best checkpoint.
     """
 
@@ -61,6 +65,7 @@ class TrainingSettings:
     position_noise_of_domain: Annotated[float, Field(ge=0, le=1)] = 0.0
     velocity_noise_of_change: Annotated[float, Field(ge=0, le=100)] = 0.3
     noise_correction: Annotated[float, Field(ge=0, le=1)] = 0.0
+    targets: Targets = "trajectory"
     sampling: Sampling = "uniform"
     push_share: Annotated[float, Field(ge=0, le=1)] = 0.0
     push_steps: Annotated[int, Field(ge=1)] = 20

@@ -12,6 +12,7 @@ of a cell. Contact of the solid with itself is not computed: a scene holds one b
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Annotated, ClassVar, no_type_check
 
 import numpy as np
@@ -98,6 +99,12 @@ class FEM:
             np.zeros_like(pos),
         )
         return min(self.frame_dt, self.cfl / _critical_rate(mesh.scale * stiffest, mesh.scale * most_viscous))
+
+    can_restart: ClassVar[bool] = True
+
+    def restarted(self, state: State) -> State:
+        """Return the same state: positions and velocities are all that a step starts from."""
+        return replace(state, velocity_history=None, stress=None)
 
     def step(self, state: State) -> State:
         """Advance one frame.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -180,6 +180,12 @@ class FLIP:
             np.array([0.0, -9.81]),
         )  # fmt: skip
         FLIP(bounds=bounds, grid_spacing=0.25).step(state)
+
+    can_restart: ClassVar[bool] = True
+
+    def restarted(self, state: State) -> State:
+        """Return the same state: positions and velocities are all that a step starts from."""
+        return replace(state, velocity_history=None, stress=None)
 
     def step(self, state: State) -> State:
         """Advance one frame.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar
 
 import numpy as np
@@ -18,6 +18,7 @@ from gpe_pl.solvers.materials import LIMITS, MEMORY, NUM_CONSTANTS, Elastomer, F
 from gpe_pl.solvers.mpm.collider import Collider, collider
 from gpe_pl.solvers.mpm.frame import ESCAPE, NOT_FINITE, OK, advance
 from gpe_pl.solvers.mpm.particles import Particles
+from gpe_pl.solvers.mpm.restart import gradients
 from gpe_pl.solvers.supported import check_surroundings
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
@@ -163,6 +164,25 @@ class MPM:
             raise self._error(status, node, particles.pos, particles.vel, state.gravity)
         internal = MPMInternal(particles.deformation, particles.affine, particles.gradient, particles.plastic, np.array(last_substep))
         return state.later(self.frame_dt, particles.pos, particles.vel, velocity_history=None, num_substeps=num_substeps, internal=internal)
+
+    @property
+    def can_restart(self) -> bool:
+        """Whether all materials are elastic. Sand and snow remember plastic flow, which positions do not tell."""
+        return set(self.materials) == {"elastomer"}
+
+    def restarted(self, state: State) -> State:
+        """Return a state with the internal part that positions and velocities of its mesh tell; see ``mpm.restart``.
+
+        Raises:
+            SimulationError: with reason ``input``, if a particle is no elastomer or the state has no cells.
+        """
+        self._require(np.asarray(state.node_type) == node_code("elastomer"), "only elastomers can be restarted from their positions")
+        if state.rest_pos is None or state.cells is None or not len(state.cells):
+            raise SimulationError("a state without cells cannot be restarted from its positions; give it its internal part", reason="input")
+        pos, vel, rest_pos, cells = (np.asarray(x) for x in (state.pos, state.vel, state.rest_pos, state.cells))
+        deformation, gradient = gradients(pos, rest_pos, cells), gradients(vel, pos, cells)
+        internal = MPMInternal(deformation, gradient, gradient.copy(), np.zeros(len(pos)))
+        return replace(state, velocity_history=None, internal=internal)
 
     def _require_undeformed(self, state: State) -> None:
         remedy = "start at frame 0 of a scene, or step on from the state that the solver returned"

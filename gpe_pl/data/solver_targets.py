@@ -1,0 +1,80 @@
+"""Training targets for states that no stored trajectory contains: the solver's step from there.
+
+Noise and unrolls lead away from the true trajectory. The usual target leads back to it within a step, which no physics does: a body that swings has restoring
+forces of its own, and a strain that noise gives it has consequences. Here the target is the true acceleration, plus the difference between the solver's steps
+from the deviating state and from the true one. Both steps start from positions and velocities alone, so what these do not tell cancels. Without a deviation
+the target is that of the data.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from gpe_pl.rollout.loop import Restartable, SimulationError
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class SolverTargets:
+    """A solver with the stretch of a true trajectory from which an unroll deviates.
+
+    A learned simulator knows the mean velocity of the frame before; a solver needs the velocity at the frame. The deviating state gets the true velocity at the
+    frame plus the deviation of the mean velocity.
+
+    Attributes:
+        solver: solver of the data set.
+        scene: true state at the start of the unroll.
+        pos: true positions [num_steps + 3, node, dim] in m, from the frame before the start on.
+        vel: true velocities at the frames [num_steps + 1, node, dim] in m/s, from the start's on.
+        stress: true stress of nodes [num_steps + 1, node, component] in Pa, from the frame after the start's on; None if the data have none.
+        frame_dt: frame interval [s].
+    """
+
+    solver: Restartable
+    scene: State
+    pos: Float64[np.ndarray, "frame node dim"]
+    vel: Float64[np.ndarray, "start node dim"]
+    stress: np.ndarray | None
+    frame_dt: float
+
+    @classmethod
+    def of(cls, solver: Restartable, trajectory: Trajectory, first: int) -> SolverTargets:
+        """Return the targets of unrolls from frame ``first`` of a stretch of a stored trajectory to its last frame but one."""
+        pos = trajectory.pos[first - 1 :].astype(np.float64)
+        vel = trajectory.vel[first:-1].astype(np.float64)
+        stress = None if trajectory.stress is None else trajectory.stress.node[first + 1 :]
+        return cls(solver, trajectory.state(first), pos, vel, stress, trajectory.metadata.frame_dt)
+
+    def target(self, state: State, step: int) -> tuple[Tensor, Tensor | None] | None:
+        """Return acceleration without gravity [node, dim] in m/s² and stress after the step [node, component] in Pa, or None if the solver refuses a state.
+
+        Args:
+            state: state that the unroll has reached, as torch tensors.
+            step: number of its steps.
+        """
+        where, dt = state.periodicity, self.frame_dt
+        pos, mean = state.pos.cpu().numpy(), state.vel.cpu().numpy()
+        before, after = integrators.velocities(self.pos[step : step + 3], dt, where)
+        try:
+            here = self._step(pos, self.vel[step] + mean - before, step)
+            there = self._step(self.pos[step + 1], self.vel[step], step)
+        except SimulationError:
+            return None
+        own = integrators.velocities(np.stack([pos, here.pos]), dt, where)[0]
+        true = integrators.velocities(np.stack([self.pos[step + 1], there.pos]), dt, where)[0]
+        vel = after + own - true
+        acceleration = torch.from_numpy(integrators.acceleration(vel, mean, dt)).to(state.pos.device) - state.gravity
+        if self.stress is None or here.stress is None or there.stress is None:
+            return acceleration, None
+        return acceleration, torch.from_numpy(self.stress[step] + here.stress.node - there.stress.node).to(state.pos.device)
+
+    def _step(self, pos: np.ndarray, vel: np.ndarray, step: int) -> State:
+        start = replace(self.scene, pos=pos, vel=vel, time=self.scene.time + step * self.frame_dt, boundary=self.scene.boundary.at(step))
+        return self.solver.step(self.solver.restarted(start))

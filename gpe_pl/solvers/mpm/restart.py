@@ -1,0 +1,42 @@
+"""Deformation of elastic particles from their positions alone.
+
+An elastomer remembers nothing but its rest shape, so positions and velocities of a lattice of particles tell how it is deformed. What the grid does not
+represent of a particle's motion is lost; that is why a restart is near the continued run, and not equal to it.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from jaxtyping import Float64, Int64
+from scipy.spatial import cKDTree
+
+
+def gradients(
+    values: Float64[np.ndarray, "node dim"], at: Float64[np.ndarray, "node dim"], cells: Int64[np.ndarray, "cell corner"]
+) -> Float64[np.ndarray, "node dim dim"]:
+    """Return the gradient at each node of the linear function that fits the differences to the nodes with which it shares cells, in least squares.
+
+    Nodes without a cell take the gradient of the nearest node that has one.
+
+    Args:
+        values: values at the nodes.
+        at: positions [m] by which they are differentiated.
+        cells: nodes of each cell; at least one.
+    """
+    dim = at.shape[1]
+    pairs = np.concatenate([cells[:, pair] for pair in itertools.permutations(range(cells.shape[1]), 2)])
+    pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
+    i, j = pairs.T
+    arm, change = at[j] - at[i], values[j] - values[i]
+    moment, mixed = np.zeros((len(at), dim, dim)), np.zeros((len(at), dim, dim))
+    np.add.at(moment, i, arm[:, :, None] * arm[:, None, :])
+    np.add.at(mixed, i, change[:, :, None] * arm[:, None, :])
+    result = mixed @ np.linalg.pinv(moment)
+    used = np.zeros(len(at), dtype=bool)
+    used[cells] = True
+    if not used.all():
+        nearest = cKDTree(at[used]).query(at[~used])[1]
+        result[~used] = result[np.flatnonzero(used)[nearest]]
+    return result
