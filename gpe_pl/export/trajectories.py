@@ -21,10 +21,9 @@ from jaxtyping import Float
 
 from gpe_pl.files.atomic import replace_text, replacing
 from gpe_pl.graphs.islands import unwrapped
-from gpe_pl.graphs.multiscale import cell_edges
 from gpe_pl.metrics import displacement
 from gpe_pl.schema import CELL_KINDS
-from gpe_pl.trajectory.cells import is_corner, kinds_of
+from gpe_pl.trajectory.cells import cell_edges, is_corner, kinds_of
 from gpe_pl.trajectory.state import von_mises
 from gpe_pl.trajectory.store import stored_arrays, stored_attributes
 from gpe_pl.trajectory.trajectory import Trajectory

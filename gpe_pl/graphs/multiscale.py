@@ -10,21 +10,18 @@ rollout and all windows of a trajectory use the same object.
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.graphs.islands import unwrapped
+from gpe_pl.trajectory.cells import cell_edges, components, pair_keys, unique_pairs
 
 SNAP = 1e-3
 """Nodes this near below the face of a box count as on it [rest spacings]. Rounding then does not divide a row of a lattice between two boxes."""
@@ -95,7 +92,7 @@ class MultiscaleGraph:
         inside = np.flatnonzero(~contact)
         far = ((self.rest_pos[i[inside]] - self.rest_pos[j[inside]]) ** 2).sum(axis=1) > (2 * radius) ** 2
         inside = inside[far]
-        contact[inside] = ~np.isin(_keys(pairs[:, inside], self.num_nodes), _keys(self.cell_edges, self.num_nodes))
+        contact[inside] = ~np.isin(pair_keys(pairs[:, inside], self.num_nodes), pair_keys(self.cell_edges, self.num_nodes))
         return contact
 
 
@@ -173,9 +170,7 @@ def build(rest_pos: np.ndarray, cells: np.ndarray, spacing: float, num_levels: i
         raise MeshError(f"node {bad[0]} has a rest position that is not finite")
     edges = cell_edges(cells, num_nodes)
     rest_pos, _ = unwrapped(rest_pos, edges, periodicity)
-    ones = np.ones(edges.shape[1], dtype=bool)
-    num_bodies, body = connected_components(coo_array((ones, tuple(edges)), shape=(num_nodes, num_nodes)), directed=False)
-    body = body.astype(np.int64)
+    num_bodies, body = components(edges, num_nodes)
 
     nodes = np.unique(cells)  # in cells
     box, depth = _smallest_boxes(rest_pos, nodes, body, num_bodies, spacing)
@@ -196,7 +191,7 @@ def build(rest_pos: np.ndarray, cells: np.ndarray, spacing: float, num_levels: i
 
         joined = parent[lower_edges - first]
         joined = joined[:, (joined >= 0).all(axis=0)]  # bodies that end below have no parents
-        lower_edges = _unique_pairs(joined[:, joined[0] != joined[1]], above + len(example))
+        lower_edges = unique_pairs(joined[:, joined[0] != joined[1]], above + len(example))
         same.append(lower_edges)
         nodes = nodes[parent[ancestor[nodes] - first] >= 0]
         ancestor[nodes] = parent[ancestor[nodes] - first]
@@ -226,23 +221,6 @@ def _smallest_boxes(
     margin = (2**depth - width) // 4 * 2  # on either side; even, so that the rows at the low corner merge in pairs
     box[nodes] += margin[body[nodes]]
     return box, depth
-
-
-def cell_edges(cells: Int64[np.ndarray, "cell corner"], num_nodes: int) -> Int64[np.ndarray, "2 edge"]:
-    """Return the pairs of nodes with a common cell, each once, the lower node first."""
-    pairs = [cells[:, [a, b]].T for a, b in itertools.combinations(range(cells.shape[1]), 2)]
-    both = np.concatenate([np.empty((2, 0), dtype=np.int64), *pairs], axis=1)
-    return _unique_pairs(both[:, both[0] != both[1]], num_nodes)  # a cell may name a node twice: a triangle among quadrilaterals
-
-
-def _keys(pairs: np.ndarray, count: int) -> Any:
-    """Return one number per unordered pair of two numbers below ``count``."""
-    return pairs.min(axis=0) * count + pairs.max(axis=0)
-
-
-def _unique_pairs(pairs: np.ndarray, count: int) -> np.ndarray:
-    keys = np.unique(_keys(pairs, count))
-    return np.stack([keys // count, keys % count])
 
 
 def _box_keys(body: np.ndarray, box: np.ndarray) -> np.ndarray:

@@ -14,13 +14,12 @@ import torch
 from torch import Tensor
 
 from gpe_pl.graphs.islands import islands_within
-from gpe_pl.graphs.multiscale import cell_edges
 from gpe_pl.graphs.neighbors import radius_between
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.boundary import search_tree
-from gpe_pl.trajectory.cells import mean_over_corners
+from gpe_pl.trajectory.cells import cell_edges, mean_over_corners
 from gpe_pl.trajectory.state import State, Stress
 
 

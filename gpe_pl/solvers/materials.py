@@ -7,7 +7,7 @@ constants per particle; ``LAMBDA`` … ``MEMORY`` name the columns. Viscous stre
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, NamedTuple, TypeVar
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -15,6 +15,8 @@ from pydantic.dataclasses import dataclass
 
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import MATERIALS
+from gpe_pl.trajectory.strain import FloatOrArray
+from gpe_pl.trajectory.strain import lame_parameters as lame_parameters
 
 SAND, SNOW, ELASTOMER = 0, 1, 2
 """Codes by which ``respond`` selects a law."""
@@ -75,16 +77,6 @@ def check_limits(material: str, values: np.ndarray, nodes: np.ndarray) -> None:
 
 Positive = Annotated[float, Field(gt=0)]
 PoissonRatio = Annotated[float, Field(ge=0, lt=0.5)]
-
-
-FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
-
-
-def lame_parameters(youngs_modulus: FloatOrArray, poisson_ratio: float) -> tuple[FloatOrArray, FloatOrArray]:
-    """Return the first Lamé parameter λ and the shear modulus μ in Pa (plane strain in 2D)."""
-    shear = youngs_modulus / (2.0 * (1.0 + poisson_ratio))
-    first = youngs_modulus * poisson_ratio / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))
-    return first, shear
 
 
 def drucker_prager_coefficient(friction_angle: np.ndarray, dim: int) -> np.ndarray:

@@ -13,10 +13,11 @@ import torch
 from torch_geometric.data import Batch, HeteroData
 
 from gpe_pl.graphs.builder import GraphBuilder, GraphError
-from gpe_pl.graphs.multiscale import MeshError, MultiscaleGraph, _cached, build, cell_edges, levels_of, multiscale_graph
+from gpe_pl.graphs.multiscale import MeshError, MultiscaleGraph, _cached, build, levels_of, multiscale_graph
 from gpe_pl.graphs.standardizer import GraphStandardizer
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import BOUNDARY, grid, is_symmetric, node_code
+from gpe_pl.trajectory.cells import cell_edges
 from gpe_pl.trajectory.state import State
 from tests import scenes
 

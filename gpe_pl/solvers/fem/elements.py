@@ -26,16 +26,12 @@ from scipy.sparse.linalg import eigsh
 
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.trajectory.state import Stress
-
-SMALLEST_RATIO = 0.2
-"""Volume ratio J below which the tangent replaces the logarithm."""
+from gpe_pl.trajectory.strain import SMALLEST_RATIO, deformation_gradients, neo_hookean_density, shape_gradients
 
 _LOG_SMALLEST = math.log(SMALLEST_RATIO)
 
 CELLS = {(2, 3): "triangle", (2, 4): "quad", (3, 4): "tetrahedron"}
 """Kinds of cells by (dim, corners)."""
-
-_GAUSS = 1.0 / math.sqrt(3.0)
 
 
 @dataclass(frozen=True)
@@ -98,7 +94,7 @@ def _build_mesh(rest_bytes: bytes, rest_shape: tuple[int, int], cell_bytes: byte
     num_nodes, dim = rest_shape
     kind = CELLS[dim, cell_shape[1]]
     _require_sound(cells, num_nodes)
-    gradient, weight = _shape_gradients(kind, rest_pos[cells])
+    gradient, weight = shape_gradients(rest_pos[cells])
     flat = ~np.all(weight > 0, axis=1)
     if np.any(flat) or not np.all(np.isfinite(gradient)):
         cell = int(np.argmax(flat))
@@ -134,26 +130,6 @@ def _require_sound(cells: np.ndarray, num_nodes: int) -> None:
     if num_nodes and not np.all(used):
         node = int(np.argmin(used))
         raise SimulationError(f"node {node} belongs to no cell", reason="input", node=node)
-
-
-def _shape_gradients(kind: str, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gradients [cell, point, corner, dim] of the shape functions, and volumes [cell, point], for corners [cell, corner, dim]."""
-    if kind == "quad":
-        signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-        points = signs * _GAUSS
-        # d/dξ of (1 + ξ ξ_a)(1 + η η_a)/4
-        local = np.stack(
-            [signs[:, 0] * (1 + points[:, 1:] * signs[:, 1]) / 4, signs[:, 1] * (1 + points[:, :1] * signs[:, 0]) / 4], axis=-1
-        )
-        share = 1.0
-    else:
-        dim = corners.shape[-1]
-        local = np.concatenate([-np.ones((1, dim)), np.eye(dim)])[None]
-        share = 1.0 / math.factorial(dim)
-    jacobian = np.einsum("cai,qaj->cqij", corners, local)
-    determinant = np.linalg.det(jacobian)
-    safe = np.where((determinant > 0)[..., None, None], jacobian, np.eye(corners.shape[-1]))
-    return np.ascontiguousarray(np.einsum("qaj,cqjd->cqad", local, np.linalg.inv(safe))), determinant * share
 
 
 def _largest_eigenvalue(cells: np.ndarray, gradient: np.ndarray, weight: np.ndarray, mass: np.ndarray) -> float:
@@ -199,14 +175,8 @@ def cauchy_stress(mesh: Mesh, pos: np.ndarray, lam: np.ndarray, mu: np.ndarray) 
 
 def elastic_energy(mesh: Mesh, pos: np.ndarray, lam: np.ndarray, mu: np.ndarray) -> float:
     """Return the stored energy ∫ Ψ in J (per metre of depth in 2D); arguments as in ``cauchy_stress``."""
-    corners = pos[mesh.cells]
-    deformation = np.einsum("cai,cqaj->cqij", corners - corners[:, :1], mesh.gradient)
-    ratio = np.linalg.det(deformation)
-    above = np.maximum(ratio, SMALLEST_RATIO)
-    logarithm = np.log(above) + (ratio - above) / SMALLEST_RATIO
-    square = np.sum(deformation**2, axis=(-2, -1)) - pos.shape[1]
-    density = mu[:, None] * (square / 2 - logarithm) + lam[:, None] / 2 * logarithm**2
-    return float(np.sum(density * mesh.weight))
+    deformation = deformation_gradients(pos[mesh.cells], mesh.gradient)
+    return float(np.sum(neo_hookean_density(deformation, lam, mu) * mesh.weight))
 
 
 # --- kernels --------------------------------------------------------------------------------------------------------------------------------

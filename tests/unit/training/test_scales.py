@@ -25,7 +25,7 @@ from gpe_pl.evaluation.rollouts import EvaluationSettings, Row, evaluate
 from gpe_pl.geometry.shapes import Box, Shape, Sphere, domain_walls
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.metrics import UNITS
+from gpe_pl.metrics import UNITS, bodies
 from gpe_pl.models.base import Model
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
@@ -161,7 +161,7 @@ def test_powers_of_two_change_nothing_but_the_units(length: int, time: int, tmp_
     assert own_losses == losses
     assert own_step == step > INTERVAL
     assert {r.metric for r in rows} >= {"share_corrected", "share_outside_uncontained", "share_outside_at_end", *UNIT_OF} - {
-        "skipping_mse", "von_mises_error", "stress_error",
+        "skipping_mse", "von_mises_error", "stress_error", *bodies.UNITS,
     }  # fmt: skip
     assert max(r.value for r in rows if r.metric == "share_corrected") > 0
     for row, own in zip(rows, own_rows, strict=True):

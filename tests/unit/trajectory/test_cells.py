@@ -14,7 +14,7 @@ from gpe_pl.learned.approximate import Sleeping
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.trajectory.cells import is_corner, mean_over_corners
+from gpe_pl.trajectory.cells import bodies, is_corner, mean_over_corners
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.values import faults
 from tests import scenes
@@ -85,3 +85,10 @@ def test_dimensions_that_no_cell_has(dim: int, cell_dim: int, allowed: str) -> N
     }
     (found,) = [str(fault) for fault in faults(arrays, ["elastomer"], ["elastomer"], []) if fault.field == "cell_dim"]
     assert found.endswith(f"is {cell_dim}, must be {allowed} in {dim}D")
+
+
+def test_bodies_are_the_nodes_that_cells_connect() -> None:
+    """Nodes 3, 4 and 6 are in no cell; the triangle among quadrilaterals repeats its last corner."""
+    cells = np.array([[0, 5, 2, 1], [5, 10, 2, 2], [7, 8, 9, 9]], np.int32)
+    assert [own.tolist() for own in bodies(cells, 12)] == [[0, 1, 2, 5, 10], [7, 8, 9]]
+    assert bodies(np.empty((0, 3), np.int32), 4) == []

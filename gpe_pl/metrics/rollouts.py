@@ -22,6 +22,8 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 from torchmetrics import Metric
 
+from gpe_pl.metrics import bodies
+from gpe_pl.metrics.bodies import Bodies, body_metrics
 from gpe_pl.rollout.loop import share_outside
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.state import von_mises
@@ -43,6 +45,7 @@ UNITS: dict[str, str] = {
     "kinetic_energy_bias": "1",
     "kinetic_energy_error": "1",
     "share_outside": "1",
+    **bodies.UNITS,
 }
 """Metrics of ``rollout_metrics`` and their units."""
 
@@ -278,7 +281,8 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     share_outside          1      fraction of predicted particle positions deeper than a thousandth of the spacing in a wall or obstacle
     ====================== ====== ====================================================================================================
 
-    Energy distance and angular momentum are undefined in periodic domains and left out. ``share_outside`` is left out if the boundary has no shapes.
+    Energy distance and angular momentum are undefined in periodic domains and left out. ``share_outside`` is left out if the boundary has no shapes. Meshes
+    also have the metrics of ``bodies.body_metrics``.
 
     Args:
         prediction: rollout from frame 0 of the ground truth.
@@ -290,15 +294,20 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     """
     error = per_frame_mse(prediction, ground_truth)
     periodic = any(ground_truth.metadata.periodic)
-    undefined = {"energy_distance", "angular_momentum_error"} if periodic else set()
+    undefined = {*bodies.UNITS, *(("energy_distance", "angular_momentum_error") if periodic else ())}
     if prediction.stress is None or ground_truth.stress is None:
         undefined |= {"von_mises_error", "stress_error"}
     if not ground_truth.boundary.shapes:
         undefined.add("share_outside")
     names = [name for name in UNITS if name not in undefined]
+    true_bodies = Bodies.of(ground_truth)
+    finite = int(np.isfinite(error).sum())  # frames, from the start
+    own_bodies = None if true_bodies is None else true_bodies.predicted(prediction.frames(0, finite))
     records = []
     for horizon, steps in _reached(horizons, error, ground_truth):
         values = dict.fromkeys(names, math.inf)
+        if true_bodies is not None:  # the ground truth decides which metrics there are
+            values |= dict.fromkeys(body_metrics(true_bodies, true_bodies, steps), math.inf)
         if np.isfinite(error[: steps + 1]).all():
             motion = _motion_errors(prediction, ground_truth, steps)
             values |= {name: motion[name] for name in motion.keys() & values.keys()}
@@ -308,6 +317,8 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
                 values["share_outside"] = share_outside(prediction.frames(1, steps + 1), tolerance=1e-3 * ground_truth.metadata.spacing)
             if not periodic:
                 values["energy_distance"] = _cloud_distance(prediction, ground_truth, steps)
+            if own_bodies is not None and true_bodies is not None:
+                values |= body_metrics(own_bodies, true_bodies, steps)
         records += [Record(name, horizon, value) for name, value in values.items()]
     return records
 
