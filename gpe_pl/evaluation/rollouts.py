@@ -216,7 +216,7 @@ def _predict(
 ) -> Iterator[tuple[dict[str, Trajectory], dict[str, float]]]:
     """Yield for each trajectory the predictions by model, and further metrics of the learned model by name. ``first`` is the number of the first trajectory."""
     truths = [trajectory.frames(start_frame) for trajectory in trajectories]
-    starts = [_start(simulator, start_frame, *pair) for pair in zip(trajectories, truths, strict=True)]
+    starts = [start_of(simulator, start_frame, *pair) for pair in zip(trajectories, truths, strict=True)]
     totals = [{"num_corrected": 0.0, "num_asleep": 0.0, "lost_impulse": 0.0} for _ in starts]
 
     def count(scene: int, _: int, state: State) -> None:
@@ -261,7 +261,7 @@ def _parameter(trajectory: Trajectory) -> float:
     return float(values[0]) if len(values) == 1 else float("nan")
 
 
-def _start(simulator: LearnedSimulator, start_frame: int, trajectory: Trajectory, truth: Trajectory) -> Start:
+def start_of(simulator: LearnedSimulator, start_frame: int, trajectory: Trajectory, truth: Trajectory) -> Start:
     """Return the start of a rollout, with a guard whose limits are far beyond the ground truth."""
     bounds = truth.metadata.bounds
     size = max(high - low for low, high in bounds)

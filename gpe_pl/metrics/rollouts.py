@@ -24,6 +24,7 @@ from torchmetrics import Metric
 
 from gpe_pl.metrics import bodies
 from gpe_pl.metrics.bodies import Bodies, body_metrics
+from gpe_pl.metrics.mirror import mirror_error, mirrors
 from gpe_pl.rollout.loop import share_outside
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.state import von_mises
@@ -45,6 +46,7 @@ UNITS: dict[str, str] = {
     "kinetic_energy_bias": "1",
     "kinetic_energy_error": "1",
     "share_outside": "1",
+    "mirror_error": "1",
     **bodies.UNITS,
 }
 """Metrics of ``rollout_metrics`` and their units."""
@@ -278,6 +280,8 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     angular_momentum_error m²/s   the same for angular momentum about the cloud's own centre of mass
     kinetic_energy_bias    1      difference in kinetic energy, mean over frames, over the largest kinetic energy of the ground truth up to h
     kinetic_energy_error   1      the same for absolute differences
+    mirror_error           1      ‖x − Mx‖ / ‖x̂ − x̂(0)‖ with Mx the mirror image of the prediction; only if the scene is symmetric about a vertical plane
+                                  (``mirror.mirrors``); the largest, if it is about several
     share_outside          1      fraction of predicted particle positions deeper than a thousandth of the spacing in a wall or obstacle
     ====================== ====== ====================================================================================================
 
@@ -300,6 +304,9 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     if not ground_truth.boundary.shapes:
         undefined.add("share_outside")
     names = [name for name in UNITS if name not in undefined]
+    planes = mirrors(ground_truth)
+    if not planes:
+        names.remove("mirror_error")
     true_bodies = Bodies.of(ground_truth)
     finite = int(np.isfinite(error).sum())  # frames, from the start
     own_bodies = None if true_bodies is None else true_bodies.predicted(prediction.frames(0, finite))
@@ -307,10 +314,13 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     for horizon, steps in _reached(horizons, error, ground_truth):
         values = dict.fromkeys(names, math.inf)
         if true_bodies is not None:  # the ground truth decides which metrics there are
-            values |= dict.fromkeys(body_metrics(true_bodies, true_bodies, steps), math.inf)
+            measured = body_metrics(true_bodies, true_bodies, steps)
+            values |= {name: math.inf for name in measured if prediction.stress is not None or name not in bodies.STRESS}
         if np.isfinite(error[: steps + 1]).all():
             motion = _motion_errors(prediction, ground_truth, steps)
             values |= {name: motion[name] for name in motion.keys() & values.keys()}
+            if planes:
+                values["mirror_error"] = max(mirror_error(prediction, ground_truth, plane, steps) for plane in planes)
             values["rollout_mse"] = float(error[1 : steps + 1].mean())
             values |= _relative_errors(prediction, ground_truth, steps)
             if "share_outside" in values:

@@ -68,7 +68,7 @@ def test_rollout_mse_is_the_mean_over_frames_one_to_horizon(ground_truth):
     records = rollout_metrics(shifted(ground_truth, 0.1 * np.arange(11)), ground_truth, (2, "full"))
     assert value(records, "rollout_mse", 2) == pytest.approx((0.01 + 0.04) / 2 / 2)
     assert value(records, "rollout_mse", "full") == pytest.approx(0.01 * 385 / 10 / 2)
-    assert {r.metric for r in records} == set(UNITS) - {"von_mises_error", "stress_error", "share_outside", *bodies.UNITS}
+    assert {r.metric for r in records} == set(UNITS) - {"von_mises_error", "stress_error", "share_outside", "mirror_error", *bodies.UNITS}
 
 
 def test_a_perfect_rollout_is_zero_everywhere(ground_truth):
@@ -169,6 +169,7 @@ def test_periodic_axes_take_the_short_way():
     records = rollout_metrics(prediction, truth, (2,))
     assert {r.metric for r in records} == set(UNITS) - {
         *bodies.UNITS,
+        "mirror_error",
         "energy_distance",
         "angular_momentum_error",
         "von_mises_error",

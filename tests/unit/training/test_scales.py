@@ -161,7 +161,7 @@ def test_powers_of_two_change_nothing_but_the_units(length: int, time: int, tmp_
     assert own_losses == losses
     assert own_step == step > INTERVAL
     assert {r.metric for r in rows} >= {"share_corrected", "share_outside_uncontained", "share_outside_at_end", *UNIT_OF} - {
-        "skipping_mse", "von_mises_error", "stress_error", *bodies.UNITS,
+        "skipping_mse", "von_mises_error", "stress_error", "mirror_error", *bodies.UNITS,
     }  # fmt: skip
     assert max(r.value for r in rows if r.metric == "share_corrected") > 0
     for row, own in zip(rows, own_rows, strict=True):
@@ -210,7 +210,7 @@ def test_limits_of_evaluated_rollouts_follow_the_scene(still: bool, tmp_path: Pa
         if still:
             trajectory = replace(trajectory, pos=np.repeat(trajectory.pos[:1], NUM_FRAMES, axis=0), vel=np.zeros_like(trajectory.vel))
         simulator = new_module(datamodule, "GPE").simulator
-        guard = rollouts._start(simulator, 2, trajectory, trajectory.frames(2)).guard
+        guard = rollouts.start_of(simulator, 2, trajectory, trajectory.frames(2)).guard
         assert guard is not None
         guards.append(guard)
     usual, scaled = guards

@@ -1,0 +1,90 @@
+"""Mirror symmetry: whether a symmetric scene stays symmetric, and whether the image of a scene moves like its image.
+
+The mirror is a vertical plane through the centre of mass, normal to an axis along which there is no gravity.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int64
+from scipy.spatial import cKDTree
+
+from gpe_pl.geometry.shapes import signed_distance
+from gpe_pl.trajectory.trajectory import Trajectory
+
+CLOSE = 0.01
+"""Positions of a scene and of its mirror image that agree up to this, in spacings, are equal."""
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """A plane that maps a scene onto itself.
+
+    Attributes:
+        axis: axis normal to the plane.
+        offset: position of the plane along the axis [m].
+        partner: the node in whose place the image of each node is.
+    """
+
+    axis: int
+    offset: float
+    partner: Int64[np.ndarray, "node"]
+
+    def image(self, pos: Float[np.ndarray, "*axes dim"]) -> Float[np.ndarray, "*axes dim"]:
+        """Return the mirror images of positions [m]."""
+        pos = pos.copy()
+        pos[..., self.axis] = 2 * self.offset - pos[..., self.axis]
+        return pos
+
+
+def mirrors(truth: Trajectory) -> list[Mirror]:
+    """Return the vertical planes about which a scene is symmetric.
+
+    Positions and velocities of the first frame, masses and materials are symmetric, and so are the walls and obstacles that nodes come near to in any frame.
+    Mesh cells may differ, as the diagonals of a lattice of triangles do. Periodic domains and boundaries that are known by their nodes have none.
+    """
+    metadata, boundary = truth.metadata, truth.boundary
+    if any(metadata.periodic) or boundary.motion is not None or (len(boundary.pos) and not boundary.shapes):
+        return []
+    pos, vel = truth.pos.astype(np.float64), truth.vel[0].astype(np.float64)
+    weight = truth.mass.astype(np.float64) / truth.mass.sum(dtype=np.float64)
+    close, fastest = CLOSE * metadata.spacing, np.abs(vel).max(initial=0.0)
+    found = []
+    for axis in (k for k, pull in enumerate(metadata.gravity) if pull == 0):
+        mirror = Mirror(axis, float(weight @ pos[0, :, axis]), np.arange(truth.num_nodes))
+        distance, partner = cKDTree(pos[0]).query(mirror.image(pos[0]))
+        if not (distance <= close).all() or len(np.unique(partner)) < len(partner):
+            continue
+        opposite = vel[partner] * np.where(np.arange(metadata.dim) == axis, -1.0, 1.0)
+        same = np.abs(vel - opposite).max() <= CLOSE * fastest and (truth.node_type == truth.node_type[partner]).all()
+        same = same and np.allclose(truth.mass, truth.mass[partner], rtol=1e-3)
+        same = same and np.allclose(truth.material_params, truth.material_params[partner], rtol=1e-3, equal_nan=True)
+        near = [np.minimum(signed_distance(boundary.shapes, x), metadata.connectivity_radius) for x in (pos, mirror.image(pos))]
+        if same and np.abs(near[0] - near[1]).max() <= close:
+            found.append(Mirror(axis, mirror.offset, partner))
+    return found
+
+
+def mirror_error(prediction: Trajectory, truth: Trajectory, mirror: Mirror, num_steps: int) -> float:
+    """Return ‖x − Mx‖ / ‖x̂ − x̂(0)‖ over frames 1 to ``num_steps``, with Mx the mirror image of the prediction and x̂ the ground truth."""
+    pos, true = (t.pos[: num_steps + 1].astype(np.float64) for t in (prediction, truth))
+    return _relative(pos[1:] - mirror.image(pos[1:])[:, mirror.partner], true[1:] - true[0])
+
+
+def equivariance_error(prediction: Trajectory, mirrored: Trajectory) -> float:
+    """Return ‖x − y‖ / ‖x − x(0)‖ over the frames of both, with x a rollout and y that of a ``rollout.mirrored.Mirrored`` simulator.
+
+    It is zero if the image of a scene moves like its image. It is infinite if only one of the rollouts stopped.
+    """
+    if prediction.num_frames != mirrored.num_frames:
+        return math.inf
+    pos, other = (t.metadata.periodicity.shortest(t.pos.astype(np.float64) - prediction.pos[0]) for t in (prediction, mirrored))
+    return _relative(prediction.metadata.periodicity.shortest(pos - other), pos)
+
+
+def _relative(error: np.ndarray, reference: np.ndarray) -> float:
+    size, scale = float(np.linalg.norm(error)), float(np.linalg.norm(reference))
+    return size / scale if scale > 0 else (0.0 if size == 0 else math.inf)
