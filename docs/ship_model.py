@@ -16,7 +16,7 @@ from gpe_pl.evaluation.rollouts import LEARNED, Row, read_rows
 from gpe_pl.learned.pretrained import FOLDER
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.reports.domain_table import EVALUATED, NOT_LEARNED
-from gpe_pl.reports.finished_runs import groups_of
+from gpe_pl.reports.finished_runs import table_of
 from gpe_pl.reports.sweep_table import summary
 
 
@@ -39,10 +39,10 @@ def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows
         "|---|---|",
         *ranges,
         "",
-        f"Values outside are warned of; the errors below say what to expect. {_against_ballistic(rows)}",
+        f"Values outside are warned of; the errors below say what to expect. {_against_ballistic(rows)}{_bodies(rows)}",
         "",
         "```",
-        summary(rows),
+        summary(table_of(rows)),
         "```",
         "",
         "It knows boxes with the obstacles of that data set. Fracture, other contact laws and other materials are beyond it.",
@@ -52,10 +52,26 @@ def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows
 
 def _against_ballistic(rows: list[Row]) -> str:
     """What comparisons ask before they say that a model has learned something."""
-    wanted = [r for r in rows if (r.metric, r.horizon) == ("rollout_mse", "full") and EVALUATED in groups_of(r)]
+    wanted = [r for r in rows if (r.metric, r.horizon) == ("rollout_mse", "full") and r.split == EVALUATED]
     learned, ballistic = (np.mean([r.value for r in wanted if r.model == name]) for name in (LEARNED, "ballistic"))
     verdict = "" if learned * NOT_LEARNED <= ballistic else ": comparisons would call it *not learned*"
     return f"Whole rollouts of `{EVALUATED}` have {100 * learned / ballistic:.2g} % of the mean error of ballistic flight{verdict}."
+
+
+def _bodies(rows: list[Row]) -> str:
+    """Sentence on how bodies bend and bounce, with medians, because a ratio can be infinite; empty for particles."""
+    named = {
+        "deformation_ratio": "deformation",
+        "strain_energy_ratio": "strain energy",
+        "bounce_height_ratio": "bounce height",
+        "peak_von_mises_ratio": "peak stress",
+    }
+    medians = {}
+    for metric, name in named.items():
+        found = [r.value for r in rows if (r.model, r.metric, r.horizon) == (LEARNED, metric, "full") and r.split == EVALUATED]
+        if found:
+            medians[name] = f"{name} {np.median(found):.2f}"
+    return f" Medians over these rollouts, relative to the ground truth: {', '.join(medians.values())}." if medians else ""
 
 
 def main(arguments: list[str]) -> int:

@@ -42,6 +42,18 @@ from gpe_pl.viz.saving import save_figure
 log = logging.getLogger(__name__)
 
 STRESS_METRICS = ("von_mises_error", "stress_error")
+BODY_COLUMNS = {
+    "deformation_ratio": "deformation, ratio",
+    "deformation_error": "deformation, error",
+    "rotation_error": "rotation error [°]",
+    "strain_energy_ratio": "strain energy, ratio",
+    "bounce_height_ratio": "bounce height, ratio",
+    "contact_time_ratio": "contact time, ratio",
+    "peak_von_mises_ratio": "peak stress, ratio",
+    "contact_von_mises_error": "stress in first contact, error",
+    "mirror_error": "mirror error",
+}
+"""Metrics of whole rollouts in the table of bodies, with their headings."""
 SWEEP_MD = "table.md"
 FORWARD_TIMES = "forward_times.json"
 Variant = tuple[str, ...]
@@ -180,6 +192,7 @@ def _markdown(axes: list[str], variants: dict[Variant, list[Run]], ratios: dict[
             "",
             *_rollout_table(names, variants, first),
             *_stress_table(names, variants),
+            *_body_table(names, variants),
             *(["", *lines] if (lines := material_lines(_material_groups(variants))) else []),
             "",
         ]
@@ -273,6 +286,26 @@ def _stress_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[
     note = (
         "L2 errors relative to the ground truth's displacement and velocity up to the horizon, and to its stress over all frames; von Mises stress, and stress "
         "as a tensor, at mesh nodes. Mean over trajectories and seeds with its interval, as above."
+    )
+    return [*lines, "", note]
+
+
+def _body_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[str]:
+    """Table of the metrics of bodies that bend over whole rollouts; empty if no variant has any."""
+    measured = {metric for runs in variants.values() for run in runs for metric in run.rows["metric"].unique()}
+    columns = {metric: heading for metric, heading in BODY_COLUMNS.items() if metric in measured}
+    if "deformation_ratio" not in columns:
+        return []
+    header = [*names, "split", *columns.values()]
+    lines = ["", table_row(header), "|" + "---|" * len(header)]
+    for key, runs in variants.items():
+        for split in splits_of(runs[0]):
+            cells = [_interval(values_by_seed(runs, LEARNED, split, metric, "full")) for metric in columns]
+            lines.append(table_row([*(key or (LEARNED,)), split, *cells]))
+    note = (
+        "Bodies over whole rollouts. Ratios are to the ground truth: 1 is right, 0 is a rigid body, no bounce or no stress. Errors are relative: 1 is the "
+        "error of a rigid body or of no stress. Deformation is what the best rigid motion of a body leaves. Means are over seeds and over the trajectories "
+        "whose ground truth has the quantity, with intervals as above."
     )
     return [*lines, "", note]
 

@@ -13,6 +13,7 @@ from lightning.pytorch.callbacks import Callback, WeightAveraging
 
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import per_frame_mse
+from gpe_pl.metrics.bodies import Bodies, body_metrics
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Start, rollouts
@@ -38,8 +39,15 @@ class WarmAverage(WeightAveraging):
         super().__init__(use_buffers=False, multi_avg_fn=average)  # buffers are copied: they do not learn, and infinite values have no mean
 
 
+BODY_METRICS = ("deformation_ratio", "deformation_error", "rotation_error", "strain_energy_ratio")
+"""Metrics of ``metrics.bodies`` that validation rollouts of meshes log."""
+
+
 class RolloutValidation(Callback):
     """Rolls the current (averaged) model out on validation trajectories and logs the position MSE [m²] as ``val/rollout_mse``.
+
+    Meshes also get ``val/deformation_ratio`` and the other ``BODY_METRICS``, as means over the trajectories whose ground truth has them. A rollout that stops
+    counts there with its good frames.
 
     Put it before ``WarmAverage`` in the list of callbacks, so that it sees the averaged weights. Each rank takes some of the trajectories.
 
@@ -58,29 +66,45 @@ class RolloutValidation(Callback):
             return
         was_training = simulator.training
         simulator.eval()
-        value = self._mse(simulator)
+        pairs = self._rollouts(simulator)
         simulator.train(was_training)
-        pl_module.log("val/rollout_mse", value, sync_dist=True)  # equal on all ranks; Lightning warns without sync_dist
+        for name, value in {"rollout_mse": self._mse(pairs), **self._bodies(pairs)}.items():
+            pl_module.log(f"val/{name}", value, sync_dist=True)  # equal on all ranks; Lightning warns without sync_dist
 
-    def _mse(self, simulator: LearnedSimulator) -> float:
+    def _rollouts(self, simulator: LearnedSimulator) -> list[tuple[Trajectory, Trajectory]]:
+        """Return prediction and ground truth of this rank's trajectories."""
         history = simulator.builder.config.history
         trajectories = self.trajectories[ranks.rank() :: ranks.num_ranks()]
         truths = [t.frames(history, history + self.num_steps + 1) for t in trajectories]
-        starts, worst = [], []
+        starts = []
         for trajectory, truth in zip(trajectories, truths, strict=True):
-            bounds = truth.metadata.bounds
-            size = max(high - low for low, high in bounds)
-            guard = Guard(bounds=bounds, margin=size)  # no max_speed: nodes that fast leave the domain within a frame
+            guard = Guard(
+                bounds=truth.metadata.bounds, margin=truth.metadata.longest_side
+            )  # no max_speed: nodes that fast leave the domain
             starts.append(Start(simulator.initial_state(trajectory, history), truth.num_frames - 1, truth.metadata, guard))
-            worst.append(size**2)  # error of the frames that a stopped rollout lacks
         contained = Contained(simulator, self.trajectories[0].metadata.frame_dt) if self.containment else simulator
-        predictions = rollouts(contained, starts)
-        errors = [per_frame_mse(p, t)[1:] for p, t in zip(predictions, truths, strict=True)]
-        means = [float(np.where(np.isfinite(e), e, w).mean()) for e, w in zip(errors, worst, strict=True)]
+        return list(zip(rollouts(contained, starts), truths, strict=True))
+
+    def _mse(self, pairs: list[tuple[Trajectory, Trajectory]]) -> float:
+        means = []
+        for prediction, truth in pairs:
+            error, worst = per_frame_mse(prediction, truth)[1:], truth.metadata.longest_side**2
+            means.append(float(np.where(np.isfinite(error), error, worst).mean()))  # frames that a stopped rollout lacks count as worst
         everywhere = [
             mean for part in zip_longest(*ranks.gathered(means)) for mean in part if mean is not None
         ]  # in the order of the trajectories
         return float(np.mean(everywhere))
+
+    def _bodies(self, pairs: list[tuple[Trajectory, Trajectory]]) -> dict[str, float]:
+        found: list[dict[str, float]] = []
+        for prediction, truth in pairs:
+            steps = int(np.isfinite(per_frame_mse(prediction, truth)[1:]).sum())
+            bodies = Bodies.of(truth)
+            if bodies is not None and steps:
+                found.append(body_metrics(bodies.predicted(prediction.frames(0, steps + 1)), bodies, steps))
+        everywhere = [values for part in ranks.gathered(found) for values in part]
+        named = {name: [values[name] for values in everywhere if name in values] for name in BODY_METRICS}
+        return {name: float(np.mean(values)) for name, values in named.items() if values}
 
 
 class StepProgress(Callback):

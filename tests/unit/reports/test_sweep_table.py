@@ -156,3 +156,24 @@ def test_scenes_without_one_parameter_make_no_figure(runs: Path) -> None:
         write_rows(path, [replace(row, parameter=float("nan")) for row in read_rows(path)])
     sweep_table.report_sweep(runs, finished_runs(runs))
     assert (runs / "table.md").exists() and not (runs / "error_by_parameter.png").exists()
+
+
+def test_bodies_have_a_table_of_what_was_measured(runs: Path) -> None:
+    """The second scene has no bounce to compare with, and one rollout has failed."""
+    path = runs / "negated" / "0" / "metrics.csv"
+    values = {"deformation_ratio": [0.5, 1.5], "rotation_error": [3.0, float("inf")], "bounce_height_ratio": [0.25]}
+    rows = [
+        Row(LEARNED, "test_unseen", k, ("interpolated", "extrapolated")[k], 20.0, metric, "full", value)
+        for metric, column in values.items()
+        for k, value in enumerate(column)
+    ]
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    assert "deformation" not in (runs / "table.md").read_text()
+    write_rows(path, [*read_rows(path), *rows])
+    sweep_table.report_sweep(runs, finished_runs(runs))
+    text = (runs / "table.md").read_text()
+    assert "| deformation, ratio | rotation error [°] | bounce height, ratio |" in text and "strain energy" not in text
+    found = {row[1]: row[2:] for row in cells(runs, "negated") if len(row) == 5}
+    assert found["test_unseen"] == ["1", "1 of 2 failed, median inf", "0.25"]
+    assert found["test_unseen/extrapolated"] == ["1.5", "1 of 1 failed, median inf", "–"]
+    assert [row[2:] for row in cells(runs, "odd") if len(row) == 5 and row[1] == "test_unseen"] == [["–", "–", "–"]]
