@@ -77,7 +77,8 @@ def ensure_data(cfg: DictConfig) -> Path:
     spec = dataset_spec(cfg)
     folder = Path(cfg.paths.data) / spec.name / spec.size
     if dataset_bytes(spec) > AUTOMATIC_BYTES and not (folder / "statistics.json").exists():
-        raise ConfigError(f"{folder}: no data; generate it first with `python -m gpe_pl.simulate data={spec.name} size={spec.size}`")
+        same = "the data, parameters, scene, dimension and size of this command"
+        raise ConfigError(f"{folder}: no data; generate it first with `python -m gpe_pl.simulate` and {same}")
     with progress_bar(f"{spec.name} {spec.size}") as on_progress:
         return generate(cfg.paths.data, spec, os.cpu_count() or 1, on_progress)
 

@@ -20,7 +20,7 @@ from pydantic import Field
 
 from gpe_pl.benchmark import benchmark, without_folder
 from gpe_pl.config import entry_point as configuration
-from gpe_pl.config.datasets import dataset_spec
+from gpe_pl.config.datasets import dataset_spec, ensure_data
 from gpe_pl.config.entry_point import ConfigError, Report, bind, construct, entry_point, explain, output_dir, quoted
 from gpe_pl.config.folder import CONF
 from gpe_pl.errors import GpeError
@@ -395,3 +395,11 @@ def test_a_full_disk_is_named_where_there_is_no_temporary_folder(monkeypatch: py
 
     monkeypatch.setattr("tempfile.gettempdir", none)
     assert Path("results") in configuration._written({"runs": "results"})
+
+
+def test_large_data_of_a_split_are_named_and_asked_for(tmp_path: Path) -> None:
+    """The name of such data is no choice of ``data=``."""
+    cfg = compose("fit", "data=fem", "parameters=paper", "size=paper", f"paths.data={tmp_path}")
+    with pytest.raises(ConfigError, match=r"fem_paper/paper: no data; .*gpe_pl\.simulate` and the data, parameters, ") as info:
+        ensure_data(cfg)
+    assert "data=fem_paper" not in str(info.value)
