@@ -289,7 +289,7 @@ def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
             panel.plot(record["time"], record["change"], linewidth=1, color=color, label=CHANGES[record["curve"]])
         panel.set_title(label, fontsize=7)
         panel.set_yscale("log")
-        panel.set_ylim(1e-10, 1e-1)
+        panel.set_ylim(1e-16, 1e-1)
         panel.tick_params(labelsize=6)
         panel.spines[["top", "right"]].set_visible(False)
     for panel in axes.flat[len(labels) :]:
