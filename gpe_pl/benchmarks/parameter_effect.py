@@ -8,7 +8,7 @@ the time step. A start with rounded positions tells whether scenes are chaotic.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
 from pathlib import Path
@@ -19,13 +19,14 @@ from matplotlib.figure import Figure
 from pydantic import Field
 
 from gpe_pl.benchmarks.trained import Case
+from gpe_pl.data.control_runs import HIGHEST, LOWEST, TrainedValues, Values, scene_values, with_values
 from gpe_pl.data.ground_truth import DatasetSpec, Solver, initial_state, parameter_values
 from gpe_pl.errors import GpeError
 from gpe_pl.files import sealed
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio
 from gpe_pl.rollout.loop import SimulationError, steps
-from gpe_pl.schema import MATERIALS
+from gpe_pl.schema import param_names
 from gpe_pl.system.progress import progress_bar
 from gpe_pl.system.workers import pool, results
 from gpe_pl.trajectory.state import State
@@ -81,20 +82,10 @@ class Settings:
 # --- one scene ------------------------------------------------------------------------------------------------------------------------------
 
 
-def nearest(material: str, value: float, choices: Sequence[float]) -> float:
-    """Return the choice nearest to a value on the scale of the material's parameter, the lower of two equally near ones."""
-    scale: Callable[[float], float] = math.log if MATERIALS[material].scale == "log" else float
-    return min(sorted(choices), key=lambda choice: round(abs(scale(choice) - scale(value)), 12))
-
-
-def trained_values(spec: DatasetSpec, values: dict[str, float]) -> dict[str, dict[str, float]]:
-    """Return the trained values of each material that are lowest, highest and nearest to unseen ones, by change."""
-    seen = {material: choices.seen for material, choices in spec.parameters.items()}
-    return {
-        "lowest": {m: min(v) for m, v in seen.items()},
-        "highest": {m: max(v) for m, v in seen.items()},
-        "nearest": {m: nearest(m, values[m], v) for m, v in seen.items()},
-    }
+def trained_values(spec: DatasetSpec, index: int) -> dict[str, Values]:
+    """Return the trained values that are lowest, highest and nearest to those of a scene, by change."""
+    trained = TrainedValues(spec)
+    return {"lowest": trained.end(LOWEST), "highest": trained.end(HIGHEST), "nearest": trained.nearest(scene_values(spec, SPLIT, index))}
 
 
 def with_half_steps(solver: Any) -> Any:
@@ -114,14 +105,14 @@ def scene_changes(spec: DatasetSpec, index: int) -> dict[str, list[float]]:
     Raises:
         EffectError: a simulation stopped early.
     """
-    values, _ = parameter_values(spec, SPLIT, index)
     start, num_frames = initial_state(spec, SPLIT, index), spec.num_frames - 1
+    names = param_names(spec.scene.materials)
     try:
         own = positions(spec.solver, start, num_frames)
-        others = {
-            name: positions(spec.solver, initial_state(spec, SPLIT, index, trained), num_frames)
-            for name, trained in trained_values(spec, values).items()
-        }
+        others = {}
+        for name, values in trained_values(spec, index).items():
+            params = with_values(start.material_params, start.node_type, names, values)
+            others[name] = positions(spec.solver, replace(start, material_params=params), num_frames)
         others["half_step"] = positions(with_half_steps(spec.solver), start, num_frames, stride=2)
         rounded = replace(start, pos=np.asarray(start.pos).astype(np.float32).astype(np.float64))
         others["rounded"] = positions(spec.solver, rounded, num_frames)
@@ -150,11 +141,9 @@ def stored_changes(spec: DatasetSpec, index: int, folder: str) -> dict[str, list
     return changes
 
 
-def group_of(spec: DatasetSpec, values: dict[str, float]) -> str:
-    """Return which of ``GROUPS`` the value of the data set's first material is in."""
-    material, choices = next(iter(spec.parameters.items()))
-    low, high = min(choices.seen), max(choices.seen)
-    return "below" if values[material] < low else "above" if values[material] > high else "between"
+def group_of(value: float, seen: Sequence[float]) -> str:
+    """Return which of ``GROUPS`` a value is in."""
+    return "below" if value < min(seen) else "above" if value > max(seen) else "between"
 
 
 # --- all scenes -----------------------------------------------------------------------------------------------------------------------------
@@ -184,8 +173,8 @@ def _job(spec: DatasetSpec, label: str, index: int, folder: str) -> tuple[str, i
 
 def _scene_records(label: str, spec: DatasetSpec, index: int, changes: dict[str, list[float]], settings: Settings) -> list[dict[str, Any]]:
     values, _ = parameter_values(spec, SPLIT, index)
-    about = {"case": label, "scene": index, "values": values, "group": group_of(spec, values)}
-    about["nearest"] = trained_values(spec, values)["nearest"]
+    material, choices = next(iter(spec.parameters.items()))
+    about = {"case": label, "scene": index, "values": values, "group": group_of(values[material], choices.seen)}
     records = []
     for horizon in settings.horizons:
         last = spec.num_frames - 1 if horizon == "full" else horizon

@@ -16,7 +16,6 @@ from gpe_pl.benchmarks.parameter_effect import (
     Settings,
     figures,
     group_of,
-    nearest,
     positions,
     report,
     run,
@@ -40,16 +39,11 @@ def tiny(*overrides: str) -> DatasetSpec:
     return dataset(*TINY, *overrides)
 
 
-def test_the_nearest_value_is_nearest_on_the_scale_of_the_parameter() -> None:
-    assert nearest("sand", 30.0, (20.0, 39.0)) == 39.0
-    assert nearest("solid", 2.1e6, (1.17e6, 3.43e6)) == 3.43e6, "in the logarithm, not in Pa"
-    assert nearest("snow", 7.0, (10.0, 4.0)) == 4.0, "the lower of two equally near ones"
-
-
 def test_the_other_values_are_trained_ones() -> None:
-    spec = tiny()
-    assert trained_values(spec, {"sand": 31.0}) == {"lowest": {"sand": 20.0}, "highest": {"sand": 42.5}, "nearest": {"sand": 30.0}}
-    assert [group_of(spec, {"sand": v}) for v in (15.0, 31.0, 47.5)] == ["below", "between", "above"]
+    """Scene 0 has a friction angle of 21°."""
+    found = trained_values(tiny(), 0)
+    assert {name: values["sand"]["friction_angle"] for name, values in found.items()} == {"lowest": 20.0, "highest": 42.5, "nearest": 20.0}
+    assert [group_of(value, (20.0, 42.5)) for value in (15.0, 31.0, 47.5)] == ["below", "between", "above"]
 
 
 @pytest.mark.parametrize("data", ["sand", "fem", pytest.param("fluid", marks=pytest.mark.slow)])
