@@ -148,6 +148,8 @@ class ControlRuns:
             WorkerError: a process died.
         """
         if not self._missing(indices):
+            if on_progress is not None:
+                on_progress(len(indices), len(indices))
             return
         with locked(self.folder, "paths.data", waits=True):
             missing = self._missing(indices)

@@ -6,6 +6,7 @@ both errors is below 1. Scenes are those with interpolated parameters, because e
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -21,6 +22,8 @@ from gpe_pl.viz.saving import save_figure
 
 MATERIALS_FIGURE = "reads_material.png"
 INTERPOLATED = f"{UNSEEN}/interpolated"
+FEWEST_SCENES = 6
+"""Fewest scenes from which a verdict follows. A model that does not read the material is better in all of so many by chance in 2 % of cases."""
 WITHOUT = "none"
 """Value of ``model.material_embedding`` of models without the parameter."""
 EMBEDDING = "model.material_embedding"
@@ -48,9 +51,9 @@ def verdict(runs: Sequence[Run]) -> str:
     found = reads_material(runs)
     if found is None:
         return ""
-    reads, ratio, count = found
+    _, ratio, count = found
     return (
-        f"reads the material: {'yes' if reads else 'no'} (error with own parameters over that with the nearest trained ones: {_ratio(ratio)}, 95 % interval, "
+        f"reads the material: {_answer(*found)} (error with own parameters over that with the nearest trained ones: {_ratio(ratio)}, 95 % interval, "
         f"{count} scenes with interpolated parameters)"
     )
 
@@ -70,14 +73,14 @@ def material_lines(groups: Groups) -> list[str]:
         means = [own, *others, _mean(_errors(_without(groups, domain, runs), LEARNED)), _mean(_solver(runs, SOLVER_NEAREST)), effect]
         found = reads_material(runs)
         assert found is not None
-        reads, ratio, _ = found
         share = f"{own / effect:.2f}" if effect > 0 else "–"
-        lines.append(table_row([domain, label, *map(_text, means), _ratio(ratio), "yes" if reads else "no", share]))
+        lines.append(table_row([domain, label, *map(_text, means), _ratio(found[1]), _answer(*found), share]))
     note = (
         "Does the model read the material parameter? Rollout MSE ×1e-3 [m²] over all frames, mean over scenes with interpolated parameters, median over seeds: "
         "with a scene's own parameters, and the same model with the nearest, the middle and the farthest trained ones and with those of another scene; a model "
         "trained without the parameter; the solver with the nearest trained parameters; effect: the solver with the lowest against the highest trained "
-        "parameters. A model reads the material if own / nearest has a 95 % interval below 1, over the same scenes and seeds. A rollout that had to be stopped "
+        "parameters. A model reads the material if own / nearest has a 95 % interval below 1, over the same scenes and seeds; "
+        f"fewer than {FEWEST_SCENES} scenes are too few to say. A rollout that had to be stopped "
         "has failed, and counts as ballistic flight in the same scene."
     )
     return [*lines, "", note]
@@ -98,6 +101,7 @@ def write_material_figure(path: Path, groups: Groups) -> None:
         curves[title] |= {f"{control} value": _points(runs, label_of(LEARNED, control)) for control in CONTROLS}
         curves[title]["without the parameter"] = _points(_without(groups, domain, runs), LEARNED)
         curves[title] |= {name: _points(runs, name) for name in (SOLVER_NEAREST, SOLVER_ENDS)}
+        curves[title] = {name: points for name, points in curves[title].items() if points}
         rows = runs[0].rows
         trained = [value for key, value in runs[0].config.items() if key.startswith("data.parameters.") and key.endswith(".seen")]
         seen[title] = _numbers(trained[0]) if len(trained) == 1 else rows[rows["parameter_group"] == "seen"]["parameter"].unique().tolist()
@@ -107,9 +111,13 @@ def write_material_figure(path: Path, groups: Groups) -> None:
         save_figure(figure, path, dpi=150)
 
 
-def _numbers(text: object) -> list[float]:
-    import json
+def _answer(is_better: bool, ratio: Interval, count: int) -> str:
+    if count < FEWEST_SCENES:
+        return "too few scenes"
+    return "yes" if is_better else "no"
 
+
+def _numbers(text: object) -> list[float]:
     return [float(value) for value in json.loads(str(text))]
 
 

@@ -93,6 +93,7 @@ def parameter_figure(
                 style,
                 markersize=2.5,
                 linewidth=0.8,
+                zorder=3 - 0.1 * k,  # the first model is not hidden
                 color="0.45" if model in references else PALETTE[k % len(PALETTE)],
                 label=model,
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,14 @@ def test_an_interval_that_reaches_1_does_not_read(tmp_path: Path) -> None:
     run.rows.loc[nearest & (run.rows["trajectory"] == 0), "value"] = np.inf  # fails, and counts as ballistic flight
     failed = reads_material([run])
     assert failed is not None and np.isfinite(failed[1].estimate) and failed[1].estimate < found[1].estimate
+
+
+def test_few_scenes_give_no_verdict(sweep: Path) -> None:
+    run = finished_runs(sweep)[0]
+    few = replace(run, rows=run.rows[run.rows["trajectory"] < 2 * (len(HARD) - 1)])
+    assert verdict([run]).startswith("reads the material: yes ")
+    assert verdict([few]).startswith("reads the material: too few scenes (") and "0.90 [0.90, 0.90]" in verdict([few])
+    assert "| too few scenes |" in "\n".join(material_lines({("sand", "GPE"): [few]}))
 
 
 def test_the_table_of_a_sweep_has_every_control(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
