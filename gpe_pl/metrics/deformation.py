@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from gpe_pl.schema import CELL_KINDS, MATERIALS, node_code
+from gpe_pl.schema import CELL_KINDS, MESH_MATERIALS, node_code
 from gpe_pl.trajectory.cells import kinds_of, mean_over_corners
 from gpe_pl.trajectory.strain import deformation_gradients, lame_parameters, neo_hookean_density, shape_gradients
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -89,9 +89,9 @@ def rotation_angle(rotation: Float[np.ndarray, "*axes dim dim"]) -> Float[np.nda
 def strain_energy(trajectory: Trajectory) -> Float[np.ndarray, "frame"] | None:
     """Return the elastic energy in all mesh cells [J] (per metre of depth in 2D), by the law of the solvers (``trajectory.strain``).
 
-    A cell takes the mean of Young's modulus over its corners, as the finite element solver does, and Poisson's ratio from the solver's settings in the
-    metadata. Crushed and inverted cells have a large, finite energy. The material point solver keeps a deformation gradient per particle, so its own
-    energy differs from that of the cells between its particles.
+    A cell takes the mean of Young's modulus and Poisson's ratio over its corners, as the finite element solver does. Poisson's ratio is a material parameter,
+    or a setting of the solver in the metadata. Crushed and inverted cells have a large, finite energy. The material point solver keeps a deformation gradient
+    per particle, so its own energy differs from that of the cells between its particles.
 
     Returns:
         None without a mesh, for surfaces in 3D, and where Young's modulus or Poisson's ratio is not known.
@@ -120,12 +120,11 @@ def strain_energy(trajectory: Trajectory) -> Float[np.ndarray, "frame"] | None:
 
 def _elastic_constants(trajectory: Trajectory) -> tuple[Float[np.ndarray, "node"], Float[np.ndarray, "node"]]:
     """Return Young's modulus [Pa] and Poisson's ratio of each node; NaN where they are not known."""
-    metadata = trajectory.metadata
-    modulus, poisson_ratio = np.full(trajectory.num_nodes, np.nan), np.full(trajectory.num_nodes, np.nan)
-    for material in {"elastomer", "solid"} & {*metadata.materials}:
-        own, name = trajectory.node_type == node_code(material), MATERIALS[material].name
-        modulus[own] = trajectory.material_params[own, metadata.param_names.index(name)]
-        poisson_ratio[own] = _poisson_ratio(metadata.config, material)
+    metadata, unknown = trajectory.metadata, np.full(trajectory.num_nodes, np.nan)
+    columns = dict(zip(metadata.param_names, trajectory.material_params.T.astype(np.float64), strict=True))
+    modulus, poisson_ratio = columns.get("youngs_modulus", unknown), columns.get("poisson_ratio", unknown).copy()
+    for material in {*MESH_MATERIALS} & {*metadata.materials}:
+        poisson_ratio[np.isnan(poisson_ratio) & (trajectory.node_type == node_code(material))] = _poisson_ratio(metadata.config, material)
     return modulus, poisson_ratio
 
 

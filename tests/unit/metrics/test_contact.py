@@ -54,6 +54,11 @@ def test_a_bounce_is_the_largest_rise_after_contact() -> None:
     assert bounce_heights(height[:4], gap[:4], LIMIT)[0] == 0
 
 
+def test_heights_before_the_contact_do_not_count() -> None:
+    """A body that is thrown from a low place against the ceiling."""
+    assert bounce_heights(column(1, 5, 4, 4.5), column(3, 0, 1, 1), LIMIT)[0] == pytest.approx(0.5)
+
+
 def falling(num_frames: int = 4, boundary: Boundary | None = None) -> Trajectory:
     """A square that falls by 0.1 m per frame, from 0.5 m above the floor."""
     square = np.array([[0.4, 0.5], [0.5, 0.5], [0.5, 0.6], [0.4, 0.6]])

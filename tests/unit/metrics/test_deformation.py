@@ -180,11 +180,34 @@ def test_the_energy_is_that_of_the_finite_element_solver(kind: str, factor: floa
     assert found[0] == pytest.approx(FEM(bounds=((-9.0, 9.0),) * dim, poisson_ratio=POISSON_RATIO).energy(state), rel=1e-6)
 
 
+@pytest.mark.parametrize("kind", ["triangle", "hexahedron"])
+def test_crushing_a_body_further_takes_ever_more_energy(kind: str) -> None:
+    """The energy goes on with the slope that it has at the smallest ratio, also where cells are inverted."""
+    rest, _, dim = mesh(kind)
+    factors = np.array([0.3, 0.2, 0.1, 0.0, -0.5, -1.0])
+    energy = energy_of(body(kind, np.stack([rest * ([factor] + [1.0] * (dim - 1)) for factor in factors])))[: len(factors)]
+    assert np.isfinite(energy).all() and (np.diff(energy) > 0).all()
+
+
 def test_the_order_of_corners_does_not_matter() -> None:
     rest, cells, _ = mesh("triangle")
     trajectory = body("triangle", np.stack([rest, 1.1 * rest]))
     reverse = replace(trajectory, cells=cells[:, [0, 2, 1]])
     np.testing.assert_allclose(energy_of(reverse), energy_of(trajectory), atol=1e-9)
+
+
+def test_poissons_ratio_may_vary_from_node_to_node() -> None:
+    """A column of the material parameters comes before the settings of the solver; a cell takes the mean over its corners."""
+    rest, cells, _ = mesh("triangle")
+    trajectory = body("triangle", 1.1 * rest[None])
+    metadata = replace(trajectory.metadata, param_names=("youngs_modulus", "poisson_ratio"))
+    ratio = np.linspace(0.1, 0.4, len(rest))
+    varied = replace(trajectory, metadata=metadata, material_params=np.stack([np.full(len(rest), MODULUS), ratio], axis=-1))
+    single = [
+        energy_of(body("triangle", 1.1 * rest[None], json.dumps({"solver": {"poisson_ratio": r}})))[0] for r in ratio[cells].mean(axis=1)
+    ]
+    areas = np.linalg.det(rest[cells][:, 1:] - rest[cells][:, :1])
+    assert energy_of(varied)[0] == pytest.approx((np.array(single) * areas).sum() / areas.sum())
 
 
 @pytest.mark.parametrize("config", ["{}", "[1]", "not JSON", '{"solver": 3}', '{"solver": {"poisson_ratio": null}}'])
