@@ -38,7 +38,8 @@ def main(file: Path, overrides: list[str]) -> None:
     table = []
     for index in range(spec.num_test_unseen):
         state = initial_state(spec, "test_unseen", index)
-        (parameter,) = parameter_values(spec, "test_unseen", index)[0].values()
+        (own,) = parameter_values(spec, "test_unseen", index)[0].values()
+        parameter = next(iter(own.values()))
         direction = rng.normal(size=len(spec.scene.bounds))
         direction /= np.linalg.norm(direction)
         truth = positions(spec, state, index)

@@ -4,6 +4,7 @@ This module imports only the standard library, so that solvers, store and models
 """
 
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -22,6 +23,17 @@ HISTORY = 5
 
 
 @dataclass(frozen=True)
+class Limits:
+    """Smallest and largest value of a material parameter that the solvers accept, in the unit of the parameter."""
+
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.low:g} … {self.high:g}"
+
+
+@dataclass(frozen=True)
 class MaterialParameter:
     """One continuous parameter of a material.
 
@@ -29,30 +41,54 @@ class MaterialParameter:
         name: column name in ``material_params``.
         unit: unit of the stored value.
         scale: how the parameter enters a model: ``linear``, or ``log`` for parameters that span decades.
+        limits: limits of the solvers. Imported data may exceed them; ``rule`` says what can be stored.
+        assumed: value that an importer stores if a source has none.
     """
 
     name: str
     unit: str
     scale: Literal["linear", "log"]
+    limits: Limits
+    assumed: float
 
     @property
     def rule(self) -> str:
-        """Rule for stored values. Solvers accept a smaller range; see ``solvers.materials.LIMITS``."""
+        """Rule for stored values."""
         return "positive and finite" if self.scale == "log" else "finite and not negative"
 
     def accepts(self, values: Any) -> Any:
         """Return a mask of the values of an array or tensor that follow the rule; for a number, whether it does."""
         return ((values > 0.0) if self.scale == "log" else (values >= 0.0)) & (values < LARGEST)
 
+    def quantity(self, value: Any) -> str:
+        """Return a number, or text that stands for one, with the unit if there is one."""
+        return (value if isinstance(value, str) else f"{value:g}") + ("" if self.unit == "1" else f" {self.unit}")
 
-MATERIALS: dict[str, MaterialParameter] = {
-    "sand": MaterialParameter("friction_angle", "deg", "linear"),
-    "snow": MaterialParameter("hardening_coefficient", "1", "linear"),
-    "fluid": MaterialParameter("kinematic_viscosity", "m^2/s", "log"),
-    "elastomer": MaterialParameter("youngs_modulus", "Pa", "log"),
-    "solid": MaterialParameter("youngs_modulus", "Pa", "log"),
+
+POISSON_RATIO = MaterialParameter("poisson_ratio", "1", "linear", Limits(0.0, 0.49), 0.3)
+
+MATERIALS: dict[str, tuple[MaterialParameter, ...]] = {
+    "sand": (
+        MaterialParameter("friction_angle", "deg", "linear", Limits(0.0, 60.0), 30.0),
+        MaterialParameter("cohesion", "Pa", "linear", Limits(0.0, 2e4), 0.0),
+    ),
+    "snow": (
+        MaterialParameter("hardening_coefficient", "1", "linear", Limits(0.0, 30.0), 8.0),
+        MaterialParameter("critical_compression", "1", "linear", Limits(1e-3, 0.5), 2.5e-2),
+        MaterialParameter("critical_stretch", "1", "linear", Limits(1e-3, 0.5), 7.5e-3),
+    ),
+    "fluid": (MaterialParameter("kinematic_viscosity", "m^2/s", "log", Limits(1e-6, 10.0), 1e-3),),
+    "elastomer": (MaterialParameter("youngs_modulus", "Pa", "log", Limits(1e3, 1e8), 1e5), POISSON_RATIO),
+    "solid": (MaterialParameter("youngs_modulus", "Pa", "log", Limits(1e3, 1e9), 1e6), POISSON_RATIO),
 }
-"""Dynamic node types with their material parameter; the order fixes the integer codes of ``node_type``."""
+"""Dynamic node types with their material parameters. The order of materials fixes the integer codes of ``node_type``.
+
+Every data set stores the first parameter of its materials. It may store further ones; those that it does not store have the values of the solver's settings.
+A name stands for one column, so materials with the same parameter store it together.
+"""
+
+MaterialValues = float | Mapping[str, float]
+"""Value of the first parameter of a material, or values of its parameters by name."""
 
 MESH_MATERIALS = ("elastomer", "solid")
 """Materials whose nodes keep their neighbours. With ``graph.mesh`` their nodes are connected along mesh cells."""
@@ -102,9 +138,37 @@ def node_code(name: str) -> int:
     return NODE_TYPES.index(name)
 
 
-def param_names(materials: tuple[str, ...]) -> tuple[str, ...]:
-    """Return column names of ``material_params`` for a data set with these materials, without repetition, in schema order."""
-    return tuple(dict.fromkeys(MATERIALS[m].name for m in MATERIALS if m in materials))
+def param_names(materials: Iterable[str], further: Iterable[str] = ()) -> tuple[str, ...]:
+    """Return the column names of ``material_params`` for a data set with these materials, without repetition, in schema order.
+
+    Args:
+        materials: materials of the data set.
+        further: names of the parameters that it stores besides the first ones of its materials.
+    """
+    chosen, further = set(materials), set(further)
+    every = [(k, p.name) for m in MATERIALS if m in chosen for k, p in enumerate(MATERIALS[m])]
+    return tuple(dict.fromkeys(name for k, name in every if k == 0 or name in further))
+
+
+def stored_parameters(material: str, names: Sequence[str]) -> tuple[MaterialParameter, ...]:
+    """Return the parameters of a material among the columns of a data set, in schema order."""
+    return tuple(p for p in MATERIALS[material] if p.name in names)
+
+
+def parameters_by_name(material: str, value: Any) -> dict[str, Any]:
+    """Return the parameters of a material by name, in schema order; a value without a name is that of the first parameter.
+
+    Raises:
+        ValueError: the material has no such parameter, or the first one is missing; names it.
+    """
+    first, *_ = own = [p.name for p in MATERIALS[material]]
+    named = dict(value) if isinstance(value, Mapping) else {first: value}
+    for name in named:
+        if name not in own:
+            raise ValueError(f"{material} has no parameter {name!r}; it has {', '.join(own)}")
+    if first not in named:
+        raise ValueError(f"{material} needs {first}; only {', '.join(own[1:]) or 'no parameter'} may be left out")
+    return {name: named[name] for name in own if name in named}
 
 
 def radius_relations(materials: tuple[str, ...]) -> tuple[EdgeType, ...]:
@@ -218,7 +282,7 @@ class FeatureSpec:
         dim: space dimension.
         materials: dynamic node types, in schema order.
         node_channels: number of channels of ``x`` per node type, including ``boundary``.
-        param_channels: number of material parameters per material.
+        parameters: stored parameters per material.
         relations: edge types that can occur.
         odd_channels: number of edge channels per relation that change sign when source and target swap. The first ``dim`` are the relative displacement.
         even_channels: number of edge channels per relation that do not change sign.
@@ -230,13 +294,18 @@ class FeatureSpec:
     dim: int
     materials: tuple[str, ...]
     node_channels: dict[str, int]
-    param_channels: dict[str, int]
+    parameters: dict[str, tuple[MaterialParameter, ...]]
     relations: tuple[EdgeType, ...]
     odd_channels: dict[EdgeType, int]
     even_channels: dict[EdgeType, int]
     stress_channels: dict[str, int] = field(default_factory=dict)
     num_levels: int = 0
     islands: bool = False
+
+    @property
+    def param_channels(self) -> dict[str, int]:
+        """Number of stored parameters per material."""
+        return {material: len(own) for material, own in self.parameters.items()}
 
     @property
     def node_types(self) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch_geometric.data import HeteroData
 
-from gpe_pl.schema import BOUNDARY, CELL, DOWN, RADIUS, SAME, EdgeType, FeatureSpec, grid, mesh_relations, radius_relations
+from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, RADIUS, SAME, EdgeType, FeatureSpec, grid, mesh_relations, radius_relations
 
 NUM_NODES, NUM_BOUNDARY = 8, 2
 
@@ -19,7 +19,7 @@ def spec(num_levels: int) -> FeatureSpec:
         dim=2,
         materials=materials,
         node_channels={"solid": 4, BOUNDARY: 6, **{grid(level): 5 for level in range(1, num_levels + 1)}},
-        param_channels={"solid": 1},
+        parameters={"solid": MATERIALS["solid"][:1]},
         relations=relations,
         odd_channels={r: widths[r[1]][0] for r in relations},
         even_channels={r: widths[r[1]][1] for r in relations},

@@ -54,7 +54,7 @@ def together(materials: tuple[str, ...], *states: State) -> State:
     blocks = []
     for state in states:
         columns = np.full((state.num_nodes, len(names)), np.nan)
-        columns[:, names.index(MATERIALS[NODE_TYPES[state.node_type[0]]].name)] = state.material_params[:, 0]
+        columns[:, names.index(MATERIALS[NODE_TYPES[state.node_type[0]]][0].name)] = state.material_params[:, 0]
         blocks.append(replace(state, material_params=columns))
     return State.joined(blocks)
 

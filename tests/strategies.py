@@ -15,7 +15,6 @@ from gpe_pl.benchmarks.faults.stores import flipped, overwritten, truncated
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.schema import MATERIALS, STICKY, node_code, param_names
-from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.solvers.scenes import BodyScene
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
@@ -58,8 +57,9 @@ def states(
     kinds = rng.integers(len(materials), size=count)
     params = np.full((count, len(names)), np.nan)
     for row, kind in enumerate(kinds):
-        low, high = LIMITS[materials[kind]]
-        params[row, names.index(MATERIALS[materials[kind]].name)] = rng.uniform(low, min(high, low + 40.0))
+        first = MATERIALS[materials[kind]][0]
+        low, high = first.limits.low, first.limits.high
+        params[row, names.index(first.name)] = rng.uniform(low, min(high, low + 40.0))
     speed = draw(st.sampled_from([0.0, 1.0, 100.0]))
     past = speed * rng.normal(size=(count, history, dim))
     shapes = domain_walls(((0.0, 1.0),) * dim, draw(st.sampled_from([0.0, 0.5, STICKY]))) if draw(st.booleans()) else ()

@@ -26,7 +26,6 @@ from gpe_pl.files import sealed
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio
 from gpe_pl.rollout.loop import SimulationError, steps
-from gpe_pl.schema import param_names
 from gpe_pl.system.progress import progress_bar
 from gpe_pl.system.workers import pool, results
 from gpe_pl.trajectory.state import State
@@ -88,6 +87,11 @@ def trained_values(spec: DatasetSpec, index: int) -> dict[str, Values]:
     return {"lowest": trained.end(LOWEST), "highest": trained.end(HIGHEST), "nearest": trained.nearest(scene_values(spec, SPLIT, index))}
 
 
+def recorded(values: Values) -> dict[str, Any]:
+    """Return values as records have them: a number for a material with one parameter, several by name."""
+    return {material: dict(own) if len(own) > 1 else next(iter(own.values())) for material, own in values.items()}
+
+
 def with_half_steps(solver: Any) -> Any:
     """Return a solver of half the frame interval and half the ``cfl``, which takes as many substeps in half a frame as the given one in a frame."""
     return replace(solver, frame_dt=solver.frame_dt / 2, cfl=solver.cfl / 2)
@@ -106,7 +110,7 @@ def scene_changes(spec: DatasetSpec, index: int) -> dict[str, list[float]]:
         EffectError: a simulation stopped early.
     """
     start, num_frames = initial_state(spec, SPLIT, index), spec.num_frames - 1
-    names = param_names(spec.scene.materials)
+    names = spec.param_names
     try:
         own = positions(spec.solver, start, num_frames)
         others = {}
@@ -130,7 +134,10 @@ def stored_changes(spec: DatasetSpec, index: int, folder: str) -> dict[str, list
     about = spec.as_dict()
     kept: dict[str, Any] = {name: about[name] for name in ("scene", "solver", "seed", "num_frames", "input_files")}
     seen = {material: list(choices.seen) for material, choices in spec.parameters.items()}
-    key = sealed.checksum({**kept, "values": values, "seen": seen, "index": index})
+    further = {m: {name: list(choices.seen) for name, choices in own.further.items()} for m, own in spec.parameters.items() if own.further}
+    if further:
+        kept["further"] = further
+    key = sealed.checksum({**kept, "values": recorded(values), "seen": seen, "index": index})
     path = Path(folder) / f"{spec.name}-{spec.size}-{index:03d}-{key[:12]}.json"
     if path.exists():
         changes: dict[str, list[float]] = sealed.read(path, "delete it, and run the same command again")["changes"]
@@ -174,7 +181,8 @@ def _job(spec: DatasetSpec, label: str, index: int, folder: str) -> tuple[str, i
 def _scene_records(label: str, spec: DatasetSpec, index: int, changes: dict[str, list[float]], settings: Settings) -> list[dict[str, Any]]:
     values, _ = parameter_values(spec, SPLIT, index)
     material, choices = next(iter(spec.parameters.items()))
-    about = {"case": label, "scene": index, "values": values, "group": group_of(values[material], choices.seen)}
+    own = next(iter(values[material].values()))
+    about = {"case": label, "scene": index, "values": recorded(values), "group": group_of(own, choices.seen)}
     records = []
     for horizon in settings.horizons:
         last = spec.num_frames - 1 if horizon == "full" else horizon
@@ -247,7 +255,8 @@ def report(records: list[dict[str, Any]]) -> str:
 
 def _values(group: str, records: Sequence[dict[str, Any]]) -> str:
     """Return the name of a group and the values in it."""
-    values = sorted({next(iter(record["values"].values())) for record in records})
+    first = (next(iter(record["values"].values())) for record in records)
+    values = sorted({next(iter(value.values())) if isinstance(value, dict) else value for value in first})
     return group if group == "all" else f"{group}: {', '.join(f'{v:g}' for v in values)}"
 
 

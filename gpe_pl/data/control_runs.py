@@ -38,7 +38,7 @@ RUNS = (NEAREST, LOWEST, HIGHEST)
 
 def scene_values(spec: DatasetSpec, split: str, index: int) -> dict[str, dict[str, float]]:
     """Return the parameters of each material in one scene by name."""
-    return {material: {MATERIALS[material].name: value} for material, value in parameter_values(spec, split, index)[0].items()}
+    return parameter_values(spec, split, index)[0]
 
 
 def with_values(material_params: Any, node_type: Any, param_names: Sequence[str], values: Values) -> Any:
@@ -107,8 +107,8 @@ class TrainedValues:
 
     def _scaled(self, material: str, vectors: np.ndarray) -> np.ndarray:
         """Return vectors in units in which each parameter is trained from 0 to 1."""
-        parameter = MATERIALS[material]
-        trained, given = ((np.log(v) if parameter.scale == "log" else v) for v in (self._vectors[material], vectors))
+        is_log = [p.scale == "log" for p in MATERIALS[material] if p.name in self._names[material]]
+        trained, given = (np.log(v, out=np.array(v, np.float64), where=is_log) for v in (self._vectors[material], vectors))
         low, high = trained.min(axis=0), trained.max(axis=0)
         return (given - low) / np.where(high > low, high - low, 1.0)
 

@@ -23,7 +23,7 @@ from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.standardizer import StatisticsSample
 from gpe_pl.rollout.loop import Restartable
-from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES, EdgeType, grid, node_code, role
+from gpe_pl.schema import BOUNDARY, NODE_TYPES, EdgeType, grid, node_code, role
 from gpe_pl.system import ranks
 from gpe_pl.trajectory.scene_ranges import scene_range, united
 from gpe_pl.trajectory.store import StoreError
@@ -177,16 +177,16 @@ class TrajectoryDataModule(L.LightningDataModule):
         return found
 
     def parameter_ranges(self) -> dict[str, torch.Tensor]:
-        """Return the lowest and highest value [2, 1] of the parameter of each material that occurs in the training trajectories."""
+        """Return the lowest and highest values [2, param] of the parameters of each material that occurs in the training trajectories."""
         found: dict[str, list[np.ndarray]] = {}
         for stored in self.train_set.trajectories:
             first = stored.window(0, 1)
             for material in self.builder.spec.param_channels:
-                column = self.metadata.param_names.index(MATERIALS[material].name)
-                values = first.material_params[first.node_type == node_code(material), column]
+                values = first.material_params[first.node_type == node_code(material)][:, self.metadata.columns_of(material)]
                 if len(values):
-                    found.setdefault(material, []).append(np.array([values.min(), values.max()]))
-        return {m: torch.tensor([[np.min(pairs)], [np.max(pairs)]], dtype=torch.float32) for m, pairs in found.items()}
+                    found.setdefault(material, []).append(np.array([values.min(axis=0), values.max(axis=0)]))
+        ranges = {m: np.stack([np.min(parts, axis=(0, 1)), np.max(parts, axis=(0, 1))]) for m, parts in found.items()}
+        return {m: torch.tensor(values, dtype=torch.float32) for m, values in ranges.items()}
 
     def trained_scene(self) -> np.ndarray:
         """Return ranges of gravity and of boundary nodes over all training trajectories; see ``scene_ranges``."""

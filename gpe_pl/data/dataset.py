@@ -402,6 +402,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
             trajectory.cells,
             cell_dim=trajectory.cell_dim,
             periodicity=trajectory.metadata.periodicity,
+            param_names=trajectory.metadata.param_names,
         ).to_torch()
         stress = None
         if self.stress and trajectory.stress is not None:

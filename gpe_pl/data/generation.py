@@ -342,12 +342,13 @@ def _draw_contact_sheet(spec: DatasetSpec, path: Path, workers: Executor | None)
     from gpe_pl.viz.contact_sheet import contact_sheet
     from gpe_pl.viz.saving import save_figure
 
-    rows: dict[str, dict[str, float]] = {}
+    rows: dict[str, dict[str, dict[str, float]]] = {}
     for fraction in np.linspace(0.0, 1.0, SHEET_ROWS):
-        values = {}
-        for material, choices in spec.parameters.items():
-            every = sorted({*choices.seen, *choices.interpolated, *choices.extrapolated})
-            values[material] = every[round(fraction * (len(every) - 1))]
+        values: dict[str, dict[str, float]] = {material: {} for material in spec.parameters}
+        for material, design in spec.parameters.items():
+            for parameter, _, choices in design.of(material):
+                every = sorted({*choices.seen, *choices.interpolated, *choices.extrapolated})
+                values[material][parameter.name] = every[round(fraction * (len(every) - 1))]
         rows[row_label(values)] = values
     index = _most_varied_scene(spec)
     arguments = [(spec, index, label, values) for label, values in rows.items()]
@@ -367,7 +368,7 @@ def _most_varied_scene(spec: DatasetSpec) -> int:
     return best
 
 
-def _labelled_trajectory(spec: DatasetSpec, index: int, label: str, values: dict[str, float]) -> tuple[str, Trajectory]:
+def _labelled_trajectory(spec: DatasetSpec, index: int, label: str, values: dict[str, dict[str, float]]) -> tuple[str, Trajectory]:
     return label, generate_trajectory(spec, "train", index, values)
 
 

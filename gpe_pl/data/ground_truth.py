@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Protocol, cast, runtime_checkable
 
@@ -21,7 +21,7 @@ from gpe_pl.files.names import DataName
 from gpe_pl.geometry.shapes import ON_SURFACE
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Simulator, rollout
-from gpe_pl.schema import SPLITS, ParameterGroup
+from gpe_pl.schema import MATERIALS, SPLITS, MaterialParameter, MaterialValues, ParameterGroup, param_names, parameters_by_name
 from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.trajectory.state import State
@@ -68,8 +68,8 @@ class Solver(Simulator, Protocol):
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
-class ParameterValues:
-    """Values of a material's parameter in a data set.
+class ValueGroups:
+    """Values of one parameter in a data set.
 
     Attributes:
         seen: values in ``train``, ``val`` and ``test``, used in turn.
@@ -92,13 +92,31 @@ class ParameterValues:
             )
 
 
+@dataclass(frozen=True, config={"extra": "forbid"})
+class ParameterValues(ValueGroups):
+    """Values of the stored parameters of a material. ``seen``, ``interpolated`` and ``extrapolated`` are values of its first parameter.
+
+    Attributes:
+        further: values of further parameters by name. A parameter that is not named has the value of the solver's settings, and is not stored.
+    """
+
+    further: dict[str, ValueGroups] = field(default_factory=dict)
+
+    def of(self, material: str) -> Iterator[tuple[MaterialParameter, str, ValueGroups]]:
+        """Yield each stored parameter in schema order, with the key of its values below that of the material, and its values."""
+        values = parameters_by_name(material, {MATERIALS[material][0].name: self, **self.further})
+        for parameter in MATERIALS[material]:
+            if parameter.name in values:
+                yield parameter, f".further.{parameter.name}" if parameter.name in self.further else "", values[parameter.name]
+
+
 @dataclass(frozen=True, config={"extra": "forbid", "arbitrary_types_allowed": True})
 class DatasetSpec:
     """Specification of a data set. It determines all bytes of the data set.
 
     Attributes:
         name, size: names of its folders.
-        parameters: values of each material's parameter.
+        parameters: values of each material's parameters.
         num_train, num_val, num_test, num_test_unseen: numbers of trajectories per split.
         num_frames: number of stored frames per trajectory, including the initial one.
         trajectories_per_shard: number of trajectories in a shard, the unit of work and of resuming.
@@ -130,18 +148,41 @@ class DatasetSpec:
                 f"parameters are for {', '.join(self.parameters)}, the scene has {', '.join(self.scene.materials)}; "
                 "leave out others with ~data.parameters.MATERIAL"
             )
-        for material, values in self.parameters.items():
-            for key, group in asdict(cast(Any, values)).items():
-                for value in group:
-                    if fault := limits_fault(material, value):
-                        raise ValueError(f"parameters.{material}.{key}: {fault}")
-            if self.num_test_unseen and not (values.interpolated and values.extrapolated):
-                raise ValueError(f"num_test_unseen > 0 needs parameters.{material}.interpolated and .extrapolated")
+        for material, design in self.parameters.items():
+            self._check(material, design)
         for key, path in self.scene.input_files.items():
             try:
                 Path(path).open("rb").close()
             except OSError as error:
                 raise ValueError(f"scene.{key} = {path}: {error.strerror} (searched from {Path.cwd()})") from None
+
+    def _check(self, material: str, design: ParameterValues) -> None:
+        first = MATERIALS[material][0].name
+        if first in design.further:
+            raise ValueError(
+                f"parameters.{material}.further.{first}: is the first parameter; give its values as parameters.{material}.seen"
+            )
+        try:
+            own = list(design.of(material))
+        except ValueError as error:
+            raise ValueError(f"parameters.{material}.further: {error}") from None
+        for parameter, key, values in own:
+            for group in ("seen", "interpolated", "extrapolated"):
+                for value in getattr(values, group):
+                    if fault := limits_fault(parameter, value):
+                        raise ValueError(f"parameters.{material}{key}.{group}: {fault}")
+        unseen = [[bool(values.interpolated), bool(values.extrapolated)] for *_, values in own]
+        if self.num_test_unseen and not np.any(unseen, axis=0).all():
+            raise ValueError(f"num_test_unseen > 0 needs parameters.{material}.interpolated and .extrapolated")
+        for other, further in ((m, d.further) for m, d in self.parameters.items()):
+            lacking = [name for name in further if name in (p.name for p in MATERIALS[material]) and name not in design.further]
+            if lacking:  # a name stands for one column
+                raise ValueError(f"parameters.{material}.further: lacks {lacking[0]}, which {other} has; give it to both or to none")
+
+    @property
+    def param_names(self) -> tuple[str, ...]:
+        """Names of the stored parameters."""
+        return param_names(tuple(self.parameters), (name for design in self.parameters.values() for name in design.further))
 
     @property
     def counts(self) -> dict[str, int]:
@@ -164,7 +205,11 @@ class DatasetSpec:
         files.
         """
         files = {path: hashlib.sha256(Path(path).read_bytes()).hexdigest() for path in self.scene.input_files.values()}
-        return json.loads(json.dumps({**asdict(self), **self.provenance, "input_files": files}))  # type: ignore[call-overload]
+        values = asdict(self)  # type: ignore[call-overload]
+        for design in values["parameters"].values():
+            if not design["further"]:  # as in the specification of a data set with one parameter per material
+                del design["further"]
+        return json.loads(json.dumps({**values, **self.provenance, "input_files": files}))
 
 
 def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:
@@ -173,22 +218,45 @@ def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:
     return int(words[0]) << 32 | int(words[1])
 
 
-def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[str, float], ParameterGroup]:
-    """Return the parameter of each material in one trajectory, and the group that these values belong to.
+def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[str, dict[str, float]], ParameterGroup]:
+    """Return the parameters of each material by name in one trajectory, and the group that these values belong to.
 
-    The values of the first material are used in turn. The values of each other material are also used in turn, but in a random order in each round. Parameters
-    of different materials are therefore independent.
+    The values of the first parameter of the first material are used in turn. Those of any other parameter are also used in turn, but each round has a random
+    order that follows from the seed, so that parameters are independent. Rounds of parameters with equally many values form a Latin hypercube.
+
+    Scenes of ``interpolated`` take the interpolated values of all parameters that have any, those of ``extrapolated`` the extrapolated ones. Other parameters
+    have seen values there. A scene is therefore unseen if any parameter is, and extrapolated if any parameter is outside the range of its seen values.
     """
     group: ParameterGroup = "seen"
     if split == "test_unseen":
         group, index = ("interpolated", "extrapolated")[index % 2], index // 2  # type: ignore[assignment]
-    values = {}
-    for k, (material, choices) in enumerate(spec.parameters.items()):
-        dealt = getattr(choices, group)
-        number, place = divmod(index, len(dealt))
-        shuffled = np.random.default_rng((spec.seed, SPLITS.index(split), k, number)).permutation(len(dealt))
-        values[material] = dealt[place if k == 0 else int(shuffled[place])]
+    values: dict[str, dict[str, float]] = {}
+    for k, (material, design) in enumerate(spec.parameters.items()):
+        values[material] = {}
+        for j, (parameter, _, choices) in enumerate(design.of(material)):
+            dealt = getattr(choices, group) or choices.seen
+            number, place = divmod(index, len(dealt))
+            key = (spec.seed, SPLITS.index(split), k, number, *([MATERIALS[material].index(parameter)] if j else []))
+            shuffled = np.random.default_rng(key).permutation(len(dealt))
+            values[material][parameter.name] = dealt[place if k == j == 0 else int(shuffled[place])]
     return values, group
+
+
+def named_values(spec: DatasetSpec, values: Mapping[str, MaterialValues]) -> dict[str, dict[str, float]]:
+    """Return other values of all stored parameters by name, for ``generate_trajectory``.
+
+    Raises:
+        ValueError: a stored parameter is missing, or another one is named.
+    """
+    named = {}
+    for material, design in spec.parameters.items():
+        if material not in values:
+            raise ValueError(f"values: {material} is missing")
+        named[material] = parameters_by_name(material, values[material])
+        stored = [parameter.name for parameter, *_ in design.of(material)]
+        if [*named[material]] != stored:
+            raise ValueError(f"values of {material} are {', '.join(named[material])}; the data set stores {', '.join(stored)}")
+    return named
 
 
 def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
@@ -201,29 +269,32 @@ def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
         seed=scene_seed(spec, split, index),
         split=split,
         parameter_group=parameter_values(spec, split, index)[1],
+        param_names=spec.param_names,
         solver=spec.solver.name,
         solver_version=spec.solver.version,
         config=json.dumps(spec.provenance, sort_keys=True),
     )
 
 
-def initial_state(spec: DatasetSpec, split: str, index: int, values: Mapping[str, float] | None = None) -> State:
-    """Sample the initial state of one trajectory, optionally with other parameter values.
+def initial_state(spec: DatasetSpec, split: str, index: int, values: Mapping[str, MaterialValues] | None = None) -> State:
+    """Sample the initial state of one trajectory, optionally with other parameter values: a number for one parameter, several by name.
 
     Raises:
         GenerationError: the scene is impossible.
     """
     seed = scene_seed(spec, split, index)
     try:
-        return spec.scene.sample(values or parameter_values(spec, split, index)[0], seed)
+        return spec.scene.sample(named_values(spec, values) if values else parameter_values(spec, split, index)[0], seed)
     except ValueError as error:
         raise GenerationError(f"split {split}, index {index}, seed {seed}: {error}", split, index, seed) from None
 
 
 def generate_trajectory(
-    spec: DatasetSpec, split: str, index: int, values: Mapping[str, float] | None = None, num_frames: int | None = None
+    spec: DatasetSpec, split: str, index: int, values: Mapping[str, MaterialValues] | None = None, num_frames: int | None = None
 ) -> Trajectory:
     """Simulate one trajectory, optionally with other parameter values or another number of frames.
+
+    Values are a number for a material with one stored parameter, otherwise parameters by name.
 
     Raises:
         GenerationError: the scene is impossible, or the simulation stopped early.

@@ -59,7 +59,7 @@ def motion(trajectory: Trajectory) -> Iterator[tuple[str, np.ndarray]]:
 
 def _scaled(trajectory: Trajectory) -> np.ndarray:
     """Return material parameters [node, param]; natural logarithms of those with a logarithmic scale."""
-    scale = {p.name: p.scale for p in MATERIALS.values()}
+    scale = {p.name: p.scale for own in MATERIALS.values() for p in own}
     columns = trajectory.material_params.astype(np.float64).T
     return np.stack([np.log(c) if scale[n] == "log" else c for n, c in zip(trajectory.metadata.param_names, columns, strict=True)], axis=-1)
 
@@ -76,7 +76,7 @@ def combined(moments: list[dict[str, Any]]) -> dict[str, Any]:
     count, total, square = np.sum([m["params"] for m in moments], axis=0)
     mean = total / np.maximum(count, 1)
     std = np.sqrt(np.maximum(square / np.maximum(count, 1) - mean * mean, 0.0))
-    parameters = {p.name: p for p in MATERIALS.values()}
+    parameters = {p.name: p for own in MATERIALS.values() for p in own}
     return {
         "velocity_std": rms["velocity"],
         "acceleration_std": rms["acceleration"],

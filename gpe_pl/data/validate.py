@@ -30,7 +30,6 @@ from gpe_pl.geometry.shape_values import shapes_fault
 from gpe_pl.geometry.shapes import Shape
 from gpe_pl.printable import printable, speak_utf8
 from gpe_pl.schema import BOUNDARY, FIELDS, MATERIALS, MOTION, NODE_TYPES, SCHEMA_VERSION, SPLITS, ParameterGroup
-from gpe_pl.solvers.materials import LIMITS
 from gpe_pl.trajectory.store import (
     StoreError,
     digest,
@@ -289,9 +288,9 @@ def _offenders(key: str, bad: np.ndarray) -> str | None:
 
 
 def _check_parameters(m: Metadata, arrays: dict[str, np.ndarray], names: tuple[str, ...]) -> Iterator[Finding]:
-    by_code = [MATERIALS.get(name) for name in names]
+    by_code = [MATERIALS.get(name, ()) for name in names]
     for column, name in enumerate(m.param_names):
-        used = np.isin(arrays["node_type"], [k for k, p in enumerate(by_code) if p is not None and p.name == name])
+        used = np.isin(arrays["node_type"], [k for k, own in enumerate(by_code) if name in (p.name for p in own)])
         if where := _offenders("mass", ~used & ~np.isnan(arrays["material_params"][:, column])):
             yield "material_params", f"{name}: {where}: has a value, but the material has no such parameter (NaN expected)"
 
@@ -335,7 +334,11 @@ def format_page() -> str:
             for key, f in FIELDS.items()
         ],
         "metadata": [f"| `{key}` | {meaning[key]} |" for key in Metadata.__dataclass_fields__],
-        "materials": [f"| `{name}` | `{p.name}` | {p.unit} | {p.rule} | {LIMITS[name]} | {p.scale} |" for name, p in MATERIALS.items()],
+        "materials": [
+            f"| `{name}` | `{p.name}` | {p.unit} | {p.rule} | {p.limits} | {p.scale} | {'optional' if k else 'always'} |"
+            for name, own in MATERIALS.items()
+            for k, p in enumerate(own)
+        ],
     }
     return _PAGE.format(
         version=SCHEMA_VERSION,
@@ -380,8 +383,8 @@ fletcher32 checksum per chunk. Arrays with frames are chunked along the frames. 
 other attributes except `prediction`. Arrays are compressed without loss (shuffle and gzip, which every HDF5 library reads). Text has a fixed length. No file
 refers to another file.
 
-Splits: {splits}. In the first three, material parameters have the trained values. In the last one they lie between or outside the trained values, as
-`parameter_group` says ({groups}).
+Splits: {splits}. In the first three, material parameters have the trained values. In the last one, some of them lie between or outside the trained values.
+`parameter_group` ({groups}) is `extrapolated` if any parameter lies outside the trained range.
 
 ## Fields
 
@@ -395,9 +398,12 @@ Values are finite and at most 1.8e19 in magnitude. The reader refuses other valu
 
 ## Materials and their parameters
 
-| material | column of `material_params` | unit | stored values are | the solvers accept | scale |
-|---|---|---|---|---|---|
+| material | column of `material_params` | unit | stored values are | the solvers accept | scale | stored |
+|---|---|---|---|---|---|---|
 {materials}
+
+`param_names` lists the columns of a data set, in the order of this table. The first parameter of each material is always stored. A parameter that is not
+stored has the value of the solver's settings. A name stands for one column: materials with the same parameter store it together.
 
 ## Metadata
 

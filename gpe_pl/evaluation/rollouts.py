@@ -32,7 +32,7 @@ from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Simulator, Start, rollout, rollouts, share_outside
-from gpe_pl.schema import SPLITS, ParameterGroup, Split
+from gpe_pl.schema import SPLITS, ParameterGroup, Split, param_names
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.saving import save_figure
@@ -255,8 +255,10 @@ def _predict(
 
 
 def _parameter(trajectory: Trajectory) -> float:
-    """Return the material parameter of a scene; NaN if the scene has several values or none."""
-    values = np.unique(np.asarray(trajectory.material_params, dtype=np.float64))
+    """Return the first material parameter of a scene; NaN if its nodes have several values or none."""
+    metadata = trajectory.metadata
+    first = [metadata.param_names.index(name) for name in param_names(metadata.materials)]
+    values = np.unique(np.asarray(trajectory.material_params, dtype=np.float64)[:, first])
     values = values[np.isfinite(values)]
     return float(values[0]) if len(values) == 1 else float("nan")
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,6 +26,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.guard import Guard, unsound
 from gpe_pl.rollout.loop import Simulator, Start, frames
+from gpe_pl.schema import MATERIALS, MaterialValues, parameters_by_name
 from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.system.machine import environment, peak_resident
@@ -48,13 +49,13 @@ class ShowcaseSettings:
     Attributes:
         num_steps: length of the rollout [frames].
         num_uncontained_steps: length [frames] of a second rollout without containment, which shows what it corrects.
-        values: value of each material's parameter, in the unit of ``schema.MATERIALS``.
+        values: parameters of each material, in the units of ``schema.MATERIALS``: a number for the first one, several by name.
         seed: seed of the scene.
     """
 
     num_steps: Annotated[int, Field(ge=1)] = 50
     num_uncontained_steps: Annotated[int, Field(ge=0)] = 0
-    values: dict[str, float] = field(default_factory=dict)
+    values: Mapping[str, MaterialValues] = field(default_factory=dict)
     seed: Annotated[int, Field(ge=0)] = 0
 
 
@@ -78,10 +79,17 @@ def start(simulator: LearnedSimulator, scene: Scene, settings: ShowcaseSettings)
     unknown = settings.values.keys() - set(metadata.materials)
     if unknown:
         raise ValueError(f"values.{min(unknown)}: no material of this scene, which has {', '.join(metadata.materials)}")
-    for material, value in settings.values.items():
-        if fault := limits_fault(material, value):
-            raise ValueError(f"values.{material}: {fault}")
-    state = simulator.standing(scene.sample(settings.values, settings.seed), metadata)
+    for material, values in settings.values.items():
+        try:
+            named = parameters_by_name(material, values)
+        except ValueError as error:
+            raise ValueError(f"values.{material}: {error}") from None
+        for parameter in MATERIALS[material]:
+            if parameter.name in named and (fault := limits_fault(parameter, named[parameter.name])):
+                raise ValueError(f"values.{material}: {fault}")
+    start_state = scene.sample(settings.values, settings.seed)
+    metadata = replace(metadata, param_names=start_state.param_names)
+    state = simulator.standing(start_state, metadata)
     impossible = unsound(state, metadata)
     if impossible is not None:
         raise ValueError(f"values: {impossible.message}")

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.export import Dim
 
@@ -32,7 +31,7 @@ from gpe_pl.graphs.features import history_of
 from gpe_pl.graphs.topology import IslandTopology, MeshTopology, Topology, descent_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.schema import BOUNDARY, DOWN, MATERIALS, EdgeType, grid, node_code
+from gpe_pl.schema import BOUNDARY, DOWN, EdgeType, grid, node_code
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 
@@ -99,12 +98,16 @@ class ExportedStep(nn.Module):
 
         The state has no periodic axes, so positions are not wrapped into the domain.
         """
-        materials, names = self.simulator.builder.spec.materials, self.simulator.builder.metadata.param_names
+        materials, metadata = self.simulator.builder.spec.materials, self.simulator.builder.metadata
 
         def joined(name: str) -> Tensor:
             return torch.cat([scene[f"{name}.{m}"] for m in materials])
 
-        columns = {m: names.index(MATERIALS[m].name) for m in materials}
+        def columns(material: str) -> Tensor:
+            own = scene[f"material_params.{material}"]
+            every = own.new_full((own.shape[0], len(metadata.param_names)), torch.nan)
+            return every.index_copy(1, torch.tensor(metadata.columns_of(material)), own)
+
         history = joined("velocity_history")
         pos, vel, normal, friction, restitution = (scene[f"boundary.{name}"] for name in BOUNDARY_FIELDS)
         return State(
@@ -112,9 +115,7 @@ class ExportedStep(nn.Module):
             vel=history[:, -1],
             node_type=torch.cat([torch.full(scene[f"mass.{m}"].shape, node_code(m)) for m in materials]),
             mass=joined("mass"),
-            material_params=torch.cat(
-                [F.pad(scene[f"material_params.{m}"], (k, len(names) - k - 1), value=torch.nan) for m, k in columns.items()]
-            ),
+            material_params=torch.cat([columns(m) for m in materials]),
             boundary=Boundary(pos, vel, normal, friction, restitution),
             gravity=scene["gravity"],
             velocity_history=history,
@@ -166,13 +167,13 @@ def describe(simulator: LearnedSimulator) -> dict[str, Input]:
     is_periodic = bool(builder.metadata.periodicity)
     positions = "positions, not wrapped into the domain, so that the nodes of a mesh stay together" if is_periodic else "positions"
     for m in spec.materials:
-        parameter = MATERIALS[m]
+        own = spec.parameters[m]
         inputs |= {
             f"pos.{m}": Input((m, dim), "float64", "m", positions),
             f"velocity_history.{m}": Input(
                 (m, history, dim), "float64", "m/s", "differences of the last positions divided by frame_dt, oldest first"
             ),
-            f"material_params.{m}": Input((m, 1), "float64", parameter.unit, parameter.name),
+            f"material_params.{m}": Input((m, len(own)), "float64", ", ".join(p.unit for p in own), ", ".join(p.name for p in own)),
             f"mass.{m}": Input((m,), "float64", "kg", "mass (per metre of depth in 2D)"),
         }
         if m in spec.meshes:
@@ -220,11 +221,10 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
         pos, rest_pos, sizes = pos if mesh.shift is None else pos + mesh.shift, mesh.rest_pos, [*mesh.num_virtual]
     scene: Scene = {"gravity": state.gravity} | {f"boundary.{name}": getattr(state.boundary, name) for name in BOUNDARY_FIELDS}
     for m, rows in topology.rows.items():
-        column = builder.metadata.param_names.index(MATERIALS[m].name)
         values = {
             "pos": pos[rows],
             "velocity_history": history_of(state)[rows],
-            "material_params": state.material_params[rows, column : column + 1],
+            "material_params": state.material_params[rows][:, builder.metadata.columns_of(m)],
             "mass": state.mass[rows],
             "rest_pos": rest_pos[rows],
         }

@@ -36,7 +36,7 @@ from gpe_pl.graphs.topology import GraphError as GraphError
 from gpe_pl.graphs.topology import MeshTopology, Topology
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.schema import BOUNDARY, CELL, DOWN, MATERIALS, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of
+from gpe_pl.schema import BOUNDARY, CELL, DOWN, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata
@@ -145,8 +145,7 @@ class GraphBuilder:
         for material, r in topology.rows.items():
             store = data[material]
             store.x = self._rounded(material_features(history[r], state.gravity, self.scales))
-            column = self.metadata.param_names.index(MATERIALS[material].name)
-            store.material_params = state.material_params[r, column : column + 1].float()
+            store.material_params = state.material_params[r][:, self.metadata.columns_of(material)].float()
             store.mass = self._rounded(state.mass[r])
             store.node_id = r
         if topology.boundary_rows is not None:

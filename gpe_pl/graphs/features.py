@@ -24,7 +24,6 @@ from gpe_pl.schema import (
     FeatureSpec,
     grid,
     mesh_relations,
-    param_names,
     radius_relations,
 )
 from gpe_pl.trajectory.boundary import Boundary
@@ -114,7 +113,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
         dim=dim,
         materials=materials,
         node_channels={**dict.fromkeys(materials, motion), BOUNDARY: 2 * dim + 2 if config.boundary_condition else dim, **virtual},
-        param_channels={m: len(param_names((m,))) for m in materials},
+        parameters={m: metadata.parameters_of(m) for m in materials},
         relations=relations,
         odd_channels={r: odd for r, (odd, _) in channels.items()},
         even_channels={r: even for r, (_, even) in channels.items()},

@@ -14,7 +14,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.graphs.features import ParameterScale
 from gpe_pl.nn.blocks import Standardize
-from gpe_pl.schema import MATERIALS, RADIUS, EdgeType, FeatureSpec, role
+from gpe_pl.schema import RADIUS, EdgeType, FeatureSpec, role
 
 
 def _no_more(roles: frozenset[str]) -> list[HeteroData]:
@@ -73,18 +73,23 @@ class GraphStandardizer(nn.Module):
         source, name, target = relation
         return f"{role(source)}__{name}__{role(target)}"
 
-    def _is_logarithmic(self, material: str) -> bool:
-        return self.parameter_scale is None and MATERIALS[material].scale == "log"
+    def _is_log(self, material: str) -> list[bool]:
+        return [self.parameter_scale is None and p.scale == "log" for p in self.spec.parameters[material]]
 
     def _precision(self, material: str) -> torch.dtype:
-        """Return the precision in which a material's parameter is standardised.
+        """Return the precision in which a material's parameters are standardised.
 
         Logarithms need double precision. In another unit they are shifted, and single precision would round them differently.
         """
-        return torch.float64 if self._is_logarithmic(material) else torch.float32
+        return torch.float64 if any(self._is_log(material)) else torch.float32
 
     def _material_scale(self, material: str, params: Tensor) -> Tensor:
-        return params.to(self._precision(material)).log() if self._is_logarithmic(material) else params
+        """Return parameters [node, param], the logarithm of those with a logarithmic scale."""
+        is_log = self._is_log(material)
+        if not any(is_log):
+            return params
+        columns = params.to(torch.float64).unbind(dim=1)
+        return torch.stack([c.log() if log else c for c, log in zip(columns, is_log, strict=True)], dim=1)
 
     def fit(self, graphs: Iterable[HeteroData]) -> list[str]:
         """Set all statistics from graphs of the training split; a ``StatisticsSample`` adds graphs of rare materials and contacts.

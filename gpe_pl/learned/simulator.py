@@ -35,7 +35,7 @@ from gpe_pl.models.lookup import model_class
 from gpe_pl.nn.static_friction import keeps_position, supported
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.schema import BOUNDARY, MATERIALS, EdgeType, node_code
+from gpe_pl.schema import BOUNDARY, EdgeType, MaterialParameter, node_code, param_names
 from gpe_pl.system.signatures import check_plain, checked
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.cells import mean_over_corners
@@ -244,9 +244,8 @@ class LearnedSimulator(nn.Module):
     def described_training(self) -> Iterator[tuple[str, str]]:
         """Yield a name, and the range in training with its unit, for each material parameter, mass, gravity and property of boundary nodes."""
         for material, trained in self.trained_ranges():
-            spec = MATERIALS[material]
-            for low, high in trained.T.tolist():
-                yield f"{spec.name} of {material}", f"{low:g} to {high:g} {spec.unit}"
+            for spec, (low, high) in zip(self.builder.spec.parameters[material], trained.T.tolist(), strict=True):
+                yield f"{spec.name} of {material}", spec.quantity(f"{low:g} to {high:g}")
         for material, (low, high) in zip(self.builder.spec.materials, self.trained_mass.T.tolist(), strict=True):
             if math.isfinite(high):
                 yield f"mass of nodes of {material}", f"{low:g} to {high:g} kg"
@@ -258,14 +257,18 @@ class LearnedSimulator(nn.Module):
 
     def _outside_parameters(self, state: State) -> Iterator[tuple[str, str]]:
         for material, trained in self.trained_ranges():
-            column = self.builder.metadata.param_names.index(MATERIALS[material].name)
-            values = state.material_params[state.node_type == node_code(material), column]
-            margin = RANGE_TOLERANCE * trained.abs()
-            is_outside = (values < trained[0] - margin[0]) | (values > trained[1] + margin[1])
-            if bool(is_outside.any()):
-                spec, (low, high) = MATERIALS[material], trained[:, 0].tolist()
-                kind = f"{spec.name} of {material}"
-                yield kind, f"{kind} is {values[is_outside][0].item():g} {spec.unit}, trained were {low:g} to {high:g}"
+            of_material = state.node_type == node_code(material)
+            for spec, column, (low, high) in self._stored(material, trained):
+                values = state.material_params[of_material, column]
+                is_outside = (values < low - RANGE_TOLERANCE * low.abs()) | (values > high + RANGE_TOLERANCE * high.abs())
+                if bool(is_outside.any()):
+                    kind = f"{spec.name} of {material}"
+                    yield kind, f"{kind} is {spec.quantity(values[is_outside][0].item())}, trained were {low.item():g} to {high.item():g}"
+
+    def _stored(self, material: str, trained: Tensor) -> Iterator[tuple[MaterialParameter, int, Tensor]]:
+        """Yield each parameter of a material with its column of ``material_params`` and its trained range [2]."""
+        metadata = self.builder.metadata
+        yield from zip(metadata.parameters_of(material), metadata.columns_of(material), trained.T, strict=True)
 
     def untrained_scene(self, state: State) -> list[str]:
         """Return one line for each kind of mass, gravity and property of boundary nodes of a scene that is outside the range of training."""
@@ -331,9 +334,9 @@ class LearnedSimulator(nn.Module):
         own = self.builder.metadata
         if not self.fits(scene):
             raise SceneError(
-                f"the model was trained with frame_dt={own.frame_dt:g} s and spacing={own.spacing:g} m in {own.dim}D on {', '.join(own.materials)}; "
+                f"the model was trained with frame_dt={own.frame_dt:g} s and spacing={own.spacing:g} m in {own.dim}D on {_materials(own)}; "
                 f"the scene has frame_dt={scene.frame_dt:g} s and spacing={scene.spacing:g} m in {scene.dim}D and "
-                f"{', '.join(scene.materials)}; choose the data set with {choice}"
+                f"{_materials(scene)}; choose the data set with {choice}"
             )
 
     def _checked(self, state: State, where: str) -> State:
@@ -347,14 +350,14 @@ class LearnedSimulator(nn.Module):
         if bad.any():
             node = int(bad.nonzero()[0])
             raise SceneError(f"node {node} has a mass of {float(state.mass[node]):g} kg; give every node a positive and finite mass")
-        for material, spec in MATERIALS.items():
-            if material in self.builder.metadata.materials:
-                rows = torch.nonzero(state.node_type == node_code(material)).flatten()
-                column = state.material_params[rows, self.builder.metadata.param_names.index(spec.name)]
+        for material, trained in self.trained_ranges():
+            rows = torch.nonzero(state.node_type == node_code(material)).flatten()
+            for spec, number, _ in self._stored(material, trained):
+                column = state.material_params[rows, number]
                 wrong = ~spec.accepts(column)
                 if wrong.any():
                     node, value = int(rows[wrong][0]), float(column[wrong][0])
-                    raise SceneError(f"node {node} ({material}): {spec.name} is {value:g} {spec.unit}, must be {spec.rule}")
+                    raise SceneError(f"node {node} ({material}): {spec.name} is {spec.quantity(value)}, must be {spec.rule}")
         clamped = "; clamped to the nearest trained value" if self.clamps_parameters else ""
         found = [(kind, line + clamped) for kind, line in self._outside_parameters(state)]
         for kind, line in (*found, *self._outside_scene(state)):
@@ -590,6 +593,12 @@ def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:
         raise CheckpointError(
             f"{path}: not a safe, complete checkpoint ({reason(error)}); if it was copied, copy it again, or take another of the run, such as last.ckpt"
         ) from None
+
+
+def _materials(metadata: Metadata) -> str:
+    """Return the materials, and the parameters that the data set stores besides the first of each."""
+    further = set(metadata.param_names) - set(param_names(metadata.materials))
+    return ", ".join(metadata.materials) + (f" with {', '.join(sorted(further))}" if further else "")
 
 
 def _per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterator[tuple[int, Tensor, Tensor]]:

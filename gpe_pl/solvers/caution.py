@@ -21,7 +21,7 @@ THIN_FRACTION = 0.1
 def unresolved(solver: Any, parameters: Mapping[str, Sequence[float]], scenes: Iterable[State]) -> Iterator[str]:
     """Yield a warning for parameter values, and one for initial states, that the solver does not resolve."""
     for material, smallest in getattr(solver, "smallest_resolved", {}).items():
-        name, unit = MATERIALS[material].name, MATERIALS[material].unit
+        name, unit = MATERIALS[material][0].name, MATERIALS[material][0].unit
         values = [value for value in parameters.get(material, ()) if value < smallest]
         if values:
             yield (

@@ -18,8 +18,18 @@ from gpe_pl.geometry.canyon import canyon
 from gpe_pl.geometry.grid_distance import Bounds, Solid
 from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Shape, domain_walls, signed_distance
 from gpe_pl.geometry.terrain import Fit, Up, read_terrain
-from gpe_pl.schema import STICKY, node_code
-from gpe_pl.solvers.scenes import CLEARANCE, MAX_ATTEMPTS, check_domain, check_ranges, draw_velocity, filled_box, floats, jittered_lattice
+from gpe_pl.schema import STICKY, MaterialValues, node_code
+from gpe_pl.solvers.scenes import (
+    CLEARANCE,
+    MAX_ATTEMPTS,
+    check_domain,
+    check_ranges,
+    draw_velocity,
+    filled_box,
+    floats,
+    jittered_lattice,
+    parameter_columns,
+)
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 
@@ -123,7 +133,7 @@ class FluidScene:
     def input_files(self) -> dict[str, str]:
         return {} if self.terrain is None else {"terrain": self.terrain}
 
-    def sample(self, values: Mapping[str, float], seed: int) -> State:
+    def sample(self, values: Mapping[str, MaterialValues], seed: int) -> State:
         """Draw a scene. It depends only on configuration, values, seed and the content of the terrain file, if any.
 
         Args:
@@ -138,15 +148,18 @@ class FluidScene:
         """
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
         shapes, pos, vel = {"bowl": _bowl, "dam_break": _dam_break, "canyon": _canyon}[self.scene](self, rng)
+        node_type = np.full(self.num_particles, node_code("fluid"), dtype=np.uint8)
+        params, names = parameter_columns(values, node_type, self.materials)
         order = rng.permutation(self.num_particles)  # node numbers must not reveal where a particle started
         return State(
             pos=np.ascontiguousarray(pos[order]),
             vel=np.ascontiguousarray(vel[order]),
-            node_type=np.full(self.num_particles, node_code("fluid"), dtype=np.uint8),
+            node_type=node_type,
             mass=np.full(self.num_particles, self.density * self.spacing**self.dim),
-            material_params=np.full((self.num_particles, 1), float(values["fluid"])),
+            material_params=params,
             boundary=Boundary.sample(shapes, self.spacing, self.dim),
             gravity=np.array(self.gravity, dtype=np.float64),
+            param_names=names,
         )
 
 

@@ -1,20 +1,23 @@
-"""Materials of the solvers: limits of their parameters, and constants of the material point method.
+"""Materials of the solvers: checks of their parameters, and constants of the material point method.
 
 Every law is isotropic hyperelasticity, some with a return mapping. The laws themselves are in ``mpm.laws_2d`` and ``mpm.laws_3d``. A law reads one row of
-constants per particle; ``LAMBDA`` … ``MEMORY`` name the columns. Viscous stress is added to the stress of every law.
+constants per particle; ``LAMBDA`` … ``MEMORY`` name the columns. Parameters that a data set does not store have the values of the settings. Viscous stress is
+added to the stress of every law.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar, NamedTuple
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
 
 import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gpe_pl.rollout.loop import SimulationError
-from gpe_pl.schema import MATERIALS
+from gpe_pl.schema import MATERIALS, MaterialParameter, param_names, stored_parameters
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.strain import FloatOrArray
 from gpe_pl.trajectory.strain import lame_parameters as lame_parameters
 
@@ -24,54 +27,67 @@ SAND, SNOW, ELASTOMER = 0, 1, 2
 LAMBDA, MU, COEFFICIENT, SMALLEST, LARGEST, MAX_HARDENING, VISCOSITY, MEMORY = range(8)
 """Columns of a particle's constants: Lamé parameters at rest [Pa]; slope of the cone in strains (sand) or ξ (snow); three constants of snow; kinematic
 viscosity [m²/s]; and the time for which a particle keeps a velocity that the grid does not represent, per grid spacing [s/m]."""
+INTERCEPT, TIP = SMALLEST, LARGEST
+"""Columns of sand, which has none of snow's constants: ``|dev ε|`` of the cone at ``tr ε = 0``, and ``tr ε`` at its tip."""
 NUM_CONSTANTS = 8
 
 
-class Limits(NamedTuple):
-    """Smallest and largest value of a material parameter that the solvers accept, in the unit of the parameter."""
-
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.low:g} … {self.high:g}"
+Parameters = Mapping[str, np.ndarray]
+"""Values of the stored parameters of one material by name, each [node]."""
 
 
-LIMITS: dict[str, Limits] = {
-    "sand": Limits(0.0, 60.0),
-    "snow": Limits(0.0, 30.0),
-    "fluid": Limits(1e-6, 10.0),
-    "elastomer": Limits(1e3, 1e8),
-    "solid": Limits(1e3, 1e9),
-}
-"""Limits by material. Imported data may exceed them; ``schema.MaterialParameter.rule`` says what can be stored."""
-
-
-def limits_fault(material: str, value: float) -> str:
+def limits_fault(parameter: MaterialParameter, value: float) -> str:
     """Return a message for a parameter outside the solvers' limits, or an empty string."""
-    parameter, limits = MATERIALS[material], LIMITS[material]
+    limits = parameter.limits
     if limits.low <= value <= limits.high:
         return ""
-    return f"{parameter.name} = {value} {parameter.unit} is outside {limits}, the solvers' limits"
+    return f"{parameter.name} = {parameter.quantity(str(value))} is outside {limits}, the solvers' limits"
 
 
-def check_limits(material: str, values: np.ndarray, nodes: np.ndarray) -> None:
+def parameters_of(state: State, material: str, nodes: np.ndarray, materials: tuple[str, ...]) -> Parameters:
+    """Return the stored parameters of the nodes of one material in float64.
+
+    Args:
+        state: state of a solver.
+        material: name of the material.
+        nodes: numbers of its nodes [chosen].
+        materials: every material of the data set; they determine the columns of a state without ``param_names``.
+
+    Raises:
+        SimulationError: with reason ``input``; the first parameter has no column, or a value is outside the limits of the solvers or not a number.
+    """
+    names = state.param_names or param_names(materials)
+    columns = np.asarray(state.material_params)
+    if columns.shape != (state.num_nodes, len(names)):
+        raise SimulationError(f"material_params has shape {columns.shape}, expected {(state.num_nodes, len(names))}", reason="input")
+    if MATERIALS[material][0].name not in names:
+        raise SimulationError(f"material_params has no column {MATERIALS[material][0].name}, which {material} needs", reason="input")
+    values = {}
+    for parameter in stored_parameters(material, names):
+        own = columns[nodes, names.index(parameter.name)].astype(np.float64)
+        check_limits(material, parameter, own, nodes)
+        values[parameter.name] = own
+    return values
+
+
+def check_limits(material: str, parameter: MaterialParameter, values: np.ndarray, nodes: np.ndarray) -> None:
     """Refuse parameters outside the solvers' limits.
 
     Args:
         material: material of all nodes.
-        values: values of its parameter [node].
+        parameter: one of its parameters.
+        values: values of the parameter [node].
         nodes: numbers of the nodes [node], for the message.
 
     Raises:
-        SimulationError: a value is outside ``LIMITS``, or not a number.
+        SimulationError: a value is outside the limits, or not a number.
     """
-    parameter, limits = MATERIALS[material], LIMITS[material]
+    limits = parameter.limits
     slack = 1 + np.finfo(np.float32).eps  # values at a limit may have been rounded in storage
     wrong = ~((values >= limits.low / slack) & (values <= limits.high * slack))
     if wrong.any():
         node, value = int(nodes[wrong][0]), values[wrong][0]
-        message = f"node {node}: {parameter.name} of {material} is {value:g} {parameter.unit}, outside {limits}, the limits of the solvers"
+        message = f"node {node}: {parameter.name} of {material} is {parameter.quantity(value)}, outside {limits}, the limits of the solvers"
         raise SimulationError(message, reason="input", node=node)
 
 
@@ -93,6 +109,23 @@ def drucker_prager_coefficient(friction_angle: np.ndarray, dim: int) -> np.ndarr
     return sine / math.sqrt(2.0) if dim == 2 else math.sqrt(2.0 / 3.0) * 2.0 * sine / (3.0 - sine)
 
 
+def drucker_prager_intercept(friction_angle: np.ndarray, cohesion: np.ndarray, dim: int) -> np.ndarray:
+    """Return k [Pa] of the Drucker-Prager cone ``|dev τ| = k - α tr τ``, with α as in ``drucker_prager_coefficient``.
+
+    The Mohr-Coulomb law with cohesion is ``τ₁ - τ₂ = 2 c cos φ - sin φ (τ₁ + τ₂)`` for the largest and the smallest principal stress. In plane strain
+    ``|dev τ| = |τ₁ - τ₂| / √2`` gives k = √2 c cos φ. In 3D the triaxial compression corners give k = √(2/3) 6 c cos φ / (3 - sin φ). In both, the tip is at
+    the isotropic tension c cot φ.
+
+    Args:
+        friction_angle: φ [node] in degrees.
+        cohesion: c [node] in Pa.
+        dim: 2 or 3.
+    """
+    angle = np.deg2rad(friction_angle)
+    factor = math.sqrt(2.0) if dim == 2 else math.sqrt(2.0 / 3.0) * 6.0 / (3.0 - np.sin(angle))
+    return factor * cohesion * np.cos(angle)
+
+
 def _memory(cells: float, lam: FloatOrArray, mu: FloatOrArray, density: float) -> FloatOrArray:
     """Return the time [s] per grid spacing [m] in which a pressure wave crosses ``cells`` cells."""
     return cells * np.sqrt(density / (lam + 2.0 * mu))  # type: ignore[return-value]
@@ -108,7 +141,10 @@ def _constants(count: int, **columns: float | np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, config={"extra": "forbid"})
 class Sand:
-    """Dry sand: Hencky elasticity with Drucker-Prager plasticity (Klar et al. 2016). Material parameter: friction angle [°].
+    """Sand: Hencky elasticity with Drucker-Prager plasticity (Klar et al. 2016). Material parameters: friction angle [°] and cohesion [Pa].
+
+    Sand without stored cohesion is dry, with cohesion 0. Cohesion moves the tip of the cone into tension, as in wet sand (Tampubolon et al. 2017). It does not
+    decrease in fracture: grains that come into contact again stick together as before.
 
     Attributes:
         youngs_modulus: Young's modulus [Pa]. It is a numerical choice, stiff enough to keep the wave speed well above the speeds of the flow.
@@ -123,12 +159,17 @@ class Sand:
     memory_cells: Annotated[float, Field(ge=0)] = 0.5
     law: ClassVar[int] = SAND
 
-    def constants(self, friction_angle: np.ndarray, dim: int) -> np.ndarray:
+    def constants(self, values: Parameters, dim: int) -> np.ndarray:
         """Return the constants that the law reads [node, constant]."""
+        friction_angle = values["friction_angle"]
+        cohesion = values.get("cohesion", np.zeros(len(friction_angle)))
         lam, mu = lame_parameters(self.youngs_modulus, self.poisson_ratio)
         slope = drucker_prager_coefficient(friction_angle, dim) * (dim * lam + 2.0 * mu) / (2.0 * mu)
+        intercept = drucker_prager_intercept(friction_angle, cohesion, dim) / (2.0 * mu)
+        without_tip = np.where(intercept > 0.0, math.inf, 0.0)  # the cone is a cylinder
+        tip = np.divide(intercept, slope, out=without_tip, where=(slope > 0.0) & (intercept > 0.0))
         memory = _memory(self.memory_cells, lam, mu, self.density)
-        return _constants(len(friction_angle), LAMBDA=lam, MU=mu, COEFFICIENT=slope, MEMORY=memory)
+        return _constants(len(slope), LAMBDA=lam, MU=mu, COEFFICIENT=slope, INTERCEPT=intercept, TIP=tip, MEMORY=memory)
 
     @property
     def smallest_stiffness(self) -> float:
@@ -138,14 +179,14 @@ class Sand:
 
 @dataclass(frozen=True, config={"extra": "forbid"})
 class Snow:
-    """Snow: fixed-corotated elasticity that hardens under compaction (Stomakhin et al. 2013). Material parameter: hardening coefficient ξ.
+    """Snow: fixed-corotated elasticity that hardens under compaction (Stomakhin et al. 2013). Material parameters: hardening coefficient ξ, θ_c and θ_s.
 
     Attributes:
         youngs_modulus: E₀ [Pa] before any compaction.
         poisson_ratio: Poisson's ratio, below 0.5.
         density: mass per volume at rest [kg/m³].
-        critical_compression: θ_c; principal stretches below 1 - θ_c become plastic.
-        critical_stretch: θ_s; principal stretches above 1 + θ_s become plastic.
+        critical_compression: θ_c; principal stretches below 1 - θ_c become plastic. A stored value has precedence.
+        critical_stretch: θ_s; principal stretches above 1 + θ_s become plastic. A stored value has precedence.
         max_hardening: largest factor on the elastic moduli. It bounds the wave speed, hence the number of substeps.
         memory_cells: as in ``Elastomer``. Without memory, snow settles at a greater height with shorter substeps.
     """
@@ -159,16 +200,16 @@ class Snow:
     memory_cells: Annotated[float, Field(ge=0)] = 2.0
     law: ClassVar[int] = SNOW
 
-    def constants(self, hardening_coefficient: np.ndarray, dim: int) -> np.ndarray:
+    def constants(self, values: Parameters, dim: int) -> np.ndarray:
         """Return the constants that the law reads [node, constant]."""
         lam, mu = lame_parameters(self.youngs_modulus, self.poisson_ratio)
         return _constants(
-            len(hardening_coefficient),
+            len(values["hardening_coefficient"]),
             LAMBDA=lam,
             MU=mu,
-            COEFFICIENT=hardening_coefficient,
-            SMALLEST=1.0 - self.critical_compression,
-            LARGEST=1.0 + self.critical_stretch,
+            COEFFICIENT=values["hardening_coefficient"],
+            SMALLEST=1.0 - values.get("critical_compression", self.critical_compression),
+            LARGEST=1.0 + values.get("critical_stretch", self.critical_stretch),
             MAX_HARDENING=self.max_hardening,
             MEMORY=_memory(self.memory_cells, lam, mu, self.density),
         )
@@ -181,10 +222,10 @@ class Snow:
 
 @dataclass(frozen=True, config={"extra": "forbid"})
 class Elastomer:
-    """Rubber: compressible neo-Hookean elasticity. Material parameter: Young's modulus [Pa].
+    """Rubber: compressible neo-Hookean elasticity. Material parameters: Young's modulus [Pa] and Poisson's ratio.
 
     Attributes:
-        poisson_ratio: Poisson's ratio, below 0.5.
+        poisson_ratio: Poisson's ratio, below 0.5, unless the data set stores it.
         density: mass per volume at rest [kg/m³].
         memory_cells: memory of the velocity that the grid does not represent. It decays to 1/e while a pressure wave crosses this many grid cells, for any
             length of substeps. 0 drops it in every substep (APIC), and then shorter substeps lose more energy.
@@ -195,15 +236,16 @@ class Elastomer:
     memory_cells: Annotated[float, Field(ge=0)] = 10.0
     law: ClassVar[int] = ELASTOMER
 
-    def constants(self, youngs_modulus: np.ndarray, dim: int) -> np.ndarray:
+    def constants(self, values: Parameters, dim: int) -> np.ndarray:
         """Return the constants that the law reads [node, constant]."""
-        lam, mu = lame_parameters(youngs_modulus, self.poisson_ratio)
-        return _constants(len(youngs_modulus), LAMBDA=lam, MU=mu, MEMORY=_memory(self.memory_cells, lam, mu, self.density))
+        lam, mu = lame_parameters(values["youngs_modulus"], values.get("poisson_ratio", self.poisson_ratio))
+        return _constants(len(lam), LAMBDA=lam, MU=mu, MEMORY=_memory(self.memory_cells, lam, mu, self.density))
 
     @property
     def smallest_stiffness(self) -> float:
         """λ + 2μ at rest [Pa] of the softest elastomer within the limits."""
-        return _pressure_wave_modulus(LIMITS["elastomer"].low, self.poisson_ratio)
+        youngs_modulus, poisson_ratio = (p.limits.low for p in MATERIALS["elastomer"])
+        return _pressure_wave_modulus(youngs_modulus, poisson_ratio)
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
@@ -223,9 +265,10 @@ class Fluid:
     memory_cells: Annotated[float, Field(ge=0)] = 2.0
     law: ClassVar[int] = SAND
 
-    def constants(self, kinematic_viscosity: np.ndarray, dim: int) -> np.ndarray:
+    def constants(self, values: Parameters, dim: int) -> np.ndarray:
         """Return the constants that the law reads [node, constant]."""
-        return _constants(len(kinematic_viscosity), LAMBDA=self.bulk_modulus, VISCOSITY=kinematic_viscosity, MEMORY=self.memory)
+        viscosity = values["kinematic_viscosity"]
+        return _constants(len(viscosity), LAMBDA=self.bulk_modulus, VISCOSITY=viscosity, MEMORY=self.memory)
 
     @property
     def memory(self) -> float:

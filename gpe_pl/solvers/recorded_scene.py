@@ -27,8 +27,8 @@ from pydantic.dataclasses import dataclass
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry.shapes import Shape, domain_walls, signed_distance
 from gpe_pl.geometry.terrain import ground_of
-from gpe_pl.schema import STICKY, node_code
-from gpe_pl.solvers.scenes import CLEARANCE, filled_box
+from gpe_pl.schema import STICKY, MaterialValues, node_code
+from gpe_pl.solvers.scenes import CLEARANCE, filled_box, parameter_columns
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 
@@ -192,7 +192,7 @@ class RecordedScene:
     def input_files(self) -> dict[str, str]:
         return {"file": self.file}
 
-    def sample(self, values: Mapping[str, float], seed: int) -> State:
+    def sample(self, values: Mapping[str, MaterialValues], seed: int) -> State:
         """Make the scene. It depends only on the settings, the file and, for a flood, the seed.
 
         Args:
@@ -217,14 +217,17 @@ class RecordedScene:
         else:
             self._check(pos, vel, shapes, bounds[2][1])
         count = len(pos)
+        node_type = np.full(count, node_code("fluid"), dtype=np.uint8)
+        params, names = parameter_columns({"fluid": recording.viscosity, **values}, node_type, self.materials)
         return State(
             pos=pos,
             vel=vel,
-            node_type=np.full(count, node_code("fluid"), dtype=np.uint8),
+            node_type=node_type,
             mass=np.full(count, self.density * self.spacing**3),
-            material_params=np.full((count, 1), float(values.get("fluid", recording.viscosity))),
+            material_params=params,
             boundary=Boundary.sample(shapes, self.spacing, 3),
             gravity=np.array(self.gravity, dtype=np.float64),
+            param_names=names,
         )
 
     def _check(self, pos: np.ndarray, vel: np.ndarray, shapes: tuple[Shape, ...], height: float) -> None:

@@ -13,11 +13,12 @@ from dataclasses import asdict
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
+from jaxtyping import Float
 from pydantic import Field
 from pydantic.dataclasses import dataclass
 
 from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, check_bounds, domain_walls, signed_distance
-from gpe_pl.schema import MATERIALS, STICKY, node_code, param_names
+from gpe_pl.schema import MATERIALS, STICKY, MaterialValues, node_code, param_names, parameters_by_name, stored_parameters
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata
@@ -69,7 +70,7 @@ class Scene(Protocol):
         """Files that scenes depend on, keyed by the setting that names them."""
         ...
 
-    def sample(self, values: Mapping[str, float], seed: int) -> State: ...
+    def sample(self, values: Mapping[str, MaterialValues], seed: int) -> State: ...
 
 
 def describe(scene: Scene, frame_dt: float, **provenance: Any) -> Metadata:
@@ -88,6 +89,30 @@ def describe(scene: Scene, frame_dt: float, **provenance: Any) -> Metadata:
             **provenance,
         }
     )
+
+
+def parameter_columns(
+    values: Mapping[str, MaterialValues], node_type: np.ndarray, materials: tuple[str, ...]
+) -> tuple[Float[np.ndarray, "node param"], tuple[str, ...]]:
+    """Return ``material_params`` and ``param_names`` of a state, the same for all nodes of a material.
+
+    Args:
+        values: parameters of each material.
+        node_type: codes of the nodes [node].
+        materials: materials of the scene.
+
+    Raises:
+        ValueError: a material has no such parameter, or lacks one; names it.
+    """
+    given = {material: parameters_by_name(material, values[material]) for material in materials}
+    names = param_names(materials, (name for own in given.values() for name in own))
+    params = np.full((len(node_type), len(names)), np.nan)
+    for material, own in given.items():
+        for parameter in stored_parameters(material, names):
+            if parameter.name not in own:
+                raise ValueError(f"{material} lacks {parameter.name}, which another material has; give it to both or to none")
+            params[node_type == node_code(material), names.index(parameter.name)] = own[parameter.name]
+    return params, names
 
 
 # --- drawing and checks that several kinds of scenes share ----------------------------------------------------------------------------------
@@ -265,11 +290,11 @@ class BodyScene:
     def input_files(self) -> dict[str, str]:
         return {}
 
-    def sample(self, values: Mapping[str, float], seed: int) -> State:
+    def sample(self, values: Mapping[str, MaterialValues], seed: int) -> State:
         """Draw a scene.
 
         Args:
-            values: value of each material's parameter, in the unit that ``schema`` gives.
+            values: parameters of each material, in the units that ``schema`` gives.
             seed: non-negative integer.
 
         Returns:
@@ -295,12 +320,10 @@ class BodyScene:
         # node numbers must not reveal where a particle started
         order = rng.permutation(self.num_particles)
         pos, material = pos[order], material[order]
-        names = param_names(self.materials)
-        params, mass = np.full((self.num_particles, len(names)), np.nan), np.empty(self.num_particles)
+        params, names = parameter_columns(values, material, self.materials)
+        mass = np.empty(self.num_particles)
         for name in self.materials:
-            chosen = material == node_code(name)
-            params[chosen, names.index(MATERIALS[name].name)] = values[name]
-            mass[chosen] = self.density[name] * self.spacing**self.dim
+            mass[material == node_code(name)] = self.density[name] * self.spacing**self.dim
         return State(
             pos=pos,
             vel=vel[order],
@@ -311,6 +334,7 @@ class BodyScene:
             gravity=np.array(self.gravity),
             rest_pos=pos.copy() if self.max_cells else None,
             cells=_cells(bodies, order) if self.max_cells else None,
+            param_names=names,
         )
 
 

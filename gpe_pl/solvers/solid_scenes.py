@@ -16,7 +16,7 @@ from pydantic.dataclasses import dataclass
 from gpe_pl.geometry.bodies import random_outline, random_solid
 from gpe_pl.geometry.meshing import TETRAHEDRA_PER_CUBE, MeshingError, quadrangulate, tetrahedralise, triangulate
 from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, signed_distance
-from gpe_pl.schema import node_code
+from gpe_pl.schema import MaterialValues, node_code
 from gpe_pl.solvers.scenes import (
     MAX_ATTEMPTS,
     ObstacleShapes,
@@ -29,6 +29,7 @@ from gpe_pl.solvers.scenes import (
     draw_velocity,
     draw_walls,
     floats,
+    parameter_columns,
 )
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State, Stress
@@ -129,11 +130,11 @@ class SolidScene:
         outline = 7.5 * self.body_size / self.spacing
         return math.ceil((1.0 if self.cell == "quad" else 0.5) * self.max_cells + outline / 2 + 1)
 
-    def sample(self, values: Mapping[str, float], seed: int) -> State:
+    def sample(self, values: Mapping[str, MaterialValues], seed: int) -> State:
         """Draw a scene.
 
         Args:
-            values: Young's modulus [Pa] under the key ``solid``.
+            values: Young's modulus [Pa] under the key ``solid``, or several parameters by name.
             seed: non-negative integer.
 
         Returns:
@@ -156,18 +157,21 @@ class SolidScene:
             )
         mass = _lumped_masses(placed, cells, self.density)
         count = len(placed)
+        node_type = np.full(count, node_code("solid"), dtype=np.uint8)
+        params, names = parameter_columns(values, node_type, self.materials)
         components = 4 if self.dim == 2 else 6
         return State(
             pos=placed,
             vel=_velocity(self, placed, mass, rng),
-            node_type=np.full(count, node_code("solid"), dtype=np.uint8),
+            node_type=node_type,
             mass=mass,
-            material_params=np.full((count, 1), float(values["solid"])),
+            material_params=params,
             boundary=Boundary.sample(shapes, self.boundary_spacing * self.spacing, self.dim),
             gravity=np.array(self.gravity, dtype=np.float64),
             rest_pos=placed.copy(),
             cells=cells,
             stress=Stress(np.zeros((count, components)), np.zeros((len(cells), components))),
+            param_names=names,
         )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.geometry.shapes import check_bounds
-from gpe_pl.schema import CELL_KINDS, LARGEST, MATERIALS, MESH_MATERIALS, NODE_TYPES, node_code, param_names
+from gpe_pl.schema import CELL_KINDS, LARGEST, MATERIALS, MESH_MATERIALS, NODE_TYPES, node_code, param_names, parameters_by_name
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.cells import fitting_kinds, stacked
 
@@ -138,8 +138,8 @@ def checked_bounds(bounds: Any, periodic: tuple[bool, ...], pos: np.ndarray, bou
 
 def checked_materials(
     materials: str | Sequence[str], params: Mapping[str, Any], num_nodes: int
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return codes of ``node_type`` [node], ``material_params`` [node, param] and the names of the materials that occur."""
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], tuple[str, ...]]:
+    """Return codes of ``node_type`` [node], ``material_params`` [node, param], the names of the materials that occur, and those of the columns."""
     names = [materials] * num_nodes if isinstance(materials, str) else [str(name) for name in materials]
     if len(names) != num_nodes:
         raise ArrayError(f"materials: {len(names)} names for {num_nodes} nodes")
@@ -148,20 +148,32 @@ def checked_materials(
     if unknown:
         raise ArrayError(f"materials: node {names.index(unknown[0])} is {unknown[0]!r}; known: {', '.join(MATERIALS)}")
     if not isinstance(params, Mapping) or set(params) != set(present):
-        wanted = ", ".join(f"{m}: {MATERIALS[m].name} [{MATERIALS[m].unit}]" for m in present)
+        wanted = ", ".join(f"{m}: {MATERIALS[m][0].name} [{MATERIALS[m][0].unit}]" for m in present)
         given = ", ".join(sorted(params)) if isinstance(params, Mapping) else "no names"
         raise ArrayError(f"params: has {given or 'nothing'}, needs {wanted}; give any constant for a parameter that never varies")
     codes = np.array([node_code(name) for name in names], np.uint8)
-    columns = np.full((num_nodes, len(param_names(present))), np.nan, np.float32)
+    by_name: dict[str, dict[str, Any]] = {}
     for material in present:
-        spec, rows = MATERIALS[material], codes == node_code(material)
-        values = per_node(f"params[{material!r}]", params[material], (num_nodes,))
-        wrong = rows & ~spec.accepts(values)
-        if wrong.any():
-            node = int(wrong.argmax())
-            raise ArrayError(f"params[{material!r}]: node {node} has {spec.name} = {values[node]:g} {spec.unit}, must be {spec.rule}")
-        columns[rows, param_names(present).index(spec.name)] = values[rows]
-    return codes, columns, present
+        try:
+            by_name[material] = parameters_by_name(material, params[material])
+        except ValueError as error:
+            raise ArrayError(f"params[{material!r}]: {error}") from None
+    stored = param_names(present, (name for own in by_name.values() for name in own))
+    columns = np.full((num_nodes, len(stored)), np.nan, np.float32)
+    for material in present:
+        rows = codes == node_code(material)
+        for spec in MATERIALS[material]:
+            if spec.name not in stored:
+                continue
+            if spec.name not in by_name[material]:  # materials with the same parameter store it together
+                raise ArrayError(f"params[{material!r}]: has no {spec.name}, which another material has; give it to both or to none")
+            values = per_node(f"params[{material!r}]", by_name[material][spec.name], (num_nodes,))
+            wrong = rows & ~spec.accepts(values)
+            if wrong.any():
+                node = int(wrong.argmax())
+                raise ArrayError(f"params[{material!r}]: node {node} has {spec.name} = {spec.quantity(values[node])}, must be {spec.rule}")
+            columns[rows, stored.index(spec.name)] = values[rows]
+    return codes, columns, present, stored
 
 
 def checked_cells(cells: Any, codes: np.ndarray, dim: int) -> tuple[np.ndarray, int]:

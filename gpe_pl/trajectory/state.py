@@ -62,7 +62,7 @@ class State:
         vel: velocities [node, dim] in m/s.
         node_type: codes of ``schema.NODE_TYPES`` [node].
         mass: masses [node] in kg.
-        material_params: material parameters [node, param]; ``Metadata.param_names`` names the columns. NaN if the node's material lacks the parameter.
+        material_params: material parameters [node, param] in the columns ``param_names``. NaN if the node's material lacks the parameter.
         boundary: boundary nodes and their conditions.
         gravity: external acceleration [dim] in m/s².
         velocity_history: the last velocities [node, history, dim] in m/s, oldest first; the last one equals ``vel``. None for solvers.
@@ -77,6 +77,8 @@ class State:
         lost_impulse: momentum [kg m/s] that these nodes lost, as the sum of magnitudes.
         internal: private data of a solver or simulator (deformation gradient, …), kept so that a restart equals running through. It is not stored.
         periodicity: axes along which space repeats.
+        param_names: names of the columns of ``material_params``; empty stands for the first parameter of each material of the data set. Solvers take the
+            values of parameters without a column from their settings.
     """
 
     pos: Array = field(metadata=NODE)
@@ -98,6 +100,7 @@ class State:
     lost_impulse: float = field(default=0.0, metadata=STEP)
     internal: Any = field(default=None, metadata=STEP)
     periodicity: Periodicity = field(default=NOWHERE, metadata=SCENE)
+    param_names: tuple[str, ...] = field(default=(), metadata=SCENE)
 
     @property
     def num_nodes(self) -> int:

@@ -30,7 +30,7 @@ _SIGNS = {
 FloatOrArray = TypeVar("FloatOrArray", float, np.ndarray)
 
 
-def lame_parameters(youngs_modulus: FloatOrArray, poisson_ratio: FloatOrArray | float) -> tuple[FloatOrArray, FloatOrArray]:
+def lame_parameters(youngs_modulus: FloatOrArray, poisson_ratio: float | np.ndarray) -> tuple[FloatOrArray, FloatOrArray]:
     """Return the first Lamé parameter λ and the shear modulus μ in Pa (plane strain in 2D)."""
     shear = youngs_modulus / (2.0 * (1.0 + poisson_ratio))
     first = youngs_modulus * poisson_ratio / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))

@@ -12,7 +12,7 @@ import numpy as np
 
 from gpe_pl.geometry.periodicity import Periodicity, PeriodicityError
 from gpe_pl.geometry.shape_values import moved
-from gpe_pl.schema import BOUNDARY, MATERIALS, node_code, param_names
+from gpe_pl.schema import BOUNDARY, MATERIALS, MaterialParameter, node_code, param_names, stored_parameters
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.arrays import (
     RADIUS_SPACINGS,
@@ -38,7 +38,7 @@ class Metadata:
     Attributes:
         dataset: name of the data set.
         materials: every material that occurs anywhere in the data set (fixes the node types of all its graphs).
-        param_names: column names of ``material_params``.
+        param_names: column names of ``material_params``: the first parameter of each material, and further ones that the data set stores.
         frame_dt: time between stored frames.
         solver_dt: largest solver substep, 0 if there is none.
         spacing: rest spacing of neighbouring nodes.
@@ -48,7 +48,8 @@ class Metadata:
         gravity: external acceleration [m/s²].
         seed: seed of the scene, -1 if unknown.
         split: split that the trajectory belongs to.
-        parameter_group: whether the material parameter is among the trained values (``seen``), between or outside them.
+        parameter_group: ``seen`` if all material parameters have trained values, ``extrapolated`` if any lies outside the trained range, otherwise
+            ``interpolated``.
         solver, solver_version, config: provenance; ``config`` is JSON.
     """
 
@@ -89,6 +90,14 @@ class Metadata:
     def periodicity(self) -> Periodicity:
         return Periodicity(self.bounds, self.periodic)
 
+    def parameters_of(self, material: str) -> tuple[MaterialParameter, ...]:
+        """Return the stored parameters of a material."""
+        return stored_parameters(material, self.param_names)
+
+    def columns_of(self, material: str) -> list[int]:
+        """Return the columns of ``material_params`` that hold the parameters of a material, in the order of ``parameters_of``."""
+        return [self.param_names.index(p.name) for p in self.parameters_of(material)]
+
     def violations(self) -> Iterator[tuple[str, str]]:
         """Yield the invalid fields, each with its fault. Call it for metadata from files, which may hold any values."""
         unknown = [name for name in self.materials if name not in MATERIALS]
@@ -96,8 +105,10 @@ class Metadata:
             yield "materials", f"names {unknown or 'nothing'}; known: {', '.join(MATERIALS)}"
         elif len(set(self.materials)) < len(self.materials):
             yield "materials", "names a material twice"
-        elif self.param_names != param_names(self.materials):
-            yield "param_names", f"is {self.param_names}, expected {param_names(self.materials)} for {self.materials}"
+        elif self.param_names != param_names(self.materials, self.param_names):
+            first, every = param_names(self.materials), param_names(self.materials, (p.name for m in self.materials for p in MATERIALS[m]))
+            also = f" and possibly more, in the order {every}" if every != first else ""
+            yield "param_names", f"is {self.param_names}, expected {first} for {self.materials}{also}"
         for key in ("frame_dt", "spacing", "connectivity_radius"):
             if not 0 < getattr(self, key) < math.inf:
                 yield key, f"is {getattr(self, key)}, must be positive"
@@ -176,7 +187,7 @@ class Trajectory:
         pos: Array,
         frame_dt: float | int,
         materials: str | Sequence[str],
-        params: Mapping[str, Array],
+        params: Mapping[str, Array | Mapping[str, Array]],
         *,
         vel: Array | None = None,
         mass: Array = 1.0,
@@ -200,7 +211,8 @@ class Trajectory:
                 kept as float32, all others in double precision until they are stored.
             frame_dt: time between frames [s].
             materials: material of all nodes, or of each node; names of ``schema.MATERIALS``.
-            params: parameter of each material that occurs, in the unit of ``schema.MATERIALS``: one value, or one per node of the trajectory.
+            params: parameters of each material that occurs, in the units of ``schema.MATERIALS``: one value, or one per node of the trajectory. A material
+                has its first parameter, or several by name, ``{"elastomer": {"youngs_modulus": 1e5, "poisson_ratio": 0.3}}``.
             vel: velocities [frame, node, dim] in m/s; None takes the differences of positions. Models learn from positions only.
             mass: mass of all nodes, or of each node [kg]; only ratios matter to a model.
             bounds: ``(low, high)`` of the domain per axis [m]; None takes the extremes of all positions. Periodic axes need bounds.
@@ -238,7 +250,7 @@ class Trajectory:
         boundary = boundary.inside(periodicity)
         if periodicity:
             pos = np.stack([periodicity.wrapped(frame.astype(np.float64)).astype(pos.dtype) for frame in pos])
-        codes, columns, names = checked_materials(materials, params, num_nodes)
+        codes, columns, names, stored = checked_materials(materials, params, num_nodes)
         spacing = positive("spacing", typical_spacing(pos[0].astype(np.float64), periodicity) if spacing is None else spacing, "m")
         radius = positive("connectivity_radius", RADIUS_SPACINGS * spacing if connectivity_radius is None else connectivity_radius, "m")
         periodicity.check_radius(radius)
@@ -253,7 +265,7 @@ class Trajectory:
             raise ArrayError("rest_pos: only meshes have rest positions; pass cells too, or leave it out")
         return cls(
             Metadata(
-                dataset, names, param_names(names), frame_dt, spacing, radius, bounds, tuple(map(float, gravity)),
+                dataset, names, stored, frame_dt, spacing, radius, bounds, tuple(map(float, gravity)),
                 periodicity.periodic, split=split, solver="import", solver_version="1",
             ),
             pos,
@@ -297,6 +309,7 @@ class Trajectory:
         return State(
             pos, vel, self.node_type, self.mass, self.material_params, self.boundary.at(frame), gravity, past,
             self.start_time + frame * self.metadata.frame_dt, rest_pos, self.cells, stress, self.cell_dim, periodicity=self.metadata.periodicity,
+            param_names=self.metadata.param_names,
         )  # fmt: skip
 
     def seen_from(self, origin: np.ndarray) -> Trajectory:

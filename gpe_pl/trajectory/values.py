@@ -11,7 +11,7 @@ from functools import partial
 
 import numpy as np
 
-from gpe_pl.schema import CELL_KINDS, FIELDS, LARGEST, MATERIALS, MOTION
+from gpe_pl.schema import CELL_KINDS, FIELDS, LARGEST, MOTION, MaterialParameter, stored_parameters
 from gpe_pl.trajectory.cells import kinds_of
 
 UNIT_TOLERANCE = 1e-4
@@ -165,19 +165,17 @@ def _node_types(scene: _Scene, array: np.ndarray) -> Iterator[_Found]:
 def _parameters(scene: _Scene, array: np.ndarray) -> Iterator[_Found]:
     """Check ``MaterialParameter.rule`` at nodes whose material has the parameter. Other nodes may have any value."""
     for material in scene.materials:
-        spec = MATERIALS[material]
-        if spec.name not in scene.param_names:
-            continue
-        values = array[:, scene.param_names.index(spec.name)]
-        bad = scene.is_type(material) & ~spec.accepts(values)
-        if bad.any():
-            yield _Found(bad, partial(_wrong_parameter, material, values), f"{spec.name}: ")
+        for spec in stored_parameters(material, scene.param_names):
+            values = array[:, scene.param_names.index(spec.name)]
+            bad = scene.is_type(material) & ~spec.accepts(values)
+            if bad.any():
+                yield _Found(bad, partial(_wrong_parameter, material, spec, values), f"{spec.name}: ")
 
 
-def _wrong_parameter(material: str, values: np.ndarray, place: tuple[int, ...]) -> str:
+def _wrong_parameter(material: str, spec: MaterialParameter, values: np.ndarray, place: tuple[int, ...]) -> str:
     if np.isnan(values[place]):
         return "NaN, but the material has this parameter"
-    return f"is {values[place]:g} {MATERIALS[material].unit} of {material}, must be {MATERIALS[material].rule}"
+    return f"is {spec.quantity(values[place])} of {material}, must be {spec.rule}"
 
 
 def _cells(scene: _Scene, array: np.ndarray) -> Iterator[_Found]:

@@ -1,10 +1,11 @@
 """Captions of pictures: names of trajectories, their materials and parameter values."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from gpe_pl.schema import MATERIALS, node_code
+from gpe_pl.schema import MATERIALS, MaterialParameter, node_code, parameters_by_name
 from gpe_pl.trajectory.trajectory import Trajectory
 
 UNITS = {"1": "", "deg": "°", "m^2/s": " m²/s"}
@@ -29,14 +30,14 @@ def with_heading(first: Trajectory, others: Mapping[str, Trajectory]) -> dict[st
     return {name: first, **others}
 
 
-def parameter_name(material: str) -> str:
-    """Return the name of a material's parameter in words."""
-    return MATERIALS[material].name.replace("_", " ").replace("youngs", "Young’s")
+def parameter_name(parameter: MaterialParameter) -> str:
+    """Return the name of a material parameter in words."""
+    return parameter.name.replace("_", " ").replace("youngs", "Young’s").replace("poisson", "Poisson’s")
 
 
-def parameter_value(material: str, low: float, high: float | None = None) -> str:
-    """Return the value of a material's parameter, or its range, with the unit: ``27.5°``, ``0.6 … 1 MPa``."""
-    high, unit = low if high is None else high, MATERIALS[material].unit
+def parameter_value(parameter: MaterialParameter, low: float, high: float | None = None) -> str:
+    """Return the value of a material parameter, or its range, with the unit: ``27.5°``, ``0.6 … 1 MPa``."""
+    high, unit = low if high is None else high, parameter.unit
     prefix, scale = next(((p, s) for p, s in PREFIXES if unit == "Pa" and high >= s), ("", 1.0))
     numbers = [f"{value / scale:.4g}" for value in (low, high)]
     return " … ".join(dict.fromkeys(numbers)) + (f" {prefix}Pa" if unit == "Pa" else UNITS[unit])
@@ -51,11 +52,13 @@ def describe(trajectory: Trajectory) -> str:
     """Return the materials that occur with their parameter values: ``sand, friction angle 27.5°``."""
     parts = []
     for material in materials_of(trajectory):
-        columns = [name == MATERIALS[material].name for name in trajectory.metadata.param_names]
-        values = trajectory.material_params[trajectory.node_type == node_code(material)][:, columns].astype(np.float64)
-        known = values[np.isfinite(values)]
-        value = f", {parameter_name(material)} {parameter_value(material, known.min(), known.max())}" if len(known) else ""
-        parts.append(material + value)
+        metadata, of_material = trajectory.metadata, trajectory.node_type == node_code(material)
+        part = material
+        for parameter, column in zip(metadata.parameters_of(material), metadata.columns_of(material), strict=True):
+            values = trajectory.material_params[of_material, column].astype(np.float64)
+            known = values[np.isfinite(values)]
+            part += f", {parameter_name(parameter)} {parameter_value(parameter, known.min(), known.max())}" if len(known) else ""
+        parts.append(part)
     return "; ".join(parts)
 
 
@@ -65,8 +68,14 @@ def in_common(trajectories: Sequence[Trajectory]) -> str:
     return texts[0] if len(texts) == 1 else ", ".join(dict.fromkeys(m for t in trajectories for m in materials_of(t)))
 
 
-def row_label(values: Mapping[str, float]) -> str:
-    """Return parameter values by material as the label of a row, one per line."""
-    if len(values) > 1:
-        return "\n".join(f"{material} {parameter_value(material, value)}" for material, value in values.items())
-    return "\n".join(f"{parameter_name(material)}\n{parameter_value(material, value)}" for material, value in values.items())
+def row_label(values: Mapping[str, Any]) -> str:
+    """Return parameter values by material as the label of a row; values without a name are those of the first parameters."""
+    lines = []
+    for material, value in values.items():
+        named = parameters_by_name(material, value)
+        own = [(p, named[p.name]) for p in MATERIALS[material] if p.name in named]
+        if len(values) > 1:
+            lines.append(f"{material} {', '.join(parameter_value(p, number) for p, number in own)}")
+        else:
+            lines += [f"{parameter_name(p)}\n{parameter_value(p, number)}" for p, number in own]
+    return "\n".join(lines)

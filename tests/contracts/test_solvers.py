@@ -15,10 +15,10 @@ from gpe_pl.geometry.periodicity import Periodicity
 from gpe_pl.geometry.shapes import Shape, Sphere, domain_walls
 from gpe_pl.rollout.baselines import Ballistic
 from gpe_pl.rollout.loop import SimulationError, Simulator, rollout
-from gpe_pl.schema import MATERIALS, NODE_TYPES, param_names
+from gpe_pl.schema import MATERIALS, NODE_TYPES, MaterialParameter, param_names
 from gpe_pl.solvers.fem import FEM
 from gpe_pl.solvers.flip import FLIP
-from gpe_pl.solvers.materials import LIMITS, check_limits
+from gpe_pl.solvers.materials import Elastomer, Snow, check_limits
 from gpe_pl.solvers.mpm import MPM
 from gpe_pl.solvers.solid_scenes import SolidScene
 from gpe_pl.trajectory.boundary import Boundary
@@ -224,26 +224,65 @@ def test_a_parameter_outside_the_limits_is_refused(case):
     solver, state = case
     node, params = state.num_nodes // 2, state.material_params.copy()
     material = NODE_TYPES[int(state.node_type[node])]
-    name = MATERIALS[material].name
+    name = MATERIALS[material][0].name
     column = param_names(tuple(NODE_TYPES[code] for code in np.unique(state.node_type))).index(name)
     params[node, column] = 1e12
-    message = rf"^node {node}: {name} of {material} is 1e\+12 .*, outside .*, the limits of the solvers$"
+    message = rf"^node {node}: {name} of {material} is 1e\+12.*, outside .*, the limits of the solvers$"
     with pytest.raises(SimulationError, match=message) as caught:
         solver.step(replace(state, material_params=params))
     assert (caught.value.reason, caught.value.node) == ("input", node)
 
 
 @pytest.mark.parametrize("end", ["low", "high"])
-@pytest.mark.parametrize("material", LIMITS)
-def test_a_parameter_at_the_limits_is_accepted_again_from_a_file(material: str, end: str) -> None:
+@pytest.mark.parametrize(("material", "parameter"), [(m, p) for m, own in MATERIALS.items() for p in own])
+def test_a_parameter_at_the_limits_is_accepted_again_from_a_file(material: str, parameter: MaterialParameter, end: str) -> None:
     """Water has the smallest viscosity that is allowed; the store rounds it to single precision, and solvers compute in double."""
-    value = getattr(LIMITS[material], end)
+    value = getattr(parameter.limits, end)
     stored = np.array([value], np.float32).astype(np.float64)
-    check_limits(material, stored, np.arange(1))
+    check_limits(material, parameter, stored, np.arange(1))
     for beyond in (value * (1 - 1e-6), value * (1 + 1e-6)):
-        if not LIMITS[material].low <= beyond <= LIMITS[material].high:
+        if not parameter.limits.low <= beyond <= parameter.limits.high:
             with pytest.raises(SimulationError, match="the limits of the solvers"):
-                check_limits(material, np.array([beyond]), np.arange(1))
+                check_limits(material, parameter, np.array([beyond]), np.arange(1))
+
+
+FURTHER = {
+    "sand": {"cohesion": 0.0},
+    "snow": {"critical_compression": Snow().critical_compression, "critical_stretch": Snow().critical_stretch},
+    "elastomer": {"poisson_ratio": Elastomer().poisson_ratio},
+    "solid": {"poisson_ratio": FEM(bounds=((0.0, 1.0),) * 2).poisson_ratio},
+}
+
+
+def with_further(state: State, further: dict[str, float]) -> State:
+    """Return the state with columns of further parameters of its material."""
+    material = NODE_TYPES[int(state.node_type[0])]
+    columns = [state.material_params[:, 0], *(np.full(state.num_nodes, value) for value in further.values())]
+    return replace(state, material_params=np.stack(columns, axis=1), param_names=param_names((material,), further))
+
+
+@pytest.mark.parametrize("material", FURTHER)
+def test_stored_parameters_replace_the_settings(material: str) -> None:
+    """Stored values of the settings give the same motion; other values give another one."""
+    solver: Simulator
+    if material == "solid":
+        scene = SolidScene(bounds=((0.0, 1.0),) * 2, cell="triangle", num_cells=60, max_speed=4.0)
+        solver, state = FEM(bounds=scene.bounds), scene.sample({"solid": 1e6}, 3)
+        assert state.cells is not None
+        state = replace(state, pos=0.5 + 0.95 * (state.pos - 0.5))
+    else:
+        solver, state = mpm(2, material)
+    num_steps = 1 if material == "solid" else 8
+    expected = run(solver, state, num_steps)
+    same = run(solver, with_further(state, FURTHER[material]), num_steps)
+    rounding = 1e-12 if material == "solid" else 0.0  # a cell takes the mean of its corners
+    np.testing.assert_allclose(same.pos, expected.pos, rtol=0, atol=rounding)
+    np.testing.assert_allclose(same.vel, expected.vel, rtol=0, atol=rounding * 1e3)
+    other = {name: {"cohesion": 2e3}.get(name, 0.8 * value) for name, value in FURTHER[material].items()}
+    assert np.abs(run(solver, with_further(state, other), num_steps).pos - expected.pos).max() > 1e-9
+    wrong = with_further(state, dict.fromkeys(FURTHER[material], -1.0))
+    with pytest.raises(SimulationError, match=f"node 0: {next(iter(FURTHER[material]))} of {material} is -1.*, outside"):
+        solver.step(wrong)
 
 
 def test_input_is_not_modified(case):

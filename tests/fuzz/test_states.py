@@ -19,7 +19,7 @@ from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.guard import Guard, crowding
 from gpe_pl.rollout.loop import SimulationError, rollout
-from gpe_pl.solvers.materials import LIMITS
+from gpe_pl.schema import MATERIALS
 from gpe_pl.solvers.scenes import BodyScene
 from gpe_pl.trajectory.state import State
 from tests.scenes import builder, metadata
@@ -120,7 +120,8 @@ def test_crowding_never_counts_too_few(seed: int, width: float, dim: int) -> Non
 
 @given(body_scenes(), seeds)
 def test_scenes_keep_their_promises(scene: BodyScene, seed: int) -> None:
-    values = {material: (LIMITS[material].low + min(LIMITS[material].high, 40.0)) / 2 for material in scene.materials}
+    limits = {material: MATERIALS[material][0].limits for material in scene.materials}
+    values = {material: (own.low + min(own.high, 40.0)) / 2 for material, own in limits.items()}
     try:
         state = scene.sample(values, seed)
     except ValueError:  # impossible settings are said to be

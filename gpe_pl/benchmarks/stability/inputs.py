@@ -14,7 +14,7 @@ from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, 
 from gpe_pl.errors import GpeError
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import SimulationError, Simulator, Start, rollout, rollouts, step_all
-from gpe_pl.schema import BOUNDARY, MATERIALS, node_code
+from gpe_pl.schema import BOUNDARY, node_code
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -49,8 +49,8 @@ def materials(subject: Subject) -> Outcome:
     for end, factor in ((0, 0.1), (1, 10.0)):
         params = state.material_params.clone()
         for material, trained in simulator.trained_ranges():
-            column = simulator.builder.metadata.param_names.index(MATERIALS[material].name)
-            params[state.node_type == node_code(material), column] = factor * trained[end].item()
+            rows = torch.nonzero(state.node_type == node_code(material)).flatten()
+            params[rows[:, None], simulator.builder.metadata.columns_of(material)] = factor * trained[end]
         scaled = replace(state, material_params=params)
         finite = bool(torch.isfinite(acceleration(simulator, scaled)).all())
         found.append(finite and bool(simulator.untrained_parameters(scaled)))

@@ -4,11 +4,12 @@
 
     np.savez("train/00.npz", pos=pos, frame_dt=0.01, materials="fluid", params_fluid=1e-3, bounds=bounds, periodic=[True, False])
 
-Keys are the arguments of ``Trajectory.from_numpy``, which documents them. ``params_{material}`` stands for ``params[material]``, and ``cells_{kind}`` for
-``cells[kind]``. ``boundary_pos``, ``boundary_normal``, ``boundary_vel``, ``boundary_friction`` and ``boundary_restitution`` are arguments of
-``Boundary.from_numpy``, or of ``Boundary.moving`` if ``boundary_pos`` is [frame, boundary_node, dim]. ``boundary_normal`` may then have the first frame or
-every frame. Without ``boundary_normal``, normals are estimated. Required keys are ``pos``, ``frame_dt``, ``materials`` and ``params_…``. Settings of the
-command override the files.
+Keys are the arguments of ``Trajectory.from_numpy``, which documents them. ``params_{material}`` stands for ``params[material]``, and
+``params_{material}_{name}`` for one of several parameters, such as ``params_elastomer_poisson_ratio``. ``cells_{kind}`` stands for ``cells[kind]``.
+``boundary_pos``, ``boundary_normal``, ``boundary_vel``, ``boundary_friction`` and ``boundary_restitution`` are arguments of ``Boundary.from_numpy``, or of
+``Boundary.moving`` if ``boundary_pos`` is [frame, boundary_node, dim]. ``boundary_normal`` may then have the first frame or every frame. Without
+``boundary_normal``, normals are estimated. Required keys are ``pos``, ``frame_dt``, ``materials`` and ``params_…``. Settings of the command override the
+files.
 """
 
 from __future__ import annotations
@@ -30,11 +31,13 @@ from gpe_pl.data.importers.source import (
     Refusal,
     Source,
     joined,
+    merged,
     natural,
     split_folders,
     walls_at_bounds,
 )
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
+from gpe_pl.schema import MATERIALS
 from gpe_pl.trajectory.arrays import estimated_normals, flags, numbers
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -94,7 +97,8 @@ def _load(path: Path, facts: Facts) -> Loaded:
     missing = [name for name in ("pos", "frame_dt", "materials") if name not in names]
     if wrong or missing:
         raise Refusal(
-            f"has {f'an unknown key {wrong[0]!r}' if wrong else f'no {missing[0]!r}'}; keys are params_MATERIAL, cells_KIND, {', '.join(KEYS)}"
+            f"has {f'an unknown key {wrong[0]!r}' if wrong else f'no {missing[0]!r}'}; keys are params_MATERIAL, params_MATERIAL_NAME, cells_KIND, "
+            f"{', '.join(KEYS)}"
         )
     for name in SCALARS:
         if name in values:
@@ -105,14 +109,20 @@ def _load(path: Path, facts: Facts) -> Loaded:
     if materials.dtype.kind != "U":
         raise Refusal(f"materials is {materials.dtype}, expected text")
     values["materials"] = materials.item() if materials.ndim == 0 else materials.tolist()
-    values["params"] = {name.removeprefix("params_"): values.pop(name) for name in names if name.startswith("params_")}
+    own: dict[str, Any] = {}
+    for name in names:
+        if name.startswith("params_"):
+            material, _, parameter = name.removeprefix("params_").partition("_")
+            if not parameter and material in MATERIALS:
+                parameter = MATERIALS[material][0].name
+            own.setdefault(material, {})[parameter] = values.pop(name)
     if by_kind := {name.removeprefix("cells_"): values.pop(name) for name in names if name.startswith("cells_")}:
         if "cells" in values:
             raise Refusal(f"has cells and cells_{next(iter(by_kind))}; give all of them by kind")
         values["cells"] = by_kind
     given = {"frame_dt", "bounds", "periodic", "gravity", "spacing", "connectivity_radius"}
     values |= {name: value for name in given if (value := getattr(facts, name)) is not None}
-    values["params"] = {**{m: v for m, v in facts.parameters.items() if m in np.unique(values["materials"])}, **values["params"]}
+    values["params"] = merged({m: v for m, v in facts.parameters.items() if m in np.unique(values["materials"])}, own)
     space = _periodicity(values)
     wall = {name.removeprefix("boundary_"): values.pop(name) for name in names if name.startswith("boundary_")}
     notes: list[str] = []

@@ -25,7 +25,7 @@ from gpe_pl.files.atomic import free_bytes, replacing
 from gpe_pl.files.names import NameRefused, data_name
 from gpe_pl.geometry.periodicity import PeriodicityError
 from gpe_pl.graphs.neighbors import radius_between, radius_pairs
-from gpe_pl.schema import HISTORY, MATERIALS, NODE_TYPES, SPLITS, ParameterGroup, node_code, param_names
+from gpe_pl.schema import HISTORY, MATERIALS, NODE_TYPES, SPLITS, ParameterGroup, node_code, param_names, stored_parameters
 from gpe_pl.system.locks import locked
 from gpe_pl.system.progress import Progress
 from gpe_pl.trajectory import integrators
@@ -178,6 +178,7 @@ class _Survey:
     Attributes:
         good: usable trajectories by split.
         materials: materials of all trajectories.
+        columns: names of the parameters of all trajectories.
         bounds: bounds of each trajectory, ``(low, high)`` per axis [m].
         spacings, distances, radii: spacing, median distance to the nearest node, and connectivity radius of each sampled trajectory [m].
         velocity_ratios: mean displacement over mean velocity × frame interval, of each sampled trajectory.
@@ -192,6 +193,7 @@ class _Survey:
 
     good: dict[str, list[Item]] = field(default_factory=dict)
     materials: set[str] = field(default_factory=set)
+    columns: set[str] = field(default_factory=set)
     bounds: list[tuple[tuple[float, float], ...]] = field(default_factory=list)
     spacings: list[float] = field(default_factory=list)
     distances: list[float] = field(default_factory=list)
@@ -308,6 +310,7 @@ class _Conversion:
             what = f"{len(at_one_place)} nodes are at the place of another node, the first is node {at_one_place[0]}: do bodies overlap?"
             survey.suspects.append(Event(split, name, 0, what))
         survey.materials |= set(m.materials)
+        survey.columns |= set(m.param_names)
         survey.num_bytes += sum(array.nbytes for array in arrays.values())
         survey.bounds.append(m.bounds)
         if len(survey.flights) < NUM_SAMPLED:
@@ -482,10 +485,16 @@ class _Conversion:
         facts, m = self.facts, trajectory.metadata
         assert facts.spacing is not None and facts.connectivity_radius is not None
         materials = tuple(name for name in MATERIALS if name in self.survey.materials)
-        names = param_names(materials)
+        names = param_names(materials, self.survey.columns)
         columns = np.full((trajectory.num_nodes, len(names)), np.nan, np.float32)
         for old, name in enumerate(m.param_names):
             columns[:, names.index(name)] = trajectory.material_params[:, old]
+        for material in m.materials:
+            lacking = [p.name for p in stored_parameters(material, names) if p.name not in m.param_names]
+            if lacking:
+                raise Refusal(
+                    f"has no {lacking[0]} of {material}, which other trajectories have; give it to all, or choose parameters={{{material}: …}}"
+                )
         metadata = replace(
             m, dataset=self.report.name, materials=materials, param_names=names, spacing=facts.spacing, connectivity_radius=facts.connectivity_radius,
             split=split, parameter_group=self._parameter_group(columns, names) if split == "test_unseen" else "seen",
@@ -511,16 +520,16 @@ class _Conversion:
         for material in m.materials:
             rows = trajectory.node_type == node_code(material)
             if rows.any():
-                values = trajectory.material_params[rows, m.param_names.index(MATERIALS[material].name)]
-                entry = report.materials.setdefault(material, {"nodes": 0, "low": np.inf, "high": -np.inf})
-                if split == "train":
-                    low, high = self.trained.get(MATERIALS[material].name, (np.inf, -np.inf))
-                    self.trained[MATERIALS[material].name] = min(low, float(values.min())), max(high, float(values.max()))
-                elif MATERIALS[material].name not in self.trained and "train" in self.survey.good:
+                entry = report.materials.setdefault(material, {"nodes": 0, "parameters": {}})
+                entry["nodes"] += int(rows.sum())
+                for parameter, column in zip(m.parameters_of(material), m.columns_of(material), strict=True):
+                    values = trajectory.material_params[rows, column]
+                    entry["parameters"][parameter.name] = _united(entry["parameters"].get(parameter.name), values)
+                    if split == "train":
+                        self.trained[parameter.name] = _united(self.trained.get(parameter.name), values)
+                if MATERIALS[material][0].name not in self.trained and "train" in self.survey.good:
                     warning = f"{material} occurs in {split} but not in train: no model will know it"
                     report.warnings += [warning] if warning not in report.warnings else []
-                entry["nodes"] += int(rows.sum())
-                entry["low"], entry["high"] = min(entry["low"], float(values.min())), max(entry["high"], float(values.max()))
 
     def _summarize(self, folder: Path) -> None:
         """Write statistics of the training trajectories, and report their neighbours and motion."""
@@ -562,6 +571,12 @@ class _Conversion:
             report.max_speed = max(report.max_speed, float(np.linalg.norm(trajectory.vel, axis=-1).max()))
         report.mean_acceleration = np.mean(means, axis=0).tolist()
         report.step_in_spacings = report.max_speed * report.frame_dt / report.spacing
+
+
+def _united(span: tuple[float, float] | None, values: np.ndarray) -> tuple[float, float]:
+    """Return the smallest and largest value, those of an earlier span included."""
+    low, high = span or (np.inf, -np.inf)
+    return min(low, float(values.min())), max(high, float(values.max()))
 
 
 def _faults(m: Metadata, arrays: Mapping[str, np.ndarray]) -> Iterator[str]:

@@ -59,7 +59,7 @@ class Report:
         folder: folder of the data set.
         dim: space dimension.
         frame_dt, bounds, periodic, gravity, spacing, connectivity_radius: stored values.
-        materials: number of nodes, and smallest and largest value of the parameter, by material.
+        materials: by material, its number of ``nodes``, and ``parameters``, the smallest and largest value of each by name.
         splits: counts by split.
         neighbours: number of dynamic neighbours of a dynamic node within the radius (``mean``, ``min``, ``max``), and mean number of ``boundary`` neighbours.
         max_speed, velocity_std, acceleration_std: statistics of the train split [m/s, m/s, m/s²]; the last without gravity.
@@ -149,11 +149,9 @@ class Report:
                 )
             )
         for material, values in self.materials.items():
-            spec = MATERIALS[material]
-            span = _span([values["low"], values["high"]])
-            rows.append(
-                (material, f"{values['nodes']} nodes in all trajectories, {spec.name} {span}{'' if spec.unit == '1' else ' ' + spec.unit}")
-            )
+            spans = values["parameters"]
+            own = [f"{p.name} {p.quantity(_span([*spans[p.name]]))}" for p in MATERIALS[material] if p.name in spans]
+            rows.append((material, f"{values['nodes']} nodes in all trajectories, {', '.join(own)}"))
         for split, counts in self.splits.items():
             boundary = f", {_span(counts.boundary_nodes)} boundary nodes" if counts.boundary_nodes[1] else ""
             rows.append(

@@ -21,7 +21,7 @@ from gpe_pl.files.json_text import parsed
 from gpe_pl.files.names import DataName
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.geometry.shapes import domain_walls
-from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES
+from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES, MaterialValues, parameters_by_name
 from gpe_pl.trajectory.arrays import estimated_normals, numbers
 from gpe_pl.trajectory.boundary import Boundary, Motion
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -30,9 +30,6 @@ Format = Literal["gns", "lagrangebench", "meshgraphnets", "dpinet", "dmcf", "arr
 
 SPLIT_NAMES = {"train": "train", "valid": "val", "validation": "val", "val": "val", "test": "test", "test_unseen": "test_unseen"}
 """Names of splits in the store, by their names in public data sets."""
-
-ASSUMED_PARAMETERS = {"sand": 30.0, "snow": 8.0, "fluid": 1e-3, "elastomer": 1e5, "solid": 1e6}
-"""Material parameters that are stored if a source has none, in the units of ``schema.MATERIALS``."""
 
 ASSUMED_FRICTION = 0.5
 """Friction coefficient that is stored if a source has none."""
@@ -79,7 +76,7 @@ class ImportSettings:
         connectivity_radius: neighbour radius [m].
         walls: friction of walls at the bounds, by side (``x_low``, ``x_high``, …); ``{}`` for no walls.
         materials: material, or ``boundary``, of node types of the source, by their number. Other types keep the material of the format.
-        parameters: parameter of each material for which the source has none.
+        parameters: parameters of materials for which the source has none: a number for the first parameter of a material, several by name.
         max_trajectories: maximum number of trajectories per split, from its start.
         holdout: fraction of the training trajectories that becomes each of ``val`` and ``test`` if the source has none, at least one trajectory; 0 for none.
         allow_pickle: read object arrays, which can run code. Use it only for files that you trust.
@@ -96,7 +93,7 @@ class ImportSettings:
     connectivity_radius: Annotated[float, Field(gt=0)] | None = None
     walls: dict[str, Annotated[float, Field(ge=0)]] | None = None
     materials: dict[int, str] | None = None
-    parameters: dict[str, float] | None = None
+    parameters: dict[str, float | dict[str, float]] | None = None
     max_trajectories: Annotated[int, Field(ge=1)] | None = None
     holdout: Annotated[float, Field(ge=0, le=0.4)] = 0.1
     allow_pickle: bool = False
@@ -105,6 +102,11 @@ class ImportSettings:
         wrong = sorted({*(self.materials or {}).values()} - {*NODE_TYPES}) + sorted({*(self.parameters or {})} - {*MATERIALS})
         if wrong:
             raise ValueError(f"unknown material {wrong[0]!r}; known: {', '.join(NODE_TYPES)}")
+        for material, values in (self.parameters or {}).items():
+            try:
+                parameters_by_name(material, values)
+            except ValueError as error:
+                raise ValueError(f"parameters.{material}: {error}") from None
         sides = [f"{axis}_{side}" for axis in "xyz" for side in ("low", "high")]
         if self.walls and not {*self.walls} <= {*sides}:
             raise ValueError(f"walls: unknown side {min({*self.walls} - {*sides})!r}; known: {', '.join(sides)}")
@@ -122,7 +124,7 @@ class Facts:
         spacing: rest spacing of neighbours [m].
         connectivity_radius: neighbour radius [m].
         walls: friction of walls at the bounds, by side.
-        parameters: parameter of each material of which all nodes have the same value.
+        parameters: parameters of each material of which all nodes have the same value: of the first one, or by name.
         usual_gravity: usual gravity of the format per axis [m/s²]. It is used if neither the source nor a setting states one, unless groups of nodes in free
             flight show another one.
         notes: assumptions and omissions that concern the whole data set, one sentence each.
@@ -135,7 +137,7 @@ class Facts:
     spacing: float | None = None
     connectivity_radius: float | None = None
     walls: Mapping[str, float] = field(default_factory=dict)
-    parameters: Mapping[str, float] = field(default_factory=dict)
+    parameters: Mapping[str, MaterialValues] = field(default_factory=dict)
     usual_gravity: tuple[float, ...] | None = None
     notes: tuple[str, ...] = ()
 
@@ -149,7 +151,17 @@ class Facts:
         given = {name: getattr(settings, name) for name in names if getattr(settings, name) is not None}
         given = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
         notes = (*self.notes, *(f"{name} = {value} was given" for name, value in given.items()))
-        return replace(self, **given, parameters={**self.parameters, **(settings.parameters or {})}, notes=notes)
+        return replace(self, **given, parameters=merged(self.parameters, settings.parameters or {}), notes=notes)
+
+
+def merged(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+    """Return parameters by material; values of the second mapping have precedence, parameter by parameter."""
+    both: dict[str, Any] = {**first, **second}
+    for material in first.keys() & second.keys() & MATERIALS.keys():
+        own = MATERIALS[material][0].name
+        by_name = [values if isinstance(values, Mapping) else {own: values} for values in (first[material], second[material])]
+        both[material] = {**by_name[0], **by_name[1]}
+    return both
 
 
 @dataclass(frozen=True)
@@ -209,7 +221,7 @@ class Nodes:
         vel: velocities [frame, node, dim] in m/s, if the source has them.
         mass: mass of each node [node], or of all, in kg.
         gravity: gravity [dim] in m/s², if the source has it per trajectory.
-        parameters: parameter of each material, per node [node] or for all nodes.
+        parameters: parameters of each material, per node [node] or for all nodes: the first one, or by name.
         walls: positions and normals [boundary_node, dim] of additional boundary nodes.
         cells: cells of a mesh by kind [cell, corner].
         rest_pos: rest positions of a mesh [node, dim] in m.
@@ -258,11 +270,15 @@ def build(nodes: Nodes, facts: Facts) -> Loaded:
     kinds = [str(k) for k in nodes.kind[moving]]
     parameters: dict[str, Any] = {}
     for material in dict.fromkeys(kinds):
-        value = nodes.parameters.get(material, facts.parameters.get(material))
-        if value is None:
-            value, spec = ASSUMED_PARAMETERS[material], MATERIALS[material]
-            notes.append(f"{spec.name} of {material} is not in the source; {value:g} {spec.unit} is stored (parameters={{{material}: …}})")
-        parameters[material] = value if np.ndim(value) == 0 else np.asarray(value)[moving]
+        first = MATERIALS[material][0]
+        given = merged(facts.parameters, nodes.parameters).get(material, {})
+        own = dict(given) if isinstance(given, Mapping) else {first.name: given}
+        if first.name not in own:
+            own[first.name] = first.assumed
+            notes.append(
+                f"{first.name} of {material} is not in the source; {first.assumed:g} {first.unit} is stored (parameters={{{material}: …}})"
+            )
+        parameters[material] = {name: value if np.ndim(value) == 0 else np.asarray(value)[moving] for name, value in own.items()}
     cells = _cells_of(nodes, moving, repairs)
     gravity = facts.gravity if facts.gravity is not None or nodes.gravity is None else nodes.gravity[: pos.shape[2]]
     assumes_gravity = gravity is None and facts.usual_gravity is not None

@@ -22,7 +22,7 @@ from pydantic.dataclasses import dataclass
 
 from gpe_pl.geometry.shapes import check_bounds
 from gpe_pl.rollout.loop import SimulationError
-from gpe_pl.schema import node_code
+from gpe_pl.schema import MATERIALS, node_code
 from gpe_pl.solvers.fem.contact import Obstacles, collect, push_out_corners, push_out_nodes, resist_corners, resist_nodes
 from gpe_pl.solvers.fem.elements import (
     Mesh,
@@ -33,7 +33,7 @@ from gpe_pl.solvers.fem.elements import (
     cauchy_stress,
     elastic_energy,
 )
-from gpe_pl.solvers.materials import LIMITS, check_limits, lame_parameters
+from gpe_pl.solvers.materials import lame_parameters, parameters_of
 from gpe_pl.solvers.supported import check_surroundings
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
@@ -46,14 +46,14 @@ KINDS = {"triangle": 0, "quad": 1, "tetrahedron": 2}
 class FEM:
     """Finite element solver for the node type ``solid``; a ``Simulator`` of states with ``rest_pos`` and ``cells``.
 
-    Young's modulus is the material parameter of each node; a cell takes the mean of its corners. Inertia comes from ``State.mass`` alone, lumped at the nodes.
-    Every step stores the elastic Cauchy stress.
+    Young's modulus, and Poisson's ratio where it is stored, are material parameters of each node; a cell takes the mean of its corners. Inertia comes from
+    ``State.mass`` alone, lumped at the nodes. Every step stores the elastic Cauchy stress.
 
     Attributes:
         bounds: ``(low, high)`` of the domain along each of two or three axes [m].
         frame_dt: time between frames [s].
         materials: ``("solid",)``.
-        poisson_ratio: Poisson's ratio, below 0.5; linear triangles and tetrahedra stiffen from about 0.45 on.
+        poisson_ratio: Poisson's ratio, below 0.5, unless the state has a column for it; linear triangles and tetrahedra stiffen from about 0.45 on.
         damping: viscosity, as a fraction of the critical damping of the fastest mode of the mesh. A mode that is n times slower has 1/n of this fraction.
         cfl: substep as a fraction of the largest substep that is proven to be stable.
         max_substeps: largest number of substeps per frame. If a frame needs more, the step fails as an explosion.
@@ -141,7 +141,7 @@ class FEM:
         self.step(
             State(
                 pos, np.zeros_like(pos), np.full(count, node_code("solid"), dtype=np.uint8), np.full(count, size**dim),
-                np.full((count, 1), LIMITS["solid"].low), Boundary.empty(dim), np.zeros(dim), rest_pos=pos, cells=np.arange(count)[None],
+                np.full((count, 1), MATERIALS["solid"][0].limits.low), Boundary.empty(dim), np.zeros(dim), rest_pos=pos, cells=np.arange(count)[None],
             )
         )  # fmt: skip
 
@@ -168,25 +168,24 @@ class FEM:
             "mass": (state.mass, (num_nodes,)),
             "rest_pos": (state.rest_pos, (num_nodes, dim)),
             "node_type": (state.node_type, (num_nodes,)),
-            "material_params": (state.material_params, (num_nodes, 1)),
             "gravity": (state.gravity, (dim,)),
         }
         for name, (array, expected) in shapes.items():
             if np.shape(array) != expected:
                 raise SimulationError(f"{name} has shape {np.shape(array)}, expected {expected}", reason="input")
-            if name not in ("material_params", "gravity"):
+            if name != "gravity":
                 _require(np.isfinite(array), f"{name} is not finite", reason="nan")
         if not np.all(np.isfinite(state.gravity)):
             raise SimulationError(f"gravity {state.gravity} is not finite", reason="nan")
         _require(np.asarray(state.mass) > 0, "mass is not positive")
         _require(np.asarray(state.node_type) == node_code("solid"), "node_type is not solid")
-        modulus = np.asarray(state.material_params, dtype=np.float64)[:, 0]
-        check_limits("solid", modulus, np.arange(num_nodes))
+        parameters = parameters_of(state, "solid", np.arange(num_nodes), self.materials)
         check_surroundings(state, "FEM")
         mesh = build_mesh(state.rest_pos, state.cells, state.mass)
-        lam_per_modulus, mu_per_modulus = lame_parameters(1.0, self.poisson_ratio)
-        of_cell = modulus[mesh.cells].mean(axis=1)
-        lam, mu = lam_per_modulus * of_cell, mu_per_modulus * of_cell
+        modulus = parameters["youngs_modulus"][mesh.cells].mean(axis=1)
+        ratio = parameters["poisson_ratio"][mesh.cells].mean(axis=1) if "poisson_ratio" in parameters else self.poisson_ratio
+        lam_per_modulus, mu_per_modulus = lame_parameters(1.0, ratio)
+        lam, mu = lam_per_modulus * modulus, mu_per_modulus * modulus
         # Γ = 2 damping ω at rest, where ω² = scale (2μ + dim λ) and Γ = scale 2η
         eta = self.damping * np.sqrt((2.0 * mu + dim * lam) / mesh.scale)
         return mesh, lam, mu, eta, collect(tuple(state.boundary.shapes), self.bounds)

@@ -12,11 +12,11 @@ from pydantic.dataclasses import dataclass as validated_dataclass
 
 from gpe_pl.geometry.shapes import Wall, check_whole_cells, domain_walls, outward_normal, signed_distance, thickness
 from gpe_pl.rollout.loop import SimulationError
-from gpe_pl.schema import NODE_TYPES, node_code, param_names
+from gpe_pl.schema import NODE_TYPES, node_code
 from gpe_pl.solvers.flip import islands, pressure, transfer, viscosity
 from gpe_pl.solvers.flip.grid import HALF, Grid, Solids, make_grid, make_solids
 from gpe_pl.solvers.flip.linear import conjugate_gradients, incomplete_cholesky
-from gpe_pl.solvers.materials import check_limits
+from gpe_pl.solvers.materials import parameters_of
 from gpe_pl.solvers.supported import check_surroundings
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
@@ -398,7 +398,6 @@ class FLIP:
             "vel": (state.vel, (num_nodes, dim)),
             "mass": (state.mass, (num_nodes,)),
             "node_type": (state.node_type, (num_nodes,)),
-            "material_params": (state.material_params, (num_nodes, len(param_names(self.materials)))),
             "gravity": (state.gravity, (dim,)),
             "boundary.pos": (state.boundary.pos, (len(state.boundary.pos), dim)),
         }
@@ -414,9 +413,7 @@ class FLIP:
         _require(np.asarray(state.mass) > 0, "mass is not positive")
         known = np.asarray(state.node_type) == node_code(MATERIAL)
         _require(known, f"node_type is none of the solver's materials {MATERIAL} (codes of {', '.join(NODE_TYPES)})")
-        values = np.array(state.material_params, dtype=np.float64)[:, 0]
-        check_limits(MATERIAL, values, np.arange(num_nodes))
-        return np.ascontiguousarray(values)
+        return parameters_of(state, MATERIAL, np.arange(num_nodes), self.materials)["kinematic_viscosity"]
 
 
 def _in_substep(fraction: float, h: float) -> float:

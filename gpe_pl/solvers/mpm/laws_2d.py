@@ -18,7 +18,7 @@ from typing import no_type_check
 
 from numba import njit
 
-from gpe_pl.solvers.materials import COEFFICIENT, ELASTOMER, LAMBDA, LARGEST, MAX_HARDENING, MU, SAND, SMALLEST, SNOW
+from gpe_pl.solvers.materials import COEFFICIENT, ELASTOMER, INTERCEPT, LAMBDA, LARGEST, MAX_HARDENING, MU, SAND, SMALLEST, SNOW, TIP
 
 SMALLEST_STRETCH = 1e-4
 """Lower bound of the principal stretches; it keeps the logarithmic strain of a flattened particle finite."""
@@ -86,28 +86,32 @@ def _hencky(f00, f01, f10, f11):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def sand(f00, f01, f10, f11, volume_correction, lam, mu, slope):
+def sand(f00, f01, f10, f11, volume_correction, lam, mu, slope, intercept=0.0, tip=0.0):
     """Hencky elasticity with a Drucker-Prager return mapping without dilation (Klar et al. 2016, sections 5 and 6.3).
 
     ``ε = log σ + v/2`` are the principal logarithmic strains. ``v`` is the volume that the particle gained in tension and must lose before it can bear
-    pressure. In expansion (``tr ε >= 0``) the particle is stress-free. Otherwise the deviatoric strain is scaled back to the cone
-    ``|dev ε| = -α (2λ + 2μ)/(2μ) tr ε`` at constant volume, and ``τ = 2μ ε + λ tr ε``.
+    pressure. With ``τ = 2μ ε + λ tr ε``, the cone ``|dev τ| = k - α tr τ`` is ``|dev ε| = k/(2μ) - α (2λ + 2μ)/(2μ) tr ε``. Beyond its tip,
+    ``tr ε = k/(α (2λ + 2μ))``, the strain becomes that of the tip. This is stress-free without cohesion (k = 0). Otherwise the deviatoric strain is scaled
+    back to the cone at constant volume.
 
     Args:
         f00, f01, f10, f11: trial elastic deformation gradient.
         volume_correction: volume v of the particle.
         lam, mu: Lamé parameters [Pa].
-        slope: slope of the cone, ``|dev ε| / -tr ε``.
+        slope: slope of the cone, ``α (2λ + 2μ)/(2μ)``.
+        intercept: ``|dev ε|`` of the cone at ``tr ε = 0``, ``k/(2μ)``.
+        tip: ``tr ε`` at the tip; infinite for a cylinder, which has a slope of 0.
 
     Returns:
         The four entries of the return-mapped F, the new v, τ₀₀, τ₀₁, τ₁₁ and the stiffness [Pa]. If the trial F is not finite, neither is the stress.
     """
     f00, f01, f10, f11, trace, e0, e1 = _hencky(f00, f01, f10, f11)
     trace += volume_correction
-    if trace >= 0.0:
-        return 1.0, 0.0, 0.0, 1.0, trace, 0.0, 0.0, 0.0, lam + 2.0 * mu
+    if trace >= tip:
+        stretch, tension = math.exp(0.5 * tip), (lam + mu) * tip
+        return stretch, 0.0, 0.0, stretch, trace - tip, tension, 0.0, tension, lam + 2.0 * mu
     deviator = math.sqrt(e0 * e0 + e1 * e1)  # |dev ε| / √2
-    largest = -slope * trace * math.sqrt(0.5)
+    largest = -slope * trace * math.sqrt(0.5) + intercept * math.sqrt(0.5)
     if deviator > largest:
         inverse = 1.0 / deviator
         shrunk, kept = math.exp(largest - deviator), largest * inverse  # ratio of the larger stretch to the trial one
@@ -195,7 +199,7 @@ def respond(law, f00, f01, f10, f11, plastic, constants, p):
     """Apply the law with this code and row ``p`` of the constants; results as in ``sand``. An unknown code gives NaN."""
     lam, mu = constants[p, LAMBDA], constants[p, MU]
     if law == SAND:
-        return sand(f00, f01, f10, f11, plastic, lam, mu, constants[p, COEFFICIENT])
+        return sand(f00, f01, f10, f11, plastic, lam, mu, constants[p, COEFFICIENT], constants[p, INTERCEPT], constants[p, TIP])
     if law == SNOW:
         xi, smallest, largest, hardest = (
             constants[p, COEFFICIENT],

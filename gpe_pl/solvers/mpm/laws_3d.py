@@ -10,7 +10,7 @@ from typing import no_type_check
 
 from numba import njit
 
-from gpe_pl.solvers.materials import COEFFICIENT, ELASTOMER, LAMBDA, LARGEST, MAX_HARDENING, MU, SAND, SMALLEST, SNOW
+from gpe_pl.solvers.materials import COEFFICIENT, ELASTOMER, INTERCEPT, LAMBDA, LARGEST, MAX_HARDENING, MU, SAND, SMALLEST, SNOW, TIP
 from gpe_pl.solvers.mpm.laws_2d import SMALLEST_SQUARE, hardening
 
 
@@ -143,14 +143,14 @@ def _squared_stretches(f):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def sand(f, volume_correction, lam, mu, slope):
-    """Hencky elasticity with a Drucker-Prager return mapping, as in ``laws_2d``; the cone is ``|dev ε| = -α (3λ + 2μ)/(2μ) tr ε``.
+def sand(f, volume_correction, lam, mu, slope, intercept=0.0, tip=0.0):
+    """Hencky elasticity with a Drucker-Prager return mapping, as in ``laws_2d``; the cone is ``|dev ε| = k/(2μ) - α (3λ + 2μ)/(2μ) tr ε``.
 
     Args:
         f: trial elastic deformation gradient.
         volume_correction: volume v of the particle, as in ``laws_2d``.
         lam, mu: Lamé parameters [Pa].
-        slope: slope of the cone, ``|dev ε| / -tr ε``.
+        slope, intercept, tip: slope of the cone, ``|dev ε|`` at ``tr ε = 0``, and ``tr ε`` at the tip, as in ``laws_2d``.
 
     Returns:
         The return-mapped F, the new v, τ and the stiffness [Pa].
@@ -158,11 +158,13 @@ def sand(f, volume_correction, lam, mu, slope):
     b1, b2, b3, axes, f = _squared_stretches(f)
     log_1, log_2, log_3 = 0.5 * math.log(b1), 0.5 * math.log(b2), 0.5 * math.log(b3)
     trace = log_1 + log_2 + log_3 + volume_correction
-    if trace >= 0.0:
-        return (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), trace, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), lam + 2.0 * mu
+    if trace >= tip:
+        stretch, tension = math.exp(tip / 3.0), (lam + 2.0 * mu / 3.0) * tip
+        f, tau = (stretch, 0.0, 0.0, 0.0, stretch, 0.0, 0.0, 0.0, stretch), (tension, 0.0, 0.0, tension, 0.0, tension)
+        return f, trace - tip, tau, lam + 2.0 * mu
     mean, share = trace / 3.0, volume_correction / 3.0
     dev_1, dev_2, dev_3 = log_1 + share - mean, log_2 + share - mean, log_3 + share - mean
-    size, largest_size = math.sqrt(dev_1 * dev_1 + dev_2 * dev_2 + dev_3 * dev_3), -slope * trace
+    size, largest_size = math.sqrt(dev_1 * dev_1 + dev_2 * dev_2 + dev_3 * dev_3), -slope * trace + intercept
     if size > largest_size or volume_correction != 0.0:
         factor = min(1.0, largest_size / size) if size > 0.0 else 1.0
         dev_1, dev_2, dev_3 = factor * dev_1, factor * dev_2, factor * dev_3
@@ -218,7 +220,7 @@ def respond(law, f, plastic, constants, p):
     """Apply the law with this code and row ``p`` of the constants; results as in ``sand``. An unknown code gives NaN."""
     lam, mu = constants[p, LAMBDA], constants[p, MU]
     if law == SAND:
-        return sand(f, plastic, lam, mu, constants[p, COEFFICIENT])
+        return sand(f, plastic, lam, mu, constants[p, COEFFICIENT], constants[p, INTERCEPT], constants[p, TIP])
     if law == SNOW:
         xi, smallest, largest, hardest = (
             constants[p, COEFFICIENT],

@@ -14,7 +14,7 @@ from pydantic.dataclasses import dataclass as validated_dataclass
 from gpe_pl.geometry.shapes import check_whole_cells
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.schema import MATERIALS, NODE_TYPES, node_code, param_names
-from gpe_pl.solvers.materials import LIMITS, MEMORY, NUM_CONSTANTS, Elastomer, Fluid, Sand, Snow, check_limits
+from gpe_pl.solvers.materials import MEMORY, NUM_CONSTANTS, Elastomer, Fluid, Sand, Snow, parameters_of
 from gpe_pl.solvers.mpm.collider import Collider, collider
 from gpe_pl.solvers.mpm.frame import ESCAPE, NOT_FINITE, OK, advance
 from gpe_pl.solvers.mpm.particles import Particles
@@ -73,8 +73,9 @@ class MPM:
         bounds: ``(low, high)`` of the domain along each axis [m]; each extent is a whole multiple of the grid spacing.
         grid_spacing: grid spacing Δ [m].
         frame_dt: time between frames [s].
-        materials: every material of the data set; they determine the columns of ``State.material_params``.
+        materials: every material of the data set; they determine the columns of ``State.material_params`` in a state without ``param_names``.
         sand, snow, elastomer, fluid: constants of each material; None selects the defaults of liquid. The density gives the volume of a particle of given mass.
+            Parameters with a column in ``State.material_params`` have the values there.
         cfl: fraction of a cell that a wave or a particle may cross in one substep.
         max_substeps: largest number of substeps per frame. If a frame needs more, the step fails as an explosion.
     """
@@ -128,7 +129,7 @@ class MPM:
     def compile_kernels(self) -> None:
         """Compile the kernels for this solver's dimension into Numba's disk cache, so that worker processes started later only load them."""
         material, dim = self.materials[0], len(self.bounds)
-        params = np.full((1, len(param_names(self.materials))), LIMITS[material].low)
+        params = np.full((1, len(param_names(self.materials))), MATERIALS[material][0].limits.low)
         middle = np.array([[(low + high) / 2 for low, high in self.bounds]])
         code = np.array([node_code(material)], dtype=np.uint8)
         self.step(State(middle, np.zeros((1, dim)), code, np.ones(1), params, Boundary.empty(dim), np.zeros(dim)))
@@ -204,13 +205,11 @@ class MPM:
     def _particles(self, state: State, internal: object) -> Particles:
         """Return the particles in the form that the kernels take; raise an error that names what does not fit."""
         num_nodes, dim = state.num_nodes, len(self.bounds)
-        names = param_names(self.materials)
         shapes = {
             "pos": (state.pos, (num_nodes, dim)),
             "vel": (state.vel, (num_nodes, dim)),
             "mass": (state.mass, (num_nodes,)),
             "node_type": (state.node_type, (num_nodes,)),
-            "material_params": (state.material_params, (num_nodes, len(names))),
             "gravity": (state.gravity, (dim,)),
         }
         if not isinstance(internal, MPMInternal):
@@ -222,7 +221,7 @@ class MPM:
         for name, (array, expected) in shapes.items():
             if np.shape(array) != expected:
                 raise SimulationError(f"{name} has shape {np.shape(array)}, expected {expected}", reason="input")
-            if name not in ("material_params", "gravity"):
+            if name != "gravity":
                 self._require(np.isfinite(array), f"{name} is not finite", reason="nan")
         if not np.all(np.isfinite(state.gravity)):
             raise SimulationError(f"gravity {state.gravity} is not finite", reason="nan")
@@ -230,13 +229,10 @@ class MPM:
         law, specific_volume, constants = np.empty(num_nodes, dtype=np.int64), np.empty(num_nodes), np.empty((num_nodes, NUM_CONSTANTS))
         known = np.zeros(num_nodes, dtype=bool)
         for name in self.materials:
-            chosen = np.asarray(state.node_type) == node_code(name)
-            material, parameter = self.constants_of(name), MATERIALS[name]
-            values = np.asarray(state.material_params, dtype=np.float64)[:, names.index(parameter.name)]
-            check_limits(name, values[chosen], np.flatnonzero(chosen))
+            chosen, material = np.flatnonzero(np.asarray(state.node_type) == node_code(name)), self.constants_of(name)
             law[chosen], specific_volume[chosen] = material.law, 1.0 / material.density
-            constants[chosen] = material.constants(values[chosen], dim)
-            known |= chosen
+            constants[chosen] = material.constants(parameters_of(state, name, chosen, self.materials), dim)
+            known[chosen] = True
         self._require(known, f"node_type is none of the solver's materials {', '.join(self.materials)} (codes of {', '.join(NODE_TYPES)})")
         # np.array copies: the kernels work in place, and the caller's arrays must not change
         changing = (state.pos, state.vel, internal.deformation, internal.affine, internal.plastic)

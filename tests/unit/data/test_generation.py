@@ -28,8 +28,10 @@ from gpe_pl.data.ground_truth import (
     DatasetSpec,
     GenerationError,
     ParameterValues,
+    ValueGroups,
     generate_trajectory,
     initial_state,
+    named_values,
     parameter_values,
     scene_seed,
 )
@@ -45,6 +47,7 @@ from tests.runs import compose
 
 DENSITY = {"sand": 1600.0, "snow": 400.0, "elastomer": 1000.0}
 SCENE = BodyScene(bounds=((0, 1), (0, 1)), materials=("sand",), grid_spacing=1 / 16, num_particles=40, density=DENSITY)
+SAND = {"seen": (20, 30, 40), "interpolated": (25, 35), "extrapolated": (15, 45)}
 SOLVER = MPM(bounds=SCENE.bounds, grid_spacing=SCENE.grid_spacing)
 SPEC = DatasetSpec(
     name="sand",
@@ -348,7 +351,7 @@ def test_parameter_groups_are_marked(folder):
     for split in ("train", "val", "test"):
         for trajectory in iter_trajectories(folder, split):
             assert trajectory.metadata.parameter_group == "seen" and trajectory.material_params[0, 0] in SPEC.parameters["sand"].seen
-    assert [parameter_values(SPEC, "train", i)[0]["sand"] for i in range(4)] == [20, 30, 40, 20]
+    assert [parameter_values(SPEC, "train", i)[0]["sand"]["friction_angle"] for i in range(4)] == [20, 30, 40, 20]
 
 
 def test_parameters_of_several_materials_are_dealt_independently():
@@ -356,11 +359,54 @@ def test_parameters_of_several_materials_are_dealt_independently():
     parameters = {"sand": ParameterValues(seen=(20, 30, 40)), "snow": ParameterValues(seen=(5, 8, 11))}
     solver = replace(SOLVER, materials=scene.materials)
     spec = replace(SPEC, scene=scene, solver=solver, parameters=parameters, num_test_unseen=0)
-    dealt = [parameter_values(spec, "train", i)[0] for i in range(300)]
+    dealt = [{m: v for m, own in parameter_values(spec, "train", i)[0].items() for v in own.values()} for i in range(300)]
     assert {(v["sand"], v["snow"]) for v in dealt} == {(a, b) for a in (20, 30, 40) for b in (5, 8, 11)}
     assert abs(np.corrcoef([v["sand"] for v in dealt], [v["snow"] for v in dealt])[0, 1]) < 0.15
     for material in ("sand", "snow"):  # every round has every value once
         assert all(len({v[material] for v in dealt[k : k + 3]}) == 3 for k in range(0, 300, 3))
+
+
+def further(**values):
+    """Return the specification with values of the cohesion [Pa]."""
+    sand = replace(SPEC.parameters["sand"], further={"cohesion": ValueGroups(**values)})
+    return replace(SPEC, parameters={"sand": sand})
+
+
+def test_several_parameters_of_a_material_are_dealt_independently():
+    spec = further(seen=(0, 500, 1000), interpolated=(700,))
+    assert spec.param_names == ("friction_angle", "cohesion")
+    dealt = [parameter_values(spec, "train", i)[0]["sand"] for i in range(300)]
+    assert [v["friction_angle"] for v in dealt[:4]] == [20, 30, 40, 20]
+    assert {tuple(v.values()) for v in dealt} == {(a, c) for a in (20, 30, 40) for c in (0, 500, 1000)}
+    assert abs(np.corrcoef([v["friction_angle"] for v in dealt], [v["cohesion"] for v in dealt])[0, 1]) < 0.15
+    for k in range(0, 300, 3):  # each round is a Latin hypercube
+        assert {v["cohesion"] for v in dealt[k : k + 3]} == {0, 500, 1000}
+    interpolated, extrapolated = (parameter_values(spec, "test_unseen", i) for i in range(2))
+    assert interpolated == ({"sand": {"friction_angle": 25, "cohesion": 700}}, "interpolated")
+    assert extrapolated[1] == "extrapolated"
+    assert extrapolated[0]["sand"]["friction_angle"] == 15 and extrapolated[0]["sand"]["cohesion"] in (0, 500, 1000)
+
+
+def test_a_trajectory_stores_all_parameters_of_its_material():
+    spec = further(seen=(500,), interpolated=(), extrapolated=())
+    stored = generate_trajectory(spec, "train", 1, num_frames=3)
+    assert stored.metadata.param_names == ("friction_angle", "cohesion")
+    np.testing.assert_array_equal(stored.material_params, np.broadcast_to([30.0, 500.0], (40, 2)))
+    other = generate_trajectory(spec, "train", 1, {"sand": {"friction_angle": 30.0, "cohesion": 0.0}}, num_frames=3)
+    assert (other.material_params[:, 1] == 0).all()
+    for values, message in (
+        ({"sand": 30.0}, "values of sand are friction_angle; the data set stores friction_angle, cohesion"),
+        ({"sand": {"friction_angle": 30.0, "density": 1.0}}, "sand has no parameter 'density'"),
+        ({}, "values: sand is missing"),
+    ):
+        with pytest.raises(GenerationError if values else ValueError, match=message):
+            initial_state(spec, "train", 1, values) if values else named_values(spec, values)
+
+
+def test_the_specification_of_one_parameter_is_as_before():
+    """Data sets that were generated before are found again, by the checksum of their specification."""
+    assert SPEC.as_dict()["parameters"] == {"sand": {"seen": [20, 30, 40], "interpolated": [25, 35], "extrapolated": [15, 45]}}
+    assert further(seen=(0, 500)).as_dict()["parameters"]["sand"]["further"]["cohesion"]["seen"] == [0, 500]
 
 
 def test_statistics_are_of_the_train_split(folder):
@@ -429,6 +475,22 @@ def test_disk_estimate_is_near_the_truth(folder):
         ({"parameters": {"sand": {"seen": (20, 30, 40), "interpolated": (30,)}}}, "among the seen ones"),
         ({"parameters": {"sand": {"seen": (20,), "extrapolated": (30,)}}}, "needs parameters.sand.interpolated"),
         ({"parameters": {"snow": {"seen": (20,)}}}, "parameters are for snow, the scene has sand"),
+        (
+            {"parameters": {"sand": SAND | {"further": {"density": {"seen": (1,)}}}}},
+            "parameters.sand.further: sand has no parameter 'density'",
+        ),
+        (
+            {"parameters": {"sand": SAND | {"further": {"cohesion": {"seen": (0, 1e6)}}}}},
+            "parameters.sand.further.cohesion.seen: cohesion = 1000000.0",
+        ),
+        (
+            {"parameters": {"sand": SAND | {"further": {"cohesion": {"seen": (0, 9), "interpolated": (10,)}}}}},
+            "(?s)further.cohesion.*inside",
+        ),
+        (
+            {"parameters": {"sand": SAND | {"further": {"friction_angle": {"seen": (20,)}}}}},
+            "is the first parameter; give its values as parameters.sand.seen",
+        ),
         ({"num_train": 0}, "num_train"),
         ({"name": "../evil"}, "name"),
         ({"solver": MPM(bounds=SCENE.bounds, grid_spacing=1 / 32)}, "scene.grid_spacing"),

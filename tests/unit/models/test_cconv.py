@@ -82,7 +82,7 @@ def test_layers_are_those_of_the_paper() -> None:
 
     relations = (("fluid", "radius", "fluid"), (BOUNDARY, "radius", "fluid"))
     spec = FeatureSpec(
-        3, ("fluid",), {"fluid": 3, BOUNDARY: 3}, {"fluid": 0}, relations, dict.fromkeys(relations, 3), dict.fromkeys(relations, 0)
+        3, ("fluid",), {"fluid": 3, BOUNDARY: 3}, {"fluid": ()}, relations, dict.fromkeys(relations, 3), dict.fromkeys(relations, 0)
     )
     first = conv(4, 32) + conv(3, 32) + dense(4, 32)
     others = sum(conv(a, b) + dense(a, b) for a, b in ((96, 64), (64, 64), (64, 3)))

@@ -106,7 +106,7 @@ def test_number_of_parameters_is_that_of_the_published_network() -> None:
         return (channels + 1) * out
 
     relations = (("fluid", "radius", "fluid"),)
-    spec = FeatureSpec(3, ("fluid",), {"fluid": 10, BOUNDARY: 1}, {"fluid": 0}, relations, {relations[0]: 1}, {relations[0]: 0})
+    spec = FeatureSpec(3, ("fluid",), {"fluid": 10, BOUNDARY: 1}, {"fluid": ()}, relations, {relations[0]: 1}, {relations[0]: 0})
     model = DPINet(spec)
     attribute, state, relation = 1 + 6, 6, 1
     assert model.graph.node_channels + model.graph.num_kinds == attribute + state

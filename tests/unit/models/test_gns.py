@@ -85,7 +85,7 @@ def sizes_of(dim: int, motion: int, edge: int) -> FeatureSpec:
     """Return a graph whose inputs are as wide as those of a published model; all columns but one are the material's."""
     relations = (("fluid", "radius", "fluid"),)
     return FeatureSpec(
-        dim, ("fluid",), {"fluid": motion - 1, BOUNDARY: 1}, {"fluid": 0}, relations, {relations[0]: edge}, {relations[0]: 0}
+        dim, ("fluid",), {"fluid": motion - 1, BOUNDARY: 1}, {"fluid": ()}, relations, {relations[0]: edge}, {relations[0]: 0}
     )
 
 

@@ -213,7 +213,7 @@ def test_affine_embedding_interpolates_physical_values_as_the_paper_says(kind: s
     ends = theta(low), theta(high)
     mixed = [(x, theta(x * low + (1 - x) * high)) for x in (0.1, 0.4, 0.7)]
     errors = [float((value - x * ends[0] - (1 - x) * ends[1]).norm() / (ends[0] - ends[1]).norm()) for x, value in mixed]
-    is_linear = scale == "linear" or MATERIALS[material].scale == "linear"
+    is_linear = scale == "linear" or MATERIALS[material][0].scale == "linear"
     assert (max(errors) < 1e-9) == (kind == "affine" and is_linear)
 
 

@@ -5,7 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
+from gpe_pl.schema import parameters_by_name
 from gpe_pl.solvers import materials
 from gpe_pl.solvers.materials import Elastomer, Sand, Snow
 from gpe_pl.solvers.mpm import laws_2d, laws_3d
@@ -16,10 +18,15 @@ LAM, MU = materials.lame_parameters(3e5, 0.2)
 
 
 def respond(material, value, deformation, plastic=0.0):
-    """Return return-mapped F, plastic state, Kirchhoff stress and stiffness of a material with this parameter."""
+    """Return return-mapped F, plastic state, Kirchhoff stress and stiffness of a material with this first parameter, or these by name."""
     dim = len(deformation)
-    constants = material.constants(np.array([value]), dim)
+    constants = material.constants(parameters(material, value), dim)
     return by_code(material.law, deformation, plastic, constants)
+
+
+def parameters(material, value):
+    """Return the parameters of one particle as the solver passes them."""
+    return {name: np.array([number]) for name, number in parameters_by_name(type(material).__name__.lower(), value).items()}
 
 
 def by_code(law, deformation, plastic, constants):
@@ -250,7 +257,7 @@ def test_not_finite_deformation_is_not_hidden(dim, name, bad):
 
 @pytest.mark.parametrize("dim", DIMS)
 def test_unknown_code_gives_nan(dim):
-    constants = Sand().constants(np.array([30.0]), dim)
+    constants = Sand().constants(parameters(Sand(), 30.0), dim)
     assert np.all(np.isnan(by_code(99, np.eye(dim), 0.0, constants)[2]))
 
 
@@ -282,3 +289,110 @@ def test_spectral_decomposition(kind):
 def test_coefficient_in_three_dimensions_is_triaxial():
     sine = math.sin(math.radians(30))
     assert materials.drucker_prager_coefficient(np.array([30.0]), 3)[0] == pytest.approx(math.sqrt(2 / 3) * 2 * sine / (3 - sine))
+
+
+COHESIVE = [{"friction_angle": angle, "cohesion": cohesion} for angle, cohesion in ((30.0, 1e3), (15.0, 200.0), (40.0, 5e3))]
+
+
+def cohesive_reference(deformation, plastic, friction_angle, cohesion):
+    """Apply the return mapping to the cone with its tip in tension, written with an SVD in stresses."""
+    dim, angle = len(deformation), math.radians(friction_angle)
+    alpha = float(materials.drucker_prager_coefficient(np.array([friction_angle]), dim)[0])
+    tip = cohesion / math.tan(angle)  # mean stress
+    u, sigma, vt = np.linalg.svd(deformation)
+    strain = np.log(sigma) + plastic / dim
+    bulk = LAM + 2 * MU / dim
+    if bulk * strain.sum() >= tip:
+        return u @ vt * math.exp(tip / bulk / dim), strain.sum() - tip / bulk, tip * np.eye(dim)
+    mean, deviator = bulk * strain.sum(), 2 * MU * (strain - strain.sum() / dim)
+    allowed = alpha * dim * (tip - mean)
+    deviator *= min(1.0, allowed / np.linalg.norm(deviator))
+    stress = mean + deviator
+    strain = deviator / (2 * MU) + strain.sum() / dim
+    return u @ np.diag(np.exp(strain)) @ vt, 0.0, u @ np.diag(stress) @ u.T
+
+
+@pytest.mark.parametrize("dim", DIMS)
+@pytest.mark.parametrize("values", COHESIVE)
+def test_sand_with_cohesion_equals_reference(dim, values):
+    rng, tips = np.random.default_rng(0), 0
+    for _ in range(200):
+        deformation, plastic = random_deformation(rng, dim, rng.choice([0.01, 0.1])), max(0.0, rng.uniform(-0.05, 0.02))
+        expected, got = cohesive_reference(deformation, plastic, **values), respond(Sand(), values, deformation, plastic)
+        tips += expected[1] != 0
+        np.testing.assert_allclose(got[0] @ got[0].T, expected[0] @ expected[0].T, atol=1e-12)
+        np.testing.assert_allclose(got[1], expected[1], atol=1e-12)
+        np.testing.assert_allclose(got[2], expected[2], atol=1e-9 * MU)
+    assert 20 < tips < 180
+
+
+@pytest.mark.parametrize("dim", DIMS)
+def test_sand_without_cohesion_is_dry_sand(dim):
+    rng = np.random.default_rng(0)
+    for angle in (0.0, 30.0):
+        for _ in range(50):
+            deformation, plastic = random_deformation(rng, dim), max(0.0, rng.uniform(-0.2, 0.2))
+            dry = respond(Sand(), angle, deformation, plastic)
+            for one, other in zip(dry, respond(Sand(), {"friction_angle": angle, "cohesion": 0.0}, deformation, plastic), strict=True):
+                np.testing.assert_array_equal(one, other)
+
+
+def compressed(material, values, dim, num_steps, step):
+    """Return the stress along the last axis and the lateral strains of one particle that is compressed with free sides."""
+    elastic, plastic, stretch = np.eye(dim), 0.0, np.ones(dim)
+
+    def trial(lateral):
+        return respond(material, values, np.diag([1 + lateral] * (dim - 1) + [1 - step]) @ elastic, plastic)
+
+    for _ in range(num_steps):
+        lateral = brentq(lambda x: trial(x)[2][0, 0], -step, 20 * step, xtol=1e-16, rtol=1e-14)
+        elastic, plastic, stress, _ = trial(lateral)
+        stretch *= [1 + lateral] * (dim - 1) + [1 - step]
+    return stress[-1, -1], np.log(stretch)
+
+
+@pytest.mark.parametrize("dim", DIMS)
+@pytest.mark.parametrize("values", COHESIVE)
+def test_unconfined_compressive_strength_is_that_of_mohr_coulomb(dim, values):
+    """A particle with free sides yields at ``2 c cos φ / (1 - sin φ)``, in plane strain and in triaxial compression."""
+    angle, cohesion = math.radians(values["friction_angle"]), values["cohesion"]
+    strength = 2 * cohesion * math.cos(angle) / (1 - math.sin(angle))
+    before, _ = compressed(Sand(), values, dim, 5, 0.1 * strength / 3e5)
+    after, _ = compressed(Sand(), values, dim, 40, 0.1 * strength / 3e5)
+    assert -before < 0.9 * strength and -after == pytest.approx(strength, rel=1e-6)
+
+
+@pytest.mark.parametrize("dim", DIMS)
+def test_cohesion_bears_the_isotropic_tension_of_its_tip(dim):
+    stress = respond(Sand(), COHESIVE[0], 1.5 * np.eye(dim))[2]
+    np.testing.assert_allclose(stress, 1e3 / math.tan(math.radians(30)) * np.eye(dim), rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize("dim", DIMS)
+def test_cohesion_without_friction_is_a_cylinder(dim):
+    """Without friction the deviator is bounded by ``√2 c`` (in plane strain) at any mean stress, and tension has no bound."""
+    values = {"friction_angle": 0.0, "cohesion": 1e3}
+    bound = math.sqrt(2) * 1e3 if dim == 2 else math.sqrt(2 / 3) * 2e3
+    for volume in (0.9, 1.1):
+        stress = respond(Sand(), values, volume * np.diag([1.05, 0.97, 1.0][:dim]))[2]
+        mean = np.trace(stress) / dim
+        assert np.linalg.norm(stress - mean * np.eye(dim)) == pytest.approx(bound, rel=1e-9)
+        assert mean == pytest.approx((LAM + 2 * MU / dim) * math.log(volume**dim * 1.05 * 0.97), rel=1e-9)
+
+
+@pytest.mark.parametrize("dim", DIMS)
+@pytest.mark.parametrize("ratio", [0.0, 0.2, 0.45])
+def test_an_elastomer_contracts_by_its_poisson_ratio(dim, ratio):
+    """Uniaxial stress: lateral strain over axial strain is -ν, and in plane strain -ν / (1 - ν); the modulus is E, and E / (1 - ν²)."""
+    stress, strain = compressed(Elastomer(), {"youngs_modulus": 1e5, "poisson_ratio": ratio}, dim, 1, 1e-6)
+    assert -strain[0] / strain[-1] == pytest.approx(ratio if dim == 3 else ratio / (1 - ratio), abs=1e-5)
+    assert stress / strain[-1] == pytest.approx(1e5 if dim == 3 else 1e5 / (1 - ratio**2), rel=1e-5)
+
+
+@pytest.mark.parametrize("dim", DIMS)
+def test_snow_yields_at_its_own_critical_strains(dim):
+    for compression, stretch in ((0.1, 0.02), (0.01, 0.1)):
+        values = {"hardening_coefficient": 10.0, "critical_compression": compression, "critical_stretch": stretch}
+        for change, limit in ((-0.05, compression), (0.05, stretch)):
+            new, plastic, _, _ = respond(Snow(), values, np.diag([1 + change] + [1.0] * (dim - 1)))
+            assert abs(new[0, 0] - 1) == pytest.approx(min(0.05, limit)) and (plastic != 0) == (limit < 0.05)

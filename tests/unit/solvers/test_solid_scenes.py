@@ -56,7 +56,7 @@ def test_stiffness_changes_nothing_else(config):
 def test_body_is_at_rest_inside_and_free(config, seed):
     state = drawn(config.cell, seed)
     assert state.pos.dtype == state.vel.dtype == np.float64
-    assert np.all(state.node_type == node_code("solid")) and MATERIALS["solid"].name == "youngs_modulus"
+    assert np.all(state.node_type == node_code("solid")) and MATERIALS["solid"][0].name == "youngs_modulus"
     np.testing.assert_array_equal(state.rest_pos, state.pos)
     assert not np.any(state.stress.node) and not np.any(state.stress.cell)
     components = 4 if config.dim == 2 else 6

@@ -184,7 +184,7 @@ def test_metadata_that_describe_no_scene_are_refused(tmp_path: Path, trajectory:
 def test_parameters_whose_squares_overflow_are_not_finite(trajectory: Trajectory, value: float) -> None:
     broken = with_value(trajectory, "material_params", (7, 0), value)
     (found,) = faults(stored_arrays(broken), NODE_TYPES, ("sand",), ("friction_angle",))
-    assert str(found) == f"field 'material_params': friction_angle: node 7: is {value:g} deg of sand, must be {MATERIALS['sand'].rule}"
+    assert str(found) == f"field 'material_params': friction_angle: node 7: is {value:g} deg of sand, must be {MATERIALS['sand'][0].rule}"
 
 
 def test_parameters_are_not_negative_and_positive_where_they_enter_by_their_logarithm(trajectory: Trajectory) -> None:

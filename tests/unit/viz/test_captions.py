@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from gpe_pl.data.importers import draw_contact_sheet, save_dataset
 from gpe_pl.rollout.baselines import Ballistic
 from gpe_pl.rollout.loop import rollout
-from gpe_pl.schema import node_code
+from gpe_pl.schema import MATERIALS, node_code
 from gpe_pl.trajectory.store import read_trajectory, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz import contact_sheet as sheets
@@ -127,10 +127,14 @@ def test_several_materials_are_named_above_their_legend() -> None:
 
 
 def test_values_have_their_unit() -> None:
-    assert [parameter_value("solid", x) for x in (2.1e11, 6e5, 500.0)] == ["210 GPa", "600 kPa", "500 Pa"]
-    assert parameter_value("fluid", 8.93e-7) == "8.93e-07 m²/s"
-    assert (parameter_value("snow", 8.0), parameter_value("sand", 20.0, 30.0)) == ("8", "20 … 30°")
+    first = {material: own[0] for material, own in MATERIALS.items()}
+    assert [parameter_value(first["solid"], x) for x in (2.1e11, 6e5, 500.0)] == ["210 GPa", "600 kPa", "500 Pa"]
+    assert parameter_value(first["fluid"], 8.93e-7) == "8.93e-07 m²/s"
+    assert (parameter_value(first["snow"], 8.0), parameter_value(first["sand"], 20.0, 30.0)) == ("8", "20 … 30°")
     assert row_label({"sand": 20.0}) == "friction angle\n20°" and row_label({"sand": 20.0, "snow": 8.0}) == "sand 20°\nsnow 8"
+    named = {"elastomer": {"youngs_modulus": 1e5, "poisson_ratio": 0.3}}
+    assert row_label(named) == "Young’s modulus\n100 kPa\nPoisson’s ratio\n0.3"
+    assert row_label({**named, "sand": 20.0}) == "elastomer 100 kPa, 0.3\nsand 20°"
     assert describe(replace(truth(), material_params=np.full((truth().num_nodes, 1), np.nan))) == "sand"
 
 

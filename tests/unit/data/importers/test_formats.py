@@ -110,7 +110,7 @@ def test_gns_hdf5_and_its_friction(tmp_path: Path) -> None:
         assert_stored(trajectory, motion(seed=k))
         np.testing.assert_allclose(trajectory.material_params, angles[k], rtol=1e-5)
         assert trajectory.metadata.gravity == (0.0, -9.81)
-    assert report.materials["sand"]["low"] == pytest.approx(20.0)
+    assert report.materials["sand"]["parameters"]["friction_angle"][0] == pytest.approx(20.0)
     assert not any("gravity is not" in note for note in report.notes)
 
 

@@ -36,6 +36,33 @@ def test_own_arrays(tmp_path: Path) -> None:
     assert report.format == "arrays"
 
 
+def test_several_parameters_of_a_material(tmp_path: Path) -> None:
+    (tmp_path / "raw").mkdir()
+    values: dict[str, Any] = {"frame_dt": DT, "materials": "elastomer"}
+    ratio = np.linspace(0.1, 0.4, motion().shape[1])
+    np.savez(tmp_path / "raw" / "0.npz", pos=motion(seed=0), **values, params_elastomer=1e5, params_elastomer_poisson_ratio=ratio)
+    np.savez(tmp_path / "raw" / "1.npz", pos=motion(seed=1), **values, params_elastomer_youngs_modulus=2e5)
+    report, stored = imported(tmp_path, tmp_path / "raw", "arrays", holdout=0.0)
+    (first,) = stored["train"]
+    assert first.metadata.param_names == ("youngs_modulus", "poisson_ratio")
+    np.testing.assert_allclose(first.material_params[:, 1], ratio, rtol=1e-6)
+    (refusal,) = report.refusals
+    assert "has no poisson_ratio of elastomer, which other trajectories have" in str(refusal)
+    assert "youngs_modulus 100000 Pa, poisson_ratio 0.1 … 0.4" in report.text()
+
+    report, stored = imported(
+        tmp_path / "again",
+        tmp_path / "raw",
+        "arrays",
+        holdout=0.0,
+        parameters={"elastomer": {"youngs_modulus": 1.0, "poisson_ratio": 0.25}},
+    )
+    assert not report.refusals
+    np.testing.assert_allclose(stored["train"][1].material_params, np.broadcast_to([2e5, 0.25], first.material_params.shape), rtol=1e-6)
+    with pytest.raises(ValueError, match="parameters.elastomer: elastomer has no parameter 'cohesion'"):
+        imported(tmp_path / "refused", tmp_path / "raw", "arrays", parameters={"elastomer": {"cohesion": 1.0}})
+
+
 def test_own_cells_by_kind(tmp_path: Path) -> None:
     values: dict[str, Any] = {"frame_dt": DT, "materials": "elastomer", "params_elastomer": 1e5}
     cells: dict[str, Any] = {"cells_triangle": [[0, 1, 2]], "cells_quadrilateral": [[0, 3, 4, 5], [6, 7, 8, 9]]}
