@@ -29,7 +29,11 @@ TABLES = ("sizes", "dimensions", "default_dimension", "variant", "suffix", "boun
 
 
 def dataset_spec(cfg: DictConfig) -> DatasetSpec:
-    """Return the specification of a config's data set. A ``ConfigError`` names the key and the value."""
+    """Return the specification of a config's data set.
+
+    Raises:
+        ConfigError: the data set does not have the size, or a setting of the data, the scene or the solver is not allowed. The message names key and value.
+    """
     from omegaconf import OmegaConf
 
     from gpe_pl.data.ground_truth import DatasetSpec

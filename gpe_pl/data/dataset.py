@@ -60,7 +60,7 @@ CACHE_BYTES = 2 * 1024**3
 MAX_DAMAGED = 0.2
 """Maximum fraction of a split's trajectories that may be left out. One trajectory may always be left out."""
 MAX_JUMP, MIN_RATIO = 2.0, 10.0
-"""A node that moves more than MAX_JUMP neighbour radii in one frame, and more than MIN_RATIO times as far as in the frame before or after, marks corrupt
+"""A node that moves more than MAX_JUMP connectivity radii in one frame, and more than MIN_RATIO times as far as in the frame before or after, marks corrupt
 data."""
 
 

@@ -1,6 +1,6 @@
 """Groups of nodes in free flight. They touch nothing, so their acceleration should equal the gravity of the data.
 
-A group is an island: a connected component of the graph. It is in free flight if no boundary node lies within the neighbour radius of its nodes, neither in
+A group is an island: a connected component of the graph. It is in free flight if no boundary node lies within the connectivity radius of its nodes, neither in
 this frame nor in the frame before. In the frame before, its nodes may belong to several islands. The graph of such a group contains no cause of any
 acceleration except gravity.
 """

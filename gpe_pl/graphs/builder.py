@@ -69,7 +69,7 @@ class GraphBuilder:
         skips: computations to leave out. They do not change the graph.
 
     Raises:
-        PeriodicityError: the neighbour radius is half a period or more.
+        PeriodicityError: the connectivity radius is half a period or more.
     """
 
     config: GraphConfig

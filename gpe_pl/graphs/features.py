@@ -49,7 +49,7 @@ class GraphConfig:
         features: edge features, ``paper`` or ``contact``.
         boundary_condition: boundary nodes have velocity, normal, friction and restitution. If false, they have only the velocity (paper).
         history: velocities per node.
-        connectivity_spacings: neighbour radius in rest spacings; None takes the data set's radius.
+        connectivity_spacings: radius of the edges between nodes in rest spacings; None takes the data set's radius.
         parameter_scale: ``linear`` gives models the physical value of every material parameter, as the paper does. None takes the scale of each parameter
             in ``schema.MATERIALS``, which is logarithmic where values span decades.
         trim_boundary: leave out boundary nodes without an edge, which cannot influence anything.

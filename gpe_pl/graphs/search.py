@@ -36,7 +36,7 @@ def find_topology(state: State, rows: Rows, config: GraphConfig, spec: FeatureSp
         rows: rows of each material's nodes in the state.
         config: settings of the graph.
         spec: node types and relations of the graph.
-        scales: neighbour radius and rest spacing.
+        scales: connectivity radius and rest spacing.
         skips: tell whether to search between absent node types, and whether to keep the search tree of the boundary.
 
     Raises:

@@ -1,6 +1,6 @@
 """Continuous convolution [Ummenhofer et al. 2020, "Lagrangian Fluid Simulation with Continuous Convolutions", ICLR, section 3], in torch alone.
 
-A filter is a grid of K^d matrices, stretched over the ball of the neighbour radius R and interpolated linearly::
+A filter is a grid of K^d matrices, stretched over the ball of the connectivity radius R and interpolated linearly::
 
     y_i = b + Σ_j a(u_ij) G(Λ(u_ij)) f_j         u_ij = (x_j − x_i) / R,  j ≠ i,  a(u) = (1 − |u|²)³
 

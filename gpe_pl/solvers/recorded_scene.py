@@ -172,7 +172,7 @@ class RecordedScene:
 
     @property
     def connectivity_radius(self) -> float:
-        """Recommended neighbour radius of a learned simulator in m."""
+        """Recommended connectivity radius of a learned simulator in m."""
         return self.connectivity_cells * self.grid_spacing
 
     @property

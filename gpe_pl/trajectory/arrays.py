@@ -15,7 +15,7 @@ from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.cells import fitting_kinds, stacked
 
 RADIUS_SPACINGS = 2.0
-"""Default neighbour radius in rest spacings: about 12 neighbours in the plane and 32 in space."""
+"""Default connectivity radius in rest spacings: about 12 neighbours in the plane and 32 in space."""
 
 FRAMES_AT_ONCE = 256
 NEIGHBOURS = 16

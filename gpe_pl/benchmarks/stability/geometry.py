@@ -1,4 +1,4 @@
-"""Stress tests of degenerate arrangements: coincident, isolated and crowded nodes, and nodes at the edge of the neighbour radius."""
+"""Stress tests of positions: coincident, isolated and crowded nodes, a node that crosses the connectivity radius, and neighbour lists against brute force."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ importer reads ``world_pos`` [frame, node, 3], ``mesh_pos`` [1, node, 2 or 3], `
 are quadrilaterals if ``mesh_pos`` lies in a plane, else tetrahedra.
 
 Types are 0 normal, 1 obstacle, 3 handle and 6 wall. Normal nodes become an ``elastomer``. The others become boundary nodes, still or moving as in the source.
-Cells with boundary nodes are left out; the neighbour radius connects a handle to its cloth. Data without ``world_pos`` (``cylinder_flow``, ``airfoil``) are
+Cells with boundary nodes are left out; the connectivity radius connects a handle to its cloth. Data without ``world_pos`` (``cylinder_flow``, ``airfoil``) are
 fields on a still mesh and are refused, because their nodes have no trajectory. The ``stress`` of a source is the von Mises stress only. It does not determine
 the stress tensor and is left out.
 

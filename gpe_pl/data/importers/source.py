@@ -73,7 +73,7 @@ class ImportSettings:
         periodic: whether space repeats, per axis.
         gravity: external acceleration per axis [m/s²].
         spacing: rest spacing of neighbours [m].
-        connectivity_radius: neighbour radius [m].
+        connectivity_radius: radius of the edges between nodes [m].
         walls: friction of walls at the bounds, by side (``x_low``, ``x_high``, …); ``{}`` for no walls.
         materials: material, or ``boundary``, of node types of the source, by their number. Other types keep the material of the format.
         parameters: parameters of materials for which the source has none: a number for the first parameter of a material, several by name.
@@ -122,7 +122,7 @@ class Facts:
         periodic: whether space repeats, per axis.
         gravity: external acceleration per axis [m/s²].
         spacing: rest spacing of neighbours [m].
-        connectivity_radius: neighbour radius [m].
+        connectivity_radius: radius of the edges between nodes [m].
         walls: friction of walls at the bounds, by side.
         parameters: parameters of each material of which all nodes have the same value: of the first one, or by name.
         usual_gravity: usual gravity of the format per axis [m/s²]. It is used if neither the source nor a setting states one, unless groups of nodes in free
@@ -332,7 +332,7 @@ def _cells_of(nodes: Nodes, moving: np.ndarray, repairs: list[Repair]) -> dict[s
         if kept.any():
             found[kind] = row[cells[kept]]
     if left_out:
-        repairs.append(Repair(f"{left_out} of {total} cells have boundary nodes and were left out; the neighbour radius connects these"))
+        repairs.append(Repair(f"{left_out} of {total} cells have boundary nodes and were left out; the connectivity radius connects these"))
     return found or None
 
 

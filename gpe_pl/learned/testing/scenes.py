@@ -20,7 +20,7 @@ SPACING = 0.05
 
 
 def metadata(materials: tuple[str, ...] = ("sand",), dim: int = 2, radius: float = 0.12) -> Metadata:
-    """Return metadata of a unit box with these materials and this neighbour radius [m]."""
+    """Return metadata of a unit box with these materials and this connectivity radius [m]."""
     return Metadata(
         dataset="test",
         materials=materials,
