@@ -149,6 +149,14 @@ def test_solids_have_the_papers_range() -> None:
     assert (min(values.seen), max(values.seen), values.extrapolated) == (1e6, 4e6, (5e5, 1e7))
 
 
+@pytest.mark.parametrize("size", ["small", "paper"])
+def test_faster_solids_do_not_outrun_the_graph(size: str) -> None:
+    spec = dataset("data=fem", "parameters=paper", f"size={size}")
+    (low, high), fall = spec.scene.bounds[-1], 2 * 9.81
+    speed = np.sqrt(spec.scene.max_speed**2 + fall * (high - low))  # type: ignore[attr-defined]
+    assert speed * spec.solver.frame_dt < spec.scene.connectivity_radius
+
+
 def test_other_data_have_no_such_split() -> None:
     with pytest.raises(Exception, match="split_name"):
         dataset("data=mixed", "parameters=paper")
