@@ -219,7 +219,8 @@ class Trajectory:
             periodic: whether space repeats, per axis; None stands for no axis.
             gravity: external acceleration [dim] in m/s²; None stands for zero. Models then learn gravity like any other force.
             spacing: rest spacing of neighbours [m]; None takes the median distance to the nearest node in the first frame.
-            connectivity_radius: radius of the edges between nodes [m]; nodes that act on each other should be within it. None takes ``arrays.RADIUS_SPACINGS`` spacings.
+            connectivity_radius: radius of the edges between nodes [m]; nodes that act on each other should be within it. None takes
+                ``arrays.RADIUS_SPACINGS`` spacings.
             boundary: walls and obstacles, for example ``Boundary.sample(domain_walls(bounds, friction), spacing, dim)`` or ``Boundary.from_numpy(…)``. In
                 periodic domains, its nodes are wrapped into the domain, nodes that coincide at a seam become one, and shapes get their images.
             cells: nodes of each cell [cell, corner] in meshes of elastomers and solids, or such arrays by kind, ``{"quadrilateral": …, "triangle": …}``. Give

@@ -129,7 +129,10 @@ def sand(f00, f01, f10, f11, volume_correction, lam, mu, slope, intercept=0.0, t
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def hardening(compaction, xi, largest):
-    """Return the factor on snow's elastic moduli, ``exp(-ξ c)`` with ``c = J_P - 1`` (``compaction``), at most ``largest`` (Stomakhin et al. 2013, equation 2)."""
+    """Return the factor on snow's elastic moduli, ``exp(-ξ c)`` with ``c = J_P - 1`` (``compaction``), at most ``largest``.
+
+    Source: Stomakhin et al. 2013, equation 2.
+    """
     return math.exp(min(-xi * compaction, math.log(largest)))
 
 
