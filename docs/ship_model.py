@@ -2,6 +2,9 @@
 
 ``python docs/ship_model.py RUN_FOLDER NAME COMMIT 'COMMAND'`` writes weights without the optimiser's state, and a model card whose numbers are the run's
 own, to ``gpe_pl/learned/pretrained``. COMMAND is what trained it, with the code of COMMIT.
+
+``python docs/ship_model.py --acceptance RUN_FOLDER`` takes the results of ``python -m gpe_pl.benchmark suite=acceptance`` on shipped models from the suite's
+folder, stores them beside the checkpoints, and begins the cards with what fails.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from gpe_pl.evaluation.rollouts import LEARNED, Row, read_rows
+from gpe_pl.learned import acceptance
 from gpe_pl.learned.pretrained import FOLDER
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.reports.domain_table import EVALUATED, NOT_LEARNED
@@ -28,8 +32,7 @@ def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows
     training = settings["training"]
     assert isinstance(training, dict)
     lines = [
-        f"# {name}",
-        "",
+        *_opening(name, acceptance.NOT_MEASURED),
         f"{model} with {size:,} parameters, for {', '.join(metadata.materials)} in {metadata.dim}D: data set `{metadata.dataset}`, "
         f"frames of {1e3 * metadata.frame_dt:g} ms, nodes {metadata.spacing:.4g} m apart. Other frame intervals and spacings are refused.",
         "",
@@ -74,8 +77,36 @@ def _bodies(rows: list[Row]) -> str:
     return f" Medians over these rollouts, relative to the ground truth: {', '.join(medians.values())}." if medians else ""
 
 
+def _opening(name: str, headline: str) -> list[str]:
+    """The first lines of a card."""
+    return [f"# {name}", "", f"**{headline[0].upper()}{headline[1:].replace('|', '/').replace('*', '')}.**", ""]
+
+
+def accepted(results: Path) -> None:
+    """Store acceptance results of shipped models beside their checkpoints, and write what fails into their cards.
+
+    Raises:
+        SealError: a file of results is damaged.
+        ValueError: the results are of another checkpoint.
+    """
+    for path in sorted(results.glob(f"*{acceptance.SUFFIX}")):
+        checkpoint = FOLDER / f"{path.name.removesuffix(acceptance.SUFFIX)}.ckpt"
+        measured = acceptance.read(path)
+        if measured.checkpoint != acceptance.checksum(checkpoint):
+            raise ValueError(f"{path}: of another checkpoint than {checkpoint}; run suite=acceptance again")
+        acceptance.write(acceptance.path_beside(checkpoint), measured)
+        about = checkpoint.with_suffix(".md")
+        _, _, rest = about.read_text().partition("\n\n")
+        if rest.startswith("**"):  # the headline of earlier results
+            _, _, rest = rest.partition("\n\n")
+        about.write_text("\n".join([*_opening(checkpoint.stem, acceptance.headline(checkpoint)), rest]))
+
+
 def main(arguments: list[str]) -> int:
     """Write checkpoint and card; the exit status."""
+    if arguments[0] == "--acceptance":
+        accepted(Path(arguments[1]))
+        return 0
     run, (name, commit, command) = Path(arguments[0]), arguments[1:]
     simulator = LearnedSimulator.from_checkpoint(run / "checkpoints" / "best.ckpt")
     settings = json.loads((run / "config.json").read_text())

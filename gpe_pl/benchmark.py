@@ -62,7 +62,8 @@ def benchmark(cfg: DictConfig) -> None:
     cases = getattr(settings, "cases", None)  # data sets by name, in suites that need some
     folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name
     with locked(folder), recorded(folder, "benchmark", sys.argv[1:], cfg.paths.runs):
-        records, table = suite.run(settings) if cases is None else suite.run(settings, {k: dataset(*c.overrides) for k, c in cases.items()})
+        inputs = [{k: dataset(*c.overrides) for k, c in cases.items()}] if cases is not None else []
+        records, table = suite.run(settings, *inputs, *([folder] if getattr(suite, "RESUMES", False) else []))
         for name, figure in getattr(suite, "figures", lambda _: {})(records).items():
             save_figure(figure, folder / f"{name}.png", dpi=150)
         about = {"environment": environment(), "settings": without_folder(asdict(settings), cfg.paths.runs)}

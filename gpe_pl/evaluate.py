@@ -21,11 +21,15 @@ if TYPE_CHECKING:
 
 
 def evaluate_checkpoint(cfg: DictConfig) -> None:
-    """Roll a trained model out on one split of a data set, and in the data set's showcase if it has one. Results go to ``{paths.runs}/{name}``."""
+    """Roll a trained model out on one split of a data set, and in the data set's showcase if it has one. Results go to ``{paths.runs}/{name}``.
+
+    The first printed line says what the model fails in its acceptance scenes.
+    """
     from gpe_pl.config.datasets import check_material_controls, ensure_split, evaluated_config, material_controls, scene_metadata
     from gpe_pl.evaluation.rollouts import EvaluationSettings, evaluate
     from gpe_pl.files.names import run_name
     from gpe_pl.files.run_folder import claim, release, without_orphans
+    from gpe_pl.learned.acceptance import headline
     from gpe_pl.learned.pretrained import names
     from gpe_pl.learned.simulator import LearnedSimulator
     from gpe_pl.reports.sweep_table import conclusion, report_evaluation
@@ -44,6 +48,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     device = set_up(construct(TrainerSettings, cfg.trainer, "trainer"))
     simulator = LearnedSimulator.from_checkpoint(cfg.checkpoint, device)
     simulator.skips = construct(Skips, cfg.rollout, "rollout")
+    print(headline(cfg.checkpoint), flush=True)
     evaluated = evaluated_config(cfg)
     scene = scene_metadata(evaluated, cfg.split)
     if not simulator.fits(scene):

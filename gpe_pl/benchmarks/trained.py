@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 
 from gpe_pl.data.ground_truth import DatasetSpec
@@ -49,6 +51,21 @@ def trained_on(spec: DatasetSpec, runs: Iterable[Run]) -> dict[str, tuple[Learne
             differences = [f"{axis.rpartition('.')[2]}={run.config.get(axis)}" for axis in axes]
             found.setdefault(", ".join([label, *differences]), (simulator, run))
     return found
+
+
+def checkpoint_label(checkpoint: str) -> str:
+    """Return the name of a model given by the path of a checkpoint, the folder of a run, or the name of a shipped model."""
+    path = Path(checkpoint)
+    return path.parent.parent.name if path.parent.name == "checkpoints" else path.stem
+
+
+def fingerprint_of(simulator: LearnedSimulator) -> str:
+    """Return a checksum of the weights and settings of a simulator."""
+    digest = sha256(json.dumps(simulator.description(), sort_keys=True).encode())
+    for name, value in sorted(simulator.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.cpu().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def model_label(simulator: LearnedSimulator) -> str:

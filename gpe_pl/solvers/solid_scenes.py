@@ -155,7 +155,7 @@ class SolidScene:
                 f"no room for a body of {self.body_size:g} m and {self.num_obstacles[1]} obstacles in {self.bounds}; lower body_size, num_obstacles "
                 "or drop_height"
             )
-        mass = _lumped_masses(placed, cells, self.density)
+        mass = lumped_masses(placed, cells, self.density)
         count = len(placed)
         node_type = np.full(count, node_code("solid"), dtype=np.uint8)
         params, names = parameter_columns(values, node_type, self.materials)
@@ -196,7 +196,7 @@ def _mesh(config: SolidScene, rng: np.random.Generator) -> tuple[np.ndarray, np.
     return (triangulate if config.cell == "triangle" else quadrangulate)(random_outline(rng), spacing, rng)
 
 
-def _lumped_masses(points: np.ndarray, cells: np.ndarray, density: float) -> np.ndarray:
+def lumped_masses(points: np.ndarray, cells: np.ndarray, density: float) -> np.ndarray:
     """Return masses [node] in kg: each cell's mass, divided equally among its corners."""
     corners = points[cells]
     if cells.shape[1] == 4 and points.shape[1] == 2:

@@ -114,11 +114,15 @@ def test_an_evaluation_that_fails_leaves_no_folder(tiny_data: Path, tmp_path: Pa
     assert not (tmp_path / "evaluation_test_unseen").exists()
 
 
-def test_a_shipped_model_is_named(tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shipped_model_is_named(
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     fit(tiny(tiny_data, tmp_path))
     monkeypatch.setattr(pretrained, "FOLDER", tmp_path / "shipped")
     LearnedSimulator.from_checkpoint(tmp_path / "fit" / "checkpoints" / "best.ckpt").save(tmp_path / "shipped" / "sand.ckpt")
+    capsys.readouterr()
     rows = evaluate(tiny_data, tmp_path, "sand", "evaluation.num_pictures=0")
+    assert capsys.readouterr().out.startswith("acceptance not measured\n")
     assert {r.model for r in rows} == {"learned", "ballistic", "stops_at_walls", "constant_velocity"}
     with pytest.raises(ConfigError, match=r"checkpoint=None: name the folder of a run.*, or a shipped model: sand"):
         evaluate(tiny_data, tmp_path, "null")

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,9 +22,10 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from gpe_pl.benchmarks.finished_parts import PARTS, FinishedParts
 from gpe_pl.benchmarks.stability import conservation, geometry, horizon, inputs, invariances, precision
 from gpe_pl.benchmarks.stability.subject import Outcome, StressTest, Subject
-from gpe_pl.benchmarks.trained import Case, runs_in, trained_on
+from gpe_pl.benchmarks.trained import Case, checkpoint_label, fingerprint_of, runs_in, trained_on
 from gpe_pl.data.ground_truth import DatasetSpec, generate_trajectory
 from gpe_pl.errors import GpeError
 from gpe_pl.files.markdown import table_row
@@ -33,6 +35,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
+
+RESUMES = True
+"""``run`` takes a folder and continues where an earlier run was stopped."""
 
 GROUPS = {
     "invariances": invariances.TESTS,
@@ -77,24 +82,29 @@ class Settings:
     num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
 
 
-def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
-    """Return a record per test and model, and a Markdown table per domain."""
+def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tuple[list[dict[str, Any]], str]:
+    """Return a record per test and model, and a Markdown table per domain.
+
+    Tests that had finished when an earlier run was stopped are not repeated. ``folder`` keeps their records until the suite ends.
+    """
+    parts = FinishedParts(folder / PARTS)
     records: list[dict[str, Any]] = []
     untested = [name for name, spec in specs.items() if not any(_models(spec, settings))]
     tested = {name: spec for name, spec in specs.items() if name not in untested}
     if min(settings.num_workers, len(tested)) > 1:
         with ProcessPoolExecutor(settings.num_workers, multiprocessing.get_context("spawn"), _show_progress) as pool:
-            for found in pool.map(_test_domain, tested, tested.values(), [settings] * len(tested)):
+            for found in pool.map(_test_domain, tested, tested.values(), repeat(settings), repeat(parts)):
                 records += found
     else:
         for name, spec in tested.items():
-            records += _test_domain(name, spec, settings)
+            records += _test_domain(name, spec, settings, parts)
     if not records:
         raise NothingToTestError(
             f"{', '.join([*settings.runs, *settings.checkpoints]) or 'suite.runs and suite.checkpoints are empty'}: no model that was trained on one of "
             f"{', '.join(f'{s.name} {s.size}' for s in specs.values())}; train with `python -m gpe_pl.fit data={untested[0]} model=gpe_tuned` or set "
             "suite.runs or suite.checkpoints"
         )
+    parts.clear()
     return records, _report(records, untested)
 
 
@@ -103,7 +113,7 @@ def _show_progress() -> None:
     logging.basicConfig(level=logging.INFO, format="[%(asctime)s][%(name)s][%(levelname)s] - %(message)s")
 
 
-def _test_domain(name: str, spec: DatasetSpec, settings: Settings) -> list[dict[str, Any]]:
+def _test_domain(name: str, spec: DatasetSpec, settings: Settings, parts: FinishedParts) -> list[dict[str, Any]]:
     """Return the records of all models of a data set."""
     torch.set_num_threads(settings.num_threads)
     models: dict[str, LearnedSimulator] = {}
@@ -111,19 +121,31 @@ def _test_domain(name: str, spec: DatasetSpec, settings: Settings) -> list[dict[
         if label in models:
             raise NothingToTestError(f"two models of {spec.name} are called {label}; copy one of the checkpoints to a file of another name")
         models[label] = simulator
-    return [record for subject in subjects(name, spec, models, settings) for record in test(subject, settings.tests)]
+    return [record for subject in subjects(name, spec, models, settings) for record in test(subject, settings.tests, parts)]
 
 
-def test(subject: Subject, numbers: Sequence[int] = ()) -> Iterator[dict[str, Any]]:
-    """Yield the records of all tests of one model, or of those with these numbers; a test that crashes has failed."""
+def test(subject: Subject, numbers: Sequence[int] = (), parts: FinishedParts | None = None) -> Iterator[dict[str, Any]]:
+    """Yield the records of all tests of one model, or of those with these numbers; a test that crashes has failed.
+
+    Args:
+        subject: the model with its test data.
+        numbers: numbers of the tests; all if empty.
+        parts: records of finished tests, which are not repeated.
+    """
+    identity = _identity(subject)
     for group, tests in GROUPS.items():
         for stress_test in tests:
-            if not numbers or stress_test.number in numbers:
+            if numbers and stress_test.number not in numbers:
+                continue
+            known = {**identity, "test": stress_test.number}
+            if parts is not None and (stored := parts.get(known)) is not None:
+                yield from stored
+            else:
                 started = time.perf_counter()
                 outcome = _outcome(stress_test, subject)
                 seconds = time.perf_counter() - started
                 log.info("%s, %s: test %d took %.1f s", subject.domain, subject.name, stress_test.number, seconds)
-                yield {
+                record = {
                     "test": f"{stress_test.number} {stress_test.name}",
                     "group": group,
                     "model": subject.name,
@@ -134,9 +156,26 @@ def test(subject: Subject, numbers: Sequence[int] = ()) -> Iterator[dict[str, An
                     "gating": subject.is_gating,
                     "curves": {k: [v if math.isfinite(v) else None for v in values] for k, values in outcome.curves.items()},
                 }
+                if parts is not None:
+                    parts.put(known, [record])
+                yield record
 
 
 test.__test__ = False  # type: ignore[attr-defined]
+
+
+def _identity(subject: Subject) -> dict[str, Any]:
+    """Return everything that the outcomes of a subject depend on."""
+    return {
+        "model": subject.name,
+        "domain": subject.domain,
+        "weights": {name: fingerprint_of(peer) for name, peer in {**subject.peers, subject.name: subject.simulator}.items()},
+        "gating": subject.is_gating,
+        "data": subject.spec.as_dict(),
+        "num_scenes": len(subject.scenes),
+        "horizon_factors": list(subject.horizon_factors),
+        "num_rest_steps": subject.num_rest_steps,
+    }
 
 
 def _outcome(stress_test: StressTest, subject: Subject) -> Outcome:
@@ -187,8 +226,7 @@ def _models(spec: DatasetSpec, settings: Settings) -> Iterator[tuple[str, Learne
         simulator = LearnedSimulator.from_checkpoint(checkpoint)
         metadata = simulator.builder.metadata
         if (metadata.dataset, metadata.spacing) == (spec.name, spec.scene.spacing):
-            path = Path(checkpoint)
-            yield path.parent.parent.name if path.parent.name == "checkpoints" else path.stem, simulator
+            yield checkpoint_label(checkpoint), simulator
 
 
 def failures(records: Sequence[dict[str, Any]]) -> list[str]:

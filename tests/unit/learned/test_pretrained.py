@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from gpe_pl.learned.acceptance import headline
 from gpe_pl.learned.pretrained import FOLDER, checkpoint_path, model_name, names
 from gpe_pl.learned.simulator import LearnedSimulator
 
@@ -39,4 +40,6 @@ def test_a_shipped_model_is_small_described_and_loads(name: str) -> None:
     card = path.with_suffix(".md").read_text()
     simulator = LearnedSimulator.from_checkpoint(path)
     assert simulator.builder.metadata.dataset in card
+    first = card.splitlines()[2]
+    assert first.strip("*.").lower() == headline(name).lower()
     assert "python -m gpe_pl.fit" in card

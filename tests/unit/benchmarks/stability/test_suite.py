@@ -188,7 +188,7 @@ def test_a_run_writes_records_table_and_figures(spec: DatasetSpec, scenes: list[
     tests = [1, 5, 12, 21, 23]
     settings = Settings(cases, [str(tmp_path)], [str(tmp_path / "own.ckpt")], SHIPPED, 1, [1.0, 2.0], 5, tests)
     other = dataset("data=snow", "size=tiny")
-    records, table = run(settings, {"sand": spec, "snow": other})
+    records, table = run(settings, {"sand": spec, "snow": other}, tmp_path / "results")
     assert [r["test"].split()[0] for r in records] == [str(t) for t in tests]
     assert {r["status"] for r in records} <= {"passed", "failed", "not_applicable"}
     assert all(r["gating"] and r["model"] == "own" and r["domain"] == "sand" for r in records)
@@ -198,7 +198,31 @@ def test_a_run_writes_records_table_and_figures(spec: DatasetSpec, scenes: list[
     assert "‖Pᵀf(Px) − f(x)‖" in table
     assert set(figures(records)) == {"long_horizon_sand", "perturbation_sand"}
     with pytest.raises(NothingToTestError, match="no model that was trained on one of snow tiny; train with"):
-        run(settings, {"snow": other})
+        run(settings, {"snow": other}, tmp_path / "results")
+
+
+def test_a_stopped_run_continues_with_the_next_test(
+    spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measured: list[int] = []
+
+    def stopping(stress_test: StressTest, _: Subject) -> Outcome:
+        if stress_test.number == 5 and 5 not in measured:
+            measured.append(5)
+            raise KeyboardInterrupt
+        measured.append(stress_test.number)
+        return Outcome(True, "as it should be")
+
+    subject(spec, scenes, **SHIPPED).simulator.save(tmp_path / "own.ckpt")
+    monkeypatch.setattr(suite, "_outcome", stopping)
+    settings = Settings({"sand": Case([])}, [], [str(tmp_path / "own.ckpt")], SHIPPED, 1, [1.0], 5, [1, 5, 12])
+    with pytest.raises(KeyboardInterrupt):
+        run(settings, {"sand": spec}, tmp_path / "results")
+    assert measured == [1, 5]
+    records, _ = run(settings, {"sand": spec}, tmp_path / "results")
+    assert measured == [1, 5, 5, 12] and [r["test"].split()[0] for r in records] == ["1", "5", "12"]
+    run(settings, {"sand": spec}, tmp_path / "results")
+    assert measured == [1, 5, 5, 12, 1, 5, 12]  # after the end, a run measures everything again
 
 
 def test_failures_of_gating_models_fail_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -254,4 +278,4 @@ def test_two_checkpoints_of_one_name_are_an_error(spec: DatasetSpec, scenes: lis
         subject(spec, scenes).simulator.save(file)
     settings = Settings({"sand": Case([])}, [], [str(f) for f in files], SHIPPED, 1, [1.0], 5, [19])
     with pytest.raises(NothingToTestError, match="two models of sand are called model"):
-        run(settings, {"sand": spec})
+        run(settings, {"sand": spec}, tmp_path / "results")

@@ -1,0 +1,130 @@
+"""Acceptance of models of sand and snow: a column that collapses, a pile at rest, and a ball of snow on a cylinder."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from gpe_pl.benchmarks.acceptance import scenes
+from gpe_pl.benchmarks.acceptance.trial import (
+    Candidate,
+    Result,
+    advanced,
+    at_most,
+    contained,
+    follows_parameter,
+    near_solver,
+    not_above_solver,
+    shown,
+    tried,
+)
+from gpe_pl.metrics import energy_distance
+from gpe_pl.trajectory.trajectory import Trajectory
+
+SECONDS = 1.0
+COLUMNS, ROWS = 16, 13
+RUN_OUT_TOLERANCE = 0.15
+OUTER = 0.02
+"""Fraction of particles left out on each side where a width is measured, so that single grains do not count."""
+MAX_CREEP = 0.1
+"""Largest speed of a pile at rest, in spacings per second: the limit of the stability suite is this distance in five seconds."""
+MAX_SINKING = 5.0
+"""Largest change of a pile's height [%]."""
+BALL_RADIUS, CYLINDER, SPEED = 8, 0.1, 2.0
+"""Radius of the ball [spacings] and of the cylinder [m], and speed of the ball [m/s]."""
+MAX_IMBALANCE = 5.0
+"""Largest deviation from half of the mass on each side [%]."""
+OVERLAP = 2.0
+"""The deposit may be as far from the solver's as the solver's own deposit would be if it were moved sideways by this number of spacings."""
+MAX_SLIDING = 0.5
+"""Largest mean speed of a deposit at the end, in spacings per second."""
+AT_END = 0.2
+"""Time at the end over which motion is measured [s]."""
+
+
+def column(candidate: Candidate) -> Result:
+    """Let a column of sand collapse on a rough floor."""
+    spec = candidate.spec
+    trials = [tried(candidate, value, scenes.column(spec, value, COLUMNS, ROWS), SECONDS) for value in candidate.values]
+    run_outs = [trial.measured(partial(run_out, COLUMNS * candidate.spacing)) for trial in trials]
+    checks = [
+        near_solver("column: run-out", run_outs, RUN_OUT_TOLERANCE, 0.5 * candidate.spacing, " m"),
+        *follows_parameter("column: run-out over friction angle", run_outs, " m"),
+        contained("column", trials),
+    ]
+    return Result(checks, shown(candidate, trials, 0.2, 1.0))
+
+
+def run_out(width: float, trajectory: Trajectory) -> float:
+    """Return how far both sides of a deposit are beyond the column [m], on average; ``width`` is that of the column [m]."""
+    low, high = np.quantile(trajectory.pos[-1, :, 0], [OUTER, 1 - OUTER])
+    return float(high - low - (1 - 2 * OUTER) * width) / 2
+
+
+def pile(candidate: Candidate) -> Result:
+    """Let a column collapse in the solver, and see whether the pile stays in the model."""
+    spec, value = candidate.spec, candidate.values[1]
+    state = scenes.column(spec, value, COLUMNS, ROWS)
+    settled = advanced(spec.solver, state, 2 * round(SECONDS / spec.solver.frame_dt))
+    trial = tried(candidate, value, settled, SECONDS)
+    checks = [
+        not_above_solver("pile at rest: creep", [trial.measured(creep)], MAX_CREEP, " spacings/s"),
+        at_most("pile at rest: change of height", [100 * trial.measured(sinking)[0]], MAX_SINKING, " %"),
+        contained("pile at rest", [trial]),
+    ]
+    return Result(checks, shown(candidate, [trial], 0.0, 0.25, 0.5, 0.75, 1.0))
+
+
+def creep(trajectory: Trajectory) -> float:
+    """Return the rms displacement over the whole time, in spacings per second."""
+    way = trajectory.pos[-1].astype(np.float64) - trajectory.pos[0]
+    time = (trajectory.num_frames - 1) * trajectory.metadata.frame_dt
+    return float(np.sqrt(np.square(way).sum(axis=-1).mean())) / trajectory.metadata.spacing / time
+
+
+def sinking(trajectory: Trajectory) -> float:
+    """Return the largest relative change of the height of the highest node."""
+    low = trajectory.metadata.bounds[-1][0]
+    height = trajectory.pos[..., -1].astype(np.float64).max(axis=1) - low
+    return float(np.abs(height / height[0] - 1).max())
+
+
+def ball_on_cylinder(candidate: Candidate) -> Result:
+    """Let a ball of snow fall centrally on a cylinder: it splits symmetrically, and what lies stays."""
+    spec, middle = candidate.spec, float(scenes.middle(candidate.spec)[0])
+    trials = [
+        tried(candidate, value, scenes.ball_over_cylinder(spec, value, BALL_RADIUS, CYLINDER, SPEED), SECONDS) for value in candidate.values
+    ]
+    halves = [trial.measured(partial(imbalance, middle)) for trial in trials]
+    apart = [trial.measured(partial(separation, trial.truth)) for trial in trials]
+    checks = [
+        not_above_solver("snow on a cylinder: imbalance of left and right", halves, MAX_IMBALANCE, " %"),
+        not_above_solver("snow on a cylinder: distance of the deposit from the solver's", apart, OVERLAP, " spacings"),
+        not_above_solver("snow on a cylinder: speed at the end", [t.measured(final_speed) for t in trials], MAX_SLIDING, " spacings/s"),
+        contained("snow on a cylinder", trials),
+    ]
+    return Result(checks, shown(candidate, trials, 0.2, 1.0))
+
+
+def imbalance(middle: float, trajectory: Trajectory) -> float:
+    """Return how far the mass right of x = ``middle`` [m] is from one half [%]."""
+    return 100 * abs(float(np.average(trajectory.pos[-1, :, 0] > middle, weights=trajectory.mass)) - 0.5)
+
+
+def separation(truth: Trajectory, trajectory: Trajectory) -> float:
+    """Return the energy distance of the last frame from that of the truth, as a sideways motion of the whole deposit in spacings that has the same distance.
+
+    For small motions the energy distance grows with the square of the motion.
+    """
+    cloud, mass, spacing = truth.pos[-1].astype(np.float64), truth.mass, truth.metadata.spacing
+    beside = cloud + np.eye(cloud.shape[1])[0] * OVERLAP * spacing
+    unit = energy_distance(beside, cloud, mass, mass)
+    return OVERLAP * float(np.sqrt(energy_distance(trajectory.pos[-1], cloud, mass, mass) / unit))
+
+
+def final_speed(trajectory: Trajectory) -> float:
+    """Return the mean distance that particles move per time at the end, in spacings per second."""
+    frames = min(trajectory.num_frames - 1, round(AT_END / trajectory.metadata.frame_dt))
+    way = np.linalg.norm(trajectory.pos[-1].astype(np.float64) - trajectory.pos[-1 - frames], axis=-1)
+    return float(way.mean()) / trajectory.metadata.spacing / (frames * trajectory.metadata.frame_dt)

@@ -1,0 +1,142 @@
+"""The suite of acceptance scenes: what a person would look at before using a model, run by solver and model side by side.
+
+Every check has a criterion from physics or from the solver's own uncertainty, fixed before it was measured. A model that ignores its material parameter fails
+the checks that a quantity follows it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+from pydantic import Field
+
+from gpe_pl.benchmarks.acceptance import bodies, flight, liquid, particles
+from gpe_pl.benchmarks.acceptance.trial import Candidate, Result
+from gpe_pl.benchmarks.finished_parts import PARTS, FinishedParts
+from gpe_pl.benchmarks.trained import Case, checkpoint_label
+from gpe_pl.data.ground_truth import DatasetSpec
+from gpe_pl.errors import GpeError
+from gpe_pl.files.markdown import table_row
+from gpe_pl.learned import acceptance
+from gpe_pl.learned.acceptance import Acceptance, Check
+from gpe_pl.learned.pretrained import FOLDER, checkpoint_path
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.viz.saving import save_figure
+
+log = logging.getLogger(__name__)
+
+RESUMES = True
+"""``run`` takes a folder and continues where an earlier run was stopped."""
+
+SCENES: dict[str, dict[str, Callable[[Candidate], Result]]] = {
+    "beam": {m: partial(bodies.dropped, 20, 4, "flat beam") for m in ("solid", "elastomer")},
+    "square": {m: partial(bodies.dropped, 12, 10, "square block") for m in ("solid", "elastomer")},
+    "column": {"sand": particles.column},
+    "pile": {"sand": particles.pile},
+    "cylinder": {"snow": particles.ball_on_cylinder},
+    "pool": {"fluid": liquid.pool_at_rest},
+    "dam_break": {"fluid": liquid.dam_break},
+    "flight": dict.fromkeys(("sand", "snow", "elastomer", "fluid", "solid"), flight.free_flight),
+}
+"""Scenes by name, each with the materials that it has."""
+
+
+class AcceptanceError(GpeError, ValueError):
+    """A checkpoint has no acceptance scenes, or its name is taken; the message names it."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of the suite.
+
+    Attributes:
+        cases: data sets, by name; each checkpoint must have been trained on one of them.
+        checkpoints: models as paths of checkpoints, folders of runs, or names of shipped models.
+        num_threads: threads of PyTorch; the solvers use one.
+    """
+
+    cases: dict[str, Case]
+    checkpoints: Annotated[list[str], Field(min_length=1)] = field(default_factory=lambda: ["sand"])
+    num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
+
+
+def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tuple[list[dict[str, Any]], str]:
+    """Return a record per check and a Markdown table. The results of each checkpoint are written to ``folder``, and beside it unless it is a shipped model."""
+    torch.set_num_threads(settings.num_threads)
+    candidates = _candidates(settings.checkpoints, specs)
+    parts, records = FinishedParts(folder / PARTS), list[dict[str, Any]]()
+    for candidate, path in candidates:
+        own = [record for scene in _scenes(candidate) for record in _measured(candidate, path, scene, folder, parts)]
+        records += own
+        checks = [Check(**{key: r[key] for key in ("name", "passed", "measured", "solver", "limit")}) for r in own]
+        result = Acceptance(acceptance.checksum(path), checks)
+        acceptance.write(folder / f"{candidate.name}{acceptance.SUFFIX}", result)
+        if path.parent != FOLDER:
+            acceptance.write(acceptance.path_beside(path), result)
+    parts.clear()
+    return records, _report(records)
+
+
+def _candidates(checkpoints: Sequence[str], specs: dict[str, DatasetSpec]) -> list[tuple[Candidate, Path]]:
+    """Return the models with the paths of their checkpoints, all loaded first, so that a wrong name is reported at once."""
+    found: dict[str, tuple[Candidate, Path]] = {}
+    for checkpoint in checkpoints:
+        simulator, name = LearnedSimulator.from_checkpoint(checkpoint), checkpoint_label(checkpoint)
+        own = simulator.builder.metadata
+        fitting = [s for s in specs.values() if s.name == own.dataset and abs(s.scene.spacing / own.spacing - 1) < 0.01]
+        if not fitting or len(own.materials) > 1:
+            raise AcceptanceError(
+                f"{checkpoint}: was trained on {own.dataset} ({', '.join(own.materials)}, spacing {own.spacing:g} m); acceptance scenes are for one material "
+                f"in {', '.join(f'{s.name} {s.size} ({s.scene.spacing:g} m)' for s in specs.values())}; choose its size=… or add a data set to suite.cases"
+            )
+        if name in found:
+            raise AcceptanceError(f"two checkpoints are called {name}; copy one of them to a file of another name")
+        found[name] = Candidate(name, simulator, fitting[0]), checkpoint_path(checkpoint)
+    return list(found.values())
+
+
+def _scenes(candidate: Candidate) -> list[str]:
+    (material,) = candidate.spec.scene.materials
+    return [name for name, materials in SCENES.items() if material in materials]
+
+
+def _measured(candidate: Candidate, path: Path, scene: str, folder: Path, parts: FinishedParts) -> list[dict[str, Any]]:
+    """Return the records of a scene: those of a stopped suite, or new ones, whose figure is written first."""
+    spec = candidate.spec
+    (material,) = spec.scene.materials
+    identity = {"scene": scene, "model": candidate.name, "checkpoint": acceptance.checksum(path), "data": spec.as_dict()}
+    if (stored := parts.get(identity)) is not None:
+        return stored
+    log.info("%s: %s", candidate.name, scene)
+    result = SCENES[scene][material](candidate)
+    if result.shown:
+        save_figure(result.figure(), folder / f"acceptance_{candidate.name}_{scene}.png", dpi=150)
+    for check in result.checks:
+        log.info("%s: %s", candidate.name, check)
+    records = [{"model": candidate.name, "domain": spec.name, "scene": scene, **asdict(check)} for check in result.checks]  # type: ignore[call-overload]
+    parts.put(identity, records)
+    return records
+
+
+def failures(records: Sequence[dict[str, Any]]) -> list[str]:
+    """Return the failed checks, by which the suite fails."""
+    return [f"{r['model']}: {r['name']} {r['measured']}" for r in records if not r["passed"]]
+
+
+def _report(records: Sequence[dict[str, Any]]) -> str:
+    """Return a line per model, and a table of its checks; failures come first."""
+    lines = []
+    for model in dict.fromkeys(r["model"] for r in records):
+        own = sorted((r for r in records if r["model"] == model), key=lambda r: r["passed"])
+        failed = sum(not r["passed"] for r in own)
+        lines += [f"### {model}", "", f"{len(own) - failed} of {len(own)} checks passed.", ""]
+        lines += [table_row(["", "check", "model", "solver", "limit"]), "|" + "---|" * 5]
+        lines += [table_row(["pass" if r["passed"] else "**FAIL**", r["name"], r["measured"], r["solver"], r["limit"]]) for r in own]
+        lines.append("")
+    return "\n".join(lines).rstrip()

@@ -1,0 +1,238 @@
+"""One scene, run by the solver and by a model; and the criteria that compare them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from gpe_pl.benchmarks.acceptance.scenes import material_of, values_of
+from gpe_pl.data.ground_truth import DatasetSpec
+from gpe_pl.learned.acceptance import Check
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import Simulator, rollout, steps
+from gpe_pl.schema import MATERIALS
+from gpe_pl.solvers.scenes import describe
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+from gpe_pl.viz.captions import parameter_name, parameter_value
+
+FASTER = 5.0
+"""A rollout stops at this multiple of the solver's largest speed."""
+
+MAX_CORRECTED = 0.01
+"""Largest fraction of particle-steps in which containment may move a particle back out of a wall."""
+
+SMALLEST_CHANGE = 0.1
+"""A quantity that changes by a smaller fraction over the range of the parameter does not depend on it as far as a person can see."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A trained simulator and the data set that it belongs to.
+
+    Attributes:
+        name: name of the model.
+        simulator: simulator with the weights and settings of its checkpoint, static friction among them.
+        spec: data set; its solver is the reference.
+    """
+
+    name: str
+    simulator: LearnedSimulator
+    spec: DatasetSpec
+
+    @property
+    def spacing(self) -> float:
+        return self.spec.scene.spacing
+
+    @property
+    def values(self) -> tuple[float, float, float]:
+        """Lowest and highest trained value of the material parameter, and an unseen one between."""
+        ((_, trained),) = self.simulator.trained_ranges()
+        return values_of(*trained[:, 0].tolist())
+
+    def metadata(self) -> Metadata:
+        """Return the metadata of all scenes."""
+        solver = self.spec.solver
+        return describe(
+            self.spec.scene, solver.frame_dt, dataset=self.spec.name, solver=solver.name, solver_version=solver.version,
+            config=json.dumps(self.spec.provenance, sort_keys=True),
+        )  # fmt: skip
+
+    def described(self, value: float) -> str:
+        """Return the material parameter with name and unit."""
+        unseen = "" if value in (self.values[0], self.values[2]) else ", unseen"
+        parameter = MATERIALS[material_of(self.spec)][0]
+        return f"{parameter_name(parameter)} {parameter_value(parameter, value)}{unseen}"
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One scene from the first frame of the model on.
+
+    Attributes:
+        value: material parameter.
+        truth: rollout of the solver.
+        finer: rollout of the solver with half the time step, whose difference from ``truth`` is the solver's own uncertainty.
+        model: rollout of the model with containment.
+        corrected: fraction of particle-steps that containment corrected.
+    """
+
+    value: float
+    truth: Trajectory
+    finer: Trajectory
+    model: Trajectory
+    corrected: float
+
+    def measured(self, quantity: Callable[[Trajectory], float]) -> tuple[float, float, float]:
+        """Return a quantity of model, solver and finer solver; NaN for a model that stopped early."""
+        own = math.nan if self.model.termination is not None else float(quantity(self.model))
+        return own, float(quantity(self.truth)), float(quantity(self.finer))
+
+
+def tried(candidate: Candidate, value: float, start: State, seconds: float) -> Trial:
+    """Run a scene from a start of the solver. The model takes over after the frames that its velocity history needs."""
+    solver: Any = candidate.spec.solver
+    history, metadata = candidate.simulator.builder.config.history, candidate.metadata()
+    num_frames = max(2, round(seconds / solver.frame_dt))
+    whole = rollout(solver, start, history + num_frames, metadata)
+    finer = rollout(replace(solver, cfl=solver.cfl / 2), start, history + num_frames, metadata).frames(history)
+    truth = whole.frames(history)
+    model, corrected = predicted(candidate, candidate.simulator.initial_state(whole, history), truth)
+    return Trial(value, truth, finer, model, corrected)
+
+
+def advanced(solver: Simulator, state: State, num_steps: int) -> State:
+    """Return the state after some steps."""
+    for after in steps(solver, state, num_steps):
+        state = after
+    return state
+
+
+def predicted(candidate: Candidate, state: State, truth: Trajectory) -> tuple[Trajectory, float]:
+    """Return the rollout of the model over the frames of the truth, and the fraction of particle-steps that containment corrected."""
+    metadata, num_corrected = truth.metadata, 0
+    speed = FASTER * max(1.0, float(np.linalg.norm(truth.vel, axis=-1).max()))
+    margin = max(high - low for low, high in metadata.bounds)
+
+    def count(_: int, new: State) -> None:
+        nonlocal num_corrected
+        num_corrected += new.num_corrected
+
+    contained = Contained(candidate.simulator, metadata.frame_dt)
+    guard = Guard(speed, metadata.bounds, margin, metadata.spacing)
+    model = rollout(contained, state, truth.num_frames - 1, metadata, guard, count)
+    return model, num_corrected / max(1, (model.num_frames - 1) * model.num_nodes)
+
+
+# --- criteria -------------------------------------------------------------------------------------------------------------------------------
+
+
+def listed(values: Sequence[float]) -> str:
+    """Return numbers of three digits; ``stopped`` stands for a rollout that ended early."""
+    return ", ".join("stopped" if math.isnan(v) else f"{v:.3g}" for v in values)
+
+
+def _both(model: Sequence[float], solver: Sequence[float], unit: str) -> tuple[str, str]:
+    return f"{listed(model)}{unit}", f"{listed(solver)}{unit}"
+
+
+def at_most(name: str, values: Sequence[float], limit: float, unit: str) -> Check:
+    """Return the check that no value exceeds a limit."""
+    return Check(name, all(v <= limit for v in values), f"{listed(values)}{unit}", "", f"at most {limit:.3g}{unit}")
+
+
+def not_above_solver(name: str, values: Sequence[tuple[float, float, float]], limit: float, unit: str) -> Check:
+    """Return the check that no value of the model exceeds a limit, or twice that of the solver in the same scene if that is more."""
+    own = [max(solver, finer) for _, solver, finer in values]
+    passed = all(model <= max(limit, 2 * most) for (model, _, _), most in zip(values, own, strict=True))
+    return Check(name, passed, *_both([model for model, _, _ in values], own, unit), f"at most {limit:.3g}{unit} or twice the solver's")
+
+
+def near_solver(name: str, values: Sequence[tuple[float, float, float]], tolerance: float, smallest: float, unit: str) -> Check:
+    """Return the check that values of the model are near those of the solver in the same scenes.
+
+    Args:
+        name: name of the check.
+        values: quantity of model, solver and finer solver in each scene.
+        tolerance: largest difference as a fraction of the solver's value.
+        smallest: difference that always passes, in the unit of the values; twice the solver's change at half its time step passes, too.
+        unit: unit of the values.
+    """
+    passed = all(abs(own - solver) <= max(tolerance * abs(solver), smallest, 2 * abs(finer - solver)) for own, solver, finer in values)
+    limit = f"within {100 * tolerance:.3g} % of the solver, {smallest:.2g}{unit} or twice the solver's change at half its time step"
+    return Check(name, passed, *_both([m for m, _, _ in values], [s for _, s, _ in values], unit), limit)
+
+
+def follows_parameter(name: str, values: Sequence[tuple[float, float, float]], unit: str) -> list[Check]:
+    """Return the check that a quantity changes with the material parameter as the solver's does: in the same order, and by half to twice as much.
+
+    A model that ignores the parameter fails. The check is left out if the solver's order is not beyond its own uncertainty, or if its change is too small to
+    be seen (``SMALLEST_CHANGE``).
+    """
+    model, solver, finer = (np.array(v) for v in zip(*values, strict=True))
+    change = solver[-1] - solver[0]
+    in_order = (np.diff(solver) * np.sign(change) > np.abs(solver - finer).max()).all()
+    if not in_order or abs(change) < SMALLEST_CHANGE * np.abs(solver).mean():
+        return []
+    ratio = (model[-1] - model[0]) / change
+    passed = bool((np.diff(model) * np.sign(change) > 0).all() and 0.5 <= ratio <= 2)
+    order = "rises" if change > 0 else "falls"
+    limit = f"{order} with the parameter, by half to twice the solver's change"
+    return [Check(name, passed, *_both(model.tolist(), solver.tolist(), unit), limit)]
+
+
+def contained(name: str, trials: Sequence[Trial]) -> Check:
+    """Return the check that the model does not need containment to stay out of walls."""
+    return at_most(f"{name}: particle-steps that containment corrected", [100 * t.corrected for t in trials], 100 * MAX_CORRECTED, " %")
+
+
+# --- what a scene returns -------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One column of a scene's figure: the solver above, the model below, at one frame."""
+
+    title: str
+    truth: Trajectory
+    model: Trajectory
+    frame: int
+
+
+@dataclass(frozen=True)
+class Result:
+    """Checks of a scene and the columns of its figure."""
+
+    checks: list[Check]
+    shown: list[Shown]
+
+    def figure(self) -> Figure:
+        """Draw the scene."""
+        from gpe_pl.benchmarks.acceptance.figures import scene_figure
+
+        return scene_figure(self.shown)
+
+
+def shown(candidate: Candidate, trials: Sequence[Trial], *fractions: float) -> list[Shown]:
+    """Return columns of all trials at these fractions of their length."""
+    columns = []
+    for trial in trials:
+        for fraction in fractions:
+            frame = round(fraction * (trial.truth.num_frames - 1))
+            time = frame * trial.truth.metadata.frame_dt
+            columns.append(Shown(f"{candidate.described(trial.value)}\n{time:.2f} s", trial.truth, trial.model, frame))
+    return columns
+
+
+def centre(trajectory: Trajectory) -> np.ndarray:
+    """Return the centre of mass [frame, dim] in m."""
+    mass = trajectory.mass.astype(np.float64)
+    return np.einsum("n,fnd->fd", mass / mass.sum(), trajectory.pos.astype(np.float64))

@@ -1,0 +1,66 @@
+"""Finished parts of a suite, each stored in a file of its own, so that a stopped suite continues where it was."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from gpe_pl.files import sealed
+from gpe_pl.system.machine import commit
+
+PARTS = "parts"
+"""Subfolder of a suite's results that holds them."""
+ADVICE = "delete it; the part is then measured again"
+
+
+@cache
+def _code() -> str:
+    return commit()
+
+
+@dataclass(frozen=True)
+class FinishedParts:
+    """Records of finished parts. Several processes may store different parts at once.
+
+    A part is known by everything that its records depend on, the commit of the running code included. Files of other settings or code are left alone until
+    ``clear`` and never used.
+
+    Attributes:
+        folder: folder of the files, which nothing else uses.
+    """
+
+    folder: Path
+
+    def get(self, identity: dict[str, Any]) -> list[dict[str, Any]] | None:
+        """Return the records of a part, or None if it has not finished.
+
+        Raises:
+            SealError: the file is damaged.
+        """
+        path, known = self._place(identity)
+        if not path.exists():
+            return None
+        values = sealed.read(path, ADVICE)
+        return list(values["records"]) if values.get("identity") == known else None
+
+    def put(self, identity: dict[str, Any], records: list[dict[str, Any]]) -> None:
+        """Store the records of a part.
+
+        Raises:
+            ValueError: a number is not finite.
+        """
+        path, known = self._place(identity)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        sealed.write(path, {"identity": known, "records": records})
+
+    def clear(self) -> None:
+        """Delete all files, so that the next run measures everything again."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _place(self, identity: dict[str, Any]) -> tuple[Path, dict[str, Any]]:
+        known = json.loads(json.dumps({**identity, "code": _code()}, allow_nan=False))
+        return self.folder / f"{sealed.checksum(known)[:16]}.json", known

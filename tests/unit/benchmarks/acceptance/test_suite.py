@@ -1,0 +1,87 @@
+"""The suite measures every scene of a checkpoint once, continues where it was stopped, and stores what fails where it is looked up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from gpe_pl.benchmarks.acceptance import scenes, suite
+from gpe_pl.benchmarks.acceptance.suite import AcceptanceError, Settings, failures, run
+from gpe_pl.benchmarks.acceptance.trial import Candidate, Result, at_most, shown, tried
+from gpe_pl.config.datasets import dataset
+from gpe_pl.data.ground_truth import DatasetSpec, trajectory_metadata
+from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned.acceptance import headline
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
+
+
+@pytest.fixture(scope="module")
+def spec() -> DatasetSpec:
+    return dataset("data=sand", "size=tiny")
+
+
+@pytest.fixture
+def checkpoint(spec: DatasetSpec, tmp_path: Path) -> Path:
+    """An untrained model, which passes nothing but free flight."""
+    torch.manual_seed(0)
+    build = GraphBuilder(GraphConfig(history=2, islands=True), trajectory_metadata(spec, "train", 0))
+    simulator = LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=8), build)
+    for _, trained in simulator.trained_ranges():
+        trained.copy_(torch.tensor([[20.0], [40.0]]))
+    path = tmp_path / "own" / "checkpoints" / "best.ckpt"
+    simulator.save(path)
+    return path
+
+
+def column(candidate: Candidate) -> Result:
+    """Run a column of eight particles for a moment."""
+    trials = [tried(candidate, value, scenes.column(candidate.spec, value, 4, 2), 0.02) for value in candidate.values]
+    return Result([at_most("column: tilt", [2.0], 3.0, "°"), at_most("column: sideways", [2.0], 1.0, " %")], shown(candidate, trials, 1.0))
+
+
+def test_results_are_written_and_lead(spec: DatasetSpec, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(suite, "SCENES", {"column": {"sand": column}, "flat": {"solid": column}})
+    records, table = run(Settings({}, [str(checkpoint)]), {"sand": spec}, tmp_path)
+    assert [(r["model"], r["scene"], r["passed"]) for r in records] == [("own", "column", True), ("own", "column", False)]
+    assert failures(records) == ["own: column: sideways 2 %"]
+    assert "1 of 2 checks passed" in table and table.index("**FAIL**") < table.index("| pass |")
+    assert (tmp_path / "acceptance_own_column.png").stat().st_size > 1000
+    assert headline(checkpoint) == "fails acceptance in 1 of 2 checks: column: sideways 2 %"
+    assert not (tmp_path / "parts").exists()
+
+
+def test_a_stopped_suite_continues_with_the_next_scene(
+    spec: DatasetSpec, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[str] = []
+
+    def stopping(candidate: Candidate) -> Result:
+        seen.append(candidate.name)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+        return Result([at_most(f"scene {len(seen)}", [0.0], 1.0, "")], [])
+
+    monkeypatch.setattr(suite, "SCENES", {name: {"sand": stopping} for name in "abc"})
+    settings = Settings({}, [str(checkpoint)])
+    with pytest.raises(KeyboardInterrupt):
+        run(settings, {"sand": spec}, tmp_path)
+    assert headline(checkpoint) == "acceptance not measured"
+    records, _ = run(settings, {"sand": spec}, tmp_path)
+    assert [r["name"] for r in records] == ["scene 1", "scene 3", "scene 4"] and len(seen) == 4
+
+
+def test_a_model_without_scenes_and_two_of_one_name_are_refused(spec: DatasetSpec, checkpoint: Path, tmp_path: Path) -> None:
+    with pytest.raises(AcceptanceError, match=r"best.ckpt: was trained on sand \(sand, spacing .*choose its size="):
+        run(Settings({}, [str(checkpoint)]), {"sand": dataset("data=sand", "size=small")}, tmp_path)
+    with pytest.raises(AcceptanceError, match="two checkpoints are called own"):
+        run(Settings({}, [str(checkpoint)] * 2), {"sand": spec}, tmp_path)
+
+
+def test_every_domain_has_scenes() -> None:
+    cases = {"sand": "sand", "snow": "snow", "elastomer": "elastomer", "fluid": "fluid", "fem": "solid"}
+    for name, material in cases.items():
+        assert sum(material in materials for materials in suite.SCENES.values()) >= 2, name
