@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from gpe_pl.schema import node_code
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.store import write_shard
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+
+gc.disable()  # until the tests begin: modules and tests are never freed, and to look for cycles among them takes seconds
 
 settings.register_profile("fast", max_examples=20, deadline=None, derandomize=True, database=None)
 settings.register_profile("fuzz", max_examples=2000, deadline=None, print_blob=True)  # make fuzz
@@ -32,6 +35,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("--all-extras"):
         pytest.importorskip = lambda name, *_, **__: importlib.import_module(name)  # type: ignore[assignment]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    result = yield
+    gc.freeze()
+    gc.enable()
+    return result
 
 
 def make_trajectory(seed: int = 0, num_frames: int = 6, num_nodes: int = 12, **metadata: object) -> Trajectory:
