@@ -52,7 +52,7 @@ class Bodies:
     """
 
     trajectory: Trajectory
-    nodes: list[Int64[np.ndarray, "node"]]
+    nodes: list[Int64[np.ndarray, "_"]]
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> Bodies | None:

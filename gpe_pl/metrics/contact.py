@@ -17,7 +17,7 @@ NEAR = 0.75
 edge of a cell is half a spacing from both."""
 
 
-def boundary_gaps(trajectory: Trajectory, bodies: list[Int64[np.ndarray, "node"]]) -> Float[np.ndarray, "frame body"]:
+def boundary_gaps(trajectory: Trajectory, bodies: list[Int64[np.ndarray, "_"]]) -> Float[np.ndarray, "frame body"]:
     """Return the smallest distance [m] of the nodes of each body to walls and obstacles.
 
     It is the signed distance to the shapes of a boundary. If the boundary moves or has no shapes, it is the distance to the nearest boundary node. It is
