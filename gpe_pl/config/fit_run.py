@@ -181,6 +181,7 @@ class FitRun:
             stress=bool(self.cfg.model.get("stress", False)),
             sampling=self.training.sampling,
             solver=self._solver,
+            mirror=self.training.mirror,
         )
 
     @property

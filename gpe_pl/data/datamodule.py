@@ -77,6 +77,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         stress: add the stress to samples; see ``WindowDataset``.
         sampling: how often each training window is drawn.
         solver: gives the targets of noisy and unrolled states; see ``WindowDataset``.
+        mirror: mirror half of the training windows; see ``WindowDataset``.
         num_statistics_windows: number of windows from which features are standardised, evenly spread over the ``train`` split.
 
     Attributes:
@@ -101,6 +102,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         sampling: Sampling = "uniform",
         num_statistics_windows: int = 256,
         solver: Restartable | None = None,
+        mirror: bool = False,
     ) -> None:
         super().__init__()
         self.root, self.noise, self.batch_size, self.seed = Path(root), noise, batch_size, seed
@@ -117,7 +119,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         std = statistics["acceleration_std"] if whole else acceleration_std(t.window(0, t.num_frames) for t in train)
         unit = std * self.metadata.frame_dt
         noise.check(self.metadata, unit)
-        self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress, solver)
+        self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress, solver, mirror)
         self.val_set = WindowDataset(val, self.builder, stress=stress)
         if sampling == "activity":
             self.train_set.probability = probabilities(self.train_set.activity())

@@ -25,9 +25,10 @@ from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.rollout.loop import Restartable
 from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.reflection import Reflection
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import StoreError, UnsoundError, open_field, open_group, open_shard, read_trajectory, shards, trajectory_names
-from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +57,9 @@ Key = int | tuple[int, int] | StartKey
 CACHE_BYTES = 2 * 1024**3
 """Splits smaller than this are cached in memory. Larger splits are read from disk window by window. Also the maximum memory for cached graphs [bytes]."""
 
+
+MIRROR_STREAM = 1
+"""Part of the seed by which windows are mirrored, so that it is not the randomness of their noise."""
 
 MAX_DAMAGED = 0.2
 """Maximum fraction of a split's trajectories that may be left out. One trajectory may always be left out."""
@@ -315,6 +319,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         velocity_unit: root mean square acceleration × frame interval [m/s], the unit of velocity noise.
         seed: seed of the noise.
         solver: gives the targets of noisy and unrolled states; None takes those that lead back to the trajectory.
+        mirror: take the mirror image of a random half of the windows, along each axis without gravity.
         stress: also give the Cauchy stress at t+1 of materials that have one, as ``stress_target`` [node, component] in Pa.
 
     Attributes:
@@ -334,8 +339,10 @@ class WindowDataset(Dataset[HeteroData | Start]):
         seed: int = 0,
         stress: bool = False,
         solver: Restartable | None = None,
+        mirror: bool = False,
     ) -> None:
         self.trajectories, self.builder, self.noise, self.stress, self.solver = trajectories, builder, noise, stress, solver
+        self.mirror = mirror
         self.velocity_unit, self.seed = velocity_unit, seed
         self.probability: np.ndarray | None = None
         self.ends = np.cumsum(window_counts(trajectories, builder.config.history))
@@ -364,6 +371,11 @@ class WindowDataset(Dataset[HeteroData | Start]):
             values.append(np.sqrt(np.mean(acc**2, axis=(1, 2)))[self.builder.config.history - 1 :])
         return np.concatenate(values)
 
+    def _reflection(self, metadata: Metadata, sample: int) -> Reflection:
+        rng = np.random.default_rng((self.seed, sample, MIRROR_STREAM))
+        axes = [axis for axis, pull in enumerate(metadata.gravity) if pull == 0 and rng.random() < 0.5] if self.mirror else []
+        return Reflection.of(metadata.bounds, axes)
+
     @overload
     def __getitem__(self, key: int | tuple[int, int]) -> HeteroData: ...
 
@@ -378,7 +390,9 @@ class WindowDataset(Dataset[HeteroData | Start]):
         history = self.builder.config.history
         stored = self.trajectories[number]
         ahead = 0 if start is None else min(start.num_steps, stored.num_frames - 2 - frame)
-        trajectory = stored.window(frame - history, frame + 2 + ahead)
+        original = stored.window(frame - history, frame + 2 + ahead)
+        reflection = self._reflection(original.metadata, sample)
+        trajectory = reflection.trajectory(original) if any(plane is not None for plane in reflection.planes) else original
         dt = trajectory.metadata.frame_dt
         truth = trajectory.pos.astype(np.float64)
         pos = truth[: history + 2]
@@ -411,7 +425,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         if self.probability is not None:
             about["weight"] = 1 / (len(self) * float(self.probability[window]))
         deviates = start is not None or (self.noise is not None and self.noise.is_any)
-        targets = None if self.solver is None or not deviates else SolverTargets.of(self.solver, trajectory, history)
+        targets = None if self.solver is None or not deviates else SolverTargets.of(self.solver, original, history, reflection)
         if start is not None or targets is not None:
             correction = 0.0 if self.noise is None else self.noise.correction
             key = start or StartKey(sample, window, 0)

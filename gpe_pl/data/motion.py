@@ -117,7 +117,7 @@ class MotionSummary:
         return rounding_to(self.marks, self.frame_dt)
 
     def with_gravity(self, change: np.ndarray) -> MotionSummary:
-        """Return the summary for another gravity, which differs by ``change`` [dim] in m/s²."""
+        """Return the summary for another gravity. ``change`` [dim] is the new gravity minus the old one in m/s²."""
         squares = self.acceleration**2 + float(np.mean(change * (change - 2 * self.mean_acceleration)))
         return replace(self, acceleration=math.sqrt(max(squares, 0.0)), mean_acceleration=self.mean_acceleration - change)
 

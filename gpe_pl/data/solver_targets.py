@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gpe_pl.rollout.loop import Restartable, SimulationError
 from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.reflection import Reflection
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -35,6 +36,7 @@ class SolverTargets:
         vel: true velocities at the frames [num_steps + 1, node, dim] in m/s, from the start's on.
         stress: true stress of nodes [num_steps + 1, node, component] in Pa, from the frame after the start's on; None if the data have none.
         frame_dt: frame interval [s].
+        reflection: between the coordinates of the data set and those of the unroll, which may be a mirror image.
     """
 
     solver: Restartable
@@ -43,14 +45,15 @@ class SolverTargets:
     vel: Float64[np.ndarray, "start node dim"]
     stress: np.ndarray | None
     frame_dt: float
+    reflection: Reflection
 
     @classmethod
-    def of(cls, solver: Restartable, trajectory: Trajectory, first: int) -> SolverTargets:
+    def of(cls, solver: Restartable, trajectory: Trajectory, first: int, reflection: Reflection) -> SolverTargets:
         """Return the targets of unrolls from frame ``first`` of a stretch of a stored trajectory to its last frame but one."""
         pos = trajectory.pos[first - 1 :].astype(np.float64)
         vel = trajectory.vel[first:-1].astype(np.float64)
         stress = None if trajectory.stress is None else trajectory.stress.node[first + 1 :]
-        return cls(solver, trajectory.state(first), pos, vel, stress, trajectory.metadata.frame_dt)
+        return cls(solver, trajectory.state(first), pos, vel, stress, trajectory.metadata.frame_dt, reflection)
 
     def target(self, state: State, step: int) -> tuple[Tensor, Tensor | None] | None:
         """Return acceleration without gravity [node, dim] in m/s² and stress after the step [node, component] in Pa, or None if the solver refuses a state.
@@ -60,7 +63,7 @@ class SolverTargets:
             step: number of its steps.
         """
         where, dt = state.periodicity, self.frame_dt
-        pos, mean = state.pos.cpu().numpy(), state.vel.cpu().numpy()
+        pos, mean = self.reflection.point(state.pos.cpu().numpy()), self.reflection.vector(state.vel.cpu().numpy())
         before, after = integrators.velocities(self.pos[step : step + 3], dt, where)
         try:
             here = self._step(pos, self.vel[step] + mean - before, step)
@@ -70,10 +73,12 @@ class SolverTargets:
         own = integrators.velocities(np.stack([pos, here.pos]), dt, where)[0]
         true = integrators.velocities(np.stack([self.pos[step + 1], there.pos]), dt, where)[0]
         vel = after + own - true
-        acceleration = torch.from_numpy(integrators.acceleration(vel, mean, dt)).to(state.pos.device) - state.gravity
+        acceleration = self.reflection.vector(integrators.acceleration(vel, mean, dt) - np.asarray(self.scene.gravity))
+        target = torch.from_numpy(acceleration).to(state.pos.device)
         if self.stress is None or here.stress is None or there.stress is None:
-            return acceleration, None
-        return acceleration, torch.from_numpy(self.stress[step] + here.stress.node - there.stress.node).to(state.pos.device)
+            return target, None
+        after_step = self.reflection.tensor(self.stress[step] + here.stress.node - there.stress.node)
+        return target, torch.from_numpy(after_step).to(state.pos.device)
 
     def _step(self, pos: np.ndarray, vel: np.ndarray, step: int) -> State:
         start = replace(self.scene, pos=pos, vel=vel, time=self.scene.time + step * self.frame_dt, boundary=self.scene.boundary.at(step))

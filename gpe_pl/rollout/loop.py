@@ -45,10 +45,10 @@ class Restartable(Simulator, Protocol):
         ...
 
     def restarted(self, state: State) -> State:
-        """Return the state from which ``step`` continues, given one with positions and velocities of any frame of a scene.
+        """Return a state from which ``step`` can continue. Only positions and velocities of ``state`` describe its motion.
 
         Raises:
-            SimulationError: a material of the state cannot be restarted, or positions do not make sense.
+            SimulationError: a material of the state cannot be restarted, or the state lacks the cells that a restart needs.
         """
         ...
 

@@ -49,6 +49,7 @@ class TrainingSettings:
         push_share: fraction of the steps, at the end of training, that use push-forward.
         push_steps: maximum number of steps of an unroll.
         push_correction: fraction of the velocity's deviation after an unroll that the target removes within one step, with ``targets=trajectory``.
+        mirror: mirror a random half of the training windows along each axis without gravity.
         targets: where the targets of noisy and unrolled states lead; see ``data.solver_targets``.
         val_containment: put particles that cross a wall back on its surface in the validation rollouts, which choose the best checkpoint.
     """
@@ -66,6 +67,7 @@ class TrainingSettings:
     velocity_noise_of_change: Annotated[float, Field(ge=0, le=100)] = 0.3
     noise_correction: Annotated[float, Field(ge=0, le=1)] = 0.0
     targets: Targets = "trajectory"
+    mirror: bool = False
     sampling: Sampling = "uniform"
     push_share: Annotated[float, Field(ge=0, le=1)] = 0.0
     push_steps: Annotated[int, Field(ge=1)] = 20

@@ -58,15 +58,20 @@ class Report:
         format, source: format and path of the source.
         folder: folder of the data set.
         dim: space dimension.
-        frame_dt, bounds, periodic, gravity, spacing, connectivity_radius: stored values.
+        frame_dt, periodic, spacing, connectivity_radius: stored values.
+        bounds: lowest and highest coordinate per axis over all trajectories [m].
+        gravity: smallest and largest value per axis over all trajectories [m/s²].
         materials: by material, its number of ``nodes``, and ``parameters``, the smallest and largest value of each by name.
         splits: counts by split.
-        neighbours: number of dynamic neighbours of a dynamic node within the radius (``mean``, ``min``, ``max``), and mean number of ``boundary`` neighbours.
-        max_speed, velocity_std, acceleration_std: statistics of the train split [m/s, m/s, m/s²]; the last without gravity.
-        mean_acceleration: mean acceleration in the train split per axis [m/s²]. In free fall it is gravity.
+        neighbours: number of dynamic neighbours of a dynamic node within the radius (``mean``, ``min``, ``max``), and mean number of ``boundary``
+            neighbours; in some frames of the first ``NUM_SAMPLED`` trajectories.
+        velocity_std, acceleration_std: rms per component in the train split [m/s, m/s²], the latter without gravity. Without a train split, these and what
+            follows from samples describe the first split.
+        max_speed, mean_acceleration: largest speed [m/s], and mean acceleration with gravity per axis [m/s²], of the first ``NUM_SAMPLED`` trajectories. In
+            free fall the acceleration is gravity.
         free_groups: number of groups of nodes in free flight, over the examined frames.
         free_acceleration: median acceleration of these groups per axis [m/s²]; empty if there are none.
-        step_in_spacings: largest displacement of a node in one frame, in spacings.
+        step_in_spacings: displacement in one frame at ``max_speed``, in spacings.
         notes: assumptions and omissions that concern the whole data set.
         warnings: what looks wrong, and what to do. Warnings about the whole data set come first, then those by trajectory.
         origin: origin of stored positions in the source's coordinates [m].
@@ -159,7 +164,10 @@ class Report:
             )
         mean = ", ".join(f"{a:.3g}" for a in self.mean_acceleration)
         rows += [
-            ("speed", f"{self.velocity_std:.4g} m/s rms, {self.max_speed:.4g} m/s at most: {self.step_in_spacings:.2g} spacings per frame"),
+            (
+                "speed",
+                f"{self.velocity_std:.4g} m/s rms, {self.max_speed:.4g} m/s at most in the first trajectories: {self.step_in_spacings:.2g} spacings per frame",
+            ),
             ("acceleration", f"{self.acceleration_std:.4g} m/s² rms without gravity; mean with it ({mean}) m/s²"),
         ]
         return rows

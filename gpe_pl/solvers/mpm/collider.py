@@ -107,7 +107,11 @@ def collider(shapes: tuple[Shape, ...], origin: tuple[float, ...], spacing: floa
 
 
 def _distance(shape: Shape, nodes: np.ndarray) -> np.ndarray:
-    """Return the signed distance of the nodes [node, dim] in m; raise an error if the shape has another dimension."""
+    """Return the signed distance [node] in m from nodes [node, dim] to a shape. It is negative inside.
+
+    Raises:
+        SimulationError: with reason ``input``, if the shape has another dimension than the nodes.
+    """
     dim = nodes.shape[1]
     own = {Wall: "normal", Sphere: "center", Box: "low"}.get(type(shape))
     fits = dim == 2 if isinstance(shape, Polygon) else own is None or len(getattr(shape, own)) == dim

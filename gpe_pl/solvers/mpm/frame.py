@@ -1,4 +1,4 @@
-"""The time loop of one frame, on compiled kernels; the same in 2D and 3D.
+"""Compiled loop over the substeps of one frame. The same code serves 2D and 3D.
 
 ``counts``, the number of grid nodes along each axis, is a tuple, so that kernels know the dimension at compile time.
 """

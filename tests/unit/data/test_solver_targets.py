@@ -35,10 +35,10 @@ def fem() -> tuple[Restartable, Trajectory]:
     return truth_of("fem")
 
 
-def windows(solver: Restartable | None, truth: Trajectory, noise: Noise | None = None) -> WindowDataset:
+def windows(solver: Restartable | None, truth: Trajectory, noise: Noise | None = None, mirror: bool = False) -> WindowDataset:
     stored = StoredTrajectory(Path("shard"), "0", truth.num_frames, truth.num_nodes, truth)
     builder = GraphBuilder(GraphConfig(history=HISTORY, mesh=True), truth.metadata)
-    return WindowDataset([stored], builder, noise, 0.05, seed=3, stress=truth.stress is not None, solver=solver)
+    return WindowDataset([stored], builder, noise, 0.05, seed=3, stress=truth.stress is not None, solver=solver, mirror=mirror)
 
 
 def start_of(solver: Restartable | None, truth: Trajectory, num_steps: int = 3) -> tuple[WindowDataset, Start]:
@@ -132,3 +132,26 @@ def test_materials_with_memory_cannot_restart(overrides: list[str]) -> None:
     solver = dataset(*overrides, "size=tiny").solver
     assert isinstance(solver, MPM)
     assert not solver.can_restart
+
+
+def test_mirrored_windows_are_images_with_the_images_of_all_targets(fem: tuple[Restartable, Trajectory]) -> None:
+    """About half of the windows are mirrored; positions, velocities, targets and stresses of these are images, also of unrolls."""
+    solver, truth = fem
+    plain, mirrored = (windows(solver, truth, mirror=mirror) for mirror in (False, True))
+    flipped = 0
+    for sample in range(12):
+        key = StartKey(sample, 4, 2)
+        one, other = plain[key], mirrored[key]
+        if torch.equal(one.state.pos, other.state.pos):
+            continue
+        flipped += 1
+        sign = torch.tensor([-1.0, 1.0], dtype=torch.float64)
+        pos = one.state.pos * torch.tensor([1.02, 1.0])
+        deviating = (replace(one.state, pos=pos), replace(other.state, pos=pos * sign + torch.tensor([1.0, 0.0])))
+        torch.testing.assert_close(other.state.pos, one.state.pos * sign + torch.tensor([1.0, 0.0]), rtol=0, atol=1e-6)
+        here, there = (s.graph(plain.builder, state, 1) for s, state in zip((one, other), deviating, strict=True))
+        torch.testing.assert_close(there["solid"].target, here["solid"].target * sign.float(), rtol=1e-4, atol=0.2)
+        stress = here["solid"].stress_target * torch.tensor([1.0, -1.0, 1.0, 1.0])
+        torch.testing.assert_close(there["solid"].stress_target, stress, rtol=1e-3, atol=30.0)
+        assert float(stress[:, 1].abs().max()) > 1e3
+    assert 2 <= flipped <= 10
