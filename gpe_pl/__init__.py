@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from gpe_pl.export.trajectories import write_vtk as write_vtk
     from gpe_pl.geometry.shapes import domain_walls as domain_walls
     from gpe_pl.learned.simulator import LearnedSimulator as LearnedSimulator
-    from gpe_pl.metrics import rollout_metrics as rollout_metrics
+    from gpe_pl.metrics.rollouts import rollout_metrics as rollout_metrics
     from gpe_pl.rollout.containment import Contained as Contained
     from gpe_pl.rollout.loop import rollout as roll_out  # noqa: F401
     from gpe_pl.trajectory.boundary import Boundary as Boundary
@@ -62,7 +62,7 @@ _MODULES = {
     "read_trajectory": "trajectory.store",
     "roll_out": "rollout.loop",
     "rollout_figure": "viz.figures",
-    "rollout_metrics": "metrics",
+    "rollout_metrics": "metrics.rollouts",
     "save_dataset": "data.importers.assemble",
     "write_animation": "viz.video",
     "write_npz": "export.trajectories",

@@ -72,10 +72,10 @@ MATERIALS: dict[str, tuple[MaterialParameter, ...]] = {
         MaterialParameter("friction_angle", "deg", "linear", Limits(0.0, 60.0), 30.0),
         MaterialParameter("cohesion", "Pa", "linear", Limits(0.0, 2e4), 0.0),
     ),
-    "snow": (
+    "snow": (  # with larger critical strains, much elastic energy is stored when the snow hardens, and hardening multiplies it
         MaterialParameter("hardening_coefficient", "1", "linear", Limits(0.0, 30.0), 8.0),
-        MaterialParameter("critical_compression", "1", "linear", Limits(1e-3, 0.5), 2.5e-2),
-        MaterialParameter("critical_stretch", "1", "linear", Limits(1e-3, 0.5), 7.5e-3),
+        MaterialParameter("critical_compression", "1", "linear", Limits(1e-3, 0.2), 2.5e-2),
+        MaterialParameter("critical_stretch", "1", "linear", Limits(1e-3, 0.2), 7.5e-3),
     ),
     "fluid": (MaterialParameter("kinematic_viscosity", "m^2/s", "log", Limits(1e-6, 10.0), 1e-3),),
     "elastomer": (MaterialParameter("youngs_modulus", "Pa", "log", Limits(1e3, 1e8), 1e5), POISSON_RATIO),

@@ -15,7 +15,15 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1]
 
-COMPILED = ("schema.py", "graphs/islands.py", "geometry/grid_distance.py", "data/importers/tfrecord.py", "nn/fused*.py", "solvers/**/*.py")
+COMPILED = (
+    "schema.py",
+    "graphs/islands.py",
+    "geometry/grid_distance.py",
+    "data/importers/tfrecord.py",
+    "trajectory/strain.py",
+    "nn/fused*.py",
+    "solvers/**/*.py",
+)
 """Source files of compiled functions, and of the types and constants in them."""
 NAME = "gpe_pl-compiled-"
 """Prefix of the names of folders of compiled functions; a digest of ``COMPILED`` follows."""

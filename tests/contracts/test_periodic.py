@@ -160,9 +160,9 @@ def test_a_radius_of_half_the_period_is_refused(radius: float) -> None:
 
 def test_a_state_of_another_topology_is_refused() -> None:
     build, s = builder(torus((True, False))), cloud(torus((True, True)))
-    with pytest.raises(GraphError, match="state is periodic along x, y, the data set 'test' along x$"):
+    with pytest.raises(GraphError, match="state is periodic along x, y, the data set 'test' along x; make the state"):
         build(s.to_torch())
-    with pytest.raises(GraphError, match="state is periodic along no axis, the data set 'test' along x$"):
+    with pytest.raises(GraphError, match="state is periodic along no axis, the data set 'test' along x; make the state"):
         build(replace(s, periodicity=NOWHERE).to_torch())
 
 

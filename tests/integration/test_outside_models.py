@@ -13,7 +13,13 @@ from gpe_pl.models.lookup import model_class
 from tests import outside, scenes
 from tests.runs import tiny
 
-OUTSIDE = ("model=dpinet", "model._target_=outside_gpe.net.Net", "~model.num_propagation_steps", "graph.mesh=false")
+OUTSIDE = (
+    "model=dpinet",
+    "model._target_=outside_gpe.net.Net",
+    "~model.num_propagation_steps",
+    "~model.material_embedding",
+    "graph.mesh=false",
+)
 
 
 def test_it_trains_and_its_checkpoint_needs_the_package(tiny_data: Path, tmp_path: Path) -> None:

@@ -258,12 +258,16 @@ def test_a_suite_for_a_gpu_says_that_there_is_none(
     ("task", "arguments", "line"),
     [
         (lambda cfg: None, ["suit=speed"], "error: suit: unknown key 'suit'; valid keys: paths, size, suite, trainer"),
-        (lambda cfg: None, ["suite=sped"], "error: In 'benchmark': Could not find 'suite/sped' Available options in 'suite': faults "),
+        (
+            lambda cfg: None,
+            ["suite=sped"],
+            "error: In 'benchmark': Could not find 'suite/sped' Available options in 'suite': acceptance faults ",
+        ),
         (lambda cfg: None, ["suite=3"], "error: Config group override must be a string or a list. Got int"),
         (lambda cfg: None, ["paths.data=null"], "error: paths.data=None: input should be a valid string"),
         (lambda cfg: None, ["+foo=1"], "error: foo: unknown or missing key; valid keys: paths, size, suite, trainer"),
         (benchmark, ["suite.name=nope"], "error: suite.name='nope': must be one of "),
-        (benchmark, ["suite.name=trained"], "error: suite.name='trained': must be one of faults, "),
+        (benchmark, ["suite.name=trained"], "error: suite.name='trained': must be one of acceptance, faults, "),
         (benchmark, ["suite=solvers", "+trainer.typo=1"], "error: trainer.typo: unknown key; valid keys: "),
         (benchmark, ["suite=solvers", "trainer.accelerator=[1]"], "error: trainer.accelerator=[1]: "),
         (benchmark, ["suite=skip", "suite.edge_states=[]"], "error: suite.edge_states=[]: "),

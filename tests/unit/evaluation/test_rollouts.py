@@ -98,6 +98,8 @@ def test_rollouts_start_where_asked_or_as_early_as_they_can() -> None:
 def test_a_scene_of_several_materials_has_no_one_parameter(inside: Trajectory) -> None:
     values = np.full((inside.num_nodes, 2), np.nan)
     values[:, 0] = 30.0
-    assert _parameter(replace(inside, material_params=values)) == 30.0
+    metadata = replace(inside.metadata, materials=("sand", "elastomer"), param_names=("friction_angle", "youngs_modulus"))
+    scene = replace(inside, metadata=metadata)
+    assert _parameter(replace(scene, material_params=values)) == 30.0
     values[0] = np.nan, 1e5
-    assert np.isnan(_parameter(replace(inside, material_params=values)))
+    assert np.isnan(_parameter(replace(scene, material_params=values)))

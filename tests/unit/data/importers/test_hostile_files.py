@@ -203,7 +203,7 @@ def test_an_archive_that_blows_up(tmp_path: Path) -> None:
         ({"params_sand": np.ones(3)}, r"params\['sand'\]: has shape \[3\], expected \[node 20\]"),
         ({"params_sand": np.nan}, r"params\['sand'\]: node 0 is nan"),
         ({"params_snow": 5.0}, "params: has sand, snow, needs sand"),
-        ({"positions": motion()}, "has an unknown key 'positions'; keys are params_MATERIAL, cells_KIND, pos"),
+        ({"positions": motion()}, "has an unknown key 'positions'; keys are params_MATERIAL, params_MATERIAL_NAME, cells_KIND, pos"),
         ({"periodic": [True, False]}, "a periodic axis needs bounds"),
         ({"boundary_normal": [[0, 1]]}, "has boundary arrays but no 'boundary_pos'"),
         ({"boundary_pos": [[0, 1]], "boundary_normal": [[0, 0]]}, "boundary normal: boundary_node 0 has length 0"),
