@@ -318,7 +318,7 @@ def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
 def _check_top_level(cfg: DictConfig, config_name: str) -> None:
     file = OmegaConf.load(CONF / f"{config_name}.yaml")
     known = {*_groups(config_name), *map(str, file)} - {"defaults", "hydra"}
-    wrong = {str(k) for k in cfg} ^ (known - WITHOUT_KEY)
+    wrong = {str(k) for k in cfg} ^ (known - (WITHOUT_KEY - set(file)))
     if wrong:
         raise ConfigError(f"{min(wrong)}: unknown or missing key; valid keys: {', '.join(sorted(known))}")
     if "name" in cfg and OmegaConf.to_container(file)["name"] is not None:  # type: ignore[call-overload,index]

@@ -11,10 +11,11 @@ from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.data.generation import generate
 from gpe_pl.data.validate import validate
 from gpe_pl.evaluation.rollouts import read_rows
-from gpe_pl.export.program import export_model, scene_of
+from gpe_pl.export.program import scene_of
 from gpe_pl.fit import fit
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.trajectory.store import iter_trajectories
+from tests.programs import exported
 from tests.runs import DATA, compose, tiny
 
 RATIOS = (
@@ -43,7 +44,7 @@ def test_modulus_and_ratio_from_the_solver_to_the_exported_program(tmp_path: Pat
     assert trained[:, 1].tolist() == pytest.approx([0.2, 0.4])
     truth = next(iter_trajectories(folder, "test_unseen"))
     state = simulator.initial_state(truth, simulator.builder.config.history)
-    export_model(simulator, tmp_path / "model.pt2")
+    exported(simulator, tmp_path / "model.pt2")
     moved, _ = torch.export.load(tmp_path / "model.pt2").module()(scene_of(simulator, state))
     rows_of = simulator.builder(state)["elastomer"].node_id
     torch.testing.assert_close(moved["pos.elastomer"], simulator.step(state).pos[rows_of], rtol=0, atol=1e-9)

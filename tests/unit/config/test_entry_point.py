@@ -327,6 +327,11 @@ def test_the_log_of_a_command_has_its_name(command: str) -> None:
     assert OmegaConf.load(Path(CONF) / f"{command}.yaml").hydra.job.name == command
 
 
+@pytest.mark.parametrize("command", ["fit", "simulate", "evaluate", "benchmark", "convert"])
+def test_the_settings_of_a_command_are_known_to_it(command: str) -> None:
+    configuration._check_top_level(compose(command), command)
+
+
 def test_results_do_not_say_where_they_lay(tmp_path: Path) -> None:
     runs = str(tmp_path / "runs")
     settings = {

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -25,6 +24,7 @@ from gpe_pl.models.gpe import GPE
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.trajectory.state import State
 from tests import scenes
+from tests.programs import exported
 
 SMALL: dict[Any, dict[str, Any]] = {
     GPE: {"num_message_passing_steps": 2, "hidden_channels": 8},
@@ -169,16 +169,6 @@ def test_what_a_file_cannot_be_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"an exported program ends in \.pt2"):
         export_model(learned, tmp_path / "model.pt")
     assert not [*tmp_path.iterdir()]
-
-
-def exported(learned: LearnedSimulator, path: Path) -> Path:
-    """Export a program. Lengths are symbols during export, which the tests' type checks do not accept as numbers."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    try:
-        export_model(learned, path)
-    finally:
-        jaxtyping.config.update("jaxtyping_disable", False)
-    return path
 
 
 ELSEWHERE = """
