@@ -29,6 +29,8 @@ Count = Annotated[int, Field(ge=0)]
 KILLED = "killed"
 TEMPORARY = re.compile(r"\S*/faults-\w+/")
 """Pattern of the folders in which faults are injected."""
+HERE = str(Path(__file__).resolve().parents[3])
+"""Folder that contains the package, which is another one on each machine."""
 
 
 RAW = "raw"
@@ -130,7 +132,7 @@ def failures(records: list[dict[str, Any]]) -> list[str]:
 
 
 def _note(records: list[dict[str, Any]], kind: str, name: str, verdict: Verdict) -> None:
-    detail = TEMPORARY.sub("", verdict.detail)
+    detail = TEMPORARY.sub("", verdict.detail).replace(HERE, "…")
     records.append({"kind": kind, "fault": name, "status": verdict.status, "detail": detail})
     if verdict.status in BAD:
         log.warning("%s, %s: %s: %s", kind, name, verdict.status, detail)

@@ -323,6 +323,12 @@ def test_an_import_that_is_done_need_not_be_done_again(
     assert runs.finished(runs.Command("one", module, ()), tmp_path, {"a": "1"}, 1.0).status == status
 
 
+def test_details_do_not_say_where_the_package_lies() -> None:
+    records: list[dict[str, object]] = []
+    suite._note(records, "kind", "name", Verdict("refused", f"/tmp/faults-x1/runs/fit or {suite.HERE}/gpe_pl: no room"))
+    assert records[0]["detail"] == "runs/fit or …/gpe_pl: no room"
+
+
 def test_a_traceback_is_shown_where_more_was_printed_after_it() -> None:
     text = "a\nException ignored in: <x>\nTraceback (most recent call last):\n  File 'a'\n    b()\nKeyboardInterrupt\nruns/fit\n"
     found = runs.TRACEBACK.search(text)
