@@ -18,11 +18,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from pydantic import Field
 
+from gpe_pl.benchmarks.finished_parts import PARTS, FinishedParts
 from gpe_pl.benchmarks.trained import Case
 from gpe_pl.data.control_runs import HIGHEST, LOWEST, TrainedValues, Values, scene_values, with_values
 from gpe_pl.data.ground_truth import DatasetSpec, Solver, initial_state, parameter_values
 from gpe_pl.errors import GpeError
-from gpe_pl.files import sealed
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio
 from gpe_pl.rollout.loop import SimulationError, steps
@@ -31,6 +31,9 @@ from gpe_pl.system.workers import pool, results
 from gpe_pl.trajectory.state import State
 from gpe_pl.viz.coloring import PALETTE
 from gpe_pl.viz.film_strip import TEXT_WIDTH, new_figure
+
+RESUMES = True
+"""``run`` takes a folder and continues where an earlier run was stopped."""
 
 SPLIT = "test_unseen"
 TOLD = 10.0
@@ -67,12 +70,10 @@ class Settings:
         cases: data sets, by label.
         num_scenes: number of scenes per data set, the first ones of its split ``test_unseen``.
         horizons: numbers of frames over which changes are averaged; ``full`` is the length of a scene.
-        folder: folder of finished scenes. The same command simulates only the missing ones.
         num_workers: number of processes, each of which simulates one scene.
     """
 
     cases: Annotated[dict[str, Case], Field(min_length=1)]
-    folder: str
     num_scenes: Annotated[int, Field(ge=1)] = 20
     horizons: Annotated[list[Horizon], Field(min_length=1)] = field(default_factory=lambda: [20, 50, 100, "full"])
     num_workers: Annotated[int, Field(ge=1)] = 1
@@ -128,24 +129,14 @@ def scene_changes(spec: DatasetSpec, index: int) -> dict[str, list[float]]:
     return {name: ((pairs[name][0] - pairs[name][1]) ** 2).mean(axis=(1, 2)).tolist() for name in CHANGES}
 
 
-def stored_changes(spec: DatasetSpec, index: int, folder: str) -> dict[str, list[float]]:
-    """Return ``scene_changes`` from the folder of finished scenes, or compute and store them."""
-    values, _ = parameter_values(spec, SPLIT, index)
-    about = spec.as_dict()
-    kept: dict[str, Any] = {name: about[name] for name in ("scene", "solver", "seed", "num_frames", "input_files")}
-    seen = {material: list(choices.seen) for material, choices in spec.parameters.items()}
-    further = {m: {name: list(choices.seen) for name, choices in own.further.items()} for m, own in spec.parameters.items() if own.further}
-    if further:
-        kept["further"] = further
-    key = sealed.checksum({**kept, "values": recorded(values), "seen": seen, "index": index})
-    path = Path(folder) / f"{spec.name}-{spec.size}-{index:03d}-{key[:12]}.json"
-    if path.exists():
-        changes: dict[str, list[float]] = sealed.read(path, "delete it, and run the same command again")["changes"]
-        return changes
-    changes = scene_changes(spec, index)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    sealed.write(path, {"key": key, "changes": changes})
-    return changes
+def stored_changes(spec: DatasetSpec, index: int, parts: FinishedParts) -> dict[str, list[float]]:
+    """Return ``scene_changes`` as a stopped suite stored them, or compute and store them."""
+    identity = {"data": spec.as_dict(), "scene": index}
+    stored = parts.get(identity)
+    if stored is None:
+        stored = [scene_changes(spec, index)]
+        parts.put(identity, stored)
+    return dict(stored[0])
 
 
 def group_of(value: float, seen: Sequence[float]) -> str:
@@ -156,8 +147,9 @@ def group_of(value: float, seen: Sequence[float]) -> str:
 # --- all scenes -----------------------------------------------------------------------------------------------------------------------------
 
 
-def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
+def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tuple[list[dict[str, Any]], str]:
     """Return a record per scene and horizon and one per mean curve, and Markdown tables."""
+    parts = FinishedParts(folder / PARTS)
     for label, spec in specs.items():
         if spec.num_test_unseen < 1:
             raise EffectError(f"suite.cases.{label}: the data set has no scenes with unseen values; set data.num_test_unseen")
@@ -165,17 +157,18 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
     jobs = [(label, index) for label, spec in specs.items() for index in range(min(settings.num_scenes, spec.num_test_unseen))]
     found: dict[tuple[str, int], dict[str, list[float]]] = {}
     with progress_bar("scenes") as on_progress, pool(settings.num_workers) as executor:
-        arguments = [(specs[label], label, index, settings.folder) for label, index in jobs]
+        arguments = [(specs[label], label, index, parts) for label, index in jobs]
         for done, (label, index, changes) in enumerate(results(executor, _job, arguments), start=1):
             found[label, index] = changes
             on_progress(done, len(jobs))
     records = [record for label, index in jobs for record in _scene_records(label, specs[label], index, found[label, index], settings)]
     records += [record for label, spec in specs.items() for record in _curves(label, spec, [found[job] for job in jobs if job[0] == label])]
+    parts.clear()
     return records, report(records)
 
 
-def _job(spec: DatasetSpec, label: str, index: int, folder: str) -> tuple[str, int, dict[str, list[float]]]:
-    return label, index, stored_changes(spec, index, folder)
+def _job(spec: DatasetSpec, label: str, index: int, parts: FinishedParts) -> tuple[str, int, dict[str, list[float]]]:
+    return label, index, stored_changes(spec, index, parts)
 
 
 def _scene_records(label: str, spec: DatasetSpec, index: int, changes: dict[str, list[float]], settings: Settings) -> list[dict[str, Any]]:

@@ -10,6 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from gpe_pl.benchmarks import parameter_effect as module
+from gpe_pl.benchmarks.finished_parts import FinishedParts
 from gpe_pl.benchmarks.parameter_effect import (
     CHANGES,
     EffectError,
@@ -75,15 +76,16 @@ def test_finished_scenes_are_not_simulated_again(tmp_path: Path, monkeypatch: py
         return {name: [1.0] * 4 for name in CHANGES}
 
     monkeypatch.setattr(module, "scene_changes", counted)
-    first = stored_changes(spec, 0, str(tmp_path))
-    assert stored_changes(spec, 0, str(tmp_path)) == first and calls == [0]
-    stored_changes(tiny("data.solver.cfl=0.4"), 0, str(tmp_path))
-    stored_changes(tiny("data.parameters.sand.seen=[20,42.5]"), 0, str(tmp_path))
+    parts = FinishedParts(tmp_path)
+    first = stored_changes(spec, 0, parts)
+    assert stored_changes(spec, 0, parts) == first and calls == [0]
+    stored_changes(tiny("data.solver.cfl=0.4"), 0, parts)
+    stored_changes(tiny("data.parameters.sand.seen=[20,42.5]"), 0, parts)
     assert calls == [0, 0, 0], "other settings are other scenes"
     for path in tmp_path.iterdir():
         path.write_text(path.read_text().replace("1.0", "2.0", 1))
     with pytest.raises(sealed.SealError, match="delete it"):
-        stored_changes(spec, 0, str(tmp_path))
+        stored_changes(spec, 0, parts)
 
 
 def test_a_scene_that_cannot_be_simulated_is_named() -> None:
@@ -92,16 +94,16 @@ def test_a_scene_that_cannot_be_simulated_is_named() -> None:
 
 
 def test_data_without_unseen_values_are_refused(tmp_path: Path) -> None:
-    settings = Settings({"sand": Case([])}, str(tmp_path))
+    settings = Settings({"sand": Case([])})
     with pytest.raises(EffectError, match=r"suite\.cases\.sand: .*num_test_unseen"):
-        run(settings, {"sand": tiny("data.num_test_unseen=0")})
+        run(settings, {"sand": tiny("data.num_test_unseen=0")}, tmp_path)
 
 
 def test_results_have_every_scene_horizon_and_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     curves = {name: [0.1 * k, 0.2 * k, 0.3 * k, 0.4 * k] for k, name in enumerate(CHANGES, start=1)}
     monkeypatch.setattr(module, "scene_changes", lambda spec, index: curves)
-    settings = Settings({"sand": Case([])}, str(tmp_path), num_scenes=3, horizons=[2, 100, "full"])
-    records, table = run(settings, {"sand": tiny()})
+    settings = Settings({"sand": Case([])}, num_scenes=3, horizons=[2, 100, "full"])
+    records, table = run(settings, {"sand": tiny()}, tmp_path)
     scenes = [record for record in records if "scene" in record]
     assert [(r["scene"], r["horizon"]) for r in scenes] == [(k, h) for k in range(3) for h in (2, "full")], "no scene has 100 frames"
     assert scenes[0]["range"] == pytest.approx(0.15) and scenes[1]["range"] == pytest.approx(0.25)
