@@ -30,12 +30,13 @@ from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.graphs.standardizer import GraphStandardizer, StatisticsSample, named
 from gpe_pl.learned.checkpoint_archive import check_archive, check_values
 from gpe_pl.learned.pretrained import checkpoint_path, names
+from gpe_pl.learned.training_ranges import outside_masses, outside_parameters, stored_ranges
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.lookup import model_class
 from gpe_pl.nn.static_friction import keeps_position, supported
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.rollout.skips import Skips
-from gpe_pl.schema import BOUNDARY, EdgeType, MaterialParameter, node_code, param_names
+from gpe_pl.schema import BOUNDARY, EdgeType, node_code, param_names
 from gpe_pl.system.signatures import check_plain, checked
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.cells import mean_over_corners
@@ -46,11 +47,6 @@ from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 log = logging.getLogger(__name__)
 
 CHECKPOINT_FORMAT = 3
-
-RANGE_TOLERANCE = 1e-5
-"""Relative difference of material parameters that counts as none, because they are stored in single precision."""
-MASS_FACTOR = 2.0
-"""Factor by which masses of nodes may leave the range of training: corners of meshes differ between bodies of one kind."""
 
 
 class CheckpointError(GpeError, ValueError):
@@ -256,19 +252,7 @@ class LearnedSimulator(nn.Module):
         return [line for _, line in self._outside_parameters(state)]
 
     def _outside_parameters(self, state: State) -> Iterator[tuple[str, str]]:
-        for material, trained in self.trained_ranges():
-            of_material = state.node_type == node_code(material)
-            for spec, column, (low, high) in self._stored(material, trained):
-                values = state.material_params[of_material, column]
-                is_outside = (values < low - RANGE_TOLERANCE * low.abs()) | (values > high + RANGE_TOLERANCE * high.abs())
-                if bool(is_outside.any()):
-                    kind = f"{spec.name} of {material}"
-                    yield kind, f"{kind} is {spec.quantity(values[is_outside][0].item())}, trained were {low.item():g} to {high.item():g}"
-
-    def _stored(self, material: str, trained: Tensor) -> Iterator[tuple[MaterialParameter, int, Tensor]]:
-        """Yield each parameter of a material with its column of ``material_params`` and its trained range [2]."""
-        metadata = self.builder.metadata
-        yield from zip(metadata.parameters_of(material), metadata.columns_of(material), trained.T, strict=True)
+        return outside_parameters(state, self.builder.metadata, self.trained_ranges())
 
     def untrained_scene(self, state: State) -> list[str]:
         """Return one line for each kind of mass, gravity and property of boundary nodes of a scene that is outside the range of training."""
@@ -278,12 +262,7 @@ class LearnedSimulator(nn.Module):
         own = self.builder.metadata
         here = scene_range(state.gravity.cpu().numpy(), state.boundary.to_numpy(), state.periodicity)
         yield from outside(self.trained_scene.cpu().numpy(), here, own.spacing / own.frame_dt)
-        for material, (low, high) in zip(self.builder.spec.materials, self.trained_mass.T.tolist(), strict=True):
-            mass = state.mass[state.node_type == node_code(material)]
-            is_outside = (mass < low / MASS_FACTOR) | (mass > high * MASS_FACTOR)
-            if bool(is_outside.any()):
-                kind = f"mass of nodes of {material}"
-                yield kind, f"{kind} is {mass[is_outside][0].item():g} kg, in training it was {low:g} to {high:g} kg"
+        yield from outside_masses(state, self.builder.spec.materials, self.trained_mass)
 
     def forward(self, data: HeteroData) -> Prediction:
         """Return accelerations without gravity per material, in units of ``acceleration_std``."""
@@ -352,7 +331,7 @@ class LearnedSimulator(nn.Module):
             raise SceneError(f"node {node} has a mass of {float(state.mass[node]):g} kg; give every node a positive and finite mass")
         for material, trained in self.trained_ranges():
             rows = torch.nonzero(state.node_type == node_code(material)).flatten()
-            for spec, number, _ in self._stored(material, trained):
+            for spec, number, _ in stored_ranges(self.builder.metadata, material, trained):
                 column = state.material_params[rows, number]
                 wrong = ~spec.accepts(column)
                 if wrong.any():

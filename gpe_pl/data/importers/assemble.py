@@ -16,6 +16,7 @@ import numpy as np
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.importers.report import Event, Report, SplitCounts
+from gpe_pl.data.importers.sampled import degrees_of, speed_and_acceleration
 from gpe_pl.data.importers.source import Facts, ImportFailure, ImportSettings, Item, Loaded, Refusal, Source
 from gpe_pl.data.motion import ROUNDING_FRACTION, MotionSummary, better_origin, motion_of, rounding_fault
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
@@ -24,11 +25,9 @@ from gpe_pl.files import sealed
 from gpe_pl.files.atomic import free_bytes, replacing
 from gpe_pl.files.names import NameRefused, data_name
 from gpe_pl.geometry.periodicity import PeriodicityError
-from gpe_pl.graphs.neighbors import radius_between, radius_pairs
 from gpe_pl.schema import HISTORY, MATERIALS, NODE_TYPES, SPLITS, ParameterGroup, node_code, param_names, stored_parameters
 from gpe_pl.system.locks import locked
 from gpe_pl.system.progress import Progress
-from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.arrays import ArrayError, nearest_distances
 from gpe_pl.trajectory.store import iter_trajectories, stored_arrays, write_shard
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
@@ -43,8 +42,6 @@ VERSION = "1"
 TRAJECTORIES_PER_SHARD = 8
 NUM_SAMPLED = 8
 """Number of training trajectories from which spacing and neighbours are measured."""
-FRAMES_SAMPLED = 3
-"""Number of frames of each sampled trajectory, evenly spread, in which neighbours are counted."""
 FLIGHT_FRAMES = 25
 """Number of frames of each sampled trajectory in which groups in free flight are searched for."""
 ENOUGH_GROUPS = 20
@@ -545,7 +542,7 @@ class _Conversion:
                 "or add scenes in which nodes touch something"
             )
         sample = list(islice(iter_trajectories(folder, split), NUM_SAMPLED))
-        degrees = [degree for trajectory in sample for degree in _degrees(trajectory)]
+        degrees = [degree for trajectory in sample for degree in degrees_of(trajectory)]
         among, boundary = (np.concatenate(part) for part in zip(*degrees, strict=True))
         report.neighbours = {
             "mean": float(among.mean()),
@@ -553,24 +550,12 @@ class _Conversion:
             "max": int(among.max()),
             "boundary": float(boundary.mean()),
         }
-        self._look_at_motion(sample)
+        report.max_speed, report.mean_acceleration = speed_and_acceleration(sample)
+        report.step_in_spacings = report.max_speed * report.frame_dt / report.spacing
         if not FEWEST_NEIGHBOURS <= among.mean() <= MOST_NEIGHBOURS:
             report.warnings.append(
                 f"{among.mean():.1f} neighbours within the radius are {'few' if among.mean() < FEWEST_NEIGHBOURS else 'many'}; choose connectivity_radius=…"
             )
-
-    def _look_at_motion(self, sample: Sequence[Trajectory]) -> None:
-        report = self.report
-        means = []
-        for trajectory in sample:
-            m, last = trajectory.metadata, trajectory.num_frames - 1
-            first, final = (
-                integrators.velocities(trajectory.pos[k : k + 2].astype(np.float64), m.frame_dt, m.periodicity)[0] for k in (0, last - 1)
-            )
-            means.append((final - first).mean(axis=0) / ((last - 1) * m.frame_dt))
-            report.max_speed = max(report.max_speed, float(np.linalg.norm(trajectory.vel, axis=-1).max()))
-        report.mean_acceleration = np.mean(means, axis=0).tolist()
-        report.step_in_spacings = report.max_speed * report.frame_dt / report.spacing
 
 
 def _united(span: tuple[float, float] | None, values: np.ndarray) -> tuple[float, float]:
@@ -593,14 +578,3 @@ def _free_flight(trajectory: Trajectory) -> FreeFlight:
     if trajectory.cells is not None:
         arrays["cells"] = trajectory.cells
     return joined(free_flights(trajectory.metadata, arrays, FLIGHT_FRAMES), trajectory.metadata.dim)
-
-
-def _degrees(trajectory: Trajectory) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield two arrays for each of some frames: the number of dynamic neighbours and of boundary neighbours of each dynamic node [node]."""
-    m, count = trajectory.metadata, trajectory.num_nodes
-    walls = np.ascontiguousarray(trajectory.boundary.pos, dtype=np.float64)
-    for frame in np.unique(np.linspace(0, trajectory.num_frames - 1, FRAMES_SAMPLED).astype(int)):
-        pos = trajectory.pos[frame].astype(np.float64)
-        pairs = radius_pairs(pos, m.connectivity_radius, m.periodicity)
-        touching = radius_between(walls, pos, m.connectivity_radius, m.periodicity)[1]
-        yield np.bincount(pairs.ravel(), minlength=count), np.bincount(touching, minlength=count)

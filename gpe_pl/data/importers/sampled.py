@@ -1,0 +1,39 @@
+"""What some stored trajectories of an import show: neighbours and motion of nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from jaxtyping import Int64
+
+from gpe_pl.graphs.neighbors import radius_between, radius_pairs
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.trajectory import Trajectory
+
+FRAMES_SAMPLED = 3
+"""Number of frames of each sampled trajectory, evenly spread, in which neighbours are counted."""
+
+
+def degrees_of(trajectory: Trajectory) -> Iterator[tuple[Int64[np.ndarray, " node"], Int64[np.ndarray, " node"]]]:
+    """Yield two arrays for each of some frames: the number of dynamic neighbours and of boundary neighbours of each dynamic node [node]."""
+    m, count = trajectory.metadata, trajectory.num_nodes
+    walls = np.ascontiguousarray(trajectory.boundary.pos, dtype=np.float64)
+    for frame in np.unique(np.linspace(0, trajectory.num_frames - 1, FRAMES_SAMPLED).astype(int)):
+        pos = trajectory.pos[frame].astype(np.float64)
+        pairs = radius_pairs(pos, m.connectivity_radius, m.periodicity)
+        touching = radius_between(walls, pos, m.connectivity_radius, m.periodicity)[1]
+        yield np.bincount(pairs.ravel(), minlength=count), np.bincount(touching, minlength=count)
+
+
+def speed_and_acceleration(sample: Sequence[Trajectory]) -> tuple[float, list[float]]:
+    """Return the largest speed [m/s] in some trajectories, and their mean acceleration per axis [m/s²] with gravity."""
+    fastest, means = 0.0, []
+    for trajectory in sample:
+        m, last = trajectory.metadata, trajectory.num_frames - 1
+        first, final = (
+            integrators.velocities(trajectory.pos[k : k + 2].astype(np.float64), m.frame_dt, m.periodicity)[0] for k in (0, last - 1)
+        )
+        means.append((final - first).mean(axis=0) / ((last - 1) * m.frame_dt))
+        fastest = max(fastest, float(np.linalg.norm(trajectory.vel, axis=-1).max()))
+    return fastest, np.mean(means, axis=0).tolist()
