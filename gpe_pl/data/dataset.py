@@ -372,9 +372,10 @@ class WindowDataset(Dataset[HeteroData | Start]):
         return np.concatenate(values)
 
     def _reflection(self, metadata: Metadata, sample: int) -> Reflection:
+        if not self.mirror:
+            return Reflection.of(metadata.bounds, ())
         rng = np.random.default_rng((self.seed, sample, MIRROR_STREAM))
-        axes = [axis for axis, pull in enumerate(metadata.gravity) if pull == 0 and rng.random() < 0.5] if self.mirror else []
-        return Reflection.of(metadata.bounds, axes)
+        return Reflection.of(metadata.bounds, [axis for axis, pull in enumerate(metadata.gravity) if pull == 0 and rng.random() < 0.5])
 
     @overload
     def __getitem__(self, key: int | tuple[int, int]) -> HeteroData: ...
@@ -392,7 +393,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         ahead = 0 if start is None else min(start.num_steps, stored.num_frames - 2 - frame)
         original = stored.window(frame - history, frame + 2 + ahead)
         reflection = self._reflection(original.metadata, sample)
-        trajectory = reflection.trajectory(original) if any(plane is not None for plane in reflection.planes) else original
+        trajectory = reflection.trajectory(original)
         dt = trajectory.metadata.frame_dt
         truth = trajectory.pos.astype(np.float64)
         pos = truth[: history + 2]

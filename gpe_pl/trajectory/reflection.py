@@ -74,7 +74,9 @@ class Reflection:
         )
 
     def trajectory(self, trajectory: Trajectory) -> Trajectory:
-        """Return the image of a trajectory. Its planes have to leave gravity and the domain as they are."""
+        """Return the image of a trajectory, or the trajectory itself without planes. The planes have to leave gravity and the domain as they are."""
+        if all(plane is None for plane in self.planes):
+            return trajectory
         rest_pos, stress = trajectory.rest_pos, trajectory.stress
         return replace(
             trajectory,

@@ -21,11 +21,13 @@ from gpe_pl.solvers.mpm.restart import gradients
 from gpe_pl.trajectory.trajectory import Trajectory
 
 HISTORY = 2
-SCENE = ("size=tiny", "data.num_frames=12", "data.scene.drop_height=[0.001,0.002]", "data.scene.max_speed=4")
+SCENE = ("size=tiny", "data.num_frames=12", "data.scene.max_speed=4")
+BODIES = ("data.scene.drop_height=[0.001,0.002]",)
+OVERRIDES = {"fem": (*BODIES, "data.scene.num_cells=60"), "elastomer": BODIES, "fluid": ()}
 
 
 def truth_of(data: str) -> tuple[Restartable, Trajectory]:
-    spec = dataset(f"data={data}", *SCENE, *(["data.scene.num_cells=60"] if data == "fem" else []))
+    spec = dataset(f"data={data}", *SCENE, *OVERRIDES[data])
     assert isinstance(spec.solver, Restartable)
     return spec.solver, generate_trajectory(spec, split="train", index=0)
 
@@ -47,7 +49,7 @@ def start_of(solver: Restartable | None, truth: Trajectory, num_steps: int = 3) 
 
 
 @pytest.mark.parametrize("step", [0, 2])
-@pytest.mark.parametrize("data", ["fem", pytest.param("elastomer", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("data", ["fem", *(pytest.param(name, marks=pytest.mark.slow) for name in ("elastomer", "fluid"))])
 def test_the_true_state_has_the_target_of_the_data(data: str, step: int) -> None:
     solver, truth = truth_of(data)
     windows, start = start_of(solver, truth)
