@@ -44,7 +44,7 @@ from gpe_pl.system import early_interrupts
 from gpe_pl.system.signatures import checked, parameters
 
 WITHOUT_KEY = {"comparison", "experiment", "parameters", "recipe", "scene", "solver", "tuned"}
-"""Config groups that set keys under other names than their own."""
+"""Config groups that set keys under other names than their own. A command may have a key of its own by such a name, as convert has ``parameters``."""
 
 plugins.register()  # files in conf/ use the plugins
 OmegaConf.register_new_resolver("times", lambda a, b: a * b, replace=True)  # ${times:a,b} in conf/

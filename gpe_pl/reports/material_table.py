@@ -73,8 +73,8 @@ def material_lines(groups: Groups) -> list[str]:
         means = [own, *others, _mean(_errors(_without(groups, domain, runs), LEARNED)), _mean(_solver(runs, SOLVER_NEAREST)), effect]
         found = reads_material(runs)
         assert found is not None
-        share = f"{own / effect:.2f}" if effect > 0 else "–"
-        lines.append(table_row([domain, label, *map(_text, means), _ratio(found[1]), _answer(*found), share]))
+        fraction = f"{own / effect:.2f}" if effect > 0 else "–"
+        lines.append(table_row([domain, label, *map(_text, means), _ratio(found[1]), _answer(*found), fraction]))
     note = (
         "Does the model read the material parameter? Rollout MSE ×1e-3 [m²] over all frames, mean over scenes with interpolated parameters, median over seeds: "
         "with a scene's own parameters, and the same model with the nearest, the middle and the farthest trained ones and with those of another scene; a model "
