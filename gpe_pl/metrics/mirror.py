@@ -13,6 +13,7 @@ from jaxtyping import Float, Int64
 from scipy.spatial import cKDTree
 
 from gpe_pl.geometry.shapes import signed_distance
+from gpe_pl.trajectory.reflection import Reflection
 from gpe_pl.trajectory.trajectory import Trajectory
 
 CLOSE = 0.01
@@ -35,9 +36,7 @@ class Mirror:
 
     def image(self, pos: Float[np.ndarray, "*axes dim"]) -> Float[np.ndarray, "*axes dim"]:
         """Return the mirror images of positions [m]."""
-        pos = pos.copy()
-        pos[..., self.axis] = 2 * self.offset - pos[..., self.axis]
-        return pos
+        return Reflection.at(self.axis, self.offset, pos.shape[-1]).point(pos)
 
 
 def mirrors(truth: Trajectory) -> list[Mirror]:

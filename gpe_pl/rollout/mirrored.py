@@ -33,7 +33,7 @@ class Mirrored:
         return self._reflection(state).state(after, state.boundary.at(1))
 
     def _reflection(self, state: State) -> Reflection:
-        return Reflection(tuple(self.offset if axis == self.axis else None for axis in range(state.dim)))
+        return Reflection.at(self.axis, self.offset, state.dim)
 
     def _boundary(self, state: State) -> Boundary:
         """Return the image of the boundary; that of a boundary at rest is made once, and so is its search tree."""

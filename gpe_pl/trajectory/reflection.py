@@ -30,6 +30,11 @@ class Reflection:
         """Return the reflection at the middle of a domain along some axes."""
         return cls(tuple((low + high) / 2 if axis in axes else None for axis, (low, high) in enumerate(bounds)))
 
+    @classmethod
+    def at(cls, axis: int, offset: float, dim: int) -> Reflection:
+        """Return the reflection at the plane normal to an axis at ``offset`` [m]."""
+        return cls(tuple(offset if k == axis else None for k in range(dim)))
+
     def vector(self, x: Array) -> Array:
         """Return the images of vectors [..., dim]."""
         return x * _row([1.0 if plane is None else -1.0 for plane in self.planes], x)
