@@ -1,9 +1,9 @@
 """Training targets for states that no stored trajectory contains: the solver's step from there.
 
-Noise and unrolls lead away from the true trajectory. The usual target leads back to it within a step, which no physics does: a body that swings has restoring
-forces of its own, and a strain that noise gives it has consequences. Here the target is the true acceleration, plus the difference between the solver's steps
-from the deviating state and from the true one. Both steps start from positions and velocities alone, so what these do not tell cancels. Without a deviation
-the target is that of the data.
+Noise and unrolls lead away from the true trajectory. The usual target leads back to it within a step. Real bodies do not move like that: a body that swings
+has restoring forces, and a strain that noise causes has consequences. The target here is the true acceleration, plus the difference between two steps of the
+solver: one from the deviating state, one from the true state. Both steps start from positions and velocities only. Errors from what else the solver would
+remember therefore cancel to first order. Without a deviation the target is that of the data.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Mirror images of scenes. Physics does not know left from right, so an image whose gravity is the same is as true as its original."""
+"""Mirror images of scenes. The image of a true motion is a true motion, too, if the image has the same gravity."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Deformation of elastic particles from their positions alone.
 
-An elastomer remembers nothing but its rest shape, so positions and velocities of a lattice of particles tell how it is deformed. What the grid does not
-represent of a particle's motion is lost; that is why a restart is near the continued run, and not equal to it.
+The stress of an elastomer depends on its deformation only. Positions at rest and now tell the deformation, and velocities tell its rate. A restart loses what
+the particles keep of motions that the grid does not represent. It is therefore near the continued run, but not equal to it.
 """
 
 from __future__ import annotations
