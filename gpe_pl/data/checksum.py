@@ -12,9 +12,13 @@ LENGTH = 16
 
 
 def split_checksum(root: Path | str, split: str) -> str:
-    """Return the first digits of a SHA-256 digest of a split: of the stored digests and attributes of its trajectories, in order.
+    """Return the first ``LENGTH`` digits of the SHA-256 digest of a split.
 
-    Arrays are not read, so it takes milliseconds per shard. ``read_trajectory(verify=True)`` checks arrays against their digest.
+    It covers the stored digests and attributes of the trajectories, in order. Arrays are not read, so it takes milliseconds per shard.
+    ``read_trajectory(verify=True)`` checks arrays against their digest.
+
+    Raises:
+        StoreError: the split has no shards, or one is damaged.
     """
     sha = hashlib.sha256()
     for path in shards(root, split):

@@ -1,4 +1,4 @@
-"""Scenes of a data set with other material parameters, as the solver computes them: controls for models that are said to read the material.
+"""Solver runs of a data set's scenes with other material parameters. They are the controls for models that are said to read the material.
 
 The solver starts from the state in which a model's rollout starts, internal state included, so both see the change of the parameter from the same frame on.
 Runs depend on the data and the solver only. All models that are evaluated on the data share them. A killed command resumes. Layout::
@@ -42,13 +42,13 @@ def scene_values(spec: DatasetSpec, split: str, index: int) -> dict[str, dict[st
 
 
 def with_values(material_params: Any, node_type: Any, param_names: Sequence[str], values: Values) -> Any:
-    """Return material parameters [node, param] of a scene with other values.
+    """Return a copy of the material parameters [node, param] of a scene with other values.
 
     Args:
         material_params: parameters of the scene, an array or a tensor.
         node_type: codes of the materials [node].
         param_names: names of the columns.
-        values: new parameters.
+        values: new values. Parameters that are not named keep theirs.
     """
     new = 1 * material_params
     for material, parameters in values.items():
@@ -62,7 +62,7 @@ def with_values(material_params: Any, node_type: Any, param_names: Sequence[str]
 class TrainedValues:
     """Values of material parameters in the training split of a data set, and choices among them. A material's parameters are chosen together, as a vector.
 
-    Distances between vectors are Euclidean. Each parameter has its scale of ``schema.MATERIALS``, divided by its trained range.
+    Parameters are compared on their scales in ``schema.MATERIALS``, in units of their trained ranges.
     """
 
     spec: DatasetSpec
@@ -74,16 +74,16 @@ class TrainedValues:
         return {m: np.unique([[*scene[m].values()] for scene in scenes], axis=0) for m in scenes[0]}
 
     def nearest(self, own: Values) -> Values:
-        """Return the trained values nearest to a scene's own."""
+        """Return the trained values of each material nearest to a scene's own, by the Euclidean distance of the vectors."""
         return self._chosen({m: np.argmin(distance) for m, distance in self._distances(own).items()})
 
     def farthest(self, own: Values) -> Values:
-        """Return the trained values farthest from a scene's own."""
+        """Return the trained values of each material farthest from a scene's own, by the Euclidean distance of the vectors."""
         return self._chosen({m: np.argmax(distance) for m, distance in self._distances(own).items()})
 
     @property
     def middle(self) -> Values:
-        """The trained values nearest to the middle of the trained ranges."""
+        """The trained values of each material nearest to the middle of the trained ranges, by the parameter that differs most from it."""
         return self._chosen({m: np.argmin(np.abs(self._scaled(m, v) - 0.5).max(axis=1)) for m, v in self._vectors.items()})
 
     def end(self, name: str) -> Values:
@@ -99,14 +99,14 @@ class TrainedValues:
         return {m: dict(zip(self._names[m], map(float, self._vectors[m][k]), strict=True)) for m, k in number.items()}
 
     def _distances(self, own: Values) -> dict[str, np.ndarray]:
-        """Distance of each material's trained vectors to a scene's own [vector]."""
+        """Return the distances of each material's trained vectors from a scene's own [vector]."""
         return {
             m: np.linalg.norm(self._scaled(m, v) - self._scaled(m, np.array([[*own[m].values()]])), axis=1)
             for m, v in self._vectors.items()
         }
 
     def _scaled(self, material: str, vectors: np.ndarray) -> np.ndarray:
-        """Return vectors in units in which each parameter is trained from 0 to 1."""
+        """Return vectors [vector, param] with each parameter on its scale, moved and divided so that the trained values reach from 0 to 1."""
         is_log = [p.scale == "log" for p in MATERIALS[material] if p.name in self._names[material]]
         trained, given = (np.log(v, out=np.array(v, np.float64), where=is_log) for v in (self._vectors[material], vectors))
         low, high = trained.min(axis=0), trained.max(axis=0)
@@ -120,9 +120,9 @@ class ControlRuns:
     Attributes:
         root: folder of the data set.
         spec: the data set.
-        trained: trained values of the models.
+        trained: trained values of the data set.
         split: split whose scenes are computed.
-        start_frame: frame from which the parameters are the other ones.
+        start_frame: frame at which the parameters change.
     """
 
     root: Path
@@ -136,7 +136,7 @@ class ControlRuns:
         return self.root.with_name(f"{self.root.name}-controls") / f"{self.split}-from-{self.start_frame}"
 
     def values(self, index: int) -> dict[str, Values]:
-        """Return the parameters of each run of a scene."""
+        """Return the parameters of each run of a scene, by the run's name."""
         own = scene_values(self.spec, self.split, index)
         return {NEAREST: self.trained.nearest(own), **{name: self.trained.end(name) for name in (LOWEST, HIGHEST)}}
 
@@ -144,8 +144,9 @@ class ControlRuns:
         """Compute the missing runs of these scenes. Waits while another process computes them.
 
         Raises:
-            GenerationError: the solver stopped.
+            GenerationError: a scene is impossible, or the solver stopped.
             WorkerError: a process died.
+            FolderError: the folder cannot be created or written.
         """
         if not self._missing(indices):
             if on_progress is not None:
@@ -168,7 +169,7 @@ class ControlRuns:
         """Return the runs of a scene by name. Frame 0 is ``start_frame`` of the scene.
 
         Raises:
-            StoreError: the runs were not computed.
+            StoreError: the runs were not computed, or are damaged.
         """
         return {name: read_trajectory(self._path(index), name) for name in RUNS}
 

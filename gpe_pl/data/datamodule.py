@@ -42,7 +42,7 @@ MOST_SEARCHED = 8
 
 
 def data_statistics(root: Path | str) -> dict[str, float]:
-    """Read the statistics of the train split, which ``simulate`` or ``convert`` has written.
+    """Read ``acceleration_std``, the rms acceleration of the train split [m/s²], from the file that ``simulate`` or ``convert`` has written.
 
     Raises:
         StoreError: the statistics are missing or damaged, or belong to other data.
@@ -77,7 +77,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         stress: add the stress to samples; see ``WindowDataset``.
         sampling: how often each training window is drawn.
         solver: gives the targets of noisy and unrolled states; see ``WindowDataset``.
-        mirror: mirror half of the training windows; see ``WindowDataset``.
+        mirror: mirror training windows at random; see ``WindowDataset``.
         num_statistics_windows: number of windows from which features are standardised, evenly spread over the ``train`` split.
 
     Attributes:
@@ -85,7 +85,7 @@ class TrajectoryDataModule(L.LightningDataModule):
             graphs.
 
     Raises:
-        StoreError: a split or its statistics are missing or damaged.
+        StoreError: a split or its statistics are missing or damaged, or no trajectory of a split is long enough for a window.
         NoiseError: the noise is too large for the spacing of the data.
     """
 
@@ -135,8 +135,8 @@ class TrajectoryDataModule(L.LightningDataModule):
     def _rare_graphs(self, roles: frozenset[str]) -> list[HeteroData]:
         """Sample graphs evenly from the trajectories that have nodes of all these roles.
 
-        The list is empty in two cases: the sample of the whole split already has enough such trajectories, or either all or none of the trajectories have these
-        roles.
+        The list is empty in two cases: the sample of the whole split already has enough windows of such trajectories, or either all or none of the trajectories
+        have these roles.
         """
         has = np.array([roles <= own for own in self._roles])
         if has.all() or not has.any():
@@ -150,7 +150,11 @@ class TrajectoryDataModule(L.LightningDataModule):
         return [self.train_set[int(windows[k])] for k in _spread(len(windows), enough)]
 
     def _touching_graphs(self, relation: EdgeType, known: list[HeteroData]) -> list[HeteroData]:
-        """Return graphs with edges of a relation. If few of the ``known`` graphs have such edges, random windows are searched for more."""
+        """Return the graphs for the statistics of a relation.
+
+        These are the ``known`` graphs if enough of them have such edges. Otherwise random windows are searched for graphs with such edges. They replace the
+        known graphs if they are more than the known graphs with such edges.
+        """
         num_known = sum(graph[relation].edge_index.shape[1] > 0 for graph in known)
         if num_known >= max(1, round(FEW_CONTACTS * self.num_statistics_windows)):
             return known
@@ -166,7 +170,7 @@ class TrajectoryDataModule(L.LightningDataModule):
 
     @cached_property
     def _roles(self) -> list[frozenset[str]]:
-        """Roles of nodes that occur in each training trajectory."""
+        """Roles of nodes (``schema.role``) that occur in each training trajectory."""
         found = []
         for stored in self.train_set.trajectories:
             first = stored.window(0, 1)
@@ -195,7 +199,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         return united(map(_scene, self.train_set.trajectories))
 
     def val_trajectories(self, count: int) -> list[Trajectory]:
-        """Read the first ``count`` trajectories of the ``val`` split that are long enough."""
+        """Read the first ``count`` trajectories of the ``val`` split that are valid and long enough; see ``long_enough``."""
         return list(islice(long_enough(self.root, "val", self.builder.config.history), count))
 
     def train_dataloader(self) -> DataLoader:

@@ -55,11 +55,12 @@ Key = int | tuple[int, int] | StartKey
 """The number of a window, or sample number and window, or the key of a push-forward sample."""
 
 CACHE_BYTES = 2 * 1024**3
-"""Splits smaller than this are cached in memory. Larger splits are read from disk window by window. Also the maximum memory for cached graphs [bytes]."""
+"""Splits are cached in memory if twice the size of their files, which are compressed, is at most this [bytes]. Larger splits are read from disk window by
+window. It is also the maximum memory for cached graphs."""
 
 
 MIRROR_STREAM = 1
-"""Part of the seed by which windows are mirrored, so that it is not the randomness of their noise."""
+"""Part of the seed by which windows are mirrored. It makes mirroring independent of the noise."""
 
 MAX_DAMAGED = 0.2
 """Maximum fraction of a split's trajectories that may be left out. One trajectory may always be left out."""
@@ -90,7 +91,7 @@ class StoredTrajectory:
         """Return the frames ``start:stop``.
 
         Raises:
-            StoreError: the trajectory cannot be read, or has values that nothing can be learned from.
+            StoreError: the trajectory cannot be read, or has invalid values.
         """
         if self.cached is not None:
             return self.cached.frames(start, stop)
@@ -102,7 +103,11 @@ class StoredTrajectory:
 
 
 def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> list[StoredTrajectory]:
-    """Index all trajectories of a split, and cache them in memory if the split is small enough."""
+    """Index all trajectories of a split, and cache them in memory if the split is small enough.
+
+    Raises:
+        StoreError: the split has no trajectories, or a shard is damaged. Invalid values are not an error here; ``usable`` reports them.
+    """
     paths = shards(root, split)
     fits = 2 * sum(p.stat().st_size for p in paths) <= cache_bytes
     stored = []
@@ -115,6 +120,8 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
                 with suppress(UnsoundError):  # ``usable`` reports it
                     cached = _read_only(read_trajectory(path, name, verify=True))
             stored.append(StoredTrajectory(path, name, num_frames, num_nodes, cached))
+    if not stored:
+        raise StoreError(f"{paths[0].parent}: its shards hold no trajectories; generate or import the data again")
     return stored
 
 
@@ -169,7 +176,7 @@ def usable(trajectories: list[StoredTrajectory]) -> list[StoredTrajectory]:
 
 
 def damage(trajectory: Trajectory) -> str | None:
-    """Say why nothing can be learned from a trajectory whose values are valid, with frame and node. None means that it can be used."""
+    """Return why nothing can be learned from a trajectory whose values are valid, with frame and node if there is one. None means that it can be used."""
     pos, metadata = trajectory.pos, trajectory.metadata
     if trajectory.num_nodes == 0:
         return "it has no nodes"
@@ -186,7 +193,7 @@ def damage(trajectory: Trajectory) -> str | None:
 
 
 def _jump(trajectory: Trajectory) -> str | None:
-    """Describe the first node that moves farther than ``MAX_JUMP`` radii between two frames, but hardly moves before or after them.
+    """Describe the first node that moves farther than ``MAX_JUMP`` radii between two frames, but hardly moves before or after them; None if there is none.
 
     A node that is really fast is fast for several frames. A single corrupt frame would give the largest acceleration of the data set and distort its scale.
     """
@@ -221,11 +228,12 @@ class Start:
     Attributes:
         state: initial state with noise, as float64 tensors.
         truth: true positions [num_steps + 2, node, dim] in m of the frames from the state's on.
-        stress: true Cauchy stress [num_steps + 1, node, component] in Pa of the frames after the state's; None if the data set was made without ``stress``.
+        stress: true Cauchy stress [num_steps + 1, node, component] in Pa of the frames after the state's; None if the trajectory has none, or if the
+            ``WindowDataset`` leaves it out.
         position_correction: fraction of the deviation from the true position that the target removes within one step; see ``Noise``.
-        velocity_correction: fraction of the deviation from the true velocity that the target removes within one step, after the unroll; as in the key.
+        velocity_correction: fraction of the deviation from the true velocity that the target removes within one step, after the unroll; as in ``StartKey``.
         about: numbers of trajectory and frame, and the weight in the loss if there is one.
-        sample, lane: as in the key.
+        sample, lane: as in ``StartKey``.
         solver_targets: the targets of the solver, which replace the corrections; None without them.
     """
 
@@ -252,8 +260,9 @@ class Start:
     def graph(self, builder: GraphBuilder, state: State, step: int) -> HeteroData:
         """Create the training graph of the state that the model has reached after ``step`` steps.
 
-        The target velocity is the next true velocity, plus the part of the velocity's deviation that remains, minus the part of the position's deviation that
-        is removed. With ``solver_targets``, the target is the solver's step from the state instead, unless the solver refuses the state.
+        The target velocity is the next true velocity, plus the part of the velocity's deviation that remains, minus the removed part of the position's
+        deviation per frame interval. At step 0 the velocity's deviation is noise, of which nothing remains. With ``solver_targets``, the target is that of
+        ``SolverTargets.target`` instead, unless the solver refuses the state.
         """
         if self.solver_targets is not None and (found := self.solver_targets.target(state, step)) is not None:
             acceleration, stress = found
@@ -319,7 +328,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         velocity_unit: root mean square acceleration × frame interval [m/s], the unit of velocity noise.
         seed: seed of the noise.
         solver: gives the targets of noisy and unrolled states; None takes those that lead back to the trajectory.
-        mirror: take the mirror image of a random half of the windows, along each axis without gravity.
+        mirror: mirror each window at random. Every axis without gravity is mirrored with probability 1/2, independently of the others.
         stress: also give the Cauchy stress at t+1 of materials that have one, as ``stress_target`` [node, component] in Pa.
 
     Attributes:
@@ -327,7 +336,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
             divided by this one.
 
     Raises:
-        StoreError: no trajectory is long enough, or a window has values that nothing can be learned from.
+        StoreError: no trajectory is long enough. Reading a window raises it if the trajectory cannot be read, or has invalid values.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
 """Groups of nodes in free flight. They touch nothing, so their acceleration should equal the gravity of the data.
 
 A group is an island: a connected component of the graph. It is in free flight if no boundary node lies within the connectivity radius of its nodes, neither in
-this frame nor in the frame before. In the frame before, its nodes may belong to several islands. The graph of such a group contains no cause of any
-acceleration except gravity.
+this frame nor in the frame before. In the frame before, its nodes may belong to several islands, but these islands have no other nodes. The graph of such a
+group contains no cause of any acceleration except gravity.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class FreeFlight:
 
     Attributes:
         num_islands: number of groups in all examined frames, free or not.
-        acceleration: mean acceleration of each free group [group, dim] in m/s², from second differences of the positions that models learn from.
+        acceleration: mass-weighted mean acceleration of each free group [group, dim] in m/s², from second differences of positions.
         gravity: gravity of the group's trajectory [group, dim] in m/s².
         resolution: uncertainty of ``acceleration`` due to rounding of positions [group] in m/s².
         scale: rms acceleration of all nodes in the group's frame [group] in m/s².
@@ -93,17 +93,17 @@ def joined(flights: Iterable[FreeFlight], dim: int) -> FreeFlight:
 
 
 def nothing(dim: int) -> FreeFlight:
-    """Return an object without groups."""
+    """Return a ``FreeFlight`` without groups."""
     return FreeFlight(0, np.empty((0, dim)), np.empty((0, dim)), np.empty(0), np.empty(0))
 
 
 def free_flights(metadata: Metadata, arrays: dict[str, np.ndarray], most_frames: int = MOST_FRAMES) -> Iterator[FreeFlight]:
-    """Find the free groups of a trajectory, frame by frame.
+    """Yield the free groups of a trajectory, frame by frame.
 
     Args:
         metadata: metadata of the trajectory.
         arrays: arrays by their names in ``schema.FIELDS``: ``pos``, ``mass``, ``boundary_pos`` and, for meshes, ``cells``.
-        most_frames: maximum number of frames that are examined.
+        most_frames: maximum number of frames that are examined, evenly spread.
     """
     pos, mass = arrays["pos"].astype(np.float64), arrays["mass"].astype(np.float64)
     gravity, dt, radius = np.asarray(metadata.gravity), metadata.frame_dt, metadata.connectivity_radius
@@ -131,7 +131,10 @@ def free_flights(metadata: Metadata, arrays: dict[str, np.ndarray], most_frames:
 
 
 def _independent(label: np.ndarray, pos: np.ndarray, count: int) -> np.ndarray:
-    """Number of different coordinates in each island [island], the minimum over axes. Equal coordinates, as in rows of a lattice, are rounded alike."""
+    """Return the number of different coordinates in each island [island], the minimum over axes.
+
+    Equal coordinates, as in rows of a lattice, are rounded alike, so their errors are not independent.
+    """
     different = []
     for x in pos.T:
         order = np.lexsort((x, label))

@@ -47,7 +47,7 @@ CONTACT_SHEET_FILE = "contact_sheet.png"
 SHEET_ROWS = 5
 
 SCENES_LOOKED_AT = 8
-"""Number of scenes that are checked for meshes that are too thin, because bodies of one data set differ."""
+"""Number of training scenes whose meshes are checked for thin parts. Bodies of one data set differ, so one scene is not enough."""
 
 ROUNDING_REFUSED = 0.5
 """Maximum rounding error of accelerations due to stored positions, as a fraction of the accelerations. Above ``ROUNDING_FRACTION`` a warning is logged."""
@@ -138,7 +138,7 @@ class Plan:
 
     @property
     def fits(self) -> bool:
-        """Whether the disk has enough free space."""
+        """Whether the missing shards take at most 95 % of the free space."""
         return self.bytes_needed <= 0.95 * self.bytes_free
 
 
@@ -235,7 +235,7 @@ def check_rounding(spec: DatasetSpec) -> None:
 
     Positions are stored in single precision. The error of an acceleration due to rounding grows with the inverse square of the frame interval.
 
-    If the bounds of the domain alone do not show that rounding is small, a training trajectory is simulated and measured.
+    If the error at the bounds of the domain is not small compared with gravity, the accelerations of a simulated training trajectory are measured.
 
     Raises:
         GenerationError: rounding of float32 positions is more than a fraction ``ROUNDING_REFUSED`` of the accelerations, or the trajectory failed.
@@ -272,7 +272,7 @@ def generate(
         The folder of the data set, ``root/name/size``.
 
     Raises:
-        GenerationError: the folder holds a data set of another spec, the disk is too small, or a trajectory failed.
+        GenerationError: the folder holds a data set of another spec, the disk is too small, rounding is too large (``check_rounding``), or a trajectory failed.
         WorkerError: a process died.
         FolderError: the folder cannot be created or written.
     """

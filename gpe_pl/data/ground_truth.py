@@ -103,7 +103,11 @@ class ParameterValues(ValueGroups):
     further: dict[str, ValueGroups] = field(default_factory=dict)
 
     def of(self, material: str) -> Iterator[tuple[MaterialParameter, str, ValueGroups]]:
-        """Yield each stored parameter in schema order, with the key of its values below that of the material, and its values."""
+        """Yield each stored parameter in schema order, the end of its configuration key after the material's (empty for the first parameter), and its values.
+
+        Raises:
+            ValueError: ``further`` names a parameter that the material does not have.
+        """
         values = parameters_by_name(material, {MATERIALS[material][0].name: self, **self.further})
         for parameter in MATERIALS[material]:
             if parameter.name in values:
@@ -213,7 +217,7 @@ class DatasetSpec:
 
 
 def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:
-    """Seed of one scene, which differs for every seed of the data set, split and index."""
+    """Return the seed of one scene, which differs for every seed of the data set, split and index."""
     words = np.random.SeedSequence((spec.seed, SPLITS.index(split), index)).generate_state(2, np.uint32)
     return int(words[0]) << 32 | int(words[1])
 
@@ -280,7 +284,7 @@ def initial_state(spec: DatasetSpec, split: str, index: int, values: Mapping[str
     """Sample the initial state of one trajectory, optionally with other parameter values: a number for one parameter, several by name.
 
     Raises:
-        GenerationError: the scene is impossible.
+        GenerationError: the scene is impossible, or ``values`` are not those of all stored parameters.
     """
     seed = scene_seed(spec, split, index)
     try:
@@ -297,7 +301,7 @@ def generate_trajectory(
     Values are a number for a material with one stored parameter, otherwise parameters by name.
 
     Raises:
-        GenerationError: the scene is impossible, or the simulation stopped early.
+        GenerationError: the scene is impossible, ``values`` are not those of all stored parameters, or the simulation stopped early.
     """
     metadata = trajectory_metadata(spec, split, index)
     label = f"split {split}, index {index}, seed {metadata.seed}"

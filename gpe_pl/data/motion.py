@@ -23,14 +23,15 @@ Precision = type[np.float16] | type[np.float32] | type[np.float64]
 PRECISIONS: tuple[Precision, ...] = (np.float16, np.float32, np.float64)
 
 ROUNDING_FRACTION = 0.1
-"""Largest acceptable rounding error of accelerations, as a fraction of the accelerations. It is a hundredth of their variance, which no model can learn."""
+"""Largest acceptable rounding error of accelerations, as a fraction of the accelerations. At this limit, a hundredth of their variance is rounding, which no
+model can learn."""
 
 
 ENOUGH_CHANGES = 100
 """Number of velocity changes that distinguish marks from chance."""
 
 CHANGES_PER_WINDOW = 20_000
-"""Number of velocity changes that are sampled from each part of the frames, at most."""
+"""Maximum number of velocity changes that are sampled from each part of the frames."""
 
 OFF_MARK = 0.1
 """Tolerance for second differences of positions to be multiples of the marks' distance, as a fraction of it. Floating-point rounding makes it necessary."""
@@ -63,7 +64,7 @@ def rounding_fault(rounding: float, acceleration: float, where: str = "in float3
 
 
 def marks(changes: np.ndarray, rounding: float) -> float:
-    """Return the distance of the marks [m] of which coordinates are multiples; 0 if there are none, or if they are only those of floating-point numbers.
+    """Return the distance of marks [m], of which coordinates are multiples; 0 if there are none coarser than floating-point numbers.
 
     Second differences of coordinates on marks are multiples of the marks' distance and have both signs. Rounding has no direction, unlike gravity.
 
@@ -88,8 +89,8 @@ class MotionSummary:
         low, high: smallest and largest positions [dim] in m.
         frame_dt: time between frames [s].
         precision: coarsest floating-point type that represents all positions exactly, independent of the array's type.
-        marks: distance of the marks of which positions are multiples [dim] in m; 0 if there are none coarser than ``precision``.
-        acceleration: rms acceleration without gravity [m/s²].
+        marks: distance of marks [dim] in m, of which positions are multiples; 0 if there are none coarser than ``precision``.
+        acceleration: rms per component of accelerations without gravity [m/s²].
         mean_acceleration: mean acceleration without gravity [dim] in m/s².
         step: largest displacement of a node between two frames [m].
         frame: frame in which this displacement ends.
@@ -163,10 +164,10 @@ def motion_of(m: Metadata, pos: np.ndarray) -> MotionSummary:
 
 
 def better_origin(motions: list[MotionSummary], tolerance: float) -> np.ndarray:
-    """Choose the origin [dim] in m that stored positions need so that float32 rounds accelerations by at most ``tolerance`` [m/s²].
+    """Choose an origin [dim] in m of stored positions at which float32 rounds accelerations less.
 
-    The origin is 0 unless some positions are finer than float32 and the rounding error at the present origin exceeds the tolerance. It then is a round number
-    near the middle of all positions, along the axes where that halves the largest coordinate.
+    The origin is 0 unless the positions of a trajectory are finer than float32 and their rounding error exceeds ``tolerance`` [m/s²] along an axis where a
+    new origin helps. It is then a round number near the middle of all positions along every axis where that more than halves the largest coordinate.
     """
     low, high = np.min([m.low for m in motions], axis=0), np.max([m.high for m in motions], axis=0)
     nowhere, digits = np.zeros(len(low)), -math.ceil(math.log10((high - low).max()))

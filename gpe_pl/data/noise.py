@@ -6,6 +6,8 @@ the noisy window by the formulas of the integrator.
 - Position noise: the same offset on every position, including the target's (paper, section 3.2). It does not change velocities and target.
 - Velocity noise: a random walk over the H velocities, integrated to positions. The next velocity is the true one. The target therefore removes all of the
   velocity noise, but none of the position noise that follows from it [Sanchez-Gonzalez et al. 2020, as in their published code].
+
+With ``Noise.correction``, the target also removes that fraction of the noise on the last position.
 """
 
 from dataclasses import dataclass

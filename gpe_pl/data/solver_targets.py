@@ -26,8 +26,8 @@ from gpe_pl.trajectory.trajectory import Trajectory
 class SolverTargets:
     """A solver with the stretch of a true trajectory from which an unroll deviates.
 
-    A learned simulator knows the mean velocity of the frame before; a solver needs the velocity at the frame. The deviating state gets the true velocity at the
-    frame plus the deviation of the mean velocity.
+    A learned simulator knows the mean velocity since the frame before; a solver needs the velocity at the frame. The deviating state gets the true velocity at
+    the frame plus the deviation of the mean velocity.
 
     Attributes:
         solver: solver of the data set.
@@ -60,7 +60,7 @@ class SolverTargets:
 
         Args:
             state: state that the unroll has reached, as torch tensors.
-            step: number of its steps.
+            step: number of steps of the unroll so far.
         """
         where, dt = state.periodicity, self.frame_dt
         pos, mean = self.reflection.point(state.pos.cpu().numpy()), self.reflection.vector(state.vel.cpu().numpy())

@@ -67,8 +67,8 @@ def _scaled(trajectory: Trajectory) -> np.ndarray:
 def combined(moments: list[dict[str, Any]]) -> dict[str, Any]:
     """Combine the sums of shards into statistics.
 
-    The statistics are the root mean squares per component of velocities [m/s] and accelerations [m/s²], and the mean and standard deviation of each material
-    parameter on its scale in ``schema``.
+    The statistics are the root mean squares per component of velocities [m/s] and accelerations without gravity [m/s²], the mean and standard deviation of each
+    material parameter on its scale in ``schema``, and the numbers of trajectories, frames and nodes.
     """
     rms = {}
     for key in ("velocity", "acceleration"):

@@ -53,7 +53,14 @@ SAME_IN_A_DATASET = ("dataset", "materials", "param_names", "frame_dt", "spacing
 
 @dataclass(frozen=True)
 class Violation:
-    """A violated rule. ``trajectory`` and ``field`` are empty if it concerns the whole file."""
+    """A violated rule.
+
+    Attributes:
+        path: shard, or folder without shards.
+        trajectory: name of the trajectory in the shard; empty if the violation concerns the whole shard or folder.
+        field: field or attribute; empty if the violation concerns several, or if the message names it.
+        message: what is wrong.
+    """
 
     path: Path
     trajectory: str
@@ -67,7 +74,18 @@ class Violation:
 
 @dataclass
 class Group:
-    """Summary of the valid trajectories of one data set and split."""
+    """Summary of the valid trajectories of one data set and split.
+
+    Attributes:
+        metadata: metadata of the first trajectory.
+        frames, nodes: numbers of frames and of nodes of each trajectory.
+        max_speed: largest speed [m/s].
+        low, high: smallest and largest positions [dim] in m.
+        params: values of each material parameter that occur.
+        flights: groups in free flight of each trajectory.
+        squared_accelerations: mean square acceleration without gravity [m²/s⁴] of each trajectory, and the number of its values.
+        rounding: largest rounding error of accelerations [m/s²], and how positions are rounded there.
+    """
 
     metadata: Metadata
     frames: list[int] = field(default_factory=list)
@@ -223,7 +241,7 @@ def _check_trajectory(group: h5py.Group, path: Path) -> tuple[Metadata, dict[str
     """Check one trajectory, and return its metadata, readable arrays, digest and findings.
 
     Raises:
-        StoreError: the metadata cannot be read.
+        StoreError: the metadata or another attribute cannot be read.
     """
     metadata = metadata_of(group)
     findings = list(_check_metadata(metadata, path))
@@ -311,7 +329,7 @@ def _check_motion(m: Metadata, arrays: dict[str, np.ndarray]) -> Iterator[Findin
 
 
 def _check_shapes(m: Metadata, arrays: dict[str, np.ndarray], shapes: tuple[Shape, ...], sound: bool) -> Iterator[Finding]:
-    """Check the shapes of walls and obstacles. If positions are ``sound``, also check that boundary nodes lie on the shapes."""
+    """Check the shapes of walls and obstacles. If positions are ``sound`` and not imported, also check that boundary nodes lie on the shapes."""
     pos = arrays["boundary_pos"]
     if (wrong := shapes_fault(shapes, m.periodicity)) is not None:
         yield "shapes", wrong

@@ -41,7 +41,7 @@ VERSION = "1"
 """Version of the conversion, stored as ``solver_version``."""
 TRAJECTORIES_PER_SHARD = 8
 NUM_SAMPLED = 8
-"""Number of training trajectories from which spacing and neighbours are measured."""
+"""Number of trajectories from which spacing, neighbours and free flight are measured. Training trajectories come first."""
 FLIGHT_FRAMES = 25
 """Number of frames of each sampled trajectory in which groups in free flight are searched for."""
 ENOUGH_GROUPS = 20
@@ -75,7 +75,8 @@ def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Prog
         contact_sheet: draw the contact sheet before the data set appears; see ``draw_contact_sheet``.
 
     Raises:
-        ImportFailure: the source cannot be read, no training trajectory can be used, the disk is too small, or the data set exists already.
+        ImportFailure: the source cannot be read, no trajectory of a split can be used, nothing accelerates other than by gravity, the disk is too small, or the
+            data set exists already.
     """
     path = Path(settings.source).expanduser()
     name = settings.name or path.name.partition(".")[0]
@@ -97,6 +98,8 @@ def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Prog
 def save_dataset(root: Path | str, name: str, holdout: float = 0.1, **splits: Iterable[Trajectory]) -> Report:
     """Write your own trajectories to ``{root}/{name}/imported``. ``python -m gpe_pl.fit data=imported data.name={name}`` trains on them.
 
+    Trajectories that cannot be used are left out. ``Report.refusals`` lists them.
+
     Args:
         root: folder of all data sets; ``data`` unless the command gets another ``paths.data``.
         name: name of the data set.
@@ -105,7 +108,8 @@ def save_dataset(root: Path | str, name: str, holdout: float = 0.1, **splits: It
             sequence that creates trajectories on request is never in memory as a whole. Other iterables are converted to lists first.
 
     Raises:
-        ImportFailure: there is nothing to train on, an item is not a trajectory, or the data set exists already.
+        ImportFailure: there is nothing to train on, no trajectory of a split can be used, an item is not a trajectory, the disk is too small, or the data set
+            exists already.
     """
     for split, trajectories in splits.items():
         if isinstance(trajectories, Trajectory):
@@ -370,7 +374,10 @@ class _Conversion:
             )
 
     def _compare_gravity(self, dim: int) -> None:
-        """Compare gravity with the acceleration of groups in free flight. If gravity is only assumed, the measured one replaces it."""
+        """Compare gravity with the acceleration of groups in free flight.
+
+        If gravity is only assumed, and at least ``ENOUGH_GROUPS`` groups agree on another acceleration, that acceleration replaces it.
+        """
         report, flights, usual = self.report, self.survey.flights, self.facts.usual_gravity
         if any(self.survey.assumes_gravity) and usual is not None:
             known = f"gravity is not in the source; {vector(usual[:dim])} is the format's usual one"
@@ -407,7 +414,7 @@ class _Conversion:
             )
 
     def _compare_with_rounding(self) -> None:
-        """Choose the origin at which float32 is precise enough, and warn of trajectories whose rounding error is still large."""
+        """Choose the origin of stored positions (``better_origin``), and warn of trajectories whose rounding error is still large."""
         report, suspects, motions = self.report, self.survey.suspects, self.survey.motions
         typical = float(np.median([motion.acceleration for _, _, motion in motions]))
         nowhere = np.zeros_like(motions[0][2].low)
@@ -476,7 +483,7 @@ class _Conversion:
             raise ImportFailure(f"{self.report.source}: no trajectory of {split} can be used: {self.report.refusals[-1]}")
 
     def _unified(self, trajectory: Trajectory, split: str) -> Trajectory:
-        """Give a trajectory the origin, metadata and material columns of the whole data set."""
+        """Give a trajectory the origin, metadata and material columns of the whole data set; raises ``Refusal`` if it lacks a parameter."""
         if self.origin.any():
             trajectory = trajectory.seen_from(self.origin)
         facts, m = self.facts, trajectory.metadata
@@ -500,7 +507,7 @@ class _Conversion:
         return replace(trajectory, metadata=metadata, material_params=columns)
 
     def _parameter_group(self, columns: np.ndarray, names: tuple[str, ...]) -> ParameterGroup:
-        """Return whether parameters of ``test_unseen`` lie inside or outside the range of the training values."""
+        """Return ``extrapolated`` if a parameter in ``test_unseen`` lies outside the range of its training values, else ``interpolated``."""
         for column, name in zip(columns.T, names, strict=True):
             low, high = self.trained.get(name, (np.inf, -np.inf))
             if (column < low).any() or (column > high).any():
@@ -529,7 +536,7 @@ class _Conversion:
                     report.warnings += [warning] if warning not in report.warnings else []
 
     def _summarize(self, folder: Path) -> None:
-        """Write statistics of the training trajectories, and report their neighbours and motion."""
+        """Write statistics of the training trajectories (without any, of the first split), and report their neighbours and motion."""
         split = "train" if "train" in self.survey.good else next(iter(self.survey.good))
         shards = sorted((folder / split).glob("shard-*.h5"))
         statistics = combined([shard_moments(path)[1] for path in shards])
@@ -565,7 +572,7 @@ def _united(span: tuple[float, float] | None, values: np.ndarray) -> tuple[float
 
 
 def _faults(m: Metadata, arrays: Mapping[str, np.ndarray]) -> Iterator[str]:
-    """Yield the reasons why the store would refuse to read a trajectory."""
+    """Yield the reasons why the store would refuse the metadata or arrays of a trajectory."""
     yield from (f"{key} {violation}" for key, violation in m.violations())
     yield from size_conflicts(arrays, m.dim, len(m.param_names))
     yield from map(str, faults(arrays, NODE_TYPES, m.materials, m.param_names))

@@ -8,7 +8,7 @@
 - ``.h5``: a group per trajectory with ``positions``, ``particle_type`` and ``material_property``.
 
 ``metadata.json`` has ``bounds``, ``dt``, ``default_connectivity_radius``, ``dim`` and ``sequence_length``, which is the number of frames, or one less. The
-number of frames is taken from the positions. Statistics such as ``vel_mean`` are per frame and not used; the project computes its own from the train split.
+number of frames is taken from the positions. Statistics such as ``vel_mean`` are per frame and not used; gpe_pl computes its own from the train split.
 
 Types are 0 rigid, 3 boundary, 5 water, 6 sand and 7 goop, which is plastic and becomes ``snow``. Bounds are walls. The property of sand is tan φ.
 Gravity is not in these files.

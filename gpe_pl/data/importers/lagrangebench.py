@@ -4,8 +4,9 @@
 [frame, node, dim]) and ``particle_type`` ([node]; −1 padding, 0 fluid, 1 solid wall, 2 moving wall, 3 rigid body). The time between frames is
 ``dt × write_every``. Lengths are in units of the case. The reference density is 1, so ``viscosity`` is kinematic.
 
-A moving wall slides steadily along a periodic axis. It is stored at its first position, with its velocity. A file ``force.py`` in the folder is code and is
-never run. The force of a dam break is gravity. Other forces, which ``g_ext_magnitude`` announces, depend on the place; models have to learn them.
+Moving walls slide steadily along a periodic axis. They are stored at their first position, with their velocity. A file ``force.py`` in the folder is code and
+is never run. The force of a dam break is gravity. Other forces, whose magnitude is ``g_ext_magnitude``, depend on the place and are not stored. Models without
+absolute positions cannot learn them.
 
 Source: Toshev et al. 2023, and the layout that github.com/tumaer/lagrangebench writes.
 """

@@ -4,7 +4,7 @@
 bytes) or ``.h5`` (a group per trajectory with a data set per field). ``meta.json`` gives ``field_names``, ``trajectory_length``, ``dt``, and for each of the
 ``features`` its ``type`` (``static`` has one frame, ``dynamic`` all frames, ``dynamic_varlen`` a varying number of nodes), ``dtype`` and ``shape``. The
 importer reads ``world_pos`` [frame, node, 3], ``mesh_pos`` [1, node, 2 or 3], ``cells`` [1, cell, corner] and ``node_type`` [1, node, 1]. Cells of four corners
-are quadrilaterals if ``mesh_pos`` lies in a plane, else tetrahedra.
+are quadrilaterals if ``mesh_pos`` has only two components, or lies in a plane normal to an axis. Otherwise they are tetrahedra.
 
 Types are 0 normal, 1 obstacle, 3 handle and 6 wall. Normal nodes become an ``elastomer``. The others become boundary nodes, still or moving as in the source.
 Cells with boundary nodes are left out; the connectivity radius connects a handle to its cloth. Data without ``world_pos`` (``cylinder_flow``, ``airfoil``) are

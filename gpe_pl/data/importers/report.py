@@ -59,16 +59,16 @@ class Report:
         folder: folder of the data set.
         dim: space dimension.
         frame_dt, periodic, spacing, connectivity_radius: stored values.
-        bounds: lowest and highest coordinate per axis over all trajectories [m].
+        bounds: lowest and highest bound per axis over all trajectories [m].
         gravity: smallest and largest value per axis over all trajectories [m/s²].
         materials: by material, its number of ``nodes``, and ``parameters``, the smallest and largest value of each by name.
         splits: counts by split.
         neighbours: number of dynamic neighbours of a dynamic node within the radius (``mean``, ``min``, ``max``), and mean number of ``boundary``
-            neighbours; in some frames of the first ``NUM_SAMPLED`` trajectories.
+            neighbours; in some frames of the first ``assemble.NUM_SAMPLED`` trajectories.
         velocity_std, acceleration_std: rms per component in the train split [m/s, m/s²], the latter without gravity. Without a train split, these and what
             follows from samples describe the first split.
-        max_speed, mean_acceleration: largest speed [m/s], and mean acceleration with gravity per axis [m/s²], of the first ``NUM_SAMPLED`` trajectories. In
-            free fall the acceleration is gravity.
+        max_speed, mean_acceleration: largest speed [m/s], and mean acceleration with gravity per axis [m/s²], of the same trajectories. In free fall the
+            acceleration is gravity.
         free_groups: number of groups of nodes in free flight, over the examined frames.
         free_acceleration: median acceleration of these groups per axis [m/s²]; empty if there are none.
         step_in_spacings: displacement in one frame at ``max_speed``, in spacings.

@@ -18,8 +18,8 @@ FRAMES_SAMPLED = 3
 def degrees_of(trajectory: Trajectory) -> Iterator[tuple[Int64[np.ndarray, " node"], Int64[np.ndarray, " node"]]]:
     """Yield two arrays for each of some frames: the number of dynamic neighbours and of boundary neighbours of each dynamic node [node]."""
     m, count = trajectory.metadata, trajectory.num_nodes
-    walls = np.ascontiguousarray(trajectory.boundary.pos, dtype=np.float64)
-    for frame in np.unique(np.linspace(0, trajectory.num_frames - 1, FRAMES_SAMPLED).astype(int)):
+    for frame in np.unique(np.linspace(0, trajectory.num_frames - 1, FRAMES_SAMPLED).astype(int)).tolist():
+        walls = np.ascontiguousarray(trajectory.boundary.at(frame).pos, dtype=np.float64)
         pos = trajectory.pos[frame].astype(np.float64)
         pairs = radius_pairs(pos, m.connectivity_radius, m.periodicity)
         touching = radius_between(walls, pos, m.connectivity_radius, m.periodicity)[1]

@@ -41,7 +41,7 @@ STILL = 1e-2
 """Boundary nodes are still, or slide steadily, if they never deviate from this motion by more than this fraction of the spacing."""
 
 WIDEST = 1.05
-"""Largest extent of the nodes in a first frame, in periods."""
+"""A warning is given if the nodes of the first frame extend over more than this number of periods."""
 
 MAX_JSON_BYTES = 2**24
 MAX_TRAJECTORIES = 100_000
@@ -76,7 +76,7 @@ class ImportSettings:
         connectivity_radius: radius of the edges between nodes [m].
         walls: friction of walls at the bounds, by side (``x_low``, ``x_high``, …); ``{}`` for no walls.
         materials: material, or ``boundary``, of node types of the source, by their number. Other types keep the material of the format.
-        parameters: parameters of materials for which the source has none: a number for the first parameter of a material, several by name.
+        parameters: parameters by material: a number for the first one, or several by name. Values that a trajectory of the source has itself override them.
         max_trajectories: maximum number of trajectories per split, from its start.
         holdout: fraction of the training trajectories that becomes each of ``val`` and ``test`` if the source has none, at least one trajectory; 0 for none.
         allow_pickle: read object arrays, which can run code. Use it only for files that you trust.
@@ -124,7 +124,7 @@ class Facts:
         spacing: rest spacing of neighbours [m].
         connectivity_radius: radius of the edges between nodes [m].
         walls: friction of walls at the bounds, by side.
-        parameters: parameters of each material of which all nodes have the same value: of the first one, or by name.
+        parameters: parameters by material that are the same in all trajectories: a number for the first one, or several by name.
         usual_gravity: usual gravity of the format per axis [m/s²]. It is used if neither the source nor a setting states one, unless groups of nodes in free
             flight show another one.
         notes: assumptions and omissions that concern the whole data set, one sentence each.
@@ -221,7 +221,7 @@ class Nodes:
         vel: velocities [frame, node, dim] in m/s, if the source has them.
         mass: mass of each node [node], or of all, in kg.
         gravity: gravity [dim] in m/s², if the source has it per trajectory.
-        parameters: parameters of each material, per node [node] or for all nodes: the first one, or by name.
+        parameters: parameters by material: values of the first one, or several by name. A parameter has a value per node [node] or one for all.
         walls: positions and normals [boundary_node, dim] of additional boundary nodes.
         cells: cells of a mesh by kind [cell, corner].
         rest_pos: rest positions of a mesh [node, dim] in m.
@@ -245,12 +245,12 @@ class Nodes:
 
 
 def build(nodes: Nodes, facts: Facts) -> Loaded:
-    """Build a trajectory from a source's arrays. Boundary nodes are separated, and missing parameters and normals are assumed.
+    """Build a trajectory from a source's arrays. Boundary nodes are separated, missing parameters are assumed, and missing normals are estimated.
 
     Raises:
         ImportFailure: ``frame_dt`` is unknown.
-        Refusal: there are only boundary nodes, or the facts have another number of axes.
-        ArrayError: see ``Trajectory.from_numpy``.
+        Refusal: there are only boundary nodes, the facts have another number of axes, or cells are not indices of nodes.
+        ArrayError, PeriodicityError: see ``Trajectory.from_numpy``.
     """
     if facts.frame_dt is None:
         raise ImportFailure("frame_dt: the source does not say how much time passes between frames; pass frame_dt=… [s]")
@@ -502,7 +502,13 @@ def natural(name: str) -> tuple[Any, ...]:
 
 
 def split_files(path: Path, endings: Sequence[str]) -> dict[str, Path]:
-    """Find the files ``train``, ``valid`` and ``test`` with one of the endings in a folder, by split. A single file counts as training data."""
+    """Return the files ``train``, ``valid``, ``test`` … with one of the endings in a folder, by split (``SPLIT_NAMES``).
+
+    If ``path`` is a file, it belongs to the split of its name, or to ``train`` if its name is not that of a split.
+
+    Raises:
+        ImportFailure: there is no such file, or a split has two.
+    """
     if path.is_file():
         return {SPLIT_NAMES.get(path.name.partition(".")[0], "train"): path}
     there = [(split, path / f"{name}{ending}") for name, split in SPLIT_NAMES.items() for ending in endings]
@@ -514,7 +520,13 @@ def split_files(path: Path, endings: Sequence[str]) -> dict[str, Path]:
 
 
 def split_folders(path: Path) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Find the folders ``train``, ``valid``, ``test`` and ``test_unseen`` in a folder, by split; also returns a warning for each other folder."""
+    """Return the folders ``train``, ``valid``, ``test`` … in a folder, by split (``SPLIT_NAMES``), and a warning for each other folder.
+
+    Without any such folder there are no warnings.
+
+    Raises:
+        ImportFailure: a split has two folders.
+    """
     if not path.is_dir():
         return {}, ()
     folders = {entry.name: entry for entry in path.iterdir() if entry.is_dir() and not entry.name.startswith(".")}

@@ -208,7 +208,7 @@ class _Message:
 
 
 class Features(Mapping[str, Feature]):
-    """Features by name, decoded when they are looked up; a lookup raises ``Refusal`` on damaged data."""
+    """Features by name. A feature is decoded when it is looked up; that raises ``Refusal`` if its data are damaged."""
 
     def __init__(self, features: _Message) -> None:
         self._named = features.named()
@@ -224,7 +224,7 @@ class Features(Mapping[str, Feature]):
 
 
 class Frames:
-    """A feature per frame, decoded when it is looked up; a lookup raises ``Refusal`` on damaged data."""
+    """A feature per frame. It is decoded when it is looked up; that raises ``Refusal`` if its data are damaged."""
 
     def __init__(self, entries: _Message) -> None:
         self._data, self._rows = entries.data, entries.fields(1)

@@ -319,6 +319,12 @@ def test_what_was_changed_without_its_digest_is_not_learned_from(store: Path, ke
         list(long_enough(store, "train", 2))
 
 
+def test_a_split_whose_shards_are_empty_is_named(tmp_path: Path) -> None:
+    write_shard(tmp_path / "train" / "shard-00000.h5", [])
+    with pytest.raises(StoreError, match=r"train: its shards hold no trajectories; generate or import the data again"):
+        usable(open_split(tmp_path, "train"))
+
+
 def test_changed_metadata_are_other_data_though_no_array_is_read(store: Path) -> None:
     before = split_checksum(store, "train")
     edited(store, "metadata")

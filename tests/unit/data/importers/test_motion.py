@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from gpe_pl.data.importers import ImportFailure, ImportSettings, Report, import_dataset, save_dataset
+from gpe_pl.data.importers.sampled import degrees_of
 from gpe_pl.data.motion import motion_of
 from gpe_pl.data.validate import validate
 from gpe_pl.geometry.shapes import Shape, Sphere, domain_walls
@@ -228,3 +229,11 @@ def test_motion_of_few_values_lies_on_no_marks() -> None:
         for precision in (np.float32, np.float64):
             moved = pos.astype(precision)
             assert not motion_of(Trajectory.from_numpy(moved, DT, "sand", {"sand": 30.0}).metadata, moved).marks.any()
+
+
+def test_neighbours_of_a_moving_boundary_are_counted_where_it_is() -> None:
+    path = np.array([[[2.0, 0.0]], [[1.0, 0.0]], [[0.1, 0.0]]])  # comes to the first node
+    pos = np.array([[[0.0, 0.0], [0.5, 0.0]]] * 3)
+    boundary = Boundary.moving(path, [[-1.0, 0.0]], DT)
+    trajectory = Trajectory.from_numpy(pos, DT, "sand", {"sand": 30.0}, connectivity_radius=0.2, boundary=boundary)
+    assert [touching.tolist() for _, touching in degrees_of(trajectory)] == [[0, 0], [0, 0], [1, 0]]
