@@ -10,7 +10,7 @@ import warnings
 from types import TracebackType
 
 LONGEST = 4000
-"""Maximum length of a message [characters]. A name can have tens of thousands."""
+"""Longest message that is shown in full [characters]. A name can have tens of thousands."""
 
 
 def printable(text: str) -> str:
@@ -21,8 +21,8 @@ def printable(text: str) -> str:
 def one_line(text: str, longest: int = LONGEST) -> str:
     """Return a message as one line of printable text.
 
-    Line ends become spaces, and other characters that are not printable become escapes. The middle of a message with more than ``longest`` characters is
-    left out.
+    Line ends and tabs become spaces, empty lines are dropped, and other characters that are not printable become escapes. The middle of a message with more
+    than ``longest`` characters is left out.
     """
     if len(text) > longest:
         head, tail = text[: longest * 3 // 4], text[-(longest // 4) :]
@@ -31,7 +31,7 @@ def one_line(text: str, longest: int = LONGEST) -> str:
 
 
 def _decoded(text: str) -> str:
-    """Decode file names as UTF-8 where they are UTF-8 but Python has read them in another encoding."""
+    """Decode bytes of file names that Python could not decode: as UTF-8 where they are valid UTF-8, else as escapes."""
     try:
         return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
     except UnicodeEncodeError:  # the text is not a file name

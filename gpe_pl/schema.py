@@ -53,7 +53,7 @@ class MaterialParameter:
 
     @property
     def rule(self) -> str:
-        """Rule for stored values."""
+        """Rule for stored values, as text for messages."""
         return "positive and finite" if self.scale == "log" else "finite and not negative"
 
     def accepts(self, values: Any) -> Any:
@@ -159,7 +159,7 @@ def parameters_by_name(material: str, value: Any) -> dict[str, Any]:
     """Return the parameters of a material by name, in schema order; a value without a name is that of the first parameter.
 
     Raises:
-        ValueError: the material has no such parameter, or the first one is missing; names it.
+        ValueError: the material has no such parameter, or the first one is missing. The message names it.
     """
     first, *_ = own = [p.name for p in MATERIALS[material]]
     named = dict(value) if isinstance(value, Mapping) else {first: value}
@@ -288,7 +288,7 @@ class FeatureSpec:
         even_channels: number of edge channels per relation that do not change sign.
         stress_channels: number of components of the Cauchy stress, in the order of ``STRESS_COMPONENTS``, per material that has a stress.
         num_levels: number of levels of virtual nodes above meshes.
-        islands: whether graphs contain the groups of connected nodes, and which groups touch nothing.
+        islands: whether graphs contain the island of each node, and tell which islands do not touch the boundary.
     """
 
     dim: int

@@ -63,9 +63,9 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def unnamed(error: OSError, folders: Iterable[Path]) -> OSError | FullDiskError:
-    """Return an error of a full disk that names ``folders``, for an error that names no file. Other errors are returned unchanged.
+    """Return a ``FullDiskError`` for an error of missing room (``FULL``) that names no file. Other errors are returned unchanged.
 
-    Only the folders whose disks are full are named. If no disk is full, all folders are named.
+    The message names those of ``folders`` whose disks are full, or all of them if none is.
     """
     if error.errno is None or error.errno not in FULL or error.filename is not None:
         return error

@@ -12,7 +12,7 @@ MAX_DIGITS = 20
 
 
 def parsed(text: str | bytes) -> Any:
-    """Parse a JSON text.
+    """Parse a JSON text. ``NaN`` and ``Infinity`` are accepted as numbers.
 
     Raises:
         ValueError: the text is not JSON, is longer than ``MAX_CHARACTERS``, is nested deeper than ``MAX_DEPTH``, or has an integer of more than

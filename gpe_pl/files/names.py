@@ -28,7 +28,8 @@ def run_name(name: Any, key: str = "name") -> str:
     """Check and return the name of a run in the results folder; ``/`` separates folders, as in ``sweep/first``.
 
     Raises:
-        NameRefused: the name leads out of the results folder, or some operating system does not allow it.
+        NameRefused: the name is not text, or one of its parts is empty, begins with a dot, has more than ``MOST_BYTES``, or is not allowed on some operating
+            system.
     """
     faults = ["must be the name of a folder for the results"] if not isinstance(name, str) else map(_fault, name.split("/"))
     for fault in filter(None, faults):
@@ -40,7 +41,7 @@ def data_name(name: Any, key: str = "name") -> str:
     """Check and return the name of a data set: letters, digits, ``_``, ``-`` and ``.``, starting with a letter or digit.
 
     Raises:
-        NameRefused: the name breaks this rule, or some operating system does not allow it.
+        NameRefused: the name breaks this rule, has more than ``MOST_BYTES``, or is not allowed on some operating system.
     """
     try:
         return _plain(name)
@@ -82,7 +83,10 @@ def sweep_name(overrides: str) -> str:
 
 
 def portable(part: str) -> str:
-    """Encode each character of a path's part that Windows does not allow as ``~`` and two hexadecimal digits. Different parts stay different."""
+    """Return a part of a path as a name that Windows allows. Different parts stay different.
+
+    Forbidden characters, ``~``, a dot or space at the end and the first letter of a device name become ``~`` and two hexadecimal digits.
+    """
     text = "".join(_coded(letter) if letter in FORBIDDEN or letter == "~" else letter for letter in part)
     if text.endswith((".", " ")):
         text = f"{text[:-1]}{_coded(text[-1])}"

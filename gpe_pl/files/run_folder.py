@@ -34,8 +34,8 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
         results: file patterns. A folder without any such file is free, whatever its configuration.
 
     Raises:
-        RunError: the folder holds a run with another configuration (the message names up to three differing keys), or a link that leads out of it (the
-            message names the link).
+        RunError: the folder has results, but its configuration is another one (the message names up to three differing keys), missing or damaged; or the
+            folder contains a link that leads out of it (``refuse_links``).
     """
     config = without_tables(config)
     refuse_links(run_dir)
@@ -54,6 +54,8 @@ def claim(run_dir: Path, config: dict[str, Any], results: Sequence[str] = ("chec
 def refuse_links(run_dir: Path) -> None:
     """Check that no link in the folder of a run or data set leads out of it. Commands would write through such a link, and the folder may come from others.
 
+    Only the entries of the folder itself and of its ``.hydra`` are checked.
+
     Raises:
         RunError: a link leads out of the folder; the message names it.
     """
@@ -65,9 +67,9 @@ def refuse_links(run_dir: Path) -> None:
 
 @contextlib.contextmanager
 def without_orphans(folder: Path, description: str = CONFIG) -> Iterator[None]:
-    """At the end of the block, remove files that were written into a folder after somebody had deleted it. No command would continue from such files.
+    """At the end of the block, remove a folder that was created inside the block and has no description.
 
-    A folder is removed only if it is another one than at the beginning and has no description. Nothing else is lost then.
+    Such a folder appears when somebody deletes the folder of a running command and the command then writes another file. No command could continue from it.
 
     Args:
         folder: folder of a run or a data set.
@@ -104,7 +106,7 @@ def _identity(folder: Path) -> tuple[int, int] | None:
 
 
 def release(run_dir: Path) -> None:
-    """Delete a claimed folder if nothing was written to it."""
+    """Delete a claimed folder if it contains nothing but its configuration."""
     if [path.name for path in run_dir.iterdir()] == [CONFIG]:
         (run_dir / CONFIG).unlink()
         run_dir.rmdir()
@@ -131,6 +133,7 @@ def config_in(path: Path) -> dict[str, Any]:
 
     Raises:
         RunError: the file is damaged, or was changed after the run wrote it.
+        OSError: the file cannot be read.
     """
     try:
         return sealed.read(path, f"the run was made with other settings; delete the folder {path.parent} or choose another name=…")

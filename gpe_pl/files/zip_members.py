@@ -12,7 +12,7 @@ BYTES_SEARCHED = 2**27
 
 
 def num_members(path: Path) -> int:
-    """Count the directory entries in the last ``BYTES_SEARCHED`` bytes of a file.
+    """Count the directory entries in the last ``BYTES_SEARCHED`` bytes of a file. Content that happens to contain the signature counts too.
 
     Raises:
         OSError: the file cannot be read.

@@ -20,7 +20,7 @@ def _polar(radius: np.ndarray) -> Loop:
 
 
 def _rounded(corners: np.ndarray, radius: float) -> Loop:
-    """Replace the corners of a counter-clockwise polygon by arcs of a radius, or of the largest radius that the edges allow if that is smaller."""
+    """Replace the corners of a polygon by quadratic curves that are close to arcs of this radius, or of a smaller one where edges are short."""
     pieces = []
     for before, at, after in zip(np.roll(corners, 1, axis=0), corners, np.roll(corners, -1, axis=0), strict=True):
         a, b = before - at, after - at
@@ -114,7 +114,7 @@ OUTLINES: dict[str, Callable[[np.random.Generator], list[Loop]]] = {
 
 
 def random_outline(rng: np.random.Generator, family: str | None = None) -> list[Loop]:
-    """Create a body of unit area around the origin, of a given or random family."""
+    """Return the loops of a body of unit area around the origin, of a given or random family. The outer loop comes first."""
     names = tuple(OUTLINES)
     loops = OUTLINES[family or names[rng.integers(len(names))]](rng)
     size = 1 / math.sqrt(sum(_area(loop) for loop in loops))
@@ -198,10 +198,10 @@ SOLIDS: dict[str, Callable[[np.random.Generator], Distance]] = {
 
 
 def random_solid(rng: np.random.Generator, family: str | None = None) -> tuple[Distance, float]:
-    """Create a body of unit volume, of a given or random family.
+    """Create a body of about unit volume, of a given or random family.
 
     Returns:
-        The signed distance of the body, and half the width of a cube around the origin that contains it.
+        The signed distance of the body, in some families only approximate, and half the width of a cube around the origin that contains the body.
     """
     names = tuple(SOLIDS)
     distance = SOLIDS[family or names[rng.integers(len(names))]](rng)

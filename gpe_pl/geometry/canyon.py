@@ -37,6 +37,9 @@ def canyon(seed: int, bounds: Bounds, spacing: float, friction: float = STICKY) 
         bounds: ``(low, high)`` of the domain along x, y and z [m].
         spacing: spacing of the grid of signed distances [m].
         friction: Coulomb coefficient of the rock.
+
+    Raises:
+        ValueError: seed, bounds or spacing are invalid, or the grid would have too many nodes.
     """
     low, counts = lattice(bounds, spacing)
     room = np.ptp(np.array(bounds, float), axis=1)

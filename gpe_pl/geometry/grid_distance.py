@@ -24,7 +24,7 @@ MAX_PAIRS = 2**30
 
 
 def lattice(bounds: Bounds, spacing: float) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Position of the first node [m] and number of nodes per axis of the grid that covers the domain.
+    """Return the position of the first node [m] and the number of nodes per axis of the grid that covers the domain.
 
     Raises:
         ValueError: bounds or spacing are invalid, or the grid would have more than ``MAX_GRID_NODES`` nodes.
@@ -108,7 +108,7 @@ def cloud_distances(points: np.ndarray, normals: np.ndarray, low: np.ndarray, sp
 
 
 def unsigned(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...]) -> np.ndarray:
-    """Return unsigned distances [m] of grid nodes to the nearest of the triangles [triangle, 3, 3]."""
+    """Return unsigned distances [m] of grid nodes to the nearest of the triangles [triangle, 3, 3]. They are exact within ``_BAND`` cells of a triangle."""
     triangles = np.ascontiguousarray(corners, dtype=np.float64).reshape(-1, 9)
     distance = np.full(counts, np.inf)
     nearest = np.full(counts, -1, dtype=np.int64)
@@ -130,7 +130,7 @@ def _num_pairs(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tup
 
 
 def _crossings(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...], axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Number of triangles beyond each grid node along an axis, and the last crossing on each line of nodes [m] (-inf: none)."""
+    """Return the number of triangles beyond each grid node along an axis, and the last crossing on each line of nodes [m] (-inf: none)."""
     order = [(axis + 1) % 3, (axis + 2) % 3, axis]
     hits = np.zeros([counts[k] for k in order], dtype=np.int64)
     last = np.full(hits.shape[:2], -np.inf)
@@ -236,6 +236,8 @@ def _spread(triangles, origin, spacing, distance, nearest):
 @no_type_check
 def _cast(triangles, origin, spacing, hits, last):
     """Count the triangles that cross the line along the third axis between each node and the next one (after the last node: anywhere).
+
+    The last crossing of each line is written to ``last``.
 
     Lines are moved towards the middle by at most a millionth of a cell. Otherwise they could run through edges of a mesh that is aligned with the grid or
     exactly fills it.

@@ -31,7 +31,7 @@ CORNER = math.radians(30.0)
 """Angle [rad]. A point where an outline turns more than this is a corner, which the mesh keeps."""
 
 ATTEMPTS = 8
-"""Number of random lattices to try before an outline counts as too fine for the spacing."""
+"""Number of random lattices to try before a body counts as too fine for the spacing."""
 
 SMALLEST_QUALITY = 0.25
 """Smallest accepted mean ratio of the worst cell (see ``shape_quality``)."""
@@ -85,7 +85,7 @@ def quadrangulate(loops: list[Loop], spacing: float, rng: np.random.Generator) -
 
 
 def _resample(loop: Loop, spacing: float, multiple: int = 1) -> Loop:
-    """Place evenly spaced points on a loop and keep its corners. The number of points between corners is divisible by ``multiple``."""
+    """Place evenly spaced points on a loop and keep its corners. The number of edges between two corners is divisible by ``multiple``."""
     before, after = loop - np.roll(loop, 1, axis=0), np.roll(loop, -1, axis=0) - loop
     turn = np.arctan2(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], np.sum(before * after, axis=1))
     corners = np.nonzero(np.abs(turn) > CORNER)[0]
@@ -142,7 +142,7 @@ def _lattice(loops: list[Loop], spacing: float, rng: np.random.Generator, hexago
 def _triangles(loops: list[Loop], inner: np.ndarray, smooth: int) -> tuple[np.ndarray, np.ndarray] | None:
     """Return Delaunay triangles of the points on the loops, which come first, and of inner points, which are smoothed.
 
-    Returns None if the surface of the triangles differs from the loops.
+    Returns None if the surface of the triangles differs from the loops, or a point belongs to no triangle.
     """
     rim = np.concatenate(loops)
     points = np.concatenate([rim, inner])
@@ -406,16 +406,17 @@ def optimise_shapes(
     iterations: int = 30,
     penalty: Callable[[np.ndarray], tuple[float, np.ndarray]] | None = None,
 ) -> np.ndarray:
-    """Move nodes to minimise the sum of the squared inverse mean ratios of the cells, plus a penalty.
+    """Return positions of the nodes [node, dim] that minimise ``Σ q^-dim`` plus a penalty, with the mean ratios q of ``shape_quality``.
 
-    The determinant is regularised, ``(det + √(det² + δ²))/2``, so that inverted cells are turned back (Escobar et al. 2003).
+    The determinant is regularised, ``(det + √(det² + δ²))/2``, so that inverted cells are turned back (Escobar et al. 2003). The sum runs over the cells, and
+    over the four corners of each quadrilateral.
 
     Args:
         points: positions of the nodes [node, dim].
         cells: corners of the cells [cell, corner].
         fixed: mask of nodes that do not move [node].
         iterations: maximum number of iterations of L-BFGS-B.
-        penalty: function of the positions that returns an additional cost and its gradient [node, dim].
+        penalty: function of the positions that returns an additional cost and its gradient [node, dim]; it counts 20 times.
     """
     points = np.array(points)
     if np.all(fixed) or len(cells) == 0:

@@ -53,7 +53,8 @@ def shapes_fault(shapes: Sequence[Shape], space: Periodicity) -> str | None:
     """Describe the first shape that breaks a rule; None if all are valid. Every reader of files calls it, because a file can contain anything.
 
     The rules: numbers are finite, vectors have one component per axis of ``space``, friction is at least 0, restitution lies between 0 and 1, radii are
-    positive, boxes and walls have positive widths, and normals of walls are unit vectors along one axis. Shapes of other classes are not checked.
+    positive, boxes and walls have positive widths, normals of walls are unit vectors along one axis, and repeated shapes have the periodicity ``space``. Shapes
+    of other classes are not checked.
     """
     for k, shape in enumerate(shapes):
         if isinstance(shape, Repeated) and shape.periodicity != space:

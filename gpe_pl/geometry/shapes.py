@@ -426,7 +426,7 @@ class DistanceGrid:
         return points[keep], np.asarray(outward_normal(self, points[keep], 0.5 * min(spacing, self.spacing)))
 
     def _surface(self, spacing: float) -> np.ndarray:
-        """Return points [point, dim] on the surface, at most about a third of ``spacing`` or one grid cell apart."""
+        """Return points [point, dim] on the surface, at most about one grid cell and about a third of ``spacing`` apart."""
         dim = len(self.counts)
         corners = [
             self.values[tuple(slice(c, n - 1 + c) for c, n in zip(corner, self.counts, strict=True))]

@@ -110,6 +110,7 @@ def ground_of(points: np.ndarray, normals: np.ndarray, bounds: Bounds, spacing: 
 
     Raises:
         TerrainError: seen from above all points lie on one line.
+        ValueError: bounds or spacing are invalid, or the grid would have too many nodes.
     """
     low, counts = lattice(bounds, spacing)
     values = cloud_distances(points, normals, low, spacing, counts)

@@ -1,4 +1,4 @@
-"""Warnings of scenes and parameters that a solver does not resolve. They appear before data are generated; ``docs/results/convergence.md`` has measurements."""
+"""Warnings about scenes and parameters that a solver does not resolve, before data are generated. ``docs/results/convergence.md`` has measurements."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gpe_pl.schema import MATERIALS
 from gpe_pl.trajectory.state import State
 
 CELLS_ACROSS = 4
-"""Number of cells that a body should have across; a body two triangles thick is half again as stiff in bending."""
+"""Number of cells that a body should at least be thick. One two triangles thick is about 1.5 times as stiff in bending as it should be."""
 
 THIN_FRACTION = 0.1
 """Fraction of the nodes of a mesh that may be thin without a warning."""

@@ -52,20 +52,20 @@ class FluidScene:
     """Distribution of scenes with liquid.
 
     Attributes:
-        scene: ``bowl``: liquid falls into a closed sphere (2D: circle) that is one cell narrower than the domain. ``dam_break``: a column collapses from one
-            side of a box. ``canyon``: a reservoir runs down a river bed and over a waterfall (3D).
+        scene: ``bowl``: liquid falls in a closed sphere (2D: circle), one cell away from the nearest walls. ``dam_break``: a column collapses from one side
+            of a box. ``canyon``: a reservoir runs down a river bed and over a waterfall (3D).
         bounds: ``(low, high)`` of the domain along each axis [m].
         grid_spacing: grid spacing of the solver [m].
         num_particles: exact number of particles in every scene.
         particles_per_cell: particles along each axis of a cell; the rest spacing is ``grid_spacing / particles_per_cell``.
         density: density of the liquid [kg/m³].
         gravity: acceleration of gravity [m/s²].
-        friction: friction coefficient of all solids; ``schema.STICKY`` is no-slip, 0 is frictionless.
+        friction: friction coefficient of all solids; ``schema.STICKY`` is no-slip, 0 is frictionless. The solver ``flip`` does not use it.
         connectivity_cells: recommended connectivity radius in grid cells.
         max_bodies: largest number of bodies in the bowl; the number is uniform in 1 … max_bodies.
         max_speed: largest speed of a body in the bowl along each axis [m/s]; upward at most a quarter of it.
         column_aspect: range of height / width of the column of the dam break.
-        max_obstacles: largest number of boxes on the floor of the dam break; the number is uniform in 0 … max_obstacles.
+        max_obstacles: largest number of boxes on the floor of the dam break; the number is uniform in 0 … max_obstacles. Boxes without room are left out.
         terrain: mesh, point cloud or height map that replaces the random canyon, as a path relative to the working directory.
         terrain_options: options for reading that file.
         reservoir: region ``(low, high)`` along each axis [m] where the water of the canyon starts. Water fills it from its low x and its lowest free place

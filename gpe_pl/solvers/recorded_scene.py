@@ -136,7 +136,7 @@ class RecordedScene:
             recorded particles.
         density: density of the liquid [kg/m³].
         gravity: acceleration of gravity [m/s²].
-        friction: friction coefficient of the ground.
+        friction: friction coefficient of the ground and the walls around the scene. The solver ``flip`` does not use it.
         connectivity_cells: recommended connectivity radius in grid cells.
     """
 
@@ -193,7 +193,7 @@ class RecordedScene:
         return {"file": self.file}
 
     def sample(self, values: Mapping[str, MaterialValues], seed: int) -> State:
-        """Make the scene. It depends only on the settings, the file and, for a flood, the seed.
+        """Make the scene. It depends only on the settings, the file, ``values`` and, for a flood, the seed.
 
         Args:
             values: kinematic viscosity [m²/s] under the key ``fluid``; without it the scaled viscosity of the recording applies.

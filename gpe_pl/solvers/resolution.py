@@ -37,7 +37,7 @@ def finer(state: State, spacing: float) -> Resolved:
     """Return the scene with half the spacing between nodes; ``spacing`` is the present one [m].
 
     Raises:
-        ValueError: the mesh has cells that are not triangles.
+        ValueError: the mesh has cells that are not triangles in 2D, or its scene has already started.
     """
     return _divided_particles(state, spacing) if state.cells is None or not len(state.cells) else _divided_triangles(state)
 
@@ -46,7 +46,7 @@ def coarser(state: State, spacing: float, factor: float = 2.0) -> Resolved:
     """Return the scene with ``factor`` times the spacing between nodes; ``spacing`` is the present one [m].
 
     Raises:
-        ValueError: the mesh has cells that are not triangles, or the coarser mesh would be too coarse.
+        ValueError: the mesh has cells that are not triangles in 2D, its scene has already started, or the new mesh would be too coarse.
     """
     if state.cells is None or not len(state.cells):
         return _merged_particles(state, factor * spacing)
@@ -166,7 +166,10 @@ def outline(cells: Int[np.ndarray, "cell 3"]) -> list[list[int]]:
 
 
 def _locate(points: np.ndarray, cells: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes [node, 3] and barycentric weights [node, 3] of the triangle that contains each wanted point, or that it is least far outside of."""
+    """Return nodes [node, 3] and barycentric weights [node, 3] of a triangle for each wanted point.
+
+    It is the triangle that contains the point or, for a point outside all, the one with the largest smallest weight among those nearby.
+    """
     a = points[cells[:, 0]]
     inverse = np.linalg.inv(np.stack([points[cells[:, 1]] - a, points[cells[:, 2]] - a], axis=2))
     num_near = min(12, len(cells))

@@ -1,6 +1,6 @@
 """Seeded scenes of bodies thrown into a box with obstacles, and the ``Scene`` protocol.
 
-``Scene.sample`` depends only on configuration, parameter values and seed.
+``Scene.sample`` depends only on configuration, parameter values, seed and the files that the configuration names.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def parameter_columns(
         materials: materials of the scene.
 
     Raises:
-        ValueError: a material has no such parameter, or lacks one; names it.
+        ValueError: a material has no such parameter, or lacks one. The message names it.
     """
     given = {material: parameters_by_name(material, values[material]) for material in materials}
     names = param_names(materials, (name for own in given.values() for name in own))
@@ -160,7 +160,7 @@ def check_surroundings(scene: Surroundings) -> None:
 
 
 def draw_friction(scene: Surroundings, rng: np.random.Generator, may_slip: bool = True) -> float:
-    """Draw the Coulomb coefficient of a wall or obstacle: no-slip, frictionless or in between."""
+    """Draw the Coulomb coefficient of a wall or obstacle: no-slip, frictionless (only if it ``may_slip``) or in between."""
     kind, coulomb = rng.random(), rng.uniform(*scene.coulomb_friction)
     if kind < scene.sticky_probability:
         return STICKY
@@ -169,7 +169,7 @@ def draw_friction(scene: Surroundings, rng: np.random.Generator, may_slip: bool 
 
 
 def draw_walls(scene: Surroundings, rng: np.random.Generator) -> tuple[Shape, ...]:
-    """Draw the walls of the domain, each with its own friction."""
+    """Draw the walls of the domain, each with its own friction. The floor does not slip."""
     axes = "xyz"[: len(scene.bounds)]
     floor = f"{axes[-1]}_low"  # on a frictionless floor bodies never come to rest
     names = [f"{axis}_{side}" for axis in axes for side in ("low", "high")]
@@ -223,10 +223,10 @@ class BodyScene:
         density: density at rest of each material [kg/m³].
         gravity: acceleration of gravity [m/s²].
         max_bodies: largest number of bodies; the number is uniform in 1 … max_bodies, with several materials in 2 … max_bodies.
-        max_obstacles: largest number of obstacles; the number is uniform in 0 … max_obstacles.
-        obstacle_radius: range of the obstacles' circumscribed radii [m].
+        max_obstacles: largest number of obstacles; the number is uniform in 0 … max_obstacles. Obstacles without room are left out.
+        obstacle_radius: range of the obstacles' circumscribed radii [m]. The corners of boxes in 3D are 12 % further out.
         obstacle_shapes: ``plain`` selects boxes, balls and convex polygons; ``angular``, in 2D only, selects stars and tilted ramps.
-        drop_height: range of the gap between a body and the floor [m].
+        drop_height: range of the gap between a body and the floor [m]; the gap is larger where obstacles or other bodies are in the way.
         max_speed: largest speed of a body along each axis [m/s]; upward at most a quarter of it.
         sticky_probability: probability that a wall or obstacle is no-slip.
         slip_probability: probability that a side wall, ceiling or obstacle is frictionless; all others obey Coulomb's law.
@@ -354,7 +354,7 @@ def _cells(bodies: list[_Body], order: np.ndarray) -> np.ndarray:
 
 
 def _obstacles(config: BodyScene, rng: np.random.Generator) -> tuple[Shape, ...]:
-    """Draw boxes, balls and, in 2D, convex polygons whose circumscribed balls stay clear of the walls and of each other."""
+    """Draw obstacles. Balls of ``obstacle_radius`` around their centres stay clear of the walls and of each other; those without room are left out."""
     obstacles: list[Shape] = []
     circles: list[tuple[np.ndarray, float]] = []
     low, high = np.array(config.bounds).T

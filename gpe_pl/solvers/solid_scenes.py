@@ -53,7 +53,7 @@ class SolidScene:
         body_size: edge of the square (3D: cube) that has the area (volume) of the body [m].
         density: density at rest [kg/m³].
         gravity: acceleration of gravity [m/s²].
-        num_obstacles: range of the number of obstacles.
+        num_obstacles: range of the number of obstacles. Obstacles without room are left out.
         obstacle_radius: range of the obstacles' circumscribed radii [m].
         obstacle_shapes: ``plain`` selects boxes, balls and, in 2D, irregular polygons; ``angular``, in 2D only, selects stars and tilted ramps.
         obstacle_height: fraction of the domain's height below which obstacles have their centres.
@@ -63,7 +63,7 @@ class SolidScene:
         sticky_probability: probability that a wall or obstacle is no-slip.
         slip_probability: probability that a side wall, ceiling or obstacle is frictionless; all others obey Coulomb's law.
         coulomb_friction: range of Coulomb coefficients.
-        boundary_spacing: largest distance of boundary nodes in mesh spacings.
+        boundary_spacing: distance of neighbouring boundary nodes in mesh spacings.
         connectivity_cells: recommended connectivity radius in mesh spacings; choose more than the distance that a body moves in one frame.
     """
 
@@ -208,7 +208,7 @@ def lumped_masses(points: np.ndarray, cells: np.ndarray, density: float) -> np.n
 
 
 def _obstacles(config: SolidScene, rng: np.random.Generator) -> tuple[Shape, ...]:
-    """Draw boxes, balls and, in 2D, irregular polygons in the lower part of the domain, clear of the walls and of each other."""
+    """Draw obstacles in the lower part of the domain, clear of the walls and of each other. Obstacles without room are left out."""
     obstacles: list[Shape] = []
     taken: list[tuple[np.ndarray, float]] = []
     low, high = np.array(config.bounds).T

@@ -67,7 +67,7 @@ def locked(folder: Path, key: str = "paths.runs", waits: bool = False, makes: bo
         folder: folder of a run, a sweep or a data set.
         key: configuration key of the parent folder, for messages.
         waits: wait until the other command has ended instead of raising; a log line names that command.
-        makes: create the folder.
+        makes: create the folder, else only its parent folder. New folders that are still empty at the end of the block are removed.
         num_processes: number of processes of the run, which ``RANKS`` number. The first process holds the lock for all.
 
     Raises:

@@ -47,7 +47,7 @@ def _processor() -> str:
 
 
 def commit() -> str:
-    """Return the commit of the running code, with ``-dirty`` if files differ from it.
+    """Return the commit of the running code as ``git describe`` names it, with ``-dirty`` if files differ from it.
 
     The answer is ``unknown`` if the code is not tracked in a repository, or git is not installed.
     """
@@ -99,7 +99,7 @@ def synchronized(function: Callable[[], Any], device: str) -> Callable[[], Any]:
 
 
 def best_time(function: Callable[[], Any], device: str, num_rounds: int = 10) -> float:
-    """Time of the fastest of several calls [s], after one call that does not count."""
+    """Return the time of the fastest of several calls [s], after one call that does not count."""
     call = synchronized(function, device)
     call()
     times = []
@@ -113,7 +113,7 @@ def best_time(function: Callable[[], Any], device: str, num_rounds: int = 10) ->
 def gemm_rate(rows: int, channels: int, device: str) -> float:
     """Return the rate of the product of a matrix [rows, channels] with a square one [FLOP/s].
 
-    The product is computed in one piece and in blocks that fit the cache; the faster counts.
+    The rate is also measured with at most 1024 rows, whose product fits into the cache. The higher rate is returned.
     """
     square = torch.randn(channels, channels, device=device)
     rates = []

@@ -15,7 +15,8 @@ Progress = Callable[[int, int], Any]  # arguments: amount done, total amount
 def progress_bar(description: str) -> Iterator[Progress]:
     """Show a progress bar with the remaining time; yields the callback that long work takes as ``on_progress``.
 
-    The remaining time is estimated from the work done since the bar appeared, so that resumed work does not distort it.
+    The remaining time is estimated from the updates in the last 30 s. The first update does not count, so that work done before a resumed command began does
+    not distort the estimate.
     """
     from rich.markup import escape
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn

@@ -33,7 +33,8 @@ RESULTS = ("*.json", "*.csv", "*.md", "*/**/config.json")
 def recorded(folder: Path, command: str, arguments: Sequence[str], runs: str) -> Iterator[None]:
     """Add a session to ``provenance.json`` in a results folder when the block ends, with or without an error.
 
-    A killed session is not recorded, so the total time of a resumed command may be too short. If the file cannot be written, a warning is logged.
+    A folder without results (``RESULTS``) gets no file. A killed session is not recorded, so the total time of a resumed command may be too short. If the
+    file cannot be written, or the present one is damaged, a warning is logged.
 
     Args:
         folder: folder of the results.
@@ -71,7 +72,7 @@ def sessions(folder: Path) -> list[dict[str, Any]]:
 
 
 def shown(command: str, arguments: Sequence[str], runs: str) -> str:
-    """Return a command line to repeat the command, without folders of this machine."""
+    """Return a command line that repeats the command, without the overrides in ``LOCAL`` and with ``paths.runs`` in place of the folder ``runs``."""
     folder = re.compile(rf"(?<![^=,\[\"' ]){re.escape(runs)}(?![^/,\]\"' ])")  # as a whole path or the beginning of one
     kept = [folder.sub("paths.runs", argument) for argument in arguments if not argument.lstrip("+").startswith(LOCAL)]
     return shlex.join(["python", "-m", f"gpe_pl.{command}", *kept])

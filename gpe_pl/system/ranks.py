@@ -20,7 +20,7 @@ def rank() -> int:
 
 
 def num_ranks() -> int:
-    """Number of processes of the run."""
+    """Return the number of processes of the run."""
     return dist.get_world_size() if _is_parallel() else 1
 
 

@@ -43,7 +43,7 @@ def check_plain(values: Any) -> None:
 
 
 def parameters(target: Callable[..., Any], *later: str) -> dict[str, Any]:
-    """Return annotation and default of each parameter of a class or function, except those named in ``later``."""
+    """Return annotation and default of each parameter of a class or function, except those named in ``later``. ``...`` stands for no default."""
     annotated = target.__init__ if inspect.isclass(target) and not is_dataclass(target) else target
     hints = get_type_hints(annotated, include_extras=True)
     return {
@@ -62,7 +62,7 @@ def checked(target: Callable[..., Any], values: Mapping[str, Any], *later: str) 
         later: parameters that are passed separately and are not among the values.
 
     Raises:
-        pydantic.ValidationError: a name is unknown or missing, a type is wrong, or a value is out of range.
+        pydantic.ValidationError: a name is unknown or missing, a type is wrong, or a value is out of range or not finite.
     """
     config = ConfigDict(extra="forbid", arbitrary_types_allowed=True, protected_namespaces=(), allow_inf_nan=False)
     found = create_model("Settings", __config__=config, **parameters(target, *later))(**values)

@@ -24,7 +24,7 @@ M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
 def paired_times(
     alternatives: Mapping[str, Callable[[], Any]], num_rounds: int = 20, num_warmups: int = 2, what: str = ""
 ) -> dict[str, np.ndarray]:
-    """Time each alternative in every round [round, s]. A round runs all of them once, in rotating order.
+    """Return the times [round] of each alternative in s. A round runs all alternatives once, in rotating order.
 
     Args:
         alternatives: functions by name.

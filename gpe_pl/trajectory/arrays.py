@@ -44,7 +44,7 @@ def numbers(name: str, values: Any, axes: Mapping[str, int | None]) -> np.ndarra
         axes: name and size of each axis; a size of None allows any.
 
     Raises:
-        ArrayError: other numbers or another shape; names the first place.
+        ArrayError: values are masked, are not real numbers or have another shape, or a number is not finite or too large. The message names the first place.
     """
     if np.ma.is_masked(values):
         raise ArrayError(f"{name}: is a masked array with {np.ma.count_masked(values)} masked values; only whole arrays can be used")
@@ -67,10 +67,10 @@ def numbers(name: str, values: Any, axes: Mapping[str, int | None]) -> np.ndarra
 
 
 def per_node(name: str, values: Any, shape: tuple[int, ...], axis: str = "node", low: float = -np.inf, high: float = np.inf) -> np.ndarray:
-    """Return one value for all nodes, or one per node, as float32 of ``shape``.
+    """Return float32 values of ``shape`` from a value for all nodes, or from one per node.
 
     Raises:
-        ArrayError: another shape, or a value outside ``low`` … ``high``; names the node.
+        ArrayError: the shape does not fit, or a value is not finite or outside ``low`` … ``high``. The message names the node.
     """
     array = np.asarray(values)
     if array.dtype.kind in "fiu" and array.ndim < len(shape) and array.shape == shape[len(shape) - array.ndim :]:
@@ -92,7 +92,7 @@ def positive(name: str, value: Any, unit: str) -> float:
 
 
 def flags(name: str, values: Any, count: int) -> tuple[bool, ...]:
-    """Return ``count`` truth values, one per axis; None stands for all false."""
+    """Return ``count`` truth values, one per axis; None stands for all false. Raise ``ArrayError`` for other values."""
     if values is None:
         return (False,) * count
     array = np.asarray(values)
@@ -102,10 +102,16 @@ def flags(name: str, values: Any, count: int) -> tuple[bool, ...]:
 
 
 def checked_bounds(bounds: Any, periodic: tuple[bool, ...], pos: np.ndarray, boundary_pos: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """Return bounds ``(low, high)`` per axis [m]; without ``bounds``, the extremes of all positions.
+    """Return bounds ``(low, high)`` of the domain per axis [m]. Without ``bounds``, they are the extremes of all positions, widened along axes without extent.
+
+    Args:
+        bounds: given bounds, or None.
+        periodic: whether space repeats, per axis.
+        pos: positions of the nodes [frame, node, dim] in m.
+        boundary_pos: positions of boundary nodes [boundary_node, dim] in m, which may be outside given bounds.
 
     Raises:
-        ArrayError: a position [frame, node, dim] is outside along an axis that is not periodic, or a periodic axis has no bounds.
+        ArrayError: the bounds are invalid, are missing for a periodic axis, or do not contain all nodes along an axis that is not periodic.
     """
     dim = pos.shape[2]
     if bounds is None:
@@ -139,7 +145,11 @@ def checked_bounds(bounds: Any, periodic: tuple[bool, ...], pos: np.ndarray, bou
 def checked_materials(
     materials: str | Sequence[str], params: Mapping[str, Any], num_nodes: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """Return codes of ``node_type`` [node], ``material_params`` [node, param], the names of the materials that occur, and those of the columns."""
+    """Return codes of ``node_type`` [node], ``material_params`` [node, param], the names of the materials that occur, and those of the columns.
+
+    Raises:
+        ArrayError: a material or parameter is unknown or missing, or a value breaks its rule. The message names it, and the node if there is one.
+    """
     names = [materials] * num_nodes if isinstance(materials, str) else [str(name) for name in materials]
     if len(names) != num_nodes:
         raise ArrayError(f"materials: {len(names)} names for {num_nodes} nodes")
@@ -177,15 +187,19 @@ def checked_materials(
 
 
 def checked_cells(cells: Any, codes: np.ndarray, dim: int) -> tuple[np.ndarray, int]:
-    """Return all cells [cell, corner] and their dimension.
+    """Return all cells of a mesh in one array [cell, corner], and whether they are surfaces (2) or volumes (3). In 2D they are surfaces.
+
+    Cells with fewer corners than others repeat their last corner.
 
     Args:
-        cells: cells of one kind [cell, corner], or such arrays by kind.
-        codes: types of the nodes [node].
+        cells: nodes of each cell [cell, corner], or such arrays by kind of cell, a key of ``schema.CELL_KINDS``.
+        codes: codes of ``node_type`` [node].
         dim: dimension of space.
 
     Raises:
-        ArrayError: a cell has a node that does not exist, nodes of several materials, or of a material that cannot have a mesh.
+        ArrayError: an array is not of integers or has another shape; a kind is unknown, or impossible in this dimension; the kind is missing for cells with
+            four corners in 3D; surfaces and volumes are mixed; or a cell repeats a node, has a node that does not exist, has nodes of several materials, or has
+            nodes of a material that cannot have a mesh.
     """
     if not isinstance(cells, Mapping):
         array = _integers("cells", cells)
@@ -274,7 +288,7 @@ def typical_spacing(pos: np.ndarray, periodicity: Periodicity = NOWHERE) -> floa
 
 
 def estimated_normals(boundary_pos: np.ndarray, visited: np.ndarray, periodicity: Periodicity = NOWHERE) -> np.ndarray:
-    """Return estimated unit normals [boundary_node, dim] of walls given by points: the mean direction to the nearest positions of nodes.
+    """Return estimated unit normals [boundary_node, dim] of walls given by points: the mean direction to the ``NEIGHBOURS`` nearest positions of nodes.
 
     Args:
         boundary_pos: points on the walls [boundary_node, dim] in m.

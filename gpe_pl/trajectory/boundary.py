@@ -58,7 +58,7 @@ class Boundary:
         friction: Coulomb coefficient [boundary_node]; ``schema.STICKY`` or more is no-slip.
         restitution: fraction of the normal velocity that a bounce returns [boundary_node].
         shapes: analytic geometry, for signed distances.
-        motion: prescribed motion, None if no node moves; its first frame equals ``pos``, ``vel`` and ``normal``.
+        motion: prescribed motion, None if all nodes stay in place; its first frame equals ``pos``, ``vel`` and ``normal``.
     """
 
     pos: Array = field(metadata=NODE)
@@ -71,7 +71,7 @@ class Boundary:
 
     @classmethod
     def sample(cls, shapes: tuple[Shape, ...], spacing: float, dim: int, periodicity: Periodicity = NOWHERE) -> Boundary:
-        """Return a boundary of nodes on the surfaces of shapes and of their periodic images, at most ``spacing`` [m] apart.
+        """Return a boundary of nodes on the surfaces of shapes and of their periodic images, about ``spacing`` [m] apart.
 
         Nodes inside another shape are left out.
         """
@@ -119,7 +119,7 @@ class Boundary:
             shapes: geometry of the walls, if known; containment and pictures use it.
 
         Raises:
-            ArrayError: an array has the wrong shape, or a number is not finite or out of range; names the node.
+            ArrayError: an array has the wrong shape, a number is not finite or out of range, or a normal has length 0. The message names the node.
         """
         pos = numbers("boundary pos", pos, {"boundary_node": None, "dim": None})
         normal = numbers("boundary normal", normal, dict(zip(("boundary_node", "dim"), pos.shape, strict=True)))
@@ -141,7 +141,7 @@ class Boundary:
         restitution: Array = 0.0,
         periodicity: Periodicity = NOWHERE,
     ) -> Boundary:
-        """Return a boundary with a prescribed motion, such as a gripper, piston or paddle, at its first frame.
+        """Return a boundary with a prescribed motion, such as a gripper, piston or paddle, in the first frame of the motion.
 
         Args:
             pos: positions [frame, boundary_node, dim] in m, with as many frames as the trajectory.
@@ -168,10 +168,10 @@ class Boundary:
         return replace(first, motion=Motion(inside, vel, normals)).at(0)
 
     def inside(self, periodicity: Periodicity) -> Boundary:
-        """Return this boundary of NumPy arrays, prepared for a periodic domain.
+        """Return this boundary of NumPy arrays, prepared for a periodic domain; the same object if no axis is periodic.
 
-        Nodes are wrapped into the domain. If nodes coincide at a seam, only one is kept. Nodes inside an image of a shape are left out. Shapes get their
-        periodic images.
+        Nodes are wrapped into the domain. If nodes with the same normal coincide, only one is kept. Nodes inside an image of a shape are left out. Shapes get
+        their periodic images.
         """
         if not periodicity:
             return self
@@ -198,7 +198,7 @@ class Boundary:
         return replace(self, **values)
 
     def at(self, frame: int, stop: int | None = None) -> Boundary:
-        """Return the boundary ``frame`` frames later, with its motion up to the frame ``stop``; the same object if it does not move.
+        """Return the boundary ``frame`` frames later, with its motion before the frame ``stop``; the same object if it has no motion.
 
         After the last frame of its motion, the boundary stays in place with zero velocity.
         """

@@ -28,6 +28,8 @@ def fitting_kinds(num_corners: int, dim: int) -> list[str]:
 def kinds_of(cells: np.ndarray, cell_dim: int | None, dim: int) -> np.ndarray:
     """Return the kind of each cell [cell] as an index into ``schema.CELL_KINDS``; -1 if no kind has this number of corners, or a node occurs twice.
 
+    Repetitions of the last corner at the end of a cell do not count.
+
     Args:
         cells: nodes of each cell [cell, corner].
         cell_dim: dimension of the cells; None stands for the dimension of space, except for triangles.
@@ -57,7 +59,7 @@ def mean_over_corners(values: Array, cells: Array) -> Array:
 
 
 def stacked(groups: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return one array of cells from arrays [cell, corner] of each kind, in their order."""
+    """Return one array of cells from arrays [cell, corner] of each kind, in their order. Cells with fewer corners than others repeat their last corner."""
     width = max((cells.shape[1] for cells in groups.values()), default=3)
     padded = [np.pad(cells, ((0, 0), (0, width - cells.shape[1])), mode="edge") for cells in groups.values()]
     return np.concatenate([np.empty((0, width), np.int32), *padded]).astype(np.int32)

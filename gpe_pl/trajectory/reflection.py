@@ -1,4 +1,4 @@
-"""Mirror images of scenes. The image of a true motion is a true motion, too, if the image has the same gravity."""
+"""Mirror images of scenes. The image of a motion obeys the same laws of physics, under the image of its gravity."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Reflection:
         )
 
     def state(self, state: State, boundary: Boundary) -> State:
-        """Return the image of a state, given that of its boundary."""
+        """Return the image of a state, given that of its boundary. ``periodicity`` and ``internal`` stay as they are."""
         history, rest_pos, stress = state.velocity_history, state.rest_pos, state.stress
         return replace(
             state,

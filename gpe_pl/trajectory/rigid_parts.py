@@ -25,7 +25,7 @@ TOLERANCE = 1e-5
 """Differences of positions below this fraction of the boundary's extent are rounding."""
 
 STRETCH = 0.25
-"""Relative change of their distance up to which near nodes outside rigid parts count as connected."""
+"""Near nodes count as connected if their distance changes by at most this fraction."""
 
 PARTNERS = 8
 NEIGHBOURS = 16
@@ -188,7 +188,7 @@ def _hold_together(paths: _Paths, label: np.ndarray) -> np.ndarray:
 
 
 def _hypotheses(paths: _Paths, nodes: np.ndarray, seed: int) -> Iterator[np.ndarray]:
-    """Yield small sets of nodes whose common motion may be that of the part of ``seed``. All of them keep their distance from it."""
+    """Yield small sets of nodes whose common motion may be that of the part of ``seed``. All of ``nodes`` keep their distance from ``seed``."""
     yield np.array([seed])  # no turn
     others = nodes[nodes != seed]
     distance = np.linalg.norm(paths.arms(others, paths.first[seed]), axis=1)

@@ -74,8 +74,9 @@ class State:
         num_substeps: number of solver substeps in the last frame.
         num_corrected: number of nodes that containment put back in the last frame.
         num_asleep: number of sleeping nodes, which the simulator did not compute in the last frame.
-        lost_impulse: momentum [kg m/s] that these nodes lost, as the sum of magnitudes.
-        internal: private data of a solver or simulator (deformation gradient, …), kept so that a restart equals running through. It is not stored.
+        lost_impulse: momentum [kg m/s] that the sleeping nodes lost, as the sum of magnitudes.
+        internal: private data of a solver or simulator (deformation gradient, …). With it, a rollout goes on from any state as if it had not been interrupted.
+            It is not stored.
         periodicity: axes along which space repeats.
         param_names: names of the columns of ``material_params``; empty stands for the first parameter of each material of the data set. Solvers take the
             values of parameters without a column from their settings.
@@ -180,7 +181,7 @@ class State:
         return replace(self, pos=pos, vel=vel, velocity_history=history)
 
     def to_torch(self, device: Any = "cpu") -> State:
-        """Return the state as float64 tensors on a device. ``internal`` is dropped, as it belongs to a solver."""
+        """Return the state with tensors of float64 and int64 on a device. ``internal`` is dropped, as it belongs to a solver."""
         import torch
 
         def tensor(x: Array) -> Any:

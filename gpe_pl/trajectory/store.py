@@ -1,8 +1,10 @@
 """The store: writes and reads trajectories on disk.
 
 A shard is an HDF5 file with one group per trajectory. It is written under a temporary name and renamed, so a reader never sees an incomplete one. Every array
-is chunked with a fletcher32 checksum, and each group has a SHA-256 digest of all its arrays and attributes. Text is stored with a fixed length, because HDF5
-keeps text of variable length outside its checksums, where one flipped bit can hang the library.
+is chunked with a fletcher32 checksum, and each group has a SHA-256 digest of its arrays and of the attributes that describe them. Text is stored with a fixed
+length, because HDF5 keeps text of variable length outside its checksums, where one flipped bit can hang the library.
+
+All functions that read raise ``StoreError`` where something is missing, damaged or not of this schema.
 """
 
 from __future__ import annotations
@@ -174,7 +176,10 @@ def _write_text(owner: h5py.HLObject, key: str, text: str) -> None:
 
 @contextmanager
 def open_shard(path: Path | str) -> Iterator[h5py.File]:
-    """Open a shard of this schema version for reading. Errors that HDF5 raises on a damaged file become ``StoreError``."""
+    """Open a shard of this schema version for reading.
+
+    Errors of the types that HDF5 raises on damaged files, such as ``OSError`` and ``ValueError``, become ``StoreError``. This includes errors in the block.
+    """
     path = Path(path)
     if not path.is_file():
         raise StoreError(f"{path}: no such file; generate data with `python -m gpe_pl.simulate`")
@@ -337,8 +342,9 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
 
     Raises:
         StoreError: a file, group or field is missing, has the wrong shape or type, or does not match its checksum.
-        UnsoundError: metadata, shapes or values break their rules (``Metadata.violations``, ``shape_values.shapes_fault``, ``schema.FIELDS``);
+        UnsoundError: metadata, shapes or values break their rules (``Metadata.violations``, ``shape_values.shapes_fault``, ``schema.FIELDS``). The message
             names field, frame and node.
+        ValueError: ``verify`` and ``frames`` are given together.
     """
     if verify and frames is not None:
         raise ValueError("the digest covers all frames: pass verify or frames, not both")

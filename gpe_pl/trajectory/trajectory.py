@@ -230,7 +230,8 @@ class Trajectory:
             dataset, split: names of data set and split; ``save_dataset`` overrides both.
 
         Raises:
-            ArrayError: an argument does not fit; names it, with frame and node if there is one.
+            ArrayError: an argument does not fit. The message names it, with frame and node if there is one.
+            PeriodicityError: the connectivity radius is not below half a period.
         """
         pos = numbers("pos", pos, {"frame": None, "node": None, "dim": None})
         pos = pos.astype(np.float32 if pos.dtype in (np.float16, np.float32) else np.float64, copy=False)
@@ -316,7 +317,8 @@ class Trajectory:
     def seen_from(self, origin: np.ndarray) -> Trajectory:
         """Return the trajectory in coordinates whose origin is at ``origin`` [dim] in m.
 
-        Choose an origin near the positions before you store them: stored positions are float32, which is most precise near 0.
+        Choose an origin near the positions before you store them: stored positions are float32, which is most precise near 0. Rest positions move along an axis
+        only if that brings them nearer to 0.
         """
         b, m = self.boundary, self.metadata
         rest_pos = self.rest_pos

@@ -43,7 +43,7 @@ class Fault:
 
 
 def size_conflicts(arrays: Mapping[str, np.ndarray], dim: int, num_params: int) -> list[str]:
-    """Return one sentence for each field whose shape contradicts the schema, the numbers of dimensions and parameters, or an earlier field."""
+    """Return a sentence for each contradiction of a field's shape with the schema, the numbers of dimensions and parameters, or an earlier field."""
     sizes = {"dim": dim, "param": num_params}
     conflicts = []
     for key, array in arrays.items():
@@ -66,7 +66,7 @@ def size_conflicts(arrays: Mapping[str, np.ndarray], dim: int, num_params: int) 
 def faults(
     arrays: Mapping[str, np.ndarray], names: Sequence[str], materials: Sequence[str], param_names: Sequence[str], first_frame: int = 0
 ) -> Iterator[Fault]:
-    """Yield a fault for every field that breaks its rule; fields without frames come first.
+    """Yield a fault for every field that breaks its rule, or for every parameter in ``material_params``; fields without frames come first.
 
     Args:
         arrays: arrays by their names in ``schema.FIELDS``, without conflicts of size (``size_conflicts``).

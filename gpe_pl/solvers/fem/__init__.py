@@ -5,8 +5,8 @@ One substep of length h, with internal forces f including damping (``elements``)
     v ← v + h f(x, v) / m + h g / 2,   v ← contact(x, v),   x ← x + h v,   v ← v + h g / 2
 
 Gravity is applied in halves, so that a free body falls along the exact parabola with any substeps. A body at rest on a floor keeps a velocity of h g / 2. The
-length h depends on the current state alone. It stays below the stability limit of the present mesh, and no node moves further than half the smallest height
-of a cell. Contact of the solid with itself is not computed: a scene holds one body.
+length h depends on the current state alone. It stays below the stability limit of the present mesh. At its present velocity, no node moves further than half
+the smallest height of a cell. Contact of the solid with itself is not computed: a scene holds one body.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class FEM:
         return self.frame_dt
 
     def substep(self, state: State) -> float:
-        """Return the largest substep in s that the solver takes from this state if the state is at rest. Errors are those of ``step``."""
+        """Return an upper bound of the substep in s that the solver takes from this state if it is at rest. Errors are those of ``step``."""
         mesh, lam, mu, eta, _ = self._prepare(state)
         pos = _three_dimensional(state.pos)
         stiffest, most_viscous = _add_forces(
@@ -103,7 +103,7 @@ class FEM:
     can_restart: ClassVar[bool] = True
 
     def restarted(self, state: State) -> State:
-        """Return the same state: positions and velocities are all that a step starts from."""
+        """Return the state without velocity history and stress. A step starts from positions and velocities alone."""
         return replace(state, velocity_history=None, stress=None)
 
     def step(self, state: State) -> State:

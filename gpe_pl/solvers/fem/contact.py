@@ -25,7 +25,7 @@ FIELD_CELLS = 64
 
 
 class Obstacles(NamedTuple):
-    """Boundary shapes in the form that the kernels take; every array of floats ends with the friction coefficient.
+    """Boundary shapes as arrays for the compiled kernels. Lengths are in m; friction is the Coulomb coefficient.
 
     Attributes:
         planes: normal, offset and friction of each wall [wall, 5].
@@ -333,7 +333,10 @@ def push_out_nodes(pos, box, reach, obstacles):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _facing_edge(x, y, pos, edges, reach):
-    """Return the surface edge nearest to a point in front of it or less than half its length behind: edge (-1: none), gap, position along it, normal."""
+    """Return the surface edge nearest to a point (-1: none), with gap, position along the edge and normal.
+
+    An edge counts only if the point is less than ``reach`` in front of it or less than half of its length behind it.
+    """
     best, gap, along, nx, ny = -1, math.inf, 0.0, 0.0, 0.0
     for e in range(edges.shape[0]):
         a, b = edges[e, 0], edges[e, 1]

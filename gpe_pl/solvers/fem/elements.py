@@ -36,7 +36,7 @@ CELLS = {(2, 3): "triangle", (2, 4): "quad", (3, 4): "tetrahedron"}
 
 @dataclass(frozen=True)
 class Mesh:
-    """Rest configuration in the form that the kernels take.
+    """Rest configuration as arrays for the compiled kernels.
 
     Attributes:
         kind: kind of cell, one of ``CELLS``.

@@ -53,7 +53,7 @@ def reach_into_solids(active, strides, area, cell_room, half, density, touched):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def extend_into_solids(active, strides, area, cell_room, half, density, viscous):
-    """Add liquid to cells with a solid centre: as much as the volume ``half`` of their open neighbours contains.
+    """Give cells with a solid centre the density that they would have with further open space ``half``, filled like their open neighbours.
 
     Such cells contain few particles, so their density would be too low, and the correction of the density would draw liquid into them. The mass in the cell
     itself is counted too; otherwise particles would gather in it.
@@ -139,7 +139,7 @@ def pressure_matrix(liquid, unknown, strides, area, density):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def inflow(liquid, strides, area, velocity):
-    """Return the sum of the velocities into each liquid cell [m/s]."""
+    """Return the sum over the faces of each liquid cell of the inward velocity times the open fraction [m/s]."""
     total = np.zeros(liquid.shape[0])
     for i in range(liquid.shape[0]):
         c = liquid[i]

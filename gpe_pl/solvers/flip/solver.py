@@ -44,7 +44,7 @@ LARGEST_EXCESS = 0.5
 
 @dataclass(frozen=True)
 class Fields:
-    """Arrays of the grid during a substep; they are unchanged outside the active cells.
+    """Arrays of the grid during a substep. They are empty before and after it: zero, except for ``island``, whose old labels are not read.
 
     Attributes:
         velocity: velocities on faces [axis, cell] in m/s.
@@ -156,7 +156,7 @@ class FLIP:
 
     @property
     def solver_dt(self) -> float:
-        """Largest substep in s."""
+        """Upper bound of the substep in s: ``frame_dt``."""
         return self.frame_dt
 
     @property
@@ -167,7 +167,7 @@ class FLIP:
 
     @property
     def smallest_resolved(self) -> dict[str, float]:
-        """Smallest parameter value of each material that exceeds the numerical contribution of the grid."""
+        """Value of the first parameter of each material that equals what the grid adds. Smaller values have little effect."""
         return {MATERIAL: self.numerical_viscosity}
 
     def compile_kernels(self) -> None:
@@ -184,7 +184,7 @@ class FLIP:
     can_restart: ClassVar[bool] = True
 
     def restarted(self, state: State) -> State:
-        """Return the same state: positions and velocities are all that a step starts from."""
+        """Return the state without velocity history and stress. A step starts from positions and velocities alone."""
         return replace(state, velocity_history=None, stress=None)
 
     def step(self, state: State) -> State:
@@ -258,7 +258,10 @@ class FLIP:
         return self.density * self.grid_spacing / h * self._correct("pressure", liquid, right, tolerance, solids, fields, fields.velocity)
 
     def even_out(self, liquid: Liquid, solids: Solids, fields: Fields, h: float) -> None:
-        """Find the shift that expands cells with too many particles and contracts cells with too few (Kugelstadt et al. 2019)."""
+        """Find the shift that expands cells with too many particles and contracts cells with too few (Kugelstadt et al. 2019).
+
+        Bodies that fly freely are left out.
+        """
         if np.all(liquid.is_free):
             return
         excess = pressure.excess_density(liquid.cells, fields.liquid, self.grid.strides, solids.is_open, fields.density, LARGEST_EXCESS)
@@ -294,7 +297,11 @@ class FLIP:
         return make_grid(self.bounds, self.grid_spacing)
 
     def solids(self, boundary: Boundary) -> Solids:
-        """Sample the boundary on the solver's grid."""
+        """Sample the boundary on the solver's grid.
+
+        Raises:
+            SimulationError: with reason ``input``, if an obstacle is thinner than a cell.
+        """
         for shape in boundary.shapes:
             if thickness(shape) < self.grid_spacing * (1 - 1e-6):
                 raise SimulationError(

@@ -1,7 +1,7 @@
 """Transfers between particles and grid: multilinear kernels, the FLIP/PIC update, advection, and pushing particles out of solids.
 
-All kernels work in two and three dimensions. Positions are in m, velocities in m/s. ``fraction`` and ``weight`` hold the position in a cell and the 2^dim
-corner weights of the kernel.
+All kernels work in two and three dimensions. Positions are in m, velocities in m/s. ``fraction`` is the position in a cell, ``w`` are the 2^dim corner weights
+of the kernel.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ LONGEST_MOVE = 1.0
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _locate(x, p, origin, inverse, strides, counts, shift, axis, fraction):
-    """Return the index of the lowest sample around a particle, and its position among the samples at nodes plus ``shift`` cells (on ``axis``, at nodes)."""
+    """Return the index of the lowest sample around a particle, and write the particle's position between samples to ``fraction``.
+
+    Samples lie ``shift`` cells above the nodes along each axis except ``axis``, along which they lie at the nodes.
+    """
     base = 0
     for b in range(strides.shape[0]):
         s = (x[p, b] - origin[b]) * inverse - (0.0 if b == axis else shift)
@@ -82,7 +85,7 @@ def scatter(pos, vel, volume, viscosity, origin, inverse, strides, counts, corne
 def normalize(active, cell_room, face_room, smallest_room, velocity, old, weight, density, viscous):
     """Turn the sums of ``scatter`` into velocities, copied to ``old``, and into densities relative to the open space.
 
-    Cells with less open space than ``smallest_room`` keep their sums.
+    Cells with less open space than ``smallest_room`` keep their sums. Faces with less count as having that much.
     """
     for c in active:
         if cell_room[c] >= smallest_room:
@@ -98,7 +101,7 @@ def normalize(active, cell_room, face_room, smallest_room, velocity, old, weight
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def add_impulse(active, impulse, weight, velocity):
-    """Add an impulse to the velocity of all faces that particles reach."""
+    """Add an impulse per mass [dim] in m/s to the velocity of all faces that particles reach."""
     for c in active:
         for a in range(velocity.shape[0]):
             if weight[a, c] > 0.0:
@@ -187,7 +190,8 @@ def extend_into_solids(active, origin, spacing, strides, counts, corners, distan
 def gather(pos, vel, origin, spacing, strides, counts, corners, old, new, shift, weight, pic, h):
     """Move the particles with the grid for a time h, in place.
 
-    Velocities take the grid's change and the fraction ``pic`` of the grid's velocity. Positions follow the grid's velocity by the midpoint rule, and ``shift``.
+    Velocities take the grid's change and the fraction ``pic`` of the grid's velocity. Positions follow the grid's velocity by the midpoint rule, and ``shift``,
+    by at most ``LONGEST_MOVE``.
 
     Args:
         old, new: velocities on faces before and after the forces [axis, cell] in m/s.
@@ -259,7 +263,7 @@ def push_out(pos, vel, origin, spacing, strides, counts, corners, distance):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def clear(active, strides, velocity, old, shift, weight, density, viscous, touched, liquid, viscous_face):
-    """Undo every change of a substep: in the active cells, and on the upper faces of liquid ones."""
+    """Set to zero what a substep has changed in the active cells and on their upper faces."""
     dim = strides.shape[0]
     for c in active:
         density[c] = viscous[c] = 0.0

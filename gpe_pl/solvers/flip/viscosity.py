@@ -27,7 +27,7 @@ SMALLEST_MASS = 1e-6
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def viscous_faces(active, face_distance, weight, unknown):
-    """Number from 1 in ``unknown`` [axis, cell] (0 elsewhere) the faces in free space that particles reach; return their axes and cells."""
+    """Number the faces in free space that particles reach, from 1, in ``unknown`` [axis, cell], which is 0 elsewhere; return their axes and cells."""
     dim = weight.shape[0]
     axes, cells = np.empty(dim * active.shape[0], dtype=np.int64), np.empty(dim * active.shape[0], dtype=np.int64)
     n = 0
@@ -130,7 +130,7 @@ def viscosity_system(axes, cells, unknown, strides, is_open, face_distance, weig
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def drag_on_solids(active, strides, area, face_distance, density, viscous, velocity, step):
-    """Slow down open faces with a solid centre like the faces of neighbours at rest, because there the liquid is next to the wall."""
+    """Slow down open faces with a solid centre as if all their neighbours were at rest, because the liquid there is next to the wall."""
     dim = strides.shape[0]
     for c in active:
         for a in range(dim):

@@ -9,12 +9,9 @@ Sources: Hu et al. 2018 (MLS-MPM), Jiang et al. 2015 (APIC). One substep of leng
 
 Particles keep a part of the velocity that the grid does not represent; otherwise shorter substeps would lose more energy (``smoothing``).
 
-Particles of all materials share the grid; each has its own constitutive law. ``solver`` is the ``Simulator`` and ``frame`` the loop over substeps.
-``transfer_*`` are the first and last line above, ``laws_*`` the return mappings and stresses, ``collider`` the walls and obstacles. Only transfers and laws
-exist once for each dimension: they are written in scalars because that is fast.
-
-Numba's disk cache watches each file separately. After editing a function that another file calls, delete ``__pycache__``; otherwise the caller keeps the old
-one.
+Particles of all materials share the grid; each has its own constitutive law. ``solver`` is the ``Simulator``. ``frame`` is the loop over substeps and contains
+the third line above, ``transfer_*`` contain the other lines, ``laws_*`` the return mappings and stresses, and ``collider`` the walls and obstacles. Only
+transfers and laws exist once for each dimension: they are written in scalars because that is fast.
 """
 
 from gpe_pl.solvers.mpm.solver import MPM, MPMInternal

@@ -20,7 +20,7 @@ from gpe_pl.schema import STICKY
 
 
 class Collider(NamedTuple):
-    """Boundary shapes in the form that the kernels take; a grid node is its index in C order.
+    """Boundary shapes as arrays for the compiled kernels. Grid nodes are numbered in C order.
 
     Attributes:
         row: row of ``conditions`` for each grid node, -1 in free space.

@@ -146,7 +146,10 @@ def _move_grid(grid, collider, gravity, h, active, counts):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _obey(grid, node, conditions, row, counts):
-    """Remove the inward part of a node's velocity, and apply the proportional friction, for each shape that contains the node."""
+    """Apply the boundary condition of each shape that contains a grid node.
+
+    A no-slip shape stops the node. Any other shape removes the inward part of the velocity and applies Coulomb friction to the rest.
+    """
     dim = len(counts)
     for k in range(conditions.shape[1]):
         friction = conditions[row, k, dim]

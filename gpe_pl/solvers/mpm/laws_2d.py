@@ -87,7 +87,7 @@ def _hencky(f00, f01, f10, f11):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def sand(f00, f01, f10, f11, volume_correction, lam, mu, slope, intercept=0.0, tip=0.0):
-    """Hencky elasticity with a Drucker-Prager return mapping without dilation (Klar et al. 2016, sections 5 and 6.3).
+    """Apply the law of sand: Hencky elasticity with a Drucker-Prager return mapping without dilation (Klar et al. 2016, sections 5 and 6.3).
 
     ``ε = log σ + v/2`` are the principal logarithmic strains. ``v`` is the volume that the particle gained in tension and must lose before it can bear
     pressure. With ``τ = 2μ ε + λ tr ε``, the cone ``|dev τ| = k - α tr τ`` is ``|dev ε| = k/(2μ) - α (2λ + 2μ)/(2μ) tr ε``. Beyond its tip,
@@ -139,7 +139,7 @@ def hardening(compaction, xi, largest):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def snow(f00, f01, f10, f11, compaction, lam, mu, xi, smallest, largest, max_hardening):
-    """Fixed-corotated elasticity with hardening; principal stretches are clamped (Stomakhin et al. 2013, sections 4 and 7).
+    """Apply the law of snow: fixed-corotated elasticity with hardening and clamped principal stretches (Stomakhin et al. 2013, sections 4 and 7).
 
     ``τ = 2μ (F - R) Fᵀ + λ (J - 1) J`` with both moduli multiplied by ``hardening`` of the plastic state before the return mapping. The length of the substep
     was chosen for that state.
@@ -177,7 +177,7 @@ def snow(f00, f01, f10, f11, compaction, lam, mu, xi, smallest, largest, max_har
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def elastomer(f00, f01, f10, f11, lam, mu):
-    """Neo-Hookean elasticity, ``τ = μ (b - I) + λ log J`` (Bonet & Wood 2008, equation 6.28).
+    """Apply the law of elastomers: neo-Hookean elasticity, ``τ = μ (b - I) + λ log J`` (Bonet & Wood 2008, equation 6.28).
 
     Args:
         f00, f01, f10, f11: deformation gradient.
@@ -199,7 +199,18 @@ def elastomer(f00, f01, f10, f11, lam, mu):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def respond(law, f00, f01, f10, f11, plastic, constants, p):
-    """Apply the law with this code and row ``p`` of the constants; results as in ``sand``. An unknown code gives NaN."""
+    """Apply the law of particle ``p`` to its trial deformation gradient. An unknown law gives NaN.
+
+    Args:
+        law: code of the law: ``materials.SAND``, ``SNOW`` or ``ELASTOMER``.
+        f00, f01, f10, f11: trial deformation gradient.
+        plastic: plastic state: the volume correction of sand, ``J_P - 1`` of snow.
+        constants: constants of all particles [node, constant], in the columns that ``materials`` names.
+        p: row of the particle.
+
+    Returns:
+        The four entries of the return-mapped F, the new plastic state, τ₀₀, τ₀₁, τ₁₁ and the stiffness [Pa].
+    """
     lam, mu = constants[p, LAMBDA], constants[p, MU]
     if law == SAND:
         return sand(f00, f01, f10, f11, plastic, lam, mu, constants[p, COEFFICIENT], constants[p, INTERCEPT], constants[p, TIP])

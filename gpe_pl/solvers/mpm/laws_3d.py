@@ -144,7 +144,7 @@ def _squared_stretches(f):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def sand(f, volume_correction, lam, mu, slope, intercept=0.0, tip=0.0):
-    """Hencky elasticity with a Drucker-Prager return mapping, as in ``laws_2d``; the cone is ``|dev ε| = k/(2μ) - α (3λ + 2μ)/(2μ) tr ε``.
+    """Apply the law of sand, as in ``laws_2d``. The cone is ``|dev ε| = k/(2μ) - α (3λ + 2μ)/(2μ) tr ε``.
 
     Args:
         f: trial elastic deformation gradient.
@@ -177,7 +177,7 @@ def sand(f, volume_correction, lam, mu, slope, intercept=0.0, tip=0.0):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def snow(f, compaction, lam, mu, xi, smallest, largest, max_hardening):
-    """Fixed-corotated elasticity with hardening and clamped principal stretches; arguments as in ``laws_2d``, results as in ``sand``."""
+    """Apply the law of snow; arguments as in ``laws_2d``. Return the return-mapped F, the new compaction, τ and the stiffness [Pa]."""
     b1, b2, b3, axes, f = _squared_stretches(f)
     trial_1, trial_2, trial_3 = math.sqrt(b1), math.sqrt(b2), math.sqrt(b3)
     s1, s2, s3 = min(max(trial_1, smallest), largest), min(max(trial_2, smallest), largest), min(max(trial_3, smallest), largest)
@@ -199,7 +199,7 @@ def snow(f, compaction, lam, mu, xi, smallest, largest, max_hardening):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def elastomer(f, lam, mu):
-    """Neo-Hookean elasticity, ``τ = μ (b - I) + λ log J``; results as in ``sand``."""
+    """Apply the law of elastomers, ``τ = μ (b - I) + λ log J``. Return F, 0 (no plastic state), τ and the stiffness [Pa]."""
     b = left_cauchy_green(f)
     volume = abs(f[0] * (f[4] * f[8] - f[5] * f[7]) - f[1] * (f[3] * f[8] - f[5] * f[6]) + f[2] * (f[3] * f[7] - f[4] * f[6]))
     mean = (b[0] + b[3] + b[5]) / 3.0
@@ -217,7 +217,10 @@ def elastomer(f, lam, mu):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def respond(law, f, plastic, constants, p):
-    """Apply the law with this code and row ``p`` of the constants; results as in ``sand``. An unknown code gives NaN."""
+    """Apply the law of particle ``p`` to its trial deformation gradient F; arguments as in ``laws_2d``.
+
+    Return the return-mapped F, the new plastic state, τ and the stiffness [Pa]. An unknown law leaves F as it is, and the other results are NaN.
+    """
     lam, mu = constants[p, LAMBDA], constants[p, MU]
     if law == SAND:
         return sand(f, plastic, lam, mu, constants[p, COEFFICIENT], constants[p, INTERCEPT], constants[p, TIP])

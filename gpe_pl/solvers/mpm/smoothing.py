@@ -27,7 +27,7 @@ from gpe_pl.solvers.mpm import transfer_2d, transfer_3d
 from gpe_pl.solvers.mpm.particles import Particles
 
 SHOCK = 0.2
-"""Rate at which a particle forgets faster, per rate of deformation: the damping that keeps strong shocks stable (von Neumann and Richtmyer 1950)."""
+"""Increase of the rate r per rate of deformation. This damping keeps strong shocks stable (von Neumann and Richtmyer 1950)."""
 
 
 class Remainder(NamedTuple):

@@ -41,7 +41,7 @@ class MPMInternal:
         deformation: elastic deformation gradient F [node, dim, dim].
         affine: affine part of the velocity that the particle transfers to the grid, C of APIC [node, dim, dim] in 1/s.
         gradient: velocity gradient of the grid at the particle, by which it deforms [node, dim, dim] in 1/s.
-        plastic: plastic state [node]: the volume correction of sand, ``J_P - 1`` of snow.
+        plastic: plastic state [node]: the volume correction of sand and fluid, ``J_P - 1`` of snow, 0 of elastomers.
         last_substep: length of the previous substep [s]; 0 if none.
     """
 
@@ -119,7 +119,7 @@ class MPM:
 
     @property
     def smallest_resolved(self) -> dict[str, float]:
-        """Smallest parameter value of each material that exceeds the numerical contribution of the grid."""
+        """Value of the first parameter of each material that equals what the grid adds. Smaller values have little effect."""
         return {"fluid": self.numerical_viscosity} if "fluid" in self.materials else {}
 
     def constants_of(self, material: str) -> Sand | Snow | Elastomer | Fluid:
@@ -203,7 +203,7 @@ class MPM:
         return collider(tuple(boundary.shapes), origin, self.grid_spacing, counts)
 
     def _particles(self, state: State, internal: object) -> Particles:
-        """Return the particles in the form that the kernels take; raise an error that names what does not fit."""
+        """Return the particles as arrays for the compiled kernels; raise an error that names what does not fit."""
         num_nodes, dim = state.num_nodes, len(self.bounds)
         shapes = {
             "pos": (state.pos, (num_nodes, dim)),

@@ -43,7 +43,8 @@ def squared_wave_speed(particles):
 def deform(particles, stress, h):
     """Deform the particles by ``h ∇v`` and write their Kirchhoff stress [node, 3] in Pa; return the new ``squared_wave_speed``.
 
-    Viscosity ν adds ``2 ρ ν dev ∇v``, symmetrised and in plane strain. The next transfer removes ``8 h ν / Δ²`` of it, for any positions.
+    Viscosity ν adds ``2 ρ ν dev ∇v``, symmetrised and in plane strain. The next transfer removes the fraction ``8 h ν / Δ²`` of this rate of deformation, for
+    any positions.
     """
     deformation, gradient, plastic, specific_volume = (
         particles.deformation,
