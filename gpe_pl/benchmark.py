@@ -23,7 +23,7 @@ NAMED = 5
 
 
 def without_folder(value: Any, runs: str) -> Any:
-    """Replace the results folder ``runs`` in settings by the text ``paths.runs``, so that published settings name no folder of this machine."""
+    """Return settings in which paths inside the results folder ``runs`` begin with the text ``paths.runs``. Published settings then do not name that folder."""
     if isinstance(value, dict):
         return {key: without_folder(item, runs) for key, item in value.items()}
     if isinstance(value, list):

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def evaluate_checkpoint(cfg: DictConfig) -> None:
     """Roll a trained model out on one split of a data set, and in the data set's showcase if it has one. Results go to ``{paths.runs}/{name}``.
 
-    The first printed line says what the model fails in its acceptance scenes.
+    A split that is missing is generated first. The first printed line says which acceptance checks the model fails, or that it was not checked.
     """
     from gpe_pl.config.datasets import check_material_controls, ensure_split, evaluated_config, material_controls, scene_metadata
     from gpe_pl.evaluation.rollouts import EvaluationSettings, evaluate

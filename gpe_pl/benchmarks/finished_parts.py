@@ -13,7 +13,7 @@ from gpe_pl.files import sealed
 from gpe_pl.system.machine import commit
 
 PARTS = "parts"
-"""Subfolder of a suite's results that holds them."""
+"""Subfolder of a suite's results for the files of finished parts."""
 ADVICE = "delete it; the part is then measured again"
 
 
@@ -24,10 +24,10 @@ def _code() -> str:
 
 @dataclass(frozen=True)
 class FinishedParts:
-    """Records of finished parts. Several processes may store different parts at once.
+    """Records of finished parts of a suite, such as one scene or one test. Several processes may store different parts at once.
 
-    A part is known by everything that its records depend on, the commit of the running code included. Files of other settings or code are left alone until
-    ``clear`` and never used.
+    The identity of a part is given by the suite and contains everything that the records depend on. The commit of the running code is added to it. Files of
+    another identity are never used; ``clear`` deletes them.
 
     Attributes:
         folder: folder of the files, which nothing else uses.

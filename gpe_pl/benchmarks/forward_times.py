@@ -16,16 +16,16 @@ from gpe_pl.reports.sweep_table import FORWARD_TIMES, variants_of
 from gpe_pl.system.timing import paired_ratio, paired_times
 
 NUM_NODES, NUM_EDGES = 600, 6000
-"""Size of the graph, which has one layer of sand."""
+"""Size of the graph, a 2D lattice of sand."""
 
 
 def measure_forward_times(folder: Path, runs: list[Run], num_rounds: int = 30) -> None:
     """Write the forward time of each variant, divided by that of the first variant.
 
-    One model per variant is timed on the same graph; the value is the median of paired ratios.
+    One model per variant is timed on the same lattice, in one thread. The value is the median of paired ratios.
 
     Only PyTorch's operations are used, because fused passes exist for some variants only. Nothing is measured in these cases: the runs have several models or
-    domains, there is only one variant, models have other materials than sand, or the variants were measured before.
+    domains, there are fewer than two variants, a model is not for 2D sand alone, or the variants were measured before.
 
     Args:
         folder: folder of the sweep, where ``forward_times.json`` is written.

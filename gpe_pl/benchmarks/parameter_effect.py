@@ -59,7 +59,7 @@ GROUPS = ("below", "between", "above")
 
 
 class EffectError(GpeError):
-    """A scene could not be simulated; the message names it."""
+    """Raised when a scene cannot be simulated, or a data set has no unseen values; the message names it."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Settings:
 
 
 def trained_values(spec: DatasetSpec, index: int) -> dict[str, Values]:
-    """Return the trained values that are lowest, highest and nearest to those of a scene, by change."""
+    """Return the lowest and highest trained values, and those nearest to a scene's own, by key of ``CHANGES``."""
     trained = TrainedValues(spec)
     return {"lowest": trained.end(LOWEST), "highest": trained.end(HIGHEST), "nearest": trained.nearest(scene_values(spec, SPLIT, index))}
 
@@ -99,7 +99,7 @@ def with_half_steps(solver: Any) -> Any:
 
 
 def positions(solver: Solver, state: State, num_frames: int, stride: int = 1) -> np.ndarray:
-    """Return positions [frame, node, dim] in m of the frames after the initial state, of each ``stride`` steps one."""
+    """Return positions [frame, node, dim] in m after the initial state, one frame for every ``stride`` steps."""
     states = steps(solver, state, num_frames * stride)
     return np.stack([np.array(later.pos) for k, later in enumerate(states, start=1) if k % stride == 0])
 

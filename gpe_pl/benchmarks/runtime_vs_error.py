@@ -148,7 +148,10 @@ def _models(runs: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[
 
 
 def training_seconds(run: Run) -> float:
-    """Return the number of steps of a run times its measured step time; NaN if the sweep measured none."""
+    """Return the training time of a run [s]: its number of steps times the step time that its sweep measured.
+
+    Of several measured times, the largest counts with which the run stays within its time budget. NaN if there is none.
+    """
     path = next((p for folder in run.folder.parents if (p := folder / "step_times.json").exists()), None)
     model = str(run.config["model._target_"]).rpartition(".")[2]
     about = f"{run.config['data.name']} {run.config['size.name']} {model} "
@@ -187,7 +190,13 @@ def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]]
 
 @dataclass(frozen=True)
 class _Restricted:
-    """Start of a simulator: its state, the map from its positions to those of the scene's nodes, and the number of frames per step."""
+    """Start of a simulator.
+
+    Attributes:
+        resolved: its state, and the map from its positions to those of the scene's nodes.
+        from_start: whether it starts at frame 0, not at the first frame with enough history.
+        frames_per_step: number of frames that one step advances.
+    """
 
     resolved: Resolved
     from_start: bool
@@ -227,7 +236,10 @@ def _simulators(
 
 
 def _solver(spec: DatasetSpec, factor: float) -> Any | None:
-    """Return the solver for ``factor`` times the node spacing and grid spacing; None if that grid does not fit the domain."""
+    """Return the solver with about ``factor`` times the grid spacing, for nodes with ``factor`` times the spacing.
+
+    A solver without a grid is returned unchanged. Return None if such a grid does not fit the domain.
+    """
     solver: Any = spec.solver
     spacing = getattr(solver, "grid_spacing", None)
     if spacing is None:
@@ -262,7 +274,7 @@ def _reference(spec: DatasetSpec, start: State, data: Trajectory) -> Trajectory:
 
 
 def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Trajectory, num_frames: int = 20) -> float:
-    """Return the observed order P = log₂ (|u_2h − u_h| / |u_h − u_{h/2}|) over the first frames; NaN if the grid of spacing 2h does not fit."""
+    """Return the observed order P = log₂ (|u_2h − u_h| / |u_h − u_{h/2}|) over the first frames; NaN if there is no rollout with spacing 2h."""
     solver = _solver(spec, 2.0)
     try:
         resolved = coarser(start, spec.scene.spacing, 2.0)
@@ -280,10 +292,10 @@ def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Traject
 
 
 def _timed(simulator: Any, at: _Restricted, data: Trajectory, history: int) -> tuple[Trajectory, float]:
-    """Run from frame ``history`` to the end of the data; return the rollout at the nodes of the scene, and its wall time over its simulated time.
+    """Run from the start ``at`` to the end of the data. Return the rollout from frame ``history`` on, and its wall time over its simulated time.
 
-    The first step runs twice and is timed once, so that compilation and first use of memory do not count. A failed rollout ends early. Frames within a step
-    are interpolated.
+    The rollout has the nodes of the scene. The first step runs twice and is timed once, so that compilation and first use of memory do not count. A failed
+    rollout ends early. Frames within a step are interpolated.
     """
     start: Any = at.resolved.state
     dt = data.metadata.frame_dt
@@ -321,7 +333,7 @@ def _numpy(state: State) -> Frame:
 
 
 def _squared_error(prediction: Trajectory, truth: Trajectory) -> np.ndarray:
-    """Return the mean over nodes and axes of every frame [m²]; infinite for missing frames. Frame 0 may differ, because another resolution made it."""
+    """Return the mean squared error of every frame [m²], over nodes and axes; infinite for missing frames. Frame 0 may differ between resolutions."""
     error = np.full(truth.num_frames, np.inf)
     count = prediction.num_frames
     error[:count] = np.square(prediction.pos.astype(np.float64) - truth.pos[:count]).mean(axis=(1, 2))
@@ -377,7 +389,10 @@ def error_at_cost(points: Sequence[Point], cost: float, horizon: str) -> float:
 
 
 def break_even(point: Point, solvers: Sequence[Point], horizon: str, duration: float) -> float:
-    """Return the number of rollouts of a duration [s] after which training has paid off against a solver of the same error; infinite if never."""
+    """Return the number of rollouts of a duration [s] after which training has paid off against a solver of the same error.
+
+    It is infinite if training never pays off, 0 if no solver has so small an error, and NaN if the training time is not known.
+    """
     saved = (cost_at_error(solvers, point.error(horizon), horizon) - point.cost) * duration
     if saved <= 0:
         return float("inf")
@@ -506,7 +521,7 @@ def _none_as_accurate(learned: Sequence[Point], cheapest: Point, horizon: str) -
 
 
 def _rounded(factor: float) -> str:
-    """Format with two digits, without an exponent."""
+    """Format with two digits; from a million on, with an exponent."""
     return f"{float(f'{factor:.2g}'):g}"
 
 
@@ -518,7 +533,7 @@ def _interval(values: list[float], scale: float) -> str:
 
 
 def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
-    """Draw cost against error, a figure per case."""
+    """Draw error against cost, a figure per case."""
     from gpe_pl.viz.comparison import CostAndError, cost_error_figure
 
     found = {}

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 EDGES_PER_NODE = {2: 9.6, 3: 15.0}
-"""Number of undirected edges per node in the data sets' graphs, by dimension."""
+"""Typical number of undirected edges per node in the graphs of data sets, by dimension."""
 NUM_PAIRS = 3
 """Number of timed pairs of forward passes with and without ordered nodes; each pass takes seconds."""
 
@@ -40,8 +40,8 @@ class Settings:
     Attributes:
         num_nodes: sizes of the scenes.
         dimensions: dimensions of the scenes.
-        fitted: range of sizes over which the exponent is fitted, and whose ends are compared per edge.
-        budget: time [s] that repetitions of one size may take; the fastest counts.
+        fitted: range of sizes over which the exponent is fitted. Times per edge and layer are compared between its smallest and largest size.
+        budget: time [s] for repetitions of the graph, and as much for those of the forward pass, at one size. The fastest counts.
     """
 
     num_nodes: Annotated[list[Annotated[int, Field(ge=10)]], Field(min_length=1)] = field(default_factory=lambda: [1000, 10_000, 100_000])
@@ -167,7 +167,10 @@ def _fastest(function: Callable[[], Any], budget: float) -> float:
 
 
 def _fit(rows: list[tuple[int, float, float]], fitted: tuple[int, int], dim: int) -> list[dict[str, Any]]:
-    """Fit the exponent p of time ∝ Nᵖ by least squares of the logarithms; also return the ratio of times per edge and layer at the ends of the range."""
+    """Return the exponent p of time ∝ Nᵖ, by least squares of the logarithms, and the ratio of times per edge and layer at the ends of the range.
+
+    Return nothing if fewer than two sizes lie in the range.
+    """
     inside = sorted(row for row in rows if fitted[0] <= row[0] <= fitted[1])
     if len(inside) < 2:
         return []

@@ -32,7 +32,7 @@ from gpe_pl.trajectory.state import State
 
 MATERIALS = ("sand", "snow", "fluid")
 FAR = 5.0
-"""Position of the added parts, out of reach of the scene, which has unit size."""
+"""Offset [m] of the added parts along each axis. They are out of reach of the scene, whose side is 1 m."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def growths(settings: Settings, builder: GraphBuilder, scene: State) -> list[Gro
 
 
 def simulator(settings: Settings, edge_state: EdgeState, builder: GraphBuilder, skips: Skips) -> LearnedSimulator:
-    """Return a model with random weights, whose accelerations are so small that nodes at rest stay at rest."""
+    """Return a simulator with random weights. Its accelerations are so small that nodes at rest stay at rest."""
     torch.manual_seed(settings.seed)
     model = GPE(
         builder.spec,
@@ -128,7 +128,7 @@ def simulator(settings: Settings, edge_state: EdgeState, builder: GraphBuilder, 
 
 
 def absent_material_calls(settings: Settings, skips: Skips) -> int:
-    """Count the calls of modules for a material of the model that is absent from the scene, in one step."""
+    """Count the calls of modules for materials that the model has and the scene lacks, in one step."""
     builder, state = _with_absent_materials(*scene_of(settings))
     made = simulator(settings, settings.edge_states[0], builder, skips)
     absent, count = MATERIALS[1:], 0
@@ -145,7 +145,7 @@ def absent_material_calls(settings: Settings, skips: Skips) -> int:
 
 
 def message_passing_calls(settings: Settings, builder: GraphBuilder, scene: State, skips: Skips) -> int:
-    """Count the calls of message-passing layers, and the node updates of more than one row, in a step with falling nodes only."""
+    """Count the calls of message-passing layers and node updates that get more than one row, in a step with falling nodes only."""
     made = simulator(settings, settings.edge_states[0], builder, skips)
     count = 0
 
@@ -244,7 +244,7 @@ def _table(settings: Settings, num_edges: int, lines: list[str], records: list[d
 
 
 def _step(runner: Simulator, state: State) -> Callable[[], State]:
-    """Return a step from a state in which the level has taken effect."""
+    """Return a step from the given positions and velocities, after two steps in which the level of skipping takes effect."""
     for _ in range(2):
         state = replace(runner.step(state), pos=state.pos, vel=state.vel, velocity_history=state.velocity_history)
     return lambda: runner.step(state)
@@ -266,7 +266,7 @@ def _with_walls(scene: State, count: int) -> State:
 
 
 def _falling(scene: State, count: int) -> State:
-    """Return a scene of nodes in free fall, one unit apart."""
+    """Return a scene of nodes without neighbours, 1 m apart. They fall freely; without gravity, they stay."""
     side = int(np.ceil(count ** (1 / scene.dim)))
     lattice = np.stack(np.unravel_index(np.arange(count), (side,) * scene.dim), axis=-1)
     pos = FAR + torch.from_numpy(lattice.astype(float)).to(scene.pos.device)

@@ -2,8 +2,8 @@
 
 The models are GPE with every interaction, with and without fused passes, and the baselines.
 
-Two lower bounds (floors) are reported for each case. The first is the time of its matrix products at the machine's measured rate. The second is the time for
-moving every edge state in and out of memory once per layer.
+Two lower bounds (floors) are reported for GPE in full precision. The first is the time of its matrix products at the machine's measured rate. The second is
+the time for moving every edge state in and out of memory once per layer.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ MEDIUM = ", medium"
 
 @dataclass(frozen=True)
 class Settings:
-    """Size of the problem."""
+    """Size of the problem, and how it is timed. Edges are counted as undirected."""
 
     num_nodes: Annotated[int, Field(ge=10)] = 2500
     num_edges: Annotated[int, Field(ge=10)] = 24000
@@ -78,8 +78,9 @@ class Case:
     precision: Literal["highest", "medium"] = "highest"
 
     def runs(self, function: Callable[[], Any]) -> Callable[[], Any]:
-        """Wrap the function with the settings of this case: the precision of float32 products (``medium`` allows bfloat16 inside), and no fused passes if
-        it has none.
+        """Return a function that makes the same call with this case's precision of float32 products (``medium`` allows bfloat16 inside).
+
+        Fused passes are off unless ``is_fused``.
         """
 
         def call() -> Any:
@@ -103,7 +104,7 @@ class Case:
         return None if self.is_fused else "directed, factored"
 
     def build(self, spec: FeatureSpec, num_steps: int, hidden: int, seed: int = 0) -> Model:
-        """Build the model; equal parameters get equal weights in all cases."""
+        """Build the model. Cases with the same parameters get the same weights from one seed."""
         torch.manual_seed(seed)
         if self.model == "GNS":
             return GNS(spec, num_steps, hidden)
@@ -122,7 +123,7 @@ class Case:
 
 
 def cases(compiled: bool, reduced: bool) -> dict[str, Case]:
-    """Return all timed cases by name, the reference first; ``torch.compile`` and products of reduced precision are included if the machine has them."""
+    """Return the timed cases by name, the reference first. ``compiled`` adds cases with ``torch.compile``, ``reduced`` cases with less precise products."""
     found = {f"{i}, plain": Case(interaction=i, implementation="plain") for i in INTERACTIONS}
     found |= {f"{i}, factored": Case(interaction=i, is_fused=False) for i in INTERACTIONS}
     found |= {i: Case(interaction=i) for i in ("negated", "odd")}
@@ -136,7 +137,10 @@ def cases(compiled: bool, reduced: bool) -> dict[str, Case]:
 
 
 def flop(model: Model, graph: HeteroData) -> int:
-    """Count the floating-point operations of a forward pass's matrix products, on the meta device, where no fused passes hide products."""
+    """Count the floating-point operations of the matrix products in a forward pass.
+
+    The model is moved to the meta device, where no fused passes hide products. It loses its weights there.
+    """
     with torch.inference_mode(), FlopCounterMode(display=False) as counter:
         model.to("meta")(graph.clone().to("meta"))
     return int(counter.get_total_flops())

@@ -33,9 +33,10 @@ def runs_in(folders: Sequence[str]) -> list[Run]:
 
 
 def trained_on(spec: DatasetSpec, runs: Iterable[Run]) -> dict[str, tuple[LearnedSimulator, Run]]:
-    """Return simulators that were trained on a data set, and their runs, by label.
+    """Return simulators that were trained on a data set of this name and size, and their runs, by label.
 
-    A label names the model, and the settings in which runs of the same model differ. Among runs that differ only in seed or length, the first is returned.
+    A label names the model, and the settings of training and graph in which its runs differ. The length of training is no part of it. Of runs with the same
+    label, such as runs with other seeds, the first is returned.
     """
     same: dict[str, list[tuple[LearnedSimulator, Run]]] = defaultdict(list)
     for run in runs:
@@ -54,7 +55,7 @@ def trained_on(spec: DatasetSpec, runs: Iterable[Run]) -> dict[str, tuple[Learne
 
 
 def checkpoint_label(checkpoint: str) -> str:
-    """Return the name of a model given by the path of a checkpoint, the folder of a run, or the name of a shipped model."""
+    """Return a short name for a model that is given as the path of a checkpoint, the folder of a run, or the name of a shipped model."""
     path = Path(checkpoint)
     return path.parent.parent.name if path.parent.name == "checkpoints" else path.stem
 
@@ -69,7 +70,7 @@ def fingerprint_of(simulator: LearnedSimulator) -> str:
 
 
 def model_label(simulator: LearnedSimulator) -> str:
-    """Return class, depth, width, and all other settings that differ from the default."""
+    """Return a label: the model's class, depth × width, and the values of all other settings that differ from their defaults."""
     cls, settings = type(simulator.model), dict(simulator.description()["settings"])
     depth = next((settings.pop(k) for k in DEPTHS if k in settings), "")
     plain = cls(simulator.builder.spec).settings

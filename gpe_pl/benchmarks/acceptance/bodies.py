@@ -47,7 +47,7 @@ WINDOW = 10
 
 
 def dropped(columns: int, rows: int, name: str, candidate: Candidate) -> Result:
-    """Drop a block of ``columns`` × ``rows`` cells flat on the floor."""
+    """Drop a block of ``columns`` × ``rows`` squares flat on the floor, and return its checks."""
     seconds = SECONDS[scenes.material_of(candidate.spec)]
     trials = [
         tried(candidate, value, scenes.dropped_block(candidate.spec, value, columns, rows, GAP, SPEED), seconds)
@@ -75,19 +75,19 @@ def _bodies(trajectory: Trajectory) -> Bodies:
 
 
 def sideways_speed(trajectory: Trajectory) -> float:
-    """Return the largest sideways speed of the centre of mass [m/s]."""
+    """Return the largest sideways speed of the centre of mass [m/s], averaged over ``WINDOW`` frames."""
     x = centre(trajectory)[:, 0]
     return float(np.abs(x[WINDOW:] - x[:-WINDOW]).max()) / (WINDOW * trajectory.metadata.frame_dt)
 
 
 def asymmetry(truth: Trajectory, trajectory: Trajectory) -> float:
-    """Return the difference of a body from its mirror image, over the way of the truth, in all frames together [%]."""
+    """Return the difference of a body from its mirror image, over the displacement of the ground truth from its start, in all frames together [%]."""
     (mirror,) = mirrors(truth)
     return 100 * mirror_error(trajectory, truth, mirror, trajectory.num_frames - 1)
 
 
 def against_solver(name: str, trials: list[Trial]) -> list[Check]:
-    """Return the checks of bounce height, deformation and peak stress against the solver."""
+    """Return the checks of bounce height and deformation against the solver, and of peak stress if solver and model have a stress."""
     bounces = [t.measured(partial(bounce_height, _bodies(t.truth))) for t in trials]
     ratios = [t.measured(partial(deformation_ratio, _bodies(t.truth)))[0] for t in trials]
     has_stress = all(t.truth.stress is not None and t.model.stress is not None for t in trials)
@@ -118,7 +118,7 @@ def deformation_ratio(truth: Bodies, trajectory: Trajectory) -> float:
 
 
 def peak_stress(trajectory: Trajectory) -> float:
-    """Return the largest von Mises stress at a node [Pa]."""
+    """Return the largest von Mises stress at a node after the first frame [Pa]."""
     stress = _bodies(trajectory).von_mises
     assert stress is not None
     return float(stress[1:].max())

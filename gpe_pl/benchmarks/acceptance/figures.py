@@ -19,7 +19,7 @@ GAP, LEFT = 0.05, 0.2
 
 
 def scene_figure(columns: Sequence[Shown]) -> Figure:
-    """Draw a column per moment, coloured by height at the start, or by stress if solver and model have it."""
+    """Draw the solver above and the model below, in the given columns. Colours mean stress if both have one, else the height at the start."""
     trajectories = [t for c in columns for t in (c.truth, c.model)]
     has_stress = all(t.stress is not None for t in trajectories)
     coloring = Coloring("von_mises" if has_stress else "height", trajectories, sorted({c.frame for c in columns}))

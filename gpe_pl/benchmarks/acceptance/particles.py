@@ -28,7 +28,7 @@ RUN_OUT_TOLERANCE = 0.15
 OUTER = 0.02
 """Fraction of particles left out on each side where a width is measured, so that single grains do not count."""
 MAX_CREEP = 0.1
-"""Largest speed of a pile at rest, in spacings per second: the limit of the stability suite is this distance in five seconds."""
+"""Largest rms displacement of a pile at rest, in spacings per second. The stability suite allows a node this many spacings in 1,000 frames."""
 MAX_SINKING = 5.0
 """Largest change of a pile's height [%]."""
 BALL_RADIUS, CYLINDER, SPEED = 8, 0.1, 2.0
@@ -91,7 +91,7 @@ def sinking(trajectory: Trajectory) -> float:
 
 
 def ball_on_cylinder(candidate: Candidate) -> Result:
-    """Let a ball of snow fall centrally on a cylinder: it splits symmetrically, and what lies stays."""
+    """Let a ball of snow fall centrally on a cylinder. It must split symmetrically, and its deposit must come to rest."""
     spec, middle = candidate.spec, float(scenes.middle(candidate.spec)[0])
     trials = [
         tried(candidate, value, scenes.ball_over_cylinder(spec, value, BALL_RADIUS, CYLINDER, SPEED), SECONDS) for value in candidate.values
@@ -113,9 +113,10 @@ def imbalance(middle: float, trajectory: Trajectory) -> float:
 
 
 def separation(truth: Trajectory, trajectory: Trajectory) -> float:
-    """Return the energy distance of the last frame from that of the truth, as a sideways motion of the whole deposit in spacings that has the same distance.
+    """Return how far the deposit in the last frame is from the true one, in spacings.
 
-    For small motions the energy distance grows with the square of the motion.
+    The energy distance of both is converted into the sideways shift of the true deposit that has the same distance. For small shifts the energy distance grows
+    with the square of the shift.
     """
     cloud, mass, spacing = truth.pos[-1].astype(np.float64), truth.mass, truth.metadata.spacing
     beside = cloud + np.eye(cloud.shape[1])[0] * OVERLAP * spacing

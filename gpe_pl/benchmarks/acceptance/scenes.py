@@ -1,4 +1,4 @@
-"""Starts of the acceptance scenes, in the domain, spacing and frame interval of a data set."""
+"""Starts of the acceptance scenes, in the domain and with the spacing and gravity of a data set."""
 
 from __future__ import annotations
 
@@ -75,9 +75,9 @@ def middle(spec: DatasetSpec) -> np.ndarray:
 
 
 def block(columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nodes [node, 2] and triangles [cell, 3] of a rectangle of unit cells; nodes and diagonals are symmetric about its vertical axis.
+    """Return the nodes [node, 2] and triangles [cell, 3] of a rectangle of unit squares.
 
-    Node ``(i, j)`` has number ``i (rows + 1) + j``.
+    Nodes are symmetric about the vertical axis, and so are diagonals for an even number of columns. Node ``(i, j)`` has number ``i (rows + 1) + j``.
     """
     nodes = integer_lattice(np.zeros(2, int), np.array([columns, rows])).astype(float)
     triangles = []
@@ -107,7 +107,7 @@ def disc(radius: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def column(spec: DatasetSpec, value: float, columns: int, rows: int) -> State:
-    """Return a column of ``columns`` × ``rows`` particles at rest in the middle of a rough floor."""
+    """Return a symmetric column of ``columns`` (an even number) × ``rows`` particles at rest in the middle of a rough floor."""
     lattice = integer_lattice(np.zeros(2, int), np.array([columns - 1, rows - 1])) + 0.5
     left = lattice[lattice[:, 0] < columns / 2] + np.random.default_rng(0).uniform(-JITTER, JITTER, (columns * rows // 2, 2))
     both = np.concatenate([left, left * [-1, 1] + [columns, 0]])
@@ -136,7 +136,7 @@ def ball_over_cylinder(spec: DatasetSpec, value: float, radius: int, cylinder: f
 
 
 def vessel(spec: DatasetSpec) -> tuple[Shape, ...]:
-    """Return the solids of a data set of liquid without obstacles: the bowl, or the walls of the domain."""
+    """Return the solids of a data set of liquid without obstacles: the walls of the domain, and the bowl if the scene has one."""
     scene = cast(FluidScene, spec.scene)
     walls = domain_walls(scene.bounds, scene.friction)
     if scene.scene != "bowl":
@@ -146,7 +146,7 @@ def vessel(spec: DatasetSpec) -> tuple[Shape, ...]:
 
 
 def pool(spec: DatasetSpec, value: float, one_side: bool) -> State:
-    """Return liquid at rest that fills the vessel from below, with a jittered surface; on ``one_side`` only, it is a dam that breaks."""
+    """Return jittered particles of liquid at rest that fill the vessel from below. With ``one_side`` they fill its left half only, as before a dam breaks."""
     scene, shapes = cast(FluidScene, spec.scene), vessel(spec)
     low, high = np.array(scene.bounds).T
     count = np.floor((high - low) / scene.spacing + 1e-6).astype(int)

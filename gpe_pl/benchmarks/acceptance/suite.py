@@ -48,7 +48,7 @@ SCENES: dict[str, dict[str, Callable[[Candidate], Result]]] = {
 
 
 class AcceptanceError(GpeError, ValueError):
-    """A checkpoint has no acceptance scenes, or its name is taken; the message names it."""
+    """Raised when there are no acceptance scenes for a checkpoint, or two have one name; the message names them."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,10 @@ class Settings:
 
 
 def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tuple[list[dict[str, Any]], str]:
-    """Return a record per check and a Markdown table. The results of each checkpoint are written to ``folder``, and beside it unless it is a shipped model."""
+    """Return a record per check and a Markdown table.
+
+    The results of each checkpoint are written to ``folder``, and beside the checkpoint unless it is a shipped model.
+    """
     torch.set_num_threads(settings.num_threads)
     candidates = _candidates(settings.checkpoints, specs)
     parts, records = FinishedParts(folder / PARTS), list[dict[str, Any]]()

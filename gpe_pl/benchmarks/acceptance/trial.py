@@ -25,7 +25,7 @@ from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 from gpe_pl.viz.captions import parameter_name, parameter_value
 
 FASTER = 5.0
-"""A rollout stops at this multiple of the solver's largest speed."""
+"""A rollout stops at this multiple of the solver's largest speed, or of 1 m/s if the solver is slower."""
 
 MAX_CORRECTED = 0.01
 """Largest fraction of particle-steps in which containment may move a particle back out of a wall."""
@@ -67,7 +67,7 @@ class Candidate:
         )  # fmt: skip
 
     def described(self, value: float) -> str:
-        """Return the material parameter with name and unit."""
+        """Return the material parameter with name and unit, marked as unseen if it is not a trained value."""
         unseen = "" if value in (self.values[0], self.values[2]) else ", unseen"
         parameter = MATERIALS[material_of(self.spec)][0]
         return f"{parameter_name(parameter)} {parameter_value(parameter, value)}{unseen}"
@@ -75,7 +75,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Trial:
-    """One scene from the first frame of the model on.
+    """Rollouts of one scene by solver and model, from the frame at which the model starts.
 
     Attributes:
         value: material parameter.
@@ -136,7 +136,7 @@ def predicted(candidate: Candidate, state: State, truth: Trajectory) -> tuple[Tr
 
 
 def listed(values: Sequence[float]) -> str:
-    """Return numbers of three digits; ``stopped`` stands for a rollout that ended early."""
+    """Return numbers as text with three digits; NaN, for a rollout that ended early, is ``stopped``."""
     return ", ".join("stopped" if math.isnan(v) else f"{v:.3g}" for v in values)
 
 
@@ -150,7 +150,7 @@ def at_most(name: str, values: Sequence[float], limit: float, unit: str) -> Chec
 
 
 def not_above_solver(name: str, values: Sequence[tuple[float, float, float]], limit: float, unit: str) -> Check:
-    """Return the check that no value of the model exceeds a limit, or twice that of the solver in the same scene if that is more."""
+    """Return the check that no value of the model exceeds a limit, or twice the larger value of both solver runs in the same scene if that is more."""
     own = [max(solver, finer) for _, solver, finer in values]
     passed = all(model <= max(limit, 2 * most) for (model, _, _), most in zip(values, own, strict=True))
     return Check(name, passed, *_both([model for model, _, _ in values], own, unit), f"at most {limit:.3g}{unit} or twice the solver's")

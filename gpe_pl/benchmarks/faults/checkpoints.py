@@ -80,7 +80,7 @@ def load_changed(sound: Path, key: str, value: Any, folder: Path) -> Verdict:
 
 
 def load_without(sound: Path, key: str, folder: Path) -> Verdict:
-    """Load a checkpoint without a weight, or without the description."""
+    """Load a checkpoint without a weight, without all weights, or without the description."""
     stored = torch.load(sound, weights_only=True)
     if key in stored:
         del stored[key]
@@ -187,6 +187,6 @@ def _others(sound: Path) -> Iterator[tuple[str, str, Callable[[Path], Verdict]]]
 
 
 def faults(sound: Path, num_damages: int, seed: int = 0) -> list[Fault]:
-    """Return faults of a checkpoint: damaged bytes of a sound one, and other content in a file of its name."""
+    """Return faults of a checkpoint: damaged bytes of a sound one, and files with other content."""
     found = [Fault(f"checkpoint, {kind}", name, partial(load_damaged, sound, damage)) for kind, name, damage in damages(num_damages, seed)]
     return found + [Fault(*other) for other in _others(sound)]

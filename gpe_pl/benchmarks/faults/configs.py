@@ -35,7 +35,7 @@ class NoConfigError(GpeError):
 
 
 def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the keys of a configuration and their values, except mappings and lists of mappings."""
+    """Yield key and value of every entry of a configuration that is not itself a table, except entries of ``PLACES``."""
     if isinstance(values, dict) and values:
         for key, value in values.items():
             yield from leaves(value, f"{path}.{key}" if path else str(key))
@@ -44,7 +44,7 @@ def leaves(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def mutations(key: str, value: Any) -> Iterator[tuple[str, str, bool]]:
-    """Yield kind and override of each wrong value, and whether the command must refuse it."""
+    """Yield kind and override of every mutation of a key, and whether the command must refuse it."""
     parent, _, leaf = key.rpartition(".")
     yield "unknown key", f"+{parent + '.' if parent else ''}{leaf}_typo=1", True
     yield "missing key", f"~{key}", False  # the default of the signature may apply

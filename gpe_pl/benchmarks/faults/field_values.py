@@ -199,7 +199,10 @@ def _last_state(trajectory: Trajectory) -> State:
 
 
 def _applies(way: str, key: str) -> bool:
-    """Tell whether a field enters in one of the ways. A rollout does not take stored velocities. Neither a rollout nor an import takes the stress."""
+    """Tell whether a field enters in one of the ways.
+
+    A rollout does not take stored velocities. Neither a rollout nor an import takes stresses and the dimension of cells.
+    """
     if way == "rollout":
         return key.startswith(OF_STATES) or key == "pos"
     return way != "conversion" or not ("stress" in key or "mises" in key or key == "cell_dim")

@@ -159,7 +159,7 @@ class Ended:
     output: str
 
     def verdict(self, on_success: str = "harmless") -> Verdict:
-        """Return the verdict: ``refused`` if the output is one line of error, ``on_success`` if the command succeeded."""
+        """Return the verdict: ``on_success`` if the command succeeded, ``refused`` if it failed with a line of error and without a traceback."""
         lines = [line for line in self.output.splitlines() if line.strip()]
         last = lines[-1][:MAX_DETAIL] if lines else ""
         if self.code is None:

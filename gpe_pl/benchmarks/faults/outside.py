@@ -40,7 +40,7 @@ def linked(command: Command, sound: Path, part: str, target: str, limit: float, 
 
 
 def interrupted(command: Command, limit: float, folder: Path) -> Path | None:
-    """Kill a training once it has saved ``last.ckpt``, and return its path; return None if the training ended first."""
+    """Kill a training once it has saved ``last.ckpt``, and return its path; return None if it ended or reached the time limit first."""
     process = isolation.start(command.module, command.given(folder), folder.parent / "output")
     deadline = time.monotonic() + limit
     try:
@@ -83,7 +83,7 @@ def resumed(command: Command, state: str, path: str, limit: float, folder: Path)
 
 
 def faults(command: Command, sound: Path, keys: Sequence[str], also_files: bool, limit: float) -> list[Fault]:
-    """Return names for each key, links in place of the files of a run or data set if ``also_files``, and paths in checkpoints of trainings."""
+    """Return names for each key. With ``also_files``, also return links in place of the files of a run or data set, and paths in checkpoints of trainings."""
     found = []
     for key in keys:
         for name in LEADING_OUT:

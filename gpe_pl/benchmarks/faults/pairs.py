@@ -25,8 +25,8 @@ Results = dict[str, str]
 def together(commands: Sequence[Command], expected: Sequence[Results], delay: float, limit: float, folder: Path) -> Verdict:
     """Start two commands in one folder, the second ``delay`` seconds after the first.
 
-    The outcome is sound if the folder contains exactly the results of the commands that succeeded, and each refused command names the one that ran or says
-    that its results exist.
+    The outcome is sound if a command succeeds and the folder contains exactly the results of those that do. A command that is refused before the other ends has
+    to name it, or to say that its results exist.
     """
     own, outputs = folder / "own", [folder / f"output-{k}" for k in range(len(commands))]
     processes = []

@@ -309,7 +309,7 @@ def small_disk(folder: Path, size: int) -> Iterator[bool]:
 
 
 def full_disk(command: Command, size: int, expected: dict[str, str], limit: float, folder: Path) -> Verdict:
-    """Run a command on a disk that fills up; then make room, and run the same command to its end."""
+    """Run a command on a disk that fills up; then make room, and run the same command to its end. Without the right to mount, files are limited instead."""
     with small_disk(folder / "disk", size) as is_mounted:
         own = folder / "disk"
         prepare = None if is_mounted else partial(limit_file_size, size)

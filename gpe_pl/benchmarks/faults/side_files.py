@@ -71,7 +71,7 @@ def _truncated(path: Path) -> None:
 
 
 def _number(seed: int, text: bytes | None, path: Path) -> None:
-    """Replace a number by another text; without a text, change its first digit."""
+    """Replace a number by another text; without a text, change its first digit that is not 0. A file without a number is truncated."""
     content = path.read_bytes()
     found = list(NUMBER.finditer(content))
     if not found:
@@ -127,7 +127,7 @@ SMALL = (".json", ".csv", ".sha256")
 
 
 def command_faults(command: Command, sound: Path, count: int, seed: int, limit: float) -> list[Fault]:
-    """Return changes of small files that a command has left, each followed by the same command."""
+    """Return at most ``count`` random changes of small files that a command has left, each followed by the same command."""
     names = sorted(str(path.relative_to(sound)) for path in sound.rglob("*") if path.suffix in SMALL and "log" not in path.parts)
     every = [(name, what, change) for name in names for what, change in changes(name.endswith(".json"), seed)]
     chosen = np.random.default_rng(seed).permutation(len(every))[:count]

@@ -31,7 +31,7 @@ def read_damaged(sound: Path, damage: Callable[[bytes], bytes], folder: Path) ->
 
 
 def read_rewritten(sound: Path, rewrite: Callable[[Path], None], folder: Path) -> Verdict:
-    """Read a shard with other content and matching checksums."""
+    """Read a shard with other content and matching checksums of HDF5."""
     path = folder / sound.name
     path.write_bytes(sound.read_bytes())
     rewrite(path)

@@ -89,7 +89,7 @@ class Settings:
         commands: attacked commands; the first generates the data of the others, and the first checkpoint among their results is damaged.
         num_file_damages: number of damages to the bytes of a shard, and of a checkpoint.
         num_scenes: number of scenes of each data set, for each change.
-        limit: time [s] after which a fault counts as hung.
+        limit: time [s] after which a command counts as hung. A fault, which may run several, has four times as long.
         seed: seed of all random choices.
     """
 

@@ -18,7 +18,7 @@ def long_horizon_figure(models: Curves) -> Figure:
 
     Args:
         models: curves by name of the model. ``energy`` and ``momentum`` are given at evenly spaced frames up to the last of ``horizons``; infinite values, from
-            failed scenes, are not drawn. ``valid_steps`` and ``steps_to_failure`` are given for each scene, and are infinite if it did not fail.
+            failed scenes, are not drawn. ``valid_steps`` and ``steps_to_failure`` are given for each scene; the latter is infinite if it did not fail.
     """
     figure = new_figure(TEXT_WIDTH, 4.2)
     figure.set_layout_engine("constrained")

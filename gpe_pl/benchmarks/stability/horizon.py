@@ -24,7 +24,7 @@ from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 
 MAX_CORRECTED = 0.01
-"""Fraction of corrected particle-steps above which containment replaces the model."""
+"""Largest fraction of particle-steps that containment may correct."""
 VALID_ERROR = 0.5
 """Root mean square displacement in spacings up to which a prediction is valid."""
 PERTURBATION = 1e-6
@@ -97,7 +97,7 @@ def momentum(trajectory: Trajectory) -> np.ndarray:
 
 
 def valid_steps(prediction: Trajectory, truth: Trajectory, spacing: float) -> int:
-    """Return the number of frames before the root mean square displacement from the ground truth exceeds ``VALID_ERROR`` spacings, or of all frames."""
+    """Return the number of predicted frames before the root mean square displacement from the truth exceeds ``VALID_ERROR`` spacings, or of all of them."""
     count = min(prediction.num_frames, truth.num_frames)
     error = np.square(displacement(prediction.pos[:count], truth.pos[:count], truth.metadata)).sum(axis=-1).mean(axis=-1)
     beyond = np.flatnonzero(~(np.sqrt(error) <= VALID_ERROR * spacing))
@@ -133,7 +133,7 @@ def rest(subject: Subject) -> Outcome:
 
 
 def stays(subject: Subject, settled: State) -> Outcome:
-    """Tell whether a state at rest in the solver stays at rest in the model."""
+    """Test whether a state at rest in the solver stays at rest in the model."""
     metadata, guard = subject.scenes[0].metadata, subject.guard()
     result = rollout(Contained(subject.simulator, subject.dt), settled, subject.num_rest_steps, metadata, guard)
     moved = np.linalg.norm(result.pos - result.pos[0], axis=-1).max(axis=1) / subject.spacing
@@ -232,7 +232,7 @@ def advanced(simulator: Simulator, state: State, num_steps: int) -> State:
 
 
 def max_speed(spec: Any, generate: Callable[..., Trajectory], num_trajectories: int) -> float:
-    """Return the largest speed [m/s] in some training trajectories, from differences of positions over a frame."""
+    """Return the largest speed [m/s] in the first training trajectories, from differences of positions over a frame."""
     dt = spec.solver.frame_dt
     found = [generate(spec, "train", k).pos.astype(np.float64) for k in range(min(num_trajectories, spec.num_train))]
     return max(float(np.linalg.norm(np.diff(pos, axis=0), axis=-1).max()) / dt for pos in found)

@@ -23,7 +23,16 @@ NUM_STEPS = 20
 
 @dataclass(frozen=True)
 class Spoiled:
-    """Simulator whose result of one frame is replaced."""
+    """Simulator whose result of one frame is replaced.
+
+    Attributes:
+        simulator: the undisturbed simulator.
+        frame: number of the frame, counted from the start of the rollout.
+        num_nodes: number of nodes of the scene; results of other scenes are not replaced.
+        spoil: function of the state before the step and the result, which returns the replacement.
+        dt: time between frames [s].
+        start: time at the start of the rollout [s].
+    """
 
     simulator: Simulator
     frame: int

@@ -39,7 +39,7 @@ def relabelling_error(subject: Subject, dtype: torch.dtype, seed: int) -> float:
 
 
 def turning_error(subject: Subject, dtype: torch.dtype, seed: int, *, turn: bool, shuffle: bool) -> float:
-    """Return the relative change of the output when edges are reversed (``turn``) or shuffled."""
+    """Return the relative change of the output when a random half of the edges is reversed (``turn``), and when edges are shuffled (``shuffle``)."""
     simulator = in_double(subject.simulator) if dtype == torch.float64 else subject.simulator
     state = subject.state(seed)
     graph = simulator.builder(state)
@@ -75,7 +75,7 @@ def edge_order(subject: Subject) -> Outcome:
 
 
 def wrong_edges(graph: HeteroData, subject: Subject) -> int:
-    """Count the edges that are stored twice, in either direction, or that connect a node to itself."""
+    """Count the edges that are stored twice, also in the other direction if it is the same edge, and those that connect a node to itself."""
     count = 0
     for relation in subject.simulator.builder.spec.relations:
         index = graph[relation].edge_index

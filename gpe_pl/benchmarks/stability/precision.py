@@ -118,7 +118,8 @@ def _skipping(subject: Subject, skips: Skips) -> LearnedSimulator:
 def sleeping(subject: Subject, num_steps: int = 20) -> tuple[float, float, float]:
     """Compare rollouts with and without sleeping, from starts throughout the scenes.
 
-    Returns the ratio of the mean squared errors, the ratio of the times, and the fraction of particle-steps asleep.
+    Returns:
+        The mean squared error with sleeping over that without, the time without sleeping over that with, and the fraction of particle-steps asleep.
     """
     runners = {"asleep": approximate(_skipping(subject, ASLEEP)), "awake": subject.simulator}
     errors, seconds, num_asleep, num_steps_of_nodes = dict.fromkeys(runners, 0.0), dict.fromkeys(runners, 0.0), 0, 0
@@ -182,7 +183,7 @@ def target_power(subject: Subject, graph: HeteroData) -> float:
 
 
 def trained(subject: Subject, graphs: list[HeteroData], learning_rate: float) -> list[float]:
-    """Train fresh weights on a list of graphs with gradients clipped as in training; return the losses."""
+    """Train fresh weights on a list of graphs, with gradients clipped as in training and without stresses; return the losses."""
     torch.manual_seed(0)
     simulator = copy.deepcopy(subject.simulator).train()
     settings = simulator.description()["settings"]
@@ -203,7 +204,7 @@ def trained(subject: Subject, graphs: list[HeteroData], learning_rate: float) ->
 
 
 def gradients_are_correct(subject: Subject) -> bool:
-    """Compare gradients by node features with finite differences in double precision, on 5 nodes."""
+    """Tell whether gradients with respect to node features equal finite differences in double precision, on 5 nodes."""
     simulator = in_double(subject.simulator)
     state = subject.state()
     near = torch.argsort((state.pos - state.pos[0]).norm(dim=1))[:5]
@@ -273,7 +274,7 @@ def attacks(subject: Subject, limits: Guard) -> dict[str, Callable[[State, State
 
 
 def obstacle(state: State, spacing: float) -> Box:
-    """Return a plate, two spacings thick, directly above all nodes."""
+    """Return a plate two spacings above the highest node. It is two spacings thick and eight wide."""
     middle, top = state.pos.mean(dim=0), state.pos.max(dim=0).values
     low, high = middle - 4 * spacing, middle + 4 * spacing
     low[-1], high[-1] = top[-1] + 2 * spacing, top[-1] + 4 * spacing
@@ -286,7 +287,7 @@ def ball(state: State, radius: float) -> Sphere:
 
 
 def _beside(state: State, spacing: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return a position below the plate, and one above it."""
+    """Return positions one spacing below and one spacing above the plate."""
     plate = state.boundary.shapes[-1]
     assert isinstance(plate, Box)
     below, above = torch.tensor([plate.low, plate.high], dtype=torch.float64)

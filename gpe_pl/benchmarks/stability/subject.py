@@ -69,7 +69,7 @@ class Subject:
         return self.simulator.acceleration_std.item()
 
     def state(self, scene: int = 0, fraction: float = 0.5) -> State:
-        """Return the state after a fraction of a scene's frames, in float64."""
+        """Return the state after a fraction of a scene's frames, in float64; at the earliest the first state with enough history."""
         truth = self.scenes[scene % len(self.scenes)]
         frame = max(self.history, round(fraction * (truth.num_frames - 1)))
         return self.simulator.initial_state(truth, frame)
@@ -188,7 +188,10 @@ def no_boundary(state: State) -> Boundary:
 
 
 def shifted(state: State, offset: Tensor) -> State:
-    """Return the scene translated by an offset; shapes are not moved, because graphs do not depend on them."""
+    """Return the scene translated by an offset, for a single step.
+
+    Shapes and the prescribed motion of the boundary are not moved, because the graph of the state does not depend on them.
+    """
     boundary = replace(state.boundary, pos=state.boundary.pos + offset)
     rest = None if state.rest_pos is None else state.rest_pos + offset
     return replace(state, pos=state.pos + offset, rest_pos=rest, boundary=boundary)

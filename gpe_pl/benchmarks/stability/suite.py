@@ -50,7 +50,7 @@ GROUPS = {
 
 
 class NothingToTestError(GpeError, ValueError):
-    """Raised when a data set has no model, or two models of one name; the message says where models were searched for."""
+    """Raised when there is no model for any data set, or two models of a data set have one name; the message says what to do."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +83,12 @@ class Settings:
 
 
 def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tuple[list[dict[str, Any]], str]:
-    """Return a record per test and model, and a Markdown table per domain.
+    """Return a record per test and model, and a Markdown table per domain. Data sets without a model are not tested.
 
     Tests that had finished when an earlier run was stopped are not repeated. ``folder`` keeps their records until the suite ends.
+
+    Raises:
+        NothingToTestError: no data set has a model, or two models of a data set have one name.
     """
     parts = FinishedParts(folder / PARTS)
     records: list[dict[str, Any]] = []
@@ -190,7 +193,7 @@ def _outcome(stress_test: StressTest, subject: Subject) -> Outcome:
 
 
 def subjects(domain: str, spec: DatasetSpec, models: dict[str, LearnedSimulator], settings: Settings) -> list[Subject]:
-    """Return the models of a data set with their test data, the gating ones first."""
+    """Return the models of a data set with their test data, the gating ones first. Static friction of the models is switched off."""
     scenes = [generate_trajectory(spec, "test", k) for k in range(settings.num_scenes)]
     speed = horizon.max_speed(spec, generate_trajectory, settings.num_scenes)
     for simulator in models.values():
@@ -214,7 +217,7 @@ def subjects(domain: str, spec: DatasetSpec, models: dict[str, LearnedSimulator]
 
 
 def is_gating(simulator: LearnedSimulator, gating: dict[str, str]) -> bool:
-    """Tell whether a model has all of these settings."""
+    """Tell whether a model has all of these settings; false if there are none."""
     own = simulator.description()["settings"]
     return bool(gating) and all(own.get(key) == value for key, value in gating.items())
 
