@@ -90,7 +90,7 @@ def construct(target: Callable[..., T], settings: Mapping[str, Any], path: str, 
         given: arguments that do not come from the config; they are passed unchecked.
 
     Raises:
-        ConfigError: a key is unknown or missing, a type is wrong, or a value is out of range.
+        ConfigError: a key is unknown or missing, a type is wrong, a value is out of range, or ``target`` refuses the values.
     """
     return bind(target, settings, path, *given)(**given)
 
@@ -169,7 +169,8 @@ def _one_line(error: ValidationError, path: str) -> str:
 def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], Any]]:
     """Create the main function of a command from a file in ``conf/``; a decorator like ``hydra.main``, with one-line errors.
 
-    ``GpeError`` and configuration errors end the process with status 2 and without a traceback. Set HYDRA_FULL_ERROR=1 to see tracebacks.
+    ``GpeError``, ``OSError`` and configuration errors end the process with status 2 and without a traceback. In a job of a sweep, configuration errors have the
+    status ``launcher.USAGE_ERROR``. Set HYDRA_FULL_ERROR=1 to see tracebacks.
     """
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], Any]:

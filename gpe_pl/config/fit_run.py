@@ -42,7 +42,7 @@ OPTIMISATION = ("num_steps", "learning_rate", "final_learning_rate", "schedule",
 
 
 class FitRun:
-    """One run of ``fit``. The constructor only checks settings. The methods are called in the order of their definition.
+    """One run of ``fit``. The constructor checks settings and loads the model of ``start_from``. The methods are called in the order of their definition.
 
     Args:
         cfg: composed configuration.
@@ -50,6 +50,7 @@ class FitRun:
 
     Raises:
         ConfigError: a setting has the wrong type or value, or does not fit the others.
+        StartError: ``evaluation.start_frame`` leaves too little history.
     """
 
     def __init__(self, cfg: DictConfig, folder: Path) -> None:
@@ -76,7 +77,7 @@ class FitRun:
         self.callbacks: list[PauseForMeasurements] = []
 
     def prepare_data(self) -> None:
-        """Generate missing data, after checking that the noise and the model of ``start_from`` fit the scenes."""
+        """Generate missing data and controls, after checking that the noise and the model of ``start_from`` fit the scenes. Choose the device."""
         if self.start is not None or self.training.position_noise_of_domain:
             scenes = scene_metadata(self.cfg, "train")
             self.training.noise.check(scenes)
@@ -112,7 +113,7 @@ class FitRun:
             window_counts(open_split(self.evaluated_root, split, cache_bytes=0), self.first_frame)
 
     def finished_model(self) -> Path | None:
-        """Return the best checkpoint of a finished run with the same training in the sweep that ``reuse`` names, or None."""
+        """Copy the best checkpoint of a finished run with the same training from the sweep that ``reuse`` names. Return the copy, or None."""
         best = None if self.cfg.reuse is None else adopt(self.runs / self.cfg.reuse, self._trained, self.folder)
         if best is not None:
             end_later_processes()
@@ -131,7 +132,11 @@ class FitRun:
         publish(self._loggers, self.folder, means(rows))
 
     def error(self) -> float:
-        """Return the mean full-length rollout MSE [m²] on the first evaluated split."""
+        """Return the mean full-length rollout MSE [m²] on the first evaluated split. Failed rollouts count as in ``finished_runs.rollout_errors``.
+
+        Raises:
+            RunError: the metrics of this run have no such error.
+        """
         split = self.evaluation.splits[0]
         run = Run(self.folder, {}, table_of(read_rows(self._metrics)))
         values = [value for errors in rollout_errors([run], split, "full") for value in errors.values()]
@@ -186,7 +191,7 @@ class FitRun:
 
     @property
     def _solver(self) -> Restartable | None:
-        """Solver that gives training targets, if ``training.targets`` asks for it."""
+        """Solver that gives training targets; None if ``training.targets`` is ``trajectory``."""
         if self.training.targets == "trajectory":
             return None
         if self.cfg.data.size == IMPORTED:

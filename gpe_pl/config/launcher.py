@@ -222,7 +222,7 @@ class ProcessLauncher(CommandLauncher):
 
 
 def default_processes(num_threads: int | None, devices: int = 1) -> int:
-    """Return the number of jobs that this machine has cores for."""
+    """Return the number of jobs that this machine has cores for, at least 1. A job has ``devices`` processes of ``num_threads`` threads (None: all cores)."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // ((num_threads or cores) * devices))
 

@@ -40,7 +40,7 @@ class OptunaSweeper(Sweeper):
             ``a,b``, ``range(1, 5)``. A key on the command line replaces the key here.
 
     Raises:
-        SweepError: no trial returned a finite number, or trials of an earlier start used other settings or data.
+        SweepError: no trial returned a finite number, trials of an earlier start used other settings or data, or their journal is damaged.
     """
 
     def __init__(self, num_trials: int = 20, num_at_once: int = 1, seed: int = 0, params: Mapping[str, Any] | None = None) -> None:

@@ -1,9 +1,9 @@
 """Rollouts with other material parameters, which show whether a model reads the material.
 
-A model at its own, unseen value has to be better than the same model at the nearest trained value, else it may have learned no more than its neighbours.
-For each scene with unseen parameters, the model starts from the same state with the nearest trained values, those in the middle of the trained range, the
-farthest ones, and those of another scene. The solver runs once with the nearest trained values, whose error is what the parameter does, and with the lowest
-and the highest, whose difference is the parameter's whole effect.
+A model reads the material only if it is better with a scene's own, unseen values than with the nearest trained ones. For each scene with unseen parameters,
+the model starts from the same state with the nearest trained values, those in the middle of the trained range, the farthest ones, and those of another scene.
+The solver runs with the nearest, the lowest and the highest trained values. The error of the first run shows what the parameter changes. The difference of the
+other two is the whole effect of the parameter.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from gpe_pl.trajectory.trajectory import Trajectory
 UNSEEN: Split = "test_unseen"
 """Split whose scenes get controls."""
 CONTROLS = ("nearest", "middle", "far", "shuffled")
-"""Other values of a model's rollouts."""
+"""Names of the values that replace a scene's own in rollouts of a model."""
 SOLVER_NEAREST, SOLVER_ENDS = "solver at nearest value", "solver at lowest against highest value"
 """Labels of the solver's rows: against the ground truth, and of two runs against each other."""
 SAME_START = 1e-3
@@ -37,7 +37,7 @@ MOST_DRAWS = 100
 
 
 class ControlError(GpeError):
-    """The solver does not reproduce the scenes of a data set, or the data set has no unseen parameters."""
+    """Raised when the solver does not reproduce a scene, or the data set has no scenes with unseen parameters that are long enough."""
 
 
 def label_of(model: str, control: str) -> str:
@@ -123,7 +123,7 @@ class MaterialControls:
         ]
 
     def _shuffled(self) -> list[int]:
-        """Number of the scene from which each scene has its shuffled values, of the same group of parameters."""
+        """Return the number of the scene from which each scene takes its shuffled values. Both have the same group of parameters."""
         dealt = [parameter_values(self.spec, UNSEEN, k) for k in self._indices]
         other, rng = np.arange(len(dealt)), np.random.default_rng(0)
         for group in dict.fromkeys(group for _, group in dealt):

@@ -25,6 +25,8 @@ def mirror_equivariance_error(simulator: LearnedSimulator, trajectory: Trajector
 
     Raises:
         StartError: gravity acts along every axis.
+        IndexError: there are too few frames before ``start_frame``.
+        SceneError: the scene does not fit the simulator.
     """
     metadata, history = trajectory.metadata, simulator.builder.config.history
     level = [axis for axis, pull in enumerate(metadata.gravity) if pull == 0]

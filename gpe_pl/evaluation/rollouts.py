@@ -54,7 +54,7 @@ SCENES_AT_ONCE = 16
 
 
 class StartError(GpeError, ValueError):
-    """Raised when the start frame of rollouts has fewer frames before it than the model needs."""
+    """Raised when rollouts cannot start: the start frame has too few frames before it, or gravity leaves no mirror image of the scene."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class ExportError(GpeError):
 
 @dataclass(frozen=True)
 class Row:
-    """One number of ``metrics.csv``."""
+    """One number of ``metrics.csv``. A metric of a whole split has the trajectory -1, no parameter group and the parameter NaN."""
 
     model: str
     split: str
@@ -131,14 +131,18 @@ def evaluate(
 ) -> list[Row]:
     """Roll out every trajectory of the splits, and write metrics and pictures to ``run_dir``.
 
-    All rollouts start at ``settings.start_frame`` and run to the end of the ground truth. The files are ``metrics.csv`` and ``error_curve_*.png``. The first
-    ``settings.num_pictures`` trajectories of each split also get ``rollout_*.png``, ``rollout_*.gif`` and ``rollout_*.html`` (a viewer), and ``stress_*.png``
-    if the model decodes a stress.
+    All rollouts start at ``settings.first_frame`` and run to the end of the ground truth. The files are ``metrics.csv`` with its digest, and
+    ``error_curve_*.png``. The first ``settings.num_pictures`` trajectories of each split also get ``rollout_*.png``, ``rollout_*.gif``, ``rollout_*.html``
+    (a viewer), ``stress_*.png`` if the model decodes a stress, and the files of ``settings.export``.
 
-    These metrics are computed here:
+    These metrics are computed here, beside those of ``metrics.rollout_metrics``:
 
-    - ``share_outside_uncontained``: fraction of particle-frames outside with containment off, for the first ``settings.num_uncontained`` rollouts of a split.
-    - ``share_corrected``: fraction of particle-steps that containment corrects. These two are not reported for a boundary that consists of nodes only.
+    - ``one_step_nmse``: one value for each split (see ``one_step_nmse``).
+    - ``num_good_frames``: number of frames that the rollout reached.
+    - ``share_outside_at_end``: fraction of particles inside a wall or obstacle in the last frame.
+    - ``share_corrected``: fraction of particle-steps that containment corrects.
+    - ``share_outside_uncontained``: fraction of particle-frames inside a wall or obstacle with containment off, for the first ``settings.num_uncontained``
+      rollouts of a split. These three are not reported for a boundary that consists of nodes only.
     - ``skipping_mse`` [m²]: position MSE between the rollouts with and without the approximate levels of ``simulator.skips``, over the frames of both.
     - ``share_asleep``: fraction of particle-steps that the approximate levels did not compute.
     - ``lost_impulse`` [kg m/s]: momentum that was lost when nodes fell asleep. The last three are reported if approximate levels are on. The rollout without
@@ -326,7 +330,7 @@ def read_rows(path: Path) -> Iterator[Row]:
     """Yield the rows of a ``metrics.csv``.
 
     Raises:
-        MetricsError: the file is not as ``write_rows`` wrote it.
+        MetricsError: the file is not as ``write_rows`` wrote it. Without its digest, only the form of the rows is checked.
     """
     digest = _digest_file(path)
     try:

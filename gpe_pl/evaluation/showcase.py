@@ -1,6 +1,6 @@
 """Showcase: a rollout in a scene far larger than those in training, without ground truth.
 
-Its cost and some signs of errors are measured, such as particles in walls, and it is drawn.
+The run measures its cost and signs of errors, such as particles in walls, and draws pictures.
 
 Memory does not grow with the length of the rollout, because only the frames of the animation are kept.
 """
@@ -69,7 +69,7 @@ class Record:
 
 
 def start(simulator: LearnedSimulator, scene: Scene, settings: ShowcaseSettings) -> tuple[State, Metadata]:
-    """Return the initial state of the scene, at rest, and the scene's metadata.
+    """Return the initial state of the scene and its metadata. All velocities of the history equal the initial velocity.
 
     Raises:
         SceneError: the scene does not fit the simulator.
@@ -114,10 +114,11 @@ def run(
         on_progress: called with the number of frames done and their total.
 
     Returns:
-        Numbers of nodes, boundary nodes and steps done; time per step [s] and peak memory of the process [B]; largest speed [m/s]; and these fractions:
+        Numbers of nodes, boundary nodes and steps done with and without containment; median time per step [s] and peak memory of the process [B]; largest
+        speed [m/s]; and these fractions:
 
         - ``share_corrected``: particle-steps that containment corrected.
-        - ``share_too_fast``: particle-steps faster than gravity can explain.
+        - ``share_too_fast``: particle-steps faster than ``MAX_SPEED_FACTOR`` times a free fall through the domain.
         - ``share_outside_at_end``: particles in a wall at the end.
         - ``share_outside_uncontained``: particle-frames in a wall without containment, from the same start.
         - ``share_asleep``: particle-steps that approximate skipping did not compute; with it, ``lost_impulse`` is the momentum that it lost [kg m/s].

@@ -1,7 +1,7 @@
 """Export of a trained model as a ``torch.export`` program that advances a scene by one frame. The program needs PyTorch but not this package.
 
-The program takes a scene as a dictionary of tensors and returns the changed tensors. The caller searches for neighbours; the program does everything else. In
-Python::
+The program takes a scene as a dictionary of tensors. It returns the changed tensors and the predictions. The caller gives the topology of the graph: edges,
+and islands and virtual nodes if the model uses them. The program does everything else. In Python::
 
     program = torch.export.load("model.pt2").module()
     scene["edges.sand.radius.sand"] = …           pairs within the radius, each once; row 0 source, row 1 target
@@ -77,7 +77,8 @@ class ExportedStep(nn.Module):
     def forward(self, scene: Scene) -> tuple[Scene, Scene]:
         """Return two dictionaries: the changed tensors, and what the model predicts.
 
-        The changed tensors are positions and velocity histories. Predicted are accelerations with gravity [m/s²], and stresses [Pa] of materials that have one.
+        The changed tensors are positions and velocity histories. The predictions are accelerations with gravity [m/s²], and stresses [Pa] of the materials that
+        have one.
         """
         simulator, state, topology = self.simulator, self.state(scene), self.topology(scene)
         graph = simulator.builder.graph(topology, state)

@@ -71,7 +71,7 @@ def write_vtk(path: Path | str, trajectory: Trajectory, ground_truth: Trajectory
         stride: step between written frames.
 
     Raises:
-        ValueError: the file type is wrong, the stride is not positive, the ground truth has other nodes, or a cell has no kind in ``schema.CELL_KINDS``.
+        ValueError: the file type is wrong, the stride is not positive, the ground truth has other nodes or fewer frames, or a cell has no known kind.
         FullDiskError: the disk is full; the written part of a new series is removed.
     """
     path = Path(path)
@@ -149,7 +149,7 @@ def _cells(trajectory: Trajectory) -> tuple[_Cells, int]:
 
 
 def _displacements(trajectory: Trajectory, edges: np.ndarray) -> np.ndarray | None:
-    """Return displacements from rest [frame, node, dim] in m.
+    """Return displacements from rest [frame, node, dim] in m; None if there are no rest positions.
 
     In a periodic domain they are sums of the shortest steps between frames. All nodes of a mesh have a common start.
     """

@@ -1,7 +1,8 @@
 """Metrics of bodies that bend: deformation, strain energy, bounces, contact and peak stress of a rollout against the ground truth.
 
-A body is a mesh whose cells are connected (``trajectory.cells.bodies``). Every metric is unchanged by a rigid motion of the scene and by units. The ground
-truth alone decides which metrics a horizon has, so that all models are compared on the same trajectories.
+A body is a mesh whose cells are connected (``trajectory.cells.bodies``). No metric changes if the whole scene is moved rigidly. Other units of length, time
+and mass change ``peak_von_mises`` only. The ground truth decides which metrics a horizon has, so that all models are compared on the same trajectories; metrics
+of stress also need a stress of the prediction.
 """
 
 from __future__ import annotations

@@ -13,8 +13,8 @@ FARTHEST = 1.5
 1.1 spacings away from the walls that they rest on; nodes of finite elements reach the surface."""
 
 NEAR = 0.75
-"""A body touches while it is nearer than the ground truth's closest approach and this, in spacings. An obstacle's corner between two nodes that touches the
-edge of a cell is half a spacing from both."""
+"""A body touches while its gap is at most the smallest gap in the ground truth plus this, in spacings. An obstacle's corner that touches the edge of a cell
+between two nodes is half a spacing from both."""
 
 
 def boundary_gaps(trajectory: Trajectory, bodies: list[Int64[np.ndarray, "_"]]) -> Float[np.ndarray, "frame body"]:

@@ -1,6 +1,6 @@
-"""Mirror symmetry: whether a symmetric scene stays symmetric, and whether the image of a scene moves like its image.
+"""Mirror symmetry: whether a symmetric scene stays symmetric, and whether the mirror image of any scene moves like the scene itself, mirrored.
 
-The mirror is a vertical plane through the centre of mass, normal to an axis along which there is no gravity.
+The planes of symmetric scenes are vertical, pass through the centre of mass and are normal to an axis along which there is no gravity.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Mirror:
     Attributes:
         axis: axis normal to the plane.
         offset: position of the plane along the axis [m].
-        partner: the node in whose place the image of each node is.
+        partner: for each node, the number of the node at the place of its mirror image.
     """
 
     axis: int
@@ -43,7 +43,7 @@ def mirrors(truth: Trajectory) -> list[Mirror]:
     """Return the vertical planes about which a scene is symmetric.
 
     Positions and velocities of the first frame, masses and materials are symmetric, and so are the walls and obstacles that nodes come near to in any frame.
-    Mesh cells may differ, as the diagonals of a lattice of triangles do. Periodic domains and boundaries that are known by their nodes have none.
+    Mesh cells may differ, as the diagonals of a lattice of triangles do. The list is empty in periodic domains, and if the boundary moves or has only nodes.
     """
     metadata, boundary = truth.metadata, truth.boundary
     if any(metadata.periodic) or boundary.motion is not None or (len(boundary.pos) and not boundary.shapes):
@@ -74,9 +74,9 @@ def mirror_error(prediction: Trajectory, truth: Trajectory, mirror: Mirror, num_
 
 
 def equivariance_error(prediction: Trajectory, mirrored: Trajectory) -> float:
-    """Return ‖x − y‖ / ‖x − x(0)‖ over the frames of both, with x a rollout and y that of a ``rollout.mirrored.Mirrored`` simulator.
+    """Return ‖x − y‖ / ‖x − x(0)‖ over all frames, with x a rollout and y that of a ``rollout.mirrored.Mirrored`` simulator.
 
-    It is zero if the image of a scene moves like its image. It is infinite if only one of the rollouts stopped.
+    It is zero if the simulator moves the mirror image of a scene like the scene itself, mirrored. It is infinite if one of the rollouts stopped earlier.
     """
     if prediction.num_frames != mirrored.num_frames:
         return math.inf

@@ -88,7 +88,7 @@ def per_frame_mse(prediction: Trajectory, ground_truth: Trajectory) -> Float[np.
         from the first missing frame on. If the rollout was meant to be shorter, the array has the length of the prediction.
 
     Raises:
-        ValueError: the trajectories do not describe the same nodes from the same start.
+        ValueError: the trajectories differ in nodes, start or frame interval, or the prediction has more frames.
     """
     _check_comparable(prediction, ground_truth)
     frames = prediction.num_frames
@@ -294,7 +294,7 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
         horizons: numbers of frames, or ``"full"``.
 
     Raises:
-        ValueError: a horizon is not positive, or the trajectories do not describe the same nodes from the same start.
+        ValueError: a horizon is not positive, or as in ``per_frame_mse``.
     """
     error = per_frame_mse(prediction, ground_truth)
     periodic = any(ground_truth.metadata.periodic)
@@ -432,7 +432,7 @@ def bootstrap_interval(
         seed: seed of the resampling.
 
     Raises:
-        ValueError: ``values`` is not a table of numbers, or has NaN.
+        ValueError: ``values`` is not a table of numbers or has NaN, or ``confidence`` is not between 0 and 1.
 
     Source: Owen, The pigeonhole bootstrap, Ann. Appl. Stat. 1 (2007).
     """
@@ -463,8 +463,8 @@ def bootstrap_ratio(
     Trajectories are resampled together for both models. The other arguments are those of ``bootstrap_interval``.
 
     Args:
-        values, reference: values of the two models, one row per training seed, one column per test trajectory. Trajectories are the same for both. If both
-            statistics are infinite, the ratio is 1.
+        values, reference: values of the two models, one row per training seed, one column per test trajectory. Trajectories are the same for both. The ratio
+            is 1 where both statistics are equal, also if both are infinite or zero. It is infinite where only that of the reference is zero.
         is_paired: rows of both tables belong to the same trained networks, so they are resampled together, too.
 
     Raises:
@@ -488,7 +488,7 @@ def bootstrap_ratio(
 
 
 def _drawn(num_resamples: int, rng: np.random.Generator, *counts: int) -> list[np.ndarray]:
-    """For each count, draw ``count`` indices below it with replacement in each resample [resample, index]."""
+    """Return one array [resample, index] for each count. Each row has ``count`` indices below it, drawn with replacement."""
     return [rng.integers(count, size=(num_resamples, count)) for count in counts]
 
 

@@ -111,7 +111,7 @@ def report_domains(folder: Path, runs: list[Run]) -> None:
     """Write tables and figures of finished runs into a folder.
 
     Raises:
-        TableError: runs of one model and domain differ in more than their seeds, or runs of a domain were evaluated on different scenes.
+        TableError: runs of one model and domain differ in more than their seeds, or runs of a domain have other data or another start frame than each other.
     """
     runs = distinct_runs(runs)
     if not runs:
@@ -182,7 +182,7 @@ def _first_frame(run: Run) -> int | None:
 def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, Cell]]:
     """Return two cells for each model of a domain. Failed rollouts count as ballistic flight in the first cell, and as infinite errors in the second.
 
-    Both cells use the trajectories that all runs of the domain have evaluated.
+    Both cells use the trajectories that all runs of the domain have evaluated. Models without errors of their own or of ballistic flight are left out.
     """
     found = {}
     for model, runs in by_model.items():
@@ -206,7 +206,7 @@ def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, C
 
 
 def _write_csv(path: Path, runs: Sequence[Run]) -> None:
-    """Write means over trajectories: one line per domain, model, seed, split and metric, one column per horizon. Trivial models have no seed."""
+    """Write means over trajectories: one line per domain, model, seed, split and metric, one column per horizon. Only trained models have a seed."""
     keys = ["domain", "model", "seed", "split", "metric"]
     tables = []
     for run in runs:

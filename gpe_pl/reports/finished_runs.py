@@ -98,10 +98,12 @@ def _archived(folder: Path) -> list[Run]:
 def finished_runs(folder: Path) -> list[Run]:
     """Return all finished training runs below a folder, in order of their paths, or those of an archive in it.
 
-    Folders that ``evaluate`` has written are not training runs.
+    Folders that ``evaluate`` has written are not training runs. The keys in ``WITHOUT_CONSEQUENCE`` are left out of the configurations.
 
     Raises:
-        RunError: a configuration has values of other types than ``TRAINED``.
+        RunError: a configuration cannot be read, or has values of other types than ``TRAINED``.
+        MetricsError: a ``metrics.csv`` is damaged.
+        ArchiveError: the archive is damaged.
     """
     if (folder / run_archive.RUNS).exists():
         return _archived(folder)
@@ -212,7 +214,7 @@ Values = list[dict[int, float]]
 
 
 def values_by_seed(runs: list[Run], model: str, split: str, metric: str, horizon: str) -> Values:
-    """Return values of a metric for each run, in order of trajectories.
+    """Return values of a metric for each run, in order of trajectories. Runs without a value are left out.
 
     Args:
         runs: runs that differ in their seeds only.

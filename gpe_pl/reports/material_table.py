@@ -33,9 +33,10 @@ Groups = Mapping[tuple[str, str], Sequence[Run]]
 
 
 def reads_material(runs: Sequence[Run]) -> tuple[bool, Interval, int] | None:
-    """Return whether a model reads the material, the ratio behind it, and the number of scenes; None if its runs have no controls.
+    """Return whether a model reads the material, the ratio behind it, and the number of scenes.
 
     The ratio is that of the errors with own and with nearest trained parameters: means over scenes, median over seeds, with the bootstrap interval over both.
+    Return None unless all runs have controls and share scenes with interpolated parameters.
     """
     own, nearest = _errors(runs, LEARNED), _errors(runs, label_of(LEARNED, "nearest"))
     scenes = shared_trajectories(own, nearest)
@@ -122,7 +123,7 @@ def _numbers(text: object) -> list[float]:
 
 
 def _points(runs: Sequence[Run], label: str) -> dict[float, list[float]]:
-    """Errors in all scenes with unseen parameters, by value of the parameter."""
+    """Return the errors in all scenes with unseen parameters, by value of the parameter."""
     points: dict[float, list[float]] = {}
     for run in runs:
         rows = run.rows
@@ -135,7 +136,7 @@ def _points(runs: Sequence[Run], label: str) -> dict[float, list[float]]:
 
 
 def _without(groups: Groups, domain: str, runs: Sequence[Run]) -> list[Run]:
-    """Runs of the same model in the same domain that were trained without the parameter."""
+    """Return the runs of the same model in the same domain that were trained without the parameter."""
     model = runs[0].config.get("model._target_")
     others = [run for (d, _), members in groups.items() if d == domain for run in members if run.config.get("model._target_") == model]
     return [run for run in others if run.config.get(EMBEDDING) == WITHOUT]
@@ -146,7 +147,7 @@ def _errors(runs: Sequence[Run], label: str) -> Values:
 
 
 def _solver(runs: Sequence[Run], label: str) -> Values:
-    """Values of the solver, which are the same in all runs of a domain."""
+    """Return values of the solver, which are the same in all runs of a domain."""
     return values_by_seed(list(runs[:1]), label, INTERPOLATED, "rollout_mse", "full")
 
 

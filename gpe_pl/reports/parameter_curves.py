@@ -43,6 +43,6 @@ def parameter_curves(by_domain: dict[str, dict[str, list[Run]]]) -> Figure:
 
 
 def axis_label(run: Run) -> str:
-    """Label of an axis of a data set's material parameters."""
+    """Return the label of an axis with the material parameters of a run's data set."""
     varied = [m for m in MATERIALS if any(key.startswith(f"data.parameters.{m}.") for key in run.config)]
     return ", ".join(f"{MATERIALS[m][0].name.replace('_', ' ')}\n[{MATERIALS[m][0].unit}]" for m in varied)

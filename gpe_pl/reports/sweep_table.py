@@ -83,7 +83,12 @@ def variants_of(runs: list[Run]) -> tuple[list[str], dict[Variant, list[Run]]]:
 
 
 def _report(folder: Path, runs: list[Run]) -> None:
-    """Write ``table.csv``, ``table.md`` and ``validation_loss.png``, and ``error_by_parameter.png`` if unseen material parameters were evaluated."""
+    """Write ``table.csv``, ``table.md`` and these figures.
+
+    - ``validation_loss.png``, if every variant has a validation curve.
+    - ``reads_material.png``, if a variant has controls of the material.
+    - ``error_by_parameter.png``, if the first run was evaluated on unseen material parameters.
+    """
     if not runs:
         return
     axes, variants = variants_of(runs)
@@ -108,7 +113,7 @@ def _material_groups(variants: dict[Variant, list[Run]]) -> dict[tuple[str, str]
 
 
 def report_evaluation(folder: Path) -> None:
-    """Write the figure of an evaluation by ``evaluate`` with controls."""
+    """Write ``reads_material.png`` for an evaluation by ``evaluate``, if it has controls of the material."""
     run = evaluation_in(folder)
     write_material_figure(folder / MATERIALS_FIGURE, _material_groups({(): [run]}))
 
@@ -145,7 +150,7 @@ def _column(axis: str) -> str:
 
 
 def _write_csv(path: Path, axes: list[str], runs: list[Run]) -> None:
-    """Write means over trajectories: one line per variant, seed, split, metric and horizon."""
+    """Write means over trajectories and the last validation loss: one line per variant, seed, split, metric and horizon."""
     lines: list[list[Any]] = []
     for run in runs:
         key = [run.config.get(a) for a in axes]
@@ -291,7 +296,7 @@ def _stress_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[
 
 
 def _body_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[str]:
-    """Table of the metrics of bodies that bend over whole rollouts; empty if no variant has any."""
+    """Return a table of the metrics of bodies that bend over whole rollouts; empty if no variant has any."""
     measured = {metric for runs in variants.values() for run in runs for metric in run.rows["metric"].unique()}
     columns = {metric: heading for metric, heading in BODY_COLUMNS.items() if metric in measured}
     if "deformation_ratio" not in columns:
@@ -321,7 +326,7 @@ def _mean(values: Values) -> float:
 
 
 def _failed(values: Values) -> str:
-    """Number of failed rollouts as text; empty if none failed."""
+    """Return the number of failed rollouts as text; empty if none failed."""
     numbers = [value for seed in values for value in seed.values()]
     failed = sum(not np.isfinite(value) for value in numbers)
     return f", {failed} of {len(numbers)} failed" if failed else ""

@@ -16,7 +16,7 @@ MARGIN = 0.015
 
 
 def vertical_axis(trajectory: Trajectory) -> int:
-    """Return the axis along which gravity acts; the last axis without gravity."""
+    """Return the axis along which gravity is strongest; the last axis if there is no gravity."""
     gravity = np.abs(trajectory.metadata.gravity)
     return int(np.argmax(gravity)) if gravity.any() else trajectory.metadata.dim - 1
 

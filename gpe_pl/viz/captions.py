@@ -14,7 +14,7 @@ PREFIXES = (("G", 1e9), ("M", 1e6), ("k", 1e3))
 
 
 def heading(trajectory: Trajectory) -> str:
-    """Tell whether a trajectory is the ground truth or a prediction."""
+    """Return ``prediction`` or ``ground truth``, which a trajectory is."""
     return "prediction" if trajectory.is_prediction else "ground truth"
 
 

@@ -72,7 +72,7 @@ def parameter_figure(
         seen: trained values by domain.
         label: label of the vertical axis.
         parameters: labels of the horizontal axes by domain.
-        references: models with dashed grey lines.
+        references: models with dashed or dotted grey lines.
     """
     figure = new_figure(TEXT_WIDTH, 2.4)
     figure.set_layout_engine("constrained")
@@ -122,7 +122,7 @@ class CostAndError:
 
     Attributes:
         lines: costs and errors that form a line, such as the resolutions of a solver.
-        marks: separate costs and errors; a mark is hollow if its label is an earlier label with an addition after a comma.
+        marks: separate costs and errors. Marks have one colour if their labels agree up to the first comma; those with a comma are hollow.
         levels: errors without a cost.
     """
 
@@ -132,7 +132,7 @@ class CostAndError:
 
 
 def cost_error_figure(panels: Mapping[str, CostAndError], x_label: str, y_label: str) -> Figure:
-    """Draw cost against error on logarithmic axes, a panel per horizon.
+    """Draw errors against costs on logarithmic axes, in one panel or several.
 
     Args:
         panels: contents by title.

@@ -1,4 +1,4 @@
-"""Figures for print: rollouts as film strips, error over time, validation loss over training.
+"""Figures for print: rollouts as film strips, error over time, validation loss over training, cost over the number of nodes.
 
 Every function returns a ``Figure``. Save it with ``figure.savefig(path, dpi=300)``. Figures have their own Agg canvas and do not use pyplot, so they can be
 made in threads and without a display, and are freed like other objects.
@@ -102,6 +102,9 @@ def validation_loss_figure(curves: Mapping[str, Sequence[tuple[Numbers, Numbers]
     Args:
         curves: one ``(steps, values)`` for each seed, by label. Values that are not finite count as infinite.
         label: label of the vertical axis.
+
+    Raises:
+        ValueError: the steps of a seed do not increase, or there are more curves than can be told apart.
     """
     figure = new_figure(COLUMN_WIDTH, 2.5)
     axes = _plain_axes(figure)

@@ -26,7 +26,7 @@ LINE, CHARACTER = 0.14, 0.062
 
 
 def new_figure(width: float, height: float, dpi: int = 150) -> Figure:
-    """Return an empty figure [inch] with its own canvas, unknown to pyplot."""
+    """Return an empty figure of this width and height [inch], with its own canvas and unknown to pyplot."""
     figure = Figure(figsize=(width, height), dpi=dpi, facecolor="white")
     FigureCanvasAgg(figure)
     return figure

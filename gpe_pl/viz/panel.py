@@ -36,7 +36,10 @@ FACES = {
 
 
 def drawn_faces(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Return polygons that show a mesh, as nodes [face, corner], and the cell of each: cells of surface meshes, boundary faces of volume meshes."""
+    """Return polygons that show a mesh, as nodes [face, corner], and the cell of each [face].
+
+    They are the cells of a 2D or surface mesh, or the outer faces of a volume mesh. A volume mesh with more than ``MAX_FACES`` of them has none.
+    """
     cells = trajectory.cells
     if cells is None or len(cells) == 0:
         return np.empty((0, 3), int), np.empty(0, int)
@@ -68,7 +71,7 @@ def polygon_edges(polygons: np.ndarray) -> np.ndarray:
 
 
 def _that_occur_once(groups: np.ndarray) -> np.ndarray:
-    """Return the indices of those groups of nodes [group, node] that contain another set of nodes than all other groups."""
+    """Return the indices of the groups of nodes [group, node] whose set of nodes occurs in no other group."""
     nodes = np.sort(groups, axis=1).astype(np.int64)
     again = nodes[:, 1:] == nodes[:, :-1]
     nodes[:, 1:][again] = np.broadcast_to(nodes[:, -1:], again.shape)[again]

@@ -84,7 +84,7 @@ def _draw_2d(axes: Any, trajectory: Trajectory) -> None:
 
 
 def _patch(shape: Any) -> Patch | None:
-    """Return a solid with a simple outline as a filled area."""
+    """Return a solid with a simple outline as a filled area; None for other shapes."""
     style: dict[str, Any] = {"facecolor": SOLID, "edgecolor": INK, "linewidth": 0.6, "zorder": 2}
     if shape.kind == "sphere":
         return Circle(shape.center, shape.radius, **style)
@@ -141,7 +141,10 @@ def _draw_3d(axes: Any, camera: Camera, trajectory: Trajectory, points_per_metre
 
 
 def surface_points(boundary: Boundary, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return positions and normals [point, 3] on all surfaces that are not flat, and distances between neighbours [point] in m."""
+    """Return positions and normals [point, 3] on all surfaces except boxes, and distances between neighbours [point] in m.
+
+    Nodes on walls are among them; leave them out where walls are drawn as areas.
+    """
     flat_or_round: tuple[Any, ...] = tuple(s for s in boundary.shapes if s.kind in ("box", "sphere", "bowl"))
     rest = np.abs(signed_distance(flat_or_round, boundary.pos)) > 1e-6 * spacing
     parts = [(boundary.pos[rest], boundary.normal[rest], np.full(np.count_nonzero(rest), spacing))]

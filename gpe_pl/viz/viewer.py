@@ -212,7 +212,7 @@ class Raster:
 
     @classmethod
     def of(cls, positions: Sequence[Float[np.ndarray, "_ node dim"]], bounds: Float[np.ndarray, "dim 2"]) -> Raster:
-        """Return the smallest region with the domain and all nodes outside it by less than its size."""
+        """Return the raster of the smallest region that contains the domain, and all nodes outside that are no further away than its longest side."""
         low, high = bounds.T.copy()
         size = float(np.max(high - low))
         for pos in positions:
@@ -268,7 +268,7 @@ def _in_3d(values: np.ndarray) -> list[float]:
 
 
 def _focus(trajectory: Trajectory) -> dict[str, Any]:
-    """Return the part of the scene that fills a panel, whether it is a bowl, and the largest distance from its middle [m]."""
+    """Return the part of the scene that fills a panel, whether it is a bowl, and a distance from its middle that no shown node exceeds [m]."""
     low, high = np.asarray(trajectory.metadata.bounds, float).T
     bowls = [shape for shape in trajectory.boundary.shapes if isinstance(shape, Bowl)]
     if bowls:
