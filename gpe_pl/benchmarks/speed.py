@@ -1,6 +1,7 @@
 """Benchmark of speed: times of a forward pass and of a training step of all models on the same graph.
 
-The models are GPE with every interaction, with and without fused passes, and the baselines.
+The models are GPE with every interaction, with and without fused passes, and the baselines. The time of a whole rollout step of the shipped models is reported
+over the time of its matrix products, see ``step_ratio``.
 
 Two lower bounds (floors) are reported for GPE in full precision. The first is the time of its matrix products at the machine's measured rate. The second is
 the time for moving every edge state in and out of memory once per layer.
@@ -11,7 +12,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -22,6 +23,9 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 from torch_geometric.data import HeteroData
 
+from gpe_pl.benchmarks.step_ratio import step_records, step_table
+from gpe_pl.benchmarks.trained import Case as Trained
+from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.files.markdown import table_row
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.graphs.lattice import lattice_graph, lattice_scene
@@ -44,11 +48,17 @@ REFERENCE = "directed, plain"
 """Reference case: concatenated features and one product per directed edge, the usual form of message passing."""
 SAND = "sand"
 MEDIUM = ", medium"
+STEP_ROUNDS = 5
+"""Rollouts of a shipped model per round of measurements."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Size of the problem, and how it is timed. Edges are counted as undirected."""
+    """Size of the problem, and how it is timed. Edges are counted as undirected.
+
+    Attributes:
+        cases: data sets of shipped models, by the name of the model; a rollout step of each is timed.
+    """
 
     num_nodes: Annotated[int, Field(ge=10)] = 2500
     num_edges: Annotated[int, Field(ge=10)] = 24000
@@ -59,6 +69,7 @@ class Settings:
     accelerator: Literal["cpu", "gpu"] = "cpu"
     compile: bool = True
     seed: Annotated[int, Field(ge=0)] = 0
+    cases: dict[str, Trained] = field(default_factory=dict)
 
     @property
     def device(self) -> str:
@@ -197,7 +208,7 @@ def _compiled(model: Model, device: str) -> Model:
     return model
 
 
-def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
+def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
     """Return records of times [s], paired ratios, floors and memory, and a Markdown table."""
     torch.set_num_threads(settings.num_threads)
     device = settings.device
@@ -242,7 +253,8 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
             values["training_peak_memory"] = (peak_memory(training_pass, case, settings), "B")
         records += [{"metric": metric, "case": name, "value": value, "unit": unit} for metric, (value, unit) in values.items()]
     records += _graph_records(settings)
-    return records, table(settings, num_edges, records)
+    steps = step_records(specs, STEP_ROUNDS * settings.num_rounds)
+    return records + steps, "\n\n".join([table(settings, num_edges, records), *([step_table(steps)] if steps else [])])
 
 
 @dataclass(frozen=True)
