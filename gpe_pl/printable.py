@@ -14,7 +14,10 @@ LONGEST = 4000
 
 
 def printable(text: str) -> str:
-    """Replace control characters, text directions, line ends and other characters that are not printable by escapes."""
+    """Replace control characters, text directions, line ends and other characters that are not printable by escapes.
+
+    Bytes of file names that Python could not decode are read as UTF-8 where they are valid UTF-8.
+    """
     return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in _decoded(text))
 
 

@@ -53,9 +53,9 @@ def is_named(group: h5py.Group, name: str) -> bool:
 
 
 def attribute(owner: h5py.HLObject, name: str) -> Any:
-    """Return an attribute that is an integer or a text of fixed length (as bytes), else None.
+    """Return an attribute that is one integer or one text of fixed length (as bytes), else None.
 
-    Other types may refer to any place in the file. Texts longer than ``MAX_CHARACTERS`` are refused too.
+    Other types may refer to any place in the file. None is also returned for texts longer than ``MAX_CHARACTERS``.
     """
     if name not in owner.attrs:
         return None

@@ -38,7 +38,7 @@ def run_name(name: Any, key: str = "name") -> str:
 
 
 def data_name(name: Any, key: str = "name") -> str:
-    """Check and return the name of a data set: letters, digits, ``_``, ``-`` and ``.``, starting with a letter or digit.
+    """Check and return the name of a data set: ASCII letters, digits, ``_``, ``-`` and ``.``, starting with a letter or digit.
 
     Raises:
         NameRefused: the name breaks this rule, has more than ``MOST_BYTES``, or is not allowed on some operating system.

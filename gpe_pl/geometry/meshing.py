@@ -48,7 +48,7 @@ class MeshingError(GpeError, ValueError):
 
 
 def triangulate(loops: list[Loop], spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Mesh an outline with holes by triangles of edge length ``spacing`` [m].
+    """Mesh an outline with holes by triangles with edges of about ``spacing`` [m].
 
     Raises:
         MeshingError: details of the outline are finer than the spacing.
@@ -65,7 +65,7 @@ def triangulate(loops: list[Loop], spacing: float, rng: np.random.Generator) -> 
 
 
 def quadrangulate(loops: list[Loop], spacing: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Mesh an outline with holes by quadrilaterals of edge length ``spacing`` [m].
+    """Mesh an outline with holes by quadrilaterals with edges of about ``spacing`` [m].
 
     Raises:
         MeshingError: details of the outline are finer than the spacing.

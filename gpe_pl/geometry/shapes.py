@@ -118,7 +118,7 @@ def _directions(dim: int, radius: float, spacing: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Wall:
-    """A plane wall ``normal · x >= offset`` that closes one side of the domain.
+    """A plane wall that closes one side of the domain. Free space is where ``normal · x > offset``.
 
     Attributes:
         normal: unit normal into free space, along one axis.
@@ -272,7 +272,11 @@ def _require_simple(vertices: np.ndarray) -> None:
 
 @dataclass(frozen=True)
 class Polygon:
-    """A solid simple polygon (2D), vertices in counter-clockwise order [m]."""
+    """A solid simple polygon (2D), vertices in counter-clockwise order [m].
+
+    Raises:
+        ValueError: there are fewer than 3 vertices, edges touch or have no length, or the vertices run clockwise.
+    """
 
     vertices: tuple[tuple[float, float], ...]
     friction: float
@@ -337,7 +341,7 @@ class DistanceGrid:
             bytes come before all second bytes, and so on. ``from_values`` creates it.
 
     Raises:
-        ValueError: sizes do not fit together, or ``encoded`` is damaged.
+        ValueError: a size is invalid, sizes do not fit together, or ``encoded`` is damaged.
     """
 
     origin: tuple[float, ...]

@@ -58,7 +58,7 @@ def read_terrain(
     Raises:
         TerrainError: the file cannot be read, contains nothing usable, is too large, or does not fit the options; or it is an OBJ, STL or PLY file and the
             package trimesh is not installed.
-        ValueError: the options or bounds are invalid for every file.
+        ValueError: an option, bounds or spacing are invalid for every file.
     """
     path = Path(path)
     low, counts = lattice(bounds, spacing)

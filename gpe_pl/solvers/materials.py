@@ -80,7 +80,7 @@ def check_limits(material: str, parameter: MaterialParameter, values: np.ndarray
         nodes: numbers of the nodes [node], for the message.
 
     Raises:
-        SimulationError: a value is outside the limits, or not a number.
+        SimulationError: with reason ``input``; a value is outside the limits, or not a number.
     """
     limits = parameter.limits
     slack = 1 + np.finfo(np.float32).eps  # values at a limit may have been rounded in storage

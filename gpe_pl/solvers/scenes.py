@@ -169,7 +169,7 @@ def draw_friction(scene: Surroundings, rng: np.random.Generator, may_slip: bool 
 
 
 def draw_walls(scene: Surroundings, rng: np.random.Generator) -> tuple[Shape, ...]:
-    """Draw the walls of the domain, each with its own friction. The floor does not slip."""
+    """Draw the walls of the domain, each with its own friction. The floor is never drawn as frictionless."""
     axes = "xyz"[: len(scene.bounds)]
     floor = f"{axes[-1]}_low"  # on a frictionless floor bodies never come to rest
     names = [f"{axis}_{side}" for axis in axes for side in ("low", "high")]
@@ -225,7 +225,7 @@ class BodyScene:
         max_bodies: largest number of bodies; the number is uniform in 1 … max_bodies, with several materials in 2 … max_bodies.
         max_obstacles: largest number of obstacles; the number is uniform in 0 … max_obstacles. Obstacles without room are left out.
         obstacle_radius: range of the obstacles' circumscribed radii [m]. The corners of boxes in 3D are 12 % further out.
-        obstacle_shapes: ``plain`` selects boxes, balls and convex polygons; ``angular``, in 2D only, selects stars and tilted ramps.
+        obstacle_shapes: ``plain`` selects boxes, balls and, in 2D, convex polygons; ``angular``, in 2D only, selects stars and tilted ramps.
         drop_height: range of the gap between a body and the floor [m]; the gap is larger where obstacles or other bodies are in the way.
         max_speed: largest speed of a body along each axis [m/s]; upward at most a quarter of it.
         sticky_probability: probability that a wall or obstacle is no-slip.

@@ -55,7 +55,7 @@ def paired_ratio(times: Mapping[str, np.ndarray], name: str, reference: str) -> 
 
 @contextmanager
 def apart(factories: Mapping[str, Callable[[], Callable[[], Any]]]) -> Iterator[dict[str, Callable[[], None]]]:
-    """Run functions in separate processes. A call waits until the function has run there, and returns nothing.
+    """Yield functions, by name, that run in separate processes. A call waits until the function has run there, and returns nothing.
 
     Functions with large arrays in one process slow each other down through its heap, by up to a third. Returning memory to the system can be as slow. Here each
     function has a process and heap of its own, which keeps freed memory (with glibc).

@@ -85,7 +85,7 @@ class Solids:
 
 @lru_cache(maxsize=8)
 def make_grid(bounds: tuple[tuple[float, float], ...], spacing: float) -> Grid:
-    """Make the grid of a domain whose low corner is a node."""
+    """Make the grid of a domain. The low corner of the domain is a node, and ``PADDING`` cells surround the domain."""
     counts = np.array([round((high - low) / spacing) + 2 * PADDING for low, high in bounds])
     strides = np.array([int(np.prod(counts[axis + 1 :])) for axis in range(len(counts))])
     corners = np.array([sum(int(s) for b, s in enumerate(strides) if k >> b & 1) for k in range(1 << len(counts))])

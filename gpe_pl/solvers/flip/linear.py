@@ -75,7 +75,10 @@ def _precondition(start, column, value, inverse, r, z, above):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def conjugate_gradients(diagonal, start, column, value, right, inverse, x, tolerance, max_iterations):
-    """Improve x in place until the largest residual is at most ``tolerance``; return the number of iterations and the largest residual."""
+    """Improve x in place until the largest residual is at most ``tolerance``, for at most ``max_iterations``.
+
+    Return the number of iterations and the largest residual, which may exceed the tolerance.
+    """
     n = x.shape[0]
     r, z, s, q, above = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     _multiply(diagonal, start, column, value, x, q)

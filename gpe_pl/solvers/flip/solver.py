@@ -121,7 +121,7 @@ class FLIP:
         bounds: ``(low, high)`` of the domain along each of two or three axes [m]; each extent is a whole multiple of the grid spacing.
         grid_spacing: grid spacing Δ [m]; choose it for about two particles per cell and axis.
         frame_dt: time between frames [s].
-        materials: every material of the data set; they determine the columns of ``State.material_params``. Only ``fluid`` is supported.
+        materials: ``("fluid",)``.
         density: density of the liquid [kg/m³]; with the particles' masses it gives their volumes.
         pic: fraction of the grid's velocity in a particle's velocity after 10 ms, which damps motion that the grid does not resolve.
         evening: fraction of the error of the particle density that is corrected in 10 ms, except in bodies that fly freely.
@@ -216,7 +216,7 @@ class FLIP:
     def rasterize(
         self, pos: np.ndarray, vel: np.ndarray, mass: np.ndarray, viscosity_of_node: np.ndarray, solids: Solids, fields: Fields
     ) -> np.ndarray:
-        """Transfer the particles to empty ``fields``; return the active cells in ascending order."""
+        """Transfer the particles to empty ``fields``; return the active cells, which liquid reaches, in ascending order."""
         grid = self.grid
         volume = mass / (self.density * grid.spacing**grid.dim)
         transfer.scatter(
