@@ -122,6 +122,7 @@ class Boundary:
             ArrayError: an array has the wrong shape, a number is not finite or out of range, or a normal has length 0. The message names the node.
         """
         pos = numbers("boundary pos", pos, {"boundary_node": None, "dim": None})
+        pos = pos.astype(np.result_type(pos, np.float32), copy=False)  # wrapping integers would round the bounds
         normal = numbers("boundary normal", normal, dict(zip(("boundary_node", "dim"), pos.shape, strict=True)))
         vel = per_node("boundary vel", vel, pos.shape, "boundary_node")
         friction, restitution = (

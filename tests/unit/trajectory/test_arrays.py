@@ -210,6 +210,12 @@ def test_a_boundary_of_points() -> None:
     assert (Boundary.from_numpy([[0.0, 0.0]], [[0, 1]]).friction == STICKY).all()
 
 
+def test_boundary_points_given_as_integers_are_positions() -> None:
+    periodicity = Periodicity(((-0.5, 1.5), (0.0, 1.0)), (True, False))
+    boundary = Boundary.from_numpy([[2, 0], [3, 0]], [[0, 1], [0, 1]]).inside(periodicity)
+    np.testing.assert_array_equal(boundary.pos, [[0.0, 0.0], [1.0, 0.0]])
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
