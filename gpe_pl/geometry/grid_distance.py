@@ -63,10 +63,10 @@ def _ground(heights: np.ndarray, low: np.ndarray, spacing: float, cells: np.ndar
 
 
 def mesh_distances(corners: np.ndarray, low: np.ndarray, spacing: float, counts: tuple[int, ...], solid: Solid) -> np.ndarray:
-    """Return signed distances [m] to triangles [triangle, 3, 3].
+    """Return signed distances [m] to triangles [triangle, 3, 3]. With ``solid="below"``, their surface continues beyond its rim at the height of the rim.
 
     Raises:
-        ValueError: with ``solid="below"``, no triangle lies over the domain; or there are more than ``MAX_PAIRS`` pairs, which would take minutes.
+        ValueError: with ``solid="below"``, no triangle lies over the domain; or there are more than ``MAX_PAIRS`` pairs of a triangle and a nearby node.
     """
     from scipy.ndimage import distance_transform_edt
 

@@ -177,7 +177,7 @@ def draw_walls(scene: Surroundings, rng: np.random.Generator) -> tuple[Shape, ..
 
 
 def draw_velocity(max_speed: float, dim: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw the velocity of a body [dim] in m/s: any horizontal direction, mostly downward."""
+    """Draw the velocity of a body [dim] in m/s. No component is larger than ``max_speed``; the last one is at most a quarter of it upward."""
     return max_speed * np.array([*rng.uniform(-1.0, 1.0, dim - 1), rng.uniform(-1.0, 0.25)])
 
 
@@ -194,7 +194,7 @@ def jittered_lattice(first: np.ndarray, last: np.ndarray, rng: np.random.Generat
 
 
 def filled_box(region: Sequence[tuple[float, float]], spacing: float, rng: np.random.Generator) -> np.ndarray:
-    """Fill a box ``(low, high)`` per axis with jittered points [point, dim] of a rest spacing, half a spacing away from its low sides."""
+    """Fill a box ``(low, high)`` per axis with a jittered lattice of points [point, dim], which begins half of ``spacing`` from the low sides."""
     low, high = np.array(region, float).T
     number = np.floor((high - low) / spacing + 1e-6)
     if np.any(number < 1):

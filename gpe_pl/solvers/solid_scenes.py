@@ -124,7 +124,7 @@ class SolidScene:
 
     @property
     def max_nodes(self) -> int:
-        """Upper estimate of the number of nodes: from Euler's formula with the longest outlines in 2D, measured in 3D."""
+        """Upper estimate of the number of nodes. In 2D it follows from Euler's formula and the longest outlines; in 3D it was measured."""
         if self.cell == "tetrahedron":
             return math.ceil(0.2 * self.num_cells + 1.7 * self.num_cells ** (2 / 3))
         outline = 7.5 * self.body_size / self.spacing

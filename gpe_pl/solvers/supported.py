@@ -13,7 +13,7 @@ def check_surroundings(state: State, solver: str) -> None:
     """Raise an error for surroundings that a solver would otherwise ignore silently.
 
     Raises:
-        SimulationError: with reason ``input``; names the solver and what it does not compute.
+        SimulationError: with reason ``input``. The message names the solver and what it does not compute.
     """
     if state.periodicity:
         axes = ", ".join("xyz"[axis] for axis in state.periodicity.axes)

@@ -13,7 +13,7 @@ Progress = Callable[[int, int], Any]  # arguments: amount done, total amount
 
 @contextlib.contextmanager
 def progress_bar(description: str) -> Iterator[Progress]:
-    """Show a progress bar with the remaining time; yields the callback that long work takes as ``on_progress``.
+    """Show a progress bar with the remaining time; yields the callback ``on_progress(done, total)`` that long work takes.
 
     The remaining time is estimated from the updates in the last 30 s. The first update does not count, so that work done before a resumed command began does
     not distort the estimate.

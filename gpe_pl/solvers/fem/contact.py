@@ -54,7 +54,7 @@ class Obstacles(NamedTuple):
 
 @lru_cache(maxsize=8)
 def collect(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ...]) -> Obstacles:
-    """Prepare shapes for the kernels; ``bounds`` are ``(low, high)`` of the domain along each axis [m]."""
+    """Convert shapes to ``Obstacles``; ``bounds`` are ``(low, high)`` of the domain along each axis [m]."""
     dim = len(bounds)
     depth = (0.0,) * (3 - dim)
     low, high = np.array(bounds, dtype=np.float64).T

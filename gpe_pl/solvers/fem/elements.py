@@ -68,7 +68,8 @@ def build_mesh(rest_pos: np.ndarray, cells: np.ndarray, mass: np.ndarray) -> Mes
         mass: lumped masses [node] in kg.
 
     Raises:
-        SimulationError: with reason ``input``, if cells do not fit these nodes, a node belongs to no cell, or a cell has no or negative volume.
+        SimulationError: with reason ``input``, if cells are of another kind than ``CELLS``, a cell repeats a node or has one that does not exist, a node
+            belongs to no cell, or the volume of a cell is not positive.
     """
     rest_pos, mass = np.array(rest_pos, dtype=np.float64, order="C"), np.array(mass, dtype=np.float64, order="C")
     cells = np.asarray(cells)

@@ -94,7 +94,7 @@ def make_grid(bounds: tuple[tuple[float, float], ...], spacing: float) -> Grid:
 
 @lru_cache(maxsize=4)
 def make_solids(shapes: tuple[Shape, ...], bounds: tuple[tuple[float, float], ...], spacing: float) -> Solids:
-    """Sample the boundary on the grid of a domain."""
+    """Return the space that shapes leave open on the grid of a domain."""
     grid = make_grid(bounds, spacing)
     dim, counts = grid.dim, grid.counts
     # there is one more layer of nodes than of cells, so that every cell has all its corners

@@ -33,7 +33,7 @@ def find_islands(active, strides, area, density, weight, liquid, island):
         island: output, the label of each cell that holds mass [cell].
 
     Returns:
-        For each island, whether it touches no solid, and whether it has no free surface.
+        Two arrays by label: whether the island touches no solid, and whether it has no free surface.
     """
     dim = strides.shape[0]
     for n in range(active.shape[0]):

@@ -167,7 +167,7 @@ class FLIP:
 
     @property
     def smallest_resolved(self) -> dict[str, float]:
-        """Value of the first parameter of each material that equals what the grid adds. Smaller values have little effect."""
+        """``numerical_viscosity`` under the key ``fluid``. Smaller viscosities of the liquid have little effect."""
         return {MATERIAL: self.numerical_viscosity}
 
     def compile_kernels(self) -> None:
@@ -282,7 +282,10 @@ class FLIP:
         return x
 
     def liquid(self, active: np.ndarray, solids: Solids, fields: Fields) -> tuple[Liquid, np.ndarray]:
-        """Number the liquid cells. The second result tells, for each label of ``fields.island``, whether that island touches no solid."""
+        """Number the liquid cells and assemble the matrix of their pressure.
+
+        The second result tells, for each label of ``fields.island``, whether that island touches no solid.
+        """
         strides = self.grid.strides
         cells = pressure.liquid_cells(active, solids.is_open, fields.density, fields.liquid)
         is_free, is_closed = islands.find_islands(active, strides, solids.area, fields.density, fields.weight, fields.liquid, fields.island)

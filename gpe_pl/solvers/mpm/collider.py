@@ -47,7 +47,7 @@ class Collider(NamedTuple):
 
 @lru_cache(maxsize=8)
 def collider(shapes: tuple[Shape, ...], origin: tuple[float, ...], spacing: float, counts: tuple[int, ...]) -> Collider:
-    """Prepare shapes for a grid.
+    """Convert shapes to a ``Collider`` for a grid.
 
     Args:
         shapes: walls and obstacles.

@@ -119,7 +119,7 @@ class MPM:
 
     @property
     def smallest_resolved(self) -> dict[str, float]:
-        """Value of the first parameter of each material that equals what the grid adds. Smaller values have little effect."""
+        """``numerical_viscosity`` under the key ``fluid``, if the solver has this material. Smaller viscosities of the liquid have little effect."""
         return {"fluid": self.numerical_viscosity} if "fluid" in self.materials else {}
 
     def constants_of(self, material: str) -> Sand | Snow | Elastomer | Fluid:
@@ -168,7 +168,7 @@ class MPM:
 
     @property
     def can_restart(self) -> bool:
-        """Whether all materials are elastic. Sand and snow remember plastic flow, which positions do not tell."""
+        """Whether all materials are elastomers. The other materials remember plastic flow, which positions do not tell."""
         return set(self.materials) == {"elastomer"}
 
     def restarted(self, state: State) -> State:
