@@ -52,16 +52,16 @@ LARGEST = 1e100
 class GraphBuilder:
     """Builds the graph of a state.
 
-    Node stores of a material hold ``x``, ``material_params`` (SI), ``mass`` and ``node_id`` (row in the state); ``boundary`` and virtual nodes hold ``x``. Edge
-    stores contain ``edge_index`` (row 0 source, row 1 target), ``odd`` and ``even``. Those of ``radius`` edges also contain ``offset``: the displacement
-    divided by the radius. Standardisation does not change it.
+    Node stores of a material hold ``x``, ``material_params`` (in the units of ``schema.MATERIALS``), ``mass`` [kg] and ``node_id`` (row in the state);
+    ``boundary`` and virtual nodes hold ``x``. Edge stores contain ``edge_index`` (row 0 source, row 1 target), ``odd`` and ``even``. Those of ``radius`` edges
+    also contain ``offset``: the displacement divided by the radius. Standardisation does not change it.
 
     With ``config.islands``, nodes of materials also have ``pos`` [m] and ``island``, and the graph has ``island_is_free`` [island] and ``num_islands`` [1].
     ``pos`` is relative to the mean position of the node's island. In periodic domains, images are chosen so that an island is in one piece. In an island that
     wraps around the domain this is impossible, and ``pos`` is zero.
 
-    Nodes of meshes also have ``body``, and the graph has ``num_bodies`` [1]. A body consists of the nodes that cells connect, and of nodes without a cell
-    beside them. ``body`` is -1 in a scene without cells.
+    With ``config.islands`` and ``config.mesh``, nodes of meshes also have ``body``, and the graph has ``num_bodies`` [1]. A body consists of the nodes that
+    cells connect, and of nodes without a cell beside them. ``body`` is -1 in a scene without cells.
 
     Attributes:
         config: settings of the graph.
@@ -92,8 +92,7 @@ class GraphBuilder:
         """Build the graph of a state of float64 tensors.
 
         Raises:
-            GraphError: as ``topology``.
-            SimulationError: as ``topology``.
+            GraphError, MeshError, SimulationError: as ``topology``.
         """
         return self.graph(self.topology(state), state)
 
@@ -101,9 +100,11 @@ class GraphBuilder:
         """Search for the nodes and edges of the graph of a state of float64 tensors.
 
         Raises:
-            GraphError: the state has a node type that the data set does not have, lacks velocity history, has other periodic axes, or has cells that do not fit
-                its nodes.
-            SimulationError: a position or velocity is not finite, or so many nodes lie within each other's radius that the material has collapsed.
+            GraphError: the state has a node type that the data set does not have, has another number of past velocities, has other periodic axes, has cells
+                that do not fit its nodes, or is not float64.
+            MeshError: a cell has a node that does not exist, or a rest position is not finite.
+            SimulationError: a position or velocity is not finite or beyond ``LARGEST``, or so many nodes lie within each other's radius that the material has
+                collapsed.
         """
         self._check(state)
         rows = rows_of(state, self.spec.materials)

@@ -1,8 +1,8 @@
 """Node and edge features. They are dimensionless: each is divided by a scale of the data set.
 
-With ``paper``, edges have the relative displacement only (paper, section 2.1). With ``contact``, they also have the relative velocity, the gap, the direction
-of walls, and in meshes the difference from the rest shape. Odd channels change sign when source and target are swapped; even channels do not. Features have the
-double precision of states.
+With ``paper``, edges have the relative displacement only (paper, section 2.1). With ``contact``, they also have the relative velocity, the gap (the distance
+minus one rest spacing), the direction of walls, and in meshes the difference from the rest shape. Odd channels change sign when source and target are swapped;
+even channels do not. Features have the double precision of states.
 """
 
 from dataclasses import dataclass
@@ -72,7 +72,13 @@ class GraphConfig:
 
 @dataclass(frozen=True)
 class Scales:
-    """Physical scales of a data set, by which features are divided."""
+    """Physical scales of a data set, by which features are divided.
+
+    Attributes:
+        radius: radius of the edges between nodes [m].
+        spacing: rest spacing [m].
+        frame_dt: frame interval [s].
+    """
 
     radius: float
     spacing: float
@@ -165,6 +171,9 @@ def edge_features(
 ) -> tuple[Float[Tensor, "edge odd"], Float[Tensor, "edge even"]]:
     """Return odd and even channels of edges within the radius.
 
+    With ``contact``, odd channels are the displacement, its direction and the relative velocity. Even channels are the gap, the relative velocity along the
+    displacement, and the displacement and the relative velocity along the wall's normal, which are 0 between dynamic nodes.
+
     Args:
         features: ``paper`` or ``contact``.
         displacement: x_target − x_source [m].
@@ -214,7 +223,7 @@ def mesh_features(
     Lengths are in units of the width of the level, so that all levels of a uniformly strained body have similar features.
 
     Let x be the displacement, X the displacement at rest and x̂ = x/|x|. Odd channels are x, the relative velocity, X and (|x| − |X|) x̂, which has the
-    direction of a spring force. Even channels are |x| − |X|, the relative velocity along x̂ and |X|. Edges between virtual nodes also have the level.
+    direction of a spring force. Even channels are |x| − |X|, the relative velocity along x̂ and |X|. Edges from virtual nodes also have the level.
 
     Args:
         features: ``paper`` or ``contact``.

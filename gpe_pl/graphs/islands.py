@@ -37,7 +37,7 @@ def find_islands(num_nodes: int, edge_index: Int64[np.ndarray, "2 edge"], touche
     """Return the islands of a graph.
 
     Args:
-        num_nodes: dynamic nodes.
+        num_nodes: number of dynamic nodes.
         edge_index: edges between them, in any direction.
         touches_boundary: nodes that have an edge with a boundary node.
     """
@@ -94,10 +94,7 @@ def islands_within(
 def unwrapped(
     pos: Float64[np.ndarray, "node dim"], edge_index: Int64[np.ndarray, "2 edge"], periodicity: Periodicity
 ) -> tuple[Float64[np.ndarray, "node dim"], Bool[np.ndarray, "node"]]:
-    """Return positions [m] of images such that connected nodes lie beside each other, and a mask of the nodes without such images.
-
-    See ``image_shifts``.
-    """
+    """Return positions [m] moved by ``image_shifts``, so that connected nodes lie beside each other, and a mask of the nodes for which that is impossible."""
     if not periodicity:
         return pos, np.zeros(len(pos), dtype=bool)
     shift, goes_around = image_shifts(pos, edge_index, periodicity)
@@ -109,7 +106,7 @@ def image_shifts(
 ) -> tuple[Float64[np.ndarray, "node dim"], Bool[np.ndarray, "node"]]:
     """Return multiples of the period [m] that move each node beside its neighbours, and a mask of the nodes whose component wraps around the domain.
 
-    No images of a component that wraps around the domain lie side by side.
+    The images of such a component cannot all lie side by side, so its multiples have no meaning.
 
     Args:
         pos: positions [m].
@@ -128,7 +125,7 @@ def image_shifts(
 def _images(num_nodes, edge_index, turns):
     """Return the number of periods by which each node moves, and a mask of the nodes without a solution.
 
-    After the moves, every edge k is short if its target is shifted by ``turns[k]`` periods.
+    In a solution, the target of every edge k moves by ``turns[k]`` periods more than its source.
     """
     num_edges, dim = turns.shape
     first = np.zeros(num_nodes + 1, np.int64)  # of a node's entries in ``edge``
@@ -174,7 +171,7 @@ def _images(num_nodes, edge_index, turns):
 
 
 def free_since(before: Islands, now: Islands) -> Bool[np.ndarray, "island"]:
-    """Return a mask of the islands that are free now and whose nodes were free in the frame before, in one or several islands.
+    """Return a mask of the islands that are free now and that consist of one or several whole islands of the frame before, all of which were free.
 
     If an island touched something in the frame before, its last velocity still contains the effect of that contact.
     """

@@ -20,7 +20,7 @@ NUM_SAMPLED = 64
 
 
 def pairs_at_rest(num_nodes: int, radius: float, spacing: float, dim: int) -> float:
-    """Return the number of pairs in a cloud with one node per spacing^dim: N/2 V_dim (R / spacing)^dim."""
+    """Return the number of pairs within the radius R in a cloud with one node per spacing^dim: N/2 V_dim (R / spacing)^dim, V_dim the unit ball."""
     ball = {1: 2.0, 2: np.pi, 3: 4 / 3 * np.pi}[dim]
     return num_nodes / 2 * ball * (radius / spacing) ** dim
 
@@ -79,7 +79,7 @@ def radius_between(
     Args:
         source: positions [m], or ``search_tree`` of them with the same periodicity.
         target: positions [m].
-        radius: [m].
+        radius: largest distance of a pair [m].
         periodicity: axes along which space repeats; a tree given as ``source`` must have been built for it.
 
     Raises:

@@ -41,6 +41,7 @@ def find_topology(state: State, rows: Rows, config: GraphConfig, spec: FeatureSp
 
     Raises:
         GraphError: the cells do not fit the nodes, or a mesh wraps around a periodic domain.
+        MeshError: a cell has a node that does not exist, or a rest position is not finite.
         SimulationError: there are more neighbours than memory can hold.
     """
     multiscale = _multiscale(state, spec, scales)

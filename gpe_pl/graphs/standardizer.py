@@ -32,7 +32,7 @@ class StatisticsSample:
     Attributes:
         graphs: graphs evenly spread over the split.
         rare: function that returns graphs of trajectories with nodes of all given roles (see ``schema.role``) if ``graphs`` has too few of them, else none.
-        touching: function of a relation of contacts and of graphs. It returns other graphs with such contacts if too few of the given graphs have any.
+        touching: function of a relation of contacts and of graphs. It returns these graphs, or others with such contacts if too few of these have any.
     """
 
     graphs: list[HeteroData]
@@ -48,7 +48,7 @@ class StatisticsSample:
 
 
 class GraphStandardizer(nn.Module):
-    """Standardises every feature of a graph with training statistics; odd edge channels are only scaled, so they stay odd.
+    """Standardises every feature of a graph with training statistics. Odd edge channels are only scaled, so they stay odd. Masses are divided by their mean.
 
     All levels of virtual nodes have the same statistics, so a graph may have more levels than the graphs of training.
 
@@ -95,8 +95,8 @@ class GraphStandardizer(nn.Module):
         """Set all statistics from graphs of the training split; a ``StatisticsSample`` adds graphs of rare materials and contacts.
 
         Returns:
-            Materials without nodes in any graph, and contacts without edges between materials that occur. These are not standardised. Relations of meshes are
-                never listed.
+            Materials without nodes in any graph, and contacts without edges between node types that occur. These are not standardised. Relations of meshes
+                are never listed.
         """
 
         def fit(module: nn.Module, values: Iterable[Tensor]) -> bool:
@@ -146,7 +146,7 @@ class GraphStandardizer(nn.Module):
 
         Args:
             data: graph with features in SI units.
-            skip_absent: whether to leave out node types and relations without rows.
+            skip_absent: do nothing for node types and relations without rows.
             limits: lowest and highest value [2, param] of each material's parameters, to which values are clamped.
         """
 

@@ -26,8 +26,8 @@ class MeshTopology:
 
     Attributes:
         num_virtual: number of virtual nodes of each level, lowest level first.
-        descent: pairs of a virtual node (row 0, numbered through all levels) and a node of the state below it (row 1). In row 0, the number after the last
-            virtual node means that there is none.
+        descent: pairs of a virtual node of any level (row 0, numbered from the lowest level up) and a node of the state below it (row 1). A pair whose number
+            in row 0 is that of all virtual nodes stands for no virtual node; ``descent_of`` adds one for each level above which a node has no ancestor.
         rest_pos: undeformed positions of the nodes of the state [m]; in periodic domains the images that keep each body together.
         shift: vector to add to each position so that meshes stay in one piece at the seams of a periodic domain [m]; None stands for zero.
     """

@@ -1,4 +1,4 @@
-"""Acceptance of a checkpoint: what its scenes measured, stored beside it as ``{stem}.acceptance.json``.
+"""Results of the acceptance scenes of a checkpoint, stored beside it as ``{stem}.acceptance.json``.
 
 The file holds the checksum of the checkpoint, so results of another checkpoint are never shown. It is plain JSON with typed values, and nothing in it is loaded
 as code.
@@ -98,7 +98,7 @@ def read(path: Path) -> Acceptance:
 
 
 def headline(checkpoint: Path | str) -> str:
-    """Return the line that cards and ``evaluate`` begin with: what fails, that everything passes, or that nothing was measured.
+    """Return the line with which model cards and ``evaluate`` begin. It says what fails, that everything passes, or that nothing was measured.
 
     Args:
         checkpoint: path of a checkpoint, folder of a run, or name of a shipped model.

@@ -56,12 +56,12 @@ class _Rest:
 class Sleeping(Batched):
     """Simulator in which islands at rest sleep: their nodes keep their positions and are not computed.
 
-    An island wakes up when a moving node or wall comes within the radius of the graph.
+    An island wakes up when a node that is awake, or a wall that moves with a prescribed motion, comes within the radius of the graph.
 
     An island (see ``graphs.islands``) falls asleep if all its nodes have been at rest in the last ``Skips.sleep_after`` predictions.
-    ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` define rest. Islands sleep as a whole, so no edge connects a sleeping and a moving
-    node. For moving nodes, the model gets all nodes that can influence them, also sleeping ones. An island that falls asleep loses its momentum. New states
-    contain this loss (``State.lost_impulse``) and the number of sleeping nodes (``State.num_asleep``).
+    ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` define rest. Islands sleep as a whole, so no edge connects a sleeping node to one
+    that is awake. For awake nodes, the model gets all nodes that can influence them, also sleeping ones. An island that falls asleep loses its momentum. New
+    states contain this loss (``State.lost_impulse``) and the number of sleeping nodes (``State.num_asleep``).
 
     Args:
         simulator: simulator, whose ``skips`` set when islands sleep.
@@ -106,7 +106,7 @@ class Sleeping(Batched):
         return torch.from_numpy(awake).to(state.pos.device), torch.from_numpy(seen).to(state.pos.device)
 
     def _are_near_a_moving_wall(self, state: State, pos: np.ndarray) -> np.ndarray:
-        """Return a mask [node] of the nodes near a wall with a prescribed motion."""
+        """Return a mask [node] of the nodes within the radius of a wall that moves with a prescribed motion."""
         near = np.zeros(len(pos), dtype=bool)
         if state.boundary.motion is not None:
             moves = (state.boundary.vel != 0).any(dim=1)

@@ -272,12 +272,12 @@ class LearnedSimulator(nn.Module):
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
         """Return the state at a frame with the velocity history that the graph needs, on this model's device.
 
-        Warnings name material parameters, gravity and boundary nodes outside the range of training, and a version of the solver other than in training. Each
-        kind of warning appears once.
+        Warnings name material parameters, masses, gravity and boundary nodes outside the range of training, and a version of the solver other than in training.
+        Each kind of warning appears once.
 
         Raises:
-            IndexError: there are too few frames before ``frame``.
-            SceneError: the frame interval, dimension or materials differ from training, or a value is not finite; names the node.
+            IndexError: there are too few frames before ``frame``, or no such frame.
+            SceneError: the frame interval, spacing, dimension or materials differ from training, or a value is not finite or breaks its rule; names the node.
         """
         self.check_scene(trajectory.metadata)
         own, scene = self.builder.metadata, trajectory.metadata
@@ -299,16 +299,17 @@ class LearnedSimulator(nn.Module):
         return self._checked(replace(state, velocity_history=history.clone()), "start")
 
     def fits(self, scene: Metadata) -> bool:
-        """Return whether a scene has the frame interval, spacing, dimension and materials of training."""
+        """Return whether a scene has the frame interval, spacing (to 1 %), dimension and material parameters of training, and only materials of training."""
         own = self.builder.metadata
         same_scales = abs(scene.frame_dt / own.frame_dt - 1) < 1e-6 and abs(scene.spacing / own.spacing - 1) < 0.01
-        return same_scales and scene.dim == own.dim and scene.param_names == own.param_names
+        same_channels = scene.dim == own.dim and scene.param_names == own.param_names
+        return same_scales and same_channels and {*scene.materials} <= {*own.materials}  # materials can share their parameters
 
     def check_scene(self, scene: Metadata, choice: str = "data=… size=…") -> None:
         """Raise an error for a scene that does not fit. The message recommends a ``choice`` of the data set.
 
         Raises:
-            SceneError: another frame interval, spacing, dimension or materials than in training.
+            SceneError: the scene does not fit (``fits``).
         """
         own = self.builder.metadata
         if not self.fits(scene):
@@ -390,7 +391,7 @@ class LearnedSimulator(nn.Module):
         return self._with_stress(new, predicted.stress, graphs) if predicted.stress else new
 
     def moved(self, states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor]) -> list[State]:
-        """Return the next states from the accelerations that the model predicts for a batch of their graphs, see ``accelerations``."""
+        """Return the next states. Arguments are those of ``accelerations``."""
         acc = self.accelerations(states, graphs, predicted)
         return [self.integrated(*parts) for parts in zip(states, graphs, acc, strict=True)]
 
@@ -502,7 +503,7 @@ class LearnedSimulator(nn.Module):
         """Return a simulator rebuilt from ``description``.
 
         Raises:
-            ValueError: ``values`` are not such a description.
+            ValueError, KeyError: ``values`` are not such a description.
         """
         check_plain(values)
         if values.get("format") != CHECKPOINT_FORMAT:

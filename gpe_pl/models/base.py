@@ -46,7 +46,7 @@ class Model(nn.Module, ABC):
     settings: dict[str, Any]
     skips: Skips = Skips()
     compute: Callable[..., Any]
-    """Computes the work of ``forward`` on tensors in dictionaries and tuples. ``torch.compile`` compiles this part and replaces it on one model."""
+    """Does the work of ``forward`` on tensors in dictionaries and tuples. Training may replace it on a model by its ``torch.compile`` version."""
 
     def __init__(self, spec: FeatureSpec, **settings: Any) -> None:
         super().__init__()

@@ -98,9 +98,11 @@ class OddEncoder(nn.Module):
 class PairForce(nn.Module):
     """Decoder of one force per edge from the final node states.
 
-    Forces are antisymmetric within a type and negated between types, so their sum is zero up to rounding.
+    With z_ij = A h_i + B h_j + W o_ij + S s_ij + b, the force on the target i is
 
-    F_ij = C (φ(z_ij) − φ(z_ji)) with z_ij = A h_i + B h_j + W o_ij + S s_ij + b.
+    F_ij = C (φ(z_ij) − φ(z_ji)) within a type, and F_ij = C φ(z_ij) + c between two types.
+
+    The force on the source is −F_ij, so the sum of all forces is zero up to rounding.
     """
 
     def __init__(self, spec: FeatureSpec, relation: EdgeType, hidden_channels: int) -> None:
@@ -175,7 +177,8 @@ class GPE(Model):
         num_message_passing_steps: number of processor layers; 12 in the paper.
         hidden_channels: width of all hidden states and layers; 128 in the paper.
         implementation: ``factored`` or ``plain``; both compute the same function of the same parameters.
-        level_weights: one set of weights for all levels of virtual nodes, which allows any number of levels, or one set per level (paper).
+        level_weights: ``shared`` has one set of weights for all levels of virtual nodes, which allows any number of levels; ``separate`` has one set per level
+            (paper).
         stress: also decode the stress of materials that have one.
         node_norm: ``layer`` normalises the encoded state of every node and the update of each step, as GNS does. Accelerations then stay bounded in any
             rollout. ``none`` follows the paper.

@@ -15,7 +15,7 @@ Edges = dict[EdgeType, tuple[Tensor, Tensor, Tensor]]
 
 
 def touched(num_nodes: dict[str, int], edges: Edges) -> dict[str, Tensor]:
-    """Return for every node type a mask of the nodes that have an edge [node]."""
+    """Return a mask of the nodes that have an edge [node], for every node type of a relation in ``edges``."""
     masks: dict[str, Tensor] = {}
     for (source, _, target), (index, _, _) in edges.items():
         for node_type, rows in ((source, index[0]), (target, index[1])):
@@ -26,7 +26,7 @@ def touched(num_nodes: dict[str, int], edges: Edges) -> dict[str, Tensor]:
 
 
 def order_of_edges(num_nodes: dict[str, int], edges: Edges) -> dict[str, Tensor]:
-    """Return for every node type its nodes in the order in which edges first reach them; nodes without an edge come last [node].
+    """Return the nodes of every node type of a relation in ``edges``, in the order in which edges first reach them [node]. Nodes without an edge come last.
 
     The neighbour search proceeds through space, so in this order nodes that are near in space are near in memory. Edges keep their order, so all sums are
     taken in the same order as before.

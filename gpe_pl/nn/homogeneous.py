@@ -1,8 +1,8 @@
 """Conversion of a typed graph to a graph of one node type, for models that use the same layers for all types and distinguish types by their input.
 
 Nodes are ordered by type, in the order of ``FeatureSpec.node_types``. Features of different meaning have separate blocks of columns. For nodes these are the
-motion of materials, boundary nodes, virtual nodes, and the parameters of each material; for edges there is one block per relation. A block is zero for nodes or
-edges that do not have its features.
+motion of materials, boundary nodes, virtual nodes, and the parameters of each material. Edges have one block of odd and one of even channels per kind of
+relation (``radius``, ``cell``, …). A block is zero for nodes or edges that do not have its features.
 """
 
 from collections.abc import Iterable

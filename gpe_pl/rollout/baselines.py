@@ -16,7 +16,11 @@ NUM_BISECTIONS = 30
 
 @dataclass(frozen=True)
 class ConstantVelocity:
-    """Every node keeps its velocity and ignores walls."""
+    """Every node keeps its velocity and ignores walls.
+
+    Attributes:
+        dt: frame interval [s].
+    """
 
     dt: float
 
@@ -26,7 +30,11 @@ class ConstantVelocity:
 
 @dataclass(frozen=True)
 class StopsAtWalls:
-    """Every node keeps its velocity until it touches a wall or obstacle, where it sticks. This baseline also suits data whose gravity is unknown."""
+    """Every node keeps its velocity until it touches a wall or obstacle, where it sticks. This baseline also suits data whose gravity is unknown.
+
+    Attributes:
+        dt: frame interval [s].
+    """
 
     dt: float
 
@@ -36,7 +44,11 @@ class StopsAtWalls:
 
 @dataclass(frozen=True)
 class Ballistic:
-    """Every node falls freely until it touches a wall or obstacle, where it sticks."""
+    """Every node falls freely until it touches a wall or obstacle, where it sticks.
+
+    Attributes:
+        dt: frame interval [s].
+    """
 
     dt: float
 

@@ -17,9 +17,9 @@ from gpe_pl.trajectory.trajectory import Metadata, Termination
 from gpe_pl.trajectory.values import faults, size_conflicts
 
 CROWDING_LIMIT = 32
-"""Stop with ``clustering`` when more nodes than this share a cell of side ``spacing``; raised for starts that are already denser."""
+"""Stop with ``clustering`` when more nodes than this share a cell of side ``spacing``; raised for starts that are nearly as dense (``Guard.of``)."""
 FINEST = 0.01
-"""Nodes closer than this at the start coincide [rest spacings]; the limit on crowding then stays."""
+"""Width of a cell whose nodes count as coincident [rest spacings]. If too many nodes of a start coincide, its limit on crowding is not raised."""
 TUNNEL_DEPTH = 0.25
 """A path between two frames that is deeper than this in a wall or obstacle went through it [rest spacings]."""
 MAX_PATH_SAMPLES = 4096
@@ -126,7 +126,11 @@ class Guard:
         return Termination("tunnelling", frame, node, text)
 
     def of(self, start: State) -> Guard:
-        """Return the guard for a rollout from a state. If the state is denser in places, ``max_crowding`` is twice the number of nodes in its densest cell."""
+        """Return the guard for a rollout from a state, which may be denser than usual.
+
+        Its ``max_crowding`` is at least twice the number of nodes in the densest cell of the state. It is not raised if more nodes than ``max_crowding``
+        coincide.
+        """
         if self.spacing == 0 or start.num_nodes == 0 or self._not_finite(start, 0) is not None:
             return self
         pos = as_numpy(start.pos)
@@ -145,7 +149,7 @@ def crowding(pos: np.ndarray, width: float) -> np.ndarray:
 def unsound(state: State, metadata: Metadata) -> Termination | None:
     """Return a termination for the first array or shape of an initial state that breaks its rule, or None.
 
-    The rules are those of ``schema.FIELDS`` and ``shape_values.shapes_fault``.
+    The rules are those of ``schema.FIELDS`` and ``shape_values.shapes_fault``. Gravity and velocity history must be finite.
     """
     b, has_mesh = state.boundary, state.cells is not None and state.rest_pos is not None
     nodes = {

@@ -68,7 +68,7 @@ class SimulationError(GpeError, RuntimeError):
 
 @dataclass(frozen=True)
 class Replay:
-    """A simulator that returns the frames of a stored trajectory."""
+    """A simulator that returns the frames of a stored trajectory, chosen by the time of the state. After the last frame, ``step`` raises ``IndexError``."""
 
     trajectory: Trajectory
 

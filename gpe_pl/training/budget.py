@@ -1,4 +1,4 @@
-"""Time budgets: convert ``budget_minutes`` into a number of training steps, so that all models train for the same time.
+"""Time budgets. ``budget_minutes`` becomes a number of training steps, so that all models train for the same time.
 
 The time of one step is measured once and stored in a file, which all seeds of a sweep share. Runs count steps only, so a resumed run ends at the same step as
 an uninterrupted one.
@@ -68,7 +68,7 @@ def step_time_key(config: dict[str, Any], training: TrainingSettings, trainer: T
 
 
 class BudgetError(GpeError, ValueError):
-    """The file of measured step times cannot be used. The message names the file and says what to do."""
+    """Raised when the file of measured step times cannot be used; the message names the file and says what to do."""
 
 
 def mean_step_time(module: TrainingModule, data: WindowDataset, size: BatchSize, settings: TrainingSettings) -> float:
@@ -89,7 +89,7 @@ def step_time(
     push_forward: PushForward | None = None,
     limit: float = math.inf,
 ) -> float:
-    """Time per optimiser step [s], including the building of its graphs: the fastest of several rounds.
+    """Return the time per optimiser step [s] in the fastest of several rounds. It includes the building of graphs.
 
     The time is processor time on a CPU and wall time on a GPU. The fastest round is taken because other processes can only slow a step down; even processor
     time grows when they use the same caches and memory. No further round begins after ``limit`` seconds; the first always runs.

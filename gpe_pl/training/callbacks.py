@@ -46,8 +46,8 @@ BODY_METRICS = ("deformation_ratio", "deformation_error", "rotation_error", "str
 class RolloutValidation(Callback):
     """Rolls the current (averaged) model out on validation trajectories and logs the position MSE [m²] as ``val/rollout_mse``.
 
-    Meshes also get ``val/deformation_ratio`` and the other ``BODY_METRICS``, as means over the trajectories whose ground truth has them. A rollout that stops
-    counts there with its good frames.
+    Frames that a stopped rollout lacks count as the square of the domain's longest side. Meshes also get ``val/deformation_ratio`` and the other
+    ``BODY_METRICS``, as means over the trajectories whose ground truth has them. These metrics use only the frames before a rollout stops.
 
     Put it before ``WarmAverage`` in the list of callbacks, so that it sees the averaged weights. Each rank takes some of the trajectories.
 

@@ -98,7 +98,7 @@ class Checkpoints(Checkpoint):
 
     @contextmanager
     def taken_up(self) -> Iterator[None]:
-        """Convert errors that Lightning raises inside this context, because ``last.ckpt`` is not a checkpoint of this training, to ``CheckpointError``."""
+        """Raise ``CheckpointError`` if Lightning fails to restore ``last.ckpt`` inside this context. Errors of later training steps are not converted."""
         try:
             yield
         except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:

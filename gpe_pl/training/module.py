@@ -49,7 +49,7 @@ def clipped_norm(gradient_clip: float | None) -> float:
 
 
 def _rows(tensor: Tensor) -> int:
-    """Number of nodes or edges in a tensor of a graph; ``edge_index`` has its edges in columns."""
+    """Return the number of nodes or edges in a tensor of a graph; ``edge_index`` has its edges in columns."""
     return tensor.shape[1] if tensor.dtype == torch.int64 and tensor.dim() == 2 else tensor.shape[0]
 
 

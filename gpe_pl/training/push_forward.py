@@ -33,7 +33,7 @@ class Excursion:
     Attributes:
         samples: number of each scene's sample in the data set.
         states: state that each unroll has reached.
-        steps: steps of each unroll.
+        steps: number of steps that each unroll has made.
         graphs: graphs of ``states``; empty between ``move_on`` and the next call of ``graphs``.
     """
 
@@ -116,7 +116,7 @@ class Excursions:
         Args:
             simulator: integrates the accelerations.
             lane: lane of the graphs.
-            acceleration: prediction for the lane's last ``graphs``, by material [node, axis], as the model returns it.
+            acceleration: prediction for the lane's last ``graphs``, by material [node, dim], as the model returns it.
         """
         under_way = self._lanes[lane]
         under_way.states = simulator.moved(under_way.states, under_way.graphs, acceleration)

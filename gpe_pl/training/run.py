@@ -49,7 +49,7 @@ class TrainingSettings:
         push_share: fraction of the steps, at the end of training, that use push-forward.
         push_steps: maximum number of steps of an unroll.
         push_correction: fraction of the velocity's deviation after an unroll that the target removes within one step, with ``targets=trajectory``.
-        mirror: mirror a random half of the training windows along each axis without gravity.
+        mirror: mirror training windows at random along axes without gravity; see ``WindowDataset``.
         targets: where the targets of noisy and unrolled states lead; see ``data.solver_targets``.
         val_containment: put particles that cross a wall back on its surface in the validation rollouts, which choose the best checkpoint.
     """

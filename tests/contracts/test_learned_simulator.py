@@ -489,7 +489,9 @@ def test_gradients_reach_the_model_through_the_standardized_graph(simulator: Lea
     assert sum(float(p.grad.abs().sum()) for p in simulator.parameters() if p.grad is not None) > 0
 
 
-@pytest.mark.parametrize("change", [{"spacing": 0.06}, {"frame_dt": 0.01}, {"param_names": ("hardening_coefficient",)}])
+@pytest.mark.parametrize(
+    "change", [{"spacing": 0.06}, {"frame_dt": 0.01}, {"param_names": ("hardening_coefficient",)}, {"materials": ("sand", "snow")}]
+)
 def test_a_scene_of_other_scales_or_materials_is_refused(change: dict[str, Any]) -> None:
     build = scenes.builder()
     simulator = learned(build)

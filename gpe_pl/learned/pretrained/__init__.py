@@ -35,7 +35,8 @@ def fingerprint(checkpoint: Path | str) -> str:
 def model_name(checkpoint: Path | str | None, runs: Path | str) -> str:
     """Return the name of a model for use in folder names: that of a shipped model, or the path of its run below ``runs`` with ``_`` for ``/``.
 
-    All characters are allowed in file names (``names.portable``).
+    A checkpoint other than the best of its run adds its own name. A checkpoint outside ``checkpoints/`` has the name of its file. All characters are allowed in
+    file names (``names.portable``).
     """
     if checkpoint is None or str(checkpoint) in names():
         return str(checkpoint)

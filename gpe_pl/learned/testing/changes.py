@@ -51,7 +51,7 @@ def turned(data: HeteroData, spec: FeatureSpec, seed: int = 0, *, turn: bool = T
 
 
 def in_order(predicted: Prediction, graph: HeteroData, num_nodes: int, dim: int) -> Tensor:
-    """Return predicted accelerations in the order of the state's nodes."""
+    """Return predicted accelerations [node, dim] in the order of the state's nodes; NaN for nodes without a prediction."""
     values = [*predicted.acceleration.values()]
     out = torch.full((num_nodes, dim), float("nan"), dtype=values[0].dtype if values else torch.float64)
     for material, value in predicted.acceleration.items():

@@ -56,7 +56,7 @@ def predict(model: Model, data: HeteroData, num_nodes: int) -> Tensor:
 
 
 def check_relabelling(make: Factory, materials: tuple[str, ...]) -> None:
-    """Relabelling the nodes relabels the prediction."""
+    """Check that relabelling the nodes relabels the prediction."""
     build, state = scenes.builder(materials), scenes.state(materials=materials)
     order = np.random.default_rng(1).permutation(state.num_nodes)
     model = make(build.spec)
@@ -161,7 +161,7 @@ def check_every_parameter_is_used(make: Factory, may_be_unused: Collection[str] 
 
 
 def check_settings(make: Factory) -> None:
-    """``Model.settings`` rebuild the model, and its weights fit the rebuilt model."""
+    """Check that ``Model.settings`` rebuild the model, and that its weights fit the rebuilt model."""
     build = scenes.builder(TWO)
     model = make(build.spec)
     again = type(model)(build.spec, **model.settings).double()
@@ -187,7 +187,7 @@ def check_features(make: Factory, features: str, history: int) -> None:
 
 
 def check_mesh(make: Factory) -> None:
-    """Relabelling the nodes of a mesh relabels the prediction, and turning its edges changes nothing."""
+    """Check that relabelling the nodes of a mesh relabels the prediction, and that reversing edges changes nothing."""
     build, state = scenes.builder(WITH_MESH, mesh=True), scenes.mesh_state(materials=WITH_MESH)
     assert build.spec.num_levels > 1
     order = np.random.default_rng(1).permutation(state.num_nodes)

@@ -127,5 +127,5 @@ def mesh_state(
 
 
 def builder(materials: tuple[str, ...] = ("sand",), dim: int = 2, **config: object) -> GraphBuilder:
-    """Return a graph builder for such states."""
+    """Return a graph builder for the states of this module; ``config`` are settings of ``GraphConfig``."""
     return GraphBuilder(GraphConfig(**{"history": 1, "islands": True, **config}), metadata(materials, dim))  # type: ignore[arg-type]
