@@ -28,7 +28,9 @@ def without_folder(value: Any, runs: str) -> Any:
         return {key: without_folder(item, runs) for key, item in value.items()}
     if isinstance(value, list):
         return [without_folder(item, runs) for item in value]
-    return value.replace(runs, "paths.runs", 1) if isinstance(value, str) and Path(value).is_relative_to(runs) else value
+    if isinstance(value, str) and Path(value).is_relative_to(runs):
+        return (Path("paths.runs") / Path(value).relative_to(runs)).as_posix()
+    return value
 
 
 def _suite(name: str) -> Any:

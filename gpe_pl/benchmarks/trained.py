@@ -57,7 +57,7 @@ def trained_on(spec: DatasetSpec, runs: Iterable[Run]) -> dict[str, tuple[Learne
 def checkpoint_label(checkpoint: str) -> str:
     """Return a short name for a model that is given as the path of a checkpoint, the folder of a run, or the name of a shipped model."""
     path = Path(checkpoint)
-    return path.parent.parent.name if path.parent.name == "checkpoints" else path.stem
+    return path.parent.parent.name if path.parent.name == "checkpoints" else path.name.removesuffix(".ckpt")
 
 
 def fingerprint_of(simulator: LearnedSimulator) -> str:

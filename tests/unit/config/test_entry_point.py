@@ -342,6 +342,7 @@ def test_results_do_not_say_where_they_lay(tmp_path: Path) -> None:
     }
     assert without_folder(settings, runs) == {**settings, "runs": ["paths.runs/table1", "paths.runs", f"{runs}_old"]}
     assert without_folder({"runs": ["runs/table1"]}, "runs") == {"runs": ["paths.runs/table1"]}
+    assert without_folder({"runs": [f"{runs}/table1"]}, f"{runs}/") == {"runs": ["paths.runs/table1"]}
 
 
 def test_without_hydra_the_output_lies_under_runs(tmp_path: Path) -> None:
