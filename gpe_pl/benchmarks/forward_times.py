@@ -31,6 +31,9 @@ def measure_forward_times(folder: Path, runs: list[Run], num_rounds: int = 30) -
         folder: folder of the sweep, where ``forward_times.json`` is written.
         runs: runs of the sweep, all finished.
         num_rounds: number of rounds of the measurement.
+
+    Raises:
+        SealError: ``forward_times.json`` is damaged.
     """
     runs = distinct_runs(runs)
     path = folder / FORWARD_TIMES

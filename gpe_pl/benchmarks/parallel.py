@@ -60,7 +60,11 @@ class Settings:
 
 
 def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
-    """Return records of step times [s], throughput [nodes/s] and speed-ups, and a Markdown table."""
+    """Return records of step times [s], throughput [nodes/s] and speed-ups, and a Markdown table.
+
+    Raises:
+        ParallelError: there are fewer graphs or GPUs than processes.
+    """
     most = max(settings.num_processes)
     if most > settings.num_graphs:
         raise ParallelError(

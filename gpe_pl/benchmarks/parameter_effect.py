@@ -94,7 +94,10 @@ def recorded(values: Values) -> dict[str, Any]:
 
 
 def with_half_steps(solver: Any) -> Any:
-    """Return a solver of half the frame interval and half the ``cfl``, which takes as many substeps in half a frame as the given one in a frame."""
+    """Return a solver with half the frame interval and half the ``cfl``.
+
+    It takes as many substeps in half a frame as the given one in a frame, unless gravity or viscosity limits them.
+    """
     return replace(solver, frame_dt=solver.frame_dt / 2, cfl=solver.cfl / 2)
 
 
@@ -148,7 +151,11 @@ def group_of(value: float, seen: Sequence[float]) -> str:
 
 
 def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tuple[list[dict[str, Any]], str]:
-    """Return a record per scene and horizon and one per mean curve, and Markdown tables."""
+    """Return a record per scene and horizon and one per mean curve, and Markdown tables.
+
+    Raises:
+        EffectError: a data set has no scenes with unseen values, or a simulation stopped early.
+    """
     parts = FinishedParts(folder / PARTS)
     for label, spec in specs.items():
         if spec.num_test_unseen < 1:

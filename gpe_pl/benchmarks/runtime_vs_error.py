@@ -1,8 +1,9 @@
 """Run time against error of solvers and learned models: accuracy at equal cost, and cost at equal accuracy.
 
-The reference is the solver at half the spacing between nodes, with substeps at most half as long. Its observed order of convergence is reported. Everything is
-compared with the reference, also the solver that made the training data. No model can be expected to have a smaller error than that solver. The protocol
-follows McGreivy and Hakim 2024 (arXiv 2407.07218): a solver can always run at a lower resolution, so a fair comparison is at equal cost or at equal accuracy.
+The reference is the solver at half the spacing between nodes. Its substeps are half as long where waves or speeds limit them. A substep that takes a whole
+frame stays as long. The observed order of convergence is reported. Everything is compared with the reference, also the solver that made the training data. No
+model can be expected to have a smaller error than that solver. The protocol follows McGreivy and Hakim 2024 (arXiv 2407.07218): a solver can always run at a
+lower resolution, so a fair comparison is at equal cost or at equal accuracy.
 """
 
 from __future__ import annotations
@@ -116,7 +117,11 @@ class Point:
 
 
 def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
-    """Return records of every simulator in every case, and a Markdown table per case with a section on where learned models lose."""
+    """Return records of every simulator in every case, and a Markdown table per case with a section on where learned models lose.
+
+    Raises:
+        ComparisonError: no finished run was trained on a data set, or the reference solution failed.
+    """
     torch.set_num_threads(settings.num_threads)
     records: list[dict[str, Any]] = []
     parts = []

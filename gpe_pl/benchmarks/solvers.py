@@ -72,7 +72,11 @@ class Timing:
 
 
 def simulate(spec: DatasetSpec, index: int, num_frames: int) -> Timing:
-    """Simulate and store the first frames of a training trajectory."""
+    """Simulate the first frames of a training trajectory, and store them to measure their size.
+
+    Raises:
+        BenchmarkError: the solver stopped early.
+    """
     state, metadata = initial_state(spec, "train", index), trajectory_metadata(spec, "train", index)
     rollout(spec.solver, state, 1, metadata)  # loads the kernels before timing
     substeps: list[int] = []

@@ -49,7 +49,11 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
 
 
 def dataset(*overrides: str) -> DatasetSpec:
-    """Return the specification of a data set from overrides of the command line, such as ``dataset("data=sand", "size=tiny")``."""
+    """Return the specification of a data set from overrides of the command line, such as ``dataset("data=sand", "size=tiny")``.
+
+    Raises:
+        ConfigError: an override is not valid, or as in ``dataset_spec``.
+    """
     return dataset_spec(compose("simulate", overrides))
 
 
@@ -100,7 +104,8 @@ def scene_metadata(cfg: DictConfig, split: str) -> Metadata:
 def ensure_split(cfg: DictConfig, split: str) -> Path:
     """Return the folder of the config's data set if it exists, with missing parts generated.
 
-    Otherwise generate a data set of its own, ``{name}_{split}``, with only this split and a single training trajectory, and return its folder.
+    Otherwise generate a data set of its own, ``{name}_{split}``, with only this split and a single training trajectory, and return its folder. Errors are those
+    of ``ensure_data``.
     """
     from omegaconf import OmegaConf
 
@@ -135,7 +140,10 @@ def check_material_controls(cfg: DictConfig, settings: EvaluationSettings) -> No
 
 
 def material_controls(cfg: DictConfig, settings: EvaluationSettings, root: Path, start_frame: int) -> MaterialControls | None:
-    """Return the controls of an evaluation on the data in ``root``, or None if the settings want none. Missing solver runs are computed."""
+    """Return the controls of an evaluation on the data in ``root``, or None if the settings want none. Missing solver runs are computed.
+
+    Errors are those of ``MaterialControls.prepare``.
+    """
     from gpe_pl.evaluation.material_controls import MaterialControls
     from gpe_pl.system.progress import progress_bar
 

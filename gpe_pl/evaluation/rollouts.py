@@ -70,7 +70,7 @@ class EvaluationSettings:
         containment: put particles that cross a wall back on its surface.
         num_uncontained: number of trajectories per split that are also rolled out without containment, which shows what it corrects; None takes all.
         hold_parameters: clamp material parameters outside the trained range to the nearest trained value.
-        static_friction: nodes on a wall stay in place if they are slower than this fraction of the speed that gravity gives in one frame (see
+        static_friction: nodes that walls support stay in place if they are slower than this fraction of the speed that gravity gives in one frame (see
             ``nn.static_friction``); None takes the model's own value.
         material_controls: roll scenes with unseen parameters out with other parameters, too (see ``material_controls``).
         num_pictures: number of trajectories per split that get a figure, an animation and a viewer.

@@ -21,6 +21,9 @@ def write_tables(folder: Path, runs: list[Run]) -> Path:
 
     Returns:
         Path of the table in Markdown. It does not exist if no run has finished.
+
+    Raises:
+        TableError: the runs do not belong in one table (see ``domain_table.report_domains``).
     """
     if compares_settings(runs):
         report_trials(folder, runs)

@@ -70,6 +70,9 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
     """Return a record per check and a Markdown table.
 
     The results of each checkpoint are written to ``folder``, and beside the checkpoint unless it is a shipped model.
+
+    Raises:
+        AcceptanceError: there are no acceptance scenes for a checkpoint, or two checkpoints have one name.
     """
     torch.set_num_threads(settings.num_threads)
     candidates = _candidates(settings.checkpoints, specs)

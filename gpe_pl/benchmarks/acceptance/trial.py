@@ -80,7 +80,8 @@ class Trial:
     Attributes:
         value: material parameter.
         truth: rollout of the solver.
-        finer: rollout of the solver with half the time step, whose difference from ``truth`` is the solver's own uncertainty.
+        finer: rollout of the solver with half the ``cfl``, whose difference from ``truth`` is the solver's own uncertainty. It equals ``truth`` where one
+            substep takes a whole frame, as for slow liquids.
         model: rollout of the model with containment.
         corrected: fraction of particle-steps that containment corrected.
     """

@@ -104,7 +104,12 @@ class Settings:
 
 
 def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
-    """Return a record per fault, and a Markdown table of their counts."""
+    """Return a record per fault, and a Markdown table of their counts.
+
+    Raises:
+        PreparationError: an undisturbed command fails.
+        IsolationError: the system cannot fork processes.
+    """
     records: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory(prefix="faults-") as folder:
         root = Path(folder)
