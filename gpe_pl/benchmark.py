@@ -40,7 +40,7 @@ def _suite(name: str) -> Any:
 
 
 def benchmark(cfg: DictConfig) -> None:
-    """Run one suite and write ``results.json``, ``table.md`` and its figures. The exit status is 1 if the suite's function ``failures`` returns any."""
+    """Run one suite and write ``results.json``, ``table.md`` and its figures. The exit status is 1 if the suite's function ``failures`` finds some."""
     import torch
     from omegaconf import OmegaConf
 

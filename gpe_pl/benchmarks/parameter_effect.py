@@ -1,4 +1,4 @@
-"""How much the material parameter changes the ground truth, beside what halving the solver's time step changes.
+"""Benchmark of material parameters: how much they change the ground truth, compared with half the time step of the solver.
 
 One scene is simulated from the same initial positions and velocities with its own, unseen value, with other values, and with half the time step. A split of
 values into trained and unseen ones can tell models apart only if the truth changes more from an unseen value to the nearest trained one than it changes with
@@ -37,7 +37,7 @@ RESUMES = True
 
 SPLIT = "test_unseen"
 TOLD = 10.0
-"""Smallest ratio of the change by the nearest trained value to the change by half the time step at which a split can tell models apart."""
+"""A split can tell models apart if the nearest trained value changes the ground truth at least this many times as much as half the time step."""
 DIGITS = 4
 NUM_POINTS = 50
 """Number of points of a curve in the results."""

@@ -24,7 +24,7 @@ UNREAD: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "graph.num_levels": ("graph.mesh", lambda mesh: not mesh),
     "dimension": ("data.size", lambda size: size == "imported"),
 }
-"""Keys that are unused for some values of another key: that key, and the test of its value. The value 0 is always allowed, because it switches the setting
+"""Keys that are unused for some values of another key, with that key and the test of its value. The value 0 is always allowed, because it switches the setting
 off."""
 
 

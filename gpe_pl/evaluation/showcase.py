@@ -118,7 +118,7 @@ def run(
         speed [m/s]; and these fractions:
 
         - ``share_corrected``: particle-steps that containment corrected.
-        - ``share_too_fast``: particle-steps faster than ``MAX_SPEED_FACTOR`` times a free fall through the domain.
+        - ``share_too_fast``: particle-steps faster than ``MAX_SPEED_FACTOR`` times the speed after a free fall through the domain.
         - ``share_outside_at_end``: particles in a wall at the end.
         - ``share_outside_uncontained``: particle-frames in a wall without containment, from the same start.
         - ``share_asleep``: particle-steps that approximate skipping did not compute; with it, ``lost_impulse`` is the momentum that it lost [kg m/s].

@@ -40,7 +40,7 @@ Scene = dict[str, Tensor]
 
 DESCRIPTION = "description.json"
 EVERYTHING = Skips(absent_types=False, isolated_nodes=False, edges_at_once=None, sorted_from=None)
-"""Skips that do not depend on the values of the scene, because an exported program cannot."""
+"""Levels of skipping in an exported program. Its operations cannot depend on the values of a scene, so the levels that do are off."""
 BOUNDARY_FIELDS = ("pos", "vel", "normal", "friction", "restitution")
 
 

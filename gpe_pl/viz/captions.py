@@ -14,7 +14,7 @@ PREFIXES = (("G", 1e9), ("M", 1e6), ("k", 1e3))
 
 
 def heading(trajectory: Trajectory) -> str:
-    """Return ``prediction`` or ``ground truth``, which a trajectory is."""
+    """Return the words ``prediction`` or ``ground truth`` for a trajectory."""
     return "prediction" if trajectory.is_prediction else "ground truth"
 
 

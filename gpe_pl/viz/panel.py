@@ -18,7 +18,7 @@ DOT = 1.3
 """Diameter of a particle in rest spacings; neighbours overlap a little."""
 
 APART, APART_SPACING = 0.9, 3.0
-"""Diameter of 2D particles whose neighbours are at least this many points apart on paper; they are drawn apart, with a thin edge."""
+"""Diameter [spacings] of 2D particles that are drawn apart, with a thin edge, and the smallest spacing on paper [points] for this."""
 
 DISC = np.stack([np.cos(np.arange(12) * np.pi / 6), np.sin(np.arange(12) * np.pi / 6)], axis=-1)
 

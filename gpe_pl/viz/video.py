@@ -120,7 +120,7 @@ def _images(rows: dict[str, Trajectory], frames: range, coloring: Coloring, pane
 
 
 def _palette(color: ColorBy) -> Image.Image:
-    """Return the 256 colours of a GIF: greys, and the colours of particles, pure, mixed with white as at their edges, and darkened as on mesh edges.
+    """Return the 256 colours of a GIF: greys, and the colours of particles. These are pure, mixed with white as at their edges, and darkened as on mesh edges.
 
     The palette is fixed, because a palette of the first frame lacks later colours, and one palette per frame flickers.
     """

@@ -56,7 +56,7 @@ UNITS: dict[ColorBy, tuple[str, str]] = {
 SOLID_GRID = 512
 """Number of points along the longer side of a 2D scene at which the signed distance of obstacles is sampled."""
 SOLID_CELLS = 4
-"""Number of these grid cells up to which signed distances are stored."""
+"""Largest signed distance that is stored, in cells of this grid."""
 
 
 class ViewerError(GpeError, ValueError):

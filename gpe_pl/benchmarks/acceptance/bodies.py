@@ -102,9 +102,10 @@ def against_solver(name: str, trials: list[Trial]) -> list[Check]:
 
 
 def bounce_height(truth: Bodies, trajectory: Trajectory) -> float:
-    """Return the largest rise of the centre of mass after the first contact [m]. The closest approach of the truth defines contact.
+    """Return the largest rise of the centre of mass after the first contact [m].
 
-    Blocks surely touch the floor. In the material point method a flat side stays up to a cell of the grid away from it, which is two spacings.
+    A block is in contact while its gap is at most the smallest gap in the ground truth plus ``NEAR`` spacings. The smallest gap may be large, because a block
+    surely touches the floor: in the material point method its flat side stays up to a cell of the grid, or two spacings, away.
     """
     own = truth.predicted(trajectory)
     assert own.height is not None, "bodies fall"

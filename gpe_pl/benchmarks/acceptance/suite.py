@@ -1,7 +1,7 @@
 """The suite of acceptance scenes: what a person would look at before using a model, run by solver and model side by side.
 
-Every check has a criterion from physics or from the solver's own uncertainty. A model that ignores its material parameter fails the checks that a quantity
-follows it.
+Every check has a criterion from physics or from the solver's own uncertainty. A model that ignores its material parameter fails the checks in which a quantity
+has to change with the parameter.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ SMALLEST_CHANGE = 0.1
 
 @dataclass(frozen=True)
 class Candidate:
-    """A trained simulator and the data set that it belongs to.
+    """A trained simulator and the data set on which it was trained.
 
     Attributes:
         name: name of the model.

@@ -108,7 +108,7 @@ OF_STATES = ("node_type", "mass", "material_params", "boundary_", "rest_pos", "c
 
 
 def brought_in(way: str, shard: Path, key: str, value: Value, seed: int, folder: Path) -> Verdict:
-    """Let a wrong value enter in one way. The message must name the field."""
+    """Let a wrong value enter in one way. The message must name the field; without a message, the value was accepted."""
     try:
         text = WAYS[way](shard, key, value, seed, folder)
     except GpeError as error:

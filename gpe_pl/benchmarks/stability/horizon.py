@@ -194,7 +194,7 @@ def separation(simulator: Simulator, state: State, num_steps: int, spacing: floa
 
 
 def growth_rate(separations: np.ndarray, spacing: float, saturated: float = 0.1) -> float:
-    """Return the slope of log separation over frames, by least squares, until it first exceeds ``saturated`` spacings."""
+    """Return the growth rate per frame: the least-squares slope of log separation, before the separation first exceeds ``saturated`` spacings."""
     beyond = np.flatnonzero(~(separations < saturated))
     count = int(beyond[0]) if len(beyond) else len(separations)
     logs = np.log(np.maximum(separations[: max(count, 2)], 1e-300))

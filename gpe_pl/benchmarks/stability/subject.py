@@ -80,7 +80,7 @@ class Subject:
         return replace(state, gravity=torch.zeros_like(state.gravity), boundary=no_boundary(state))
 
     def guard(self) -> Guard:
-        """Return the limits of a stable rollout: nodes stay within one radius of the domain, below three times the largest speed in training."""
+        """Return the limits of a stable rollout: one connectivity radius outside the domain, and three times the largest speed in training."""
         metadata = self.simulator.builder.metadata
         return Guard(3 * self.max_speed, metadata.bounds, self.simulator.builder.scales.radius, self.spacing)
 

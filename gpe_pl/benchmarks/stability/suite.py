@@ -59,7 +59,7 @@ class Settings:
 
     Attributes:
         cases: data sets, by name.
-        runs: folders of finished runs; their models take part in the case whose data set they were trained on, with the first seed of each.
+        runs: folders of finished runs; their models take part in the case whose data set they were trained on, with one seed of each.
         checkpoints: further models, as files or names of shipped models; they take part in the case whose data set they were trained on.
         gating: settings of the models that must pass, which are those of the shipped configuration.
         num_scenes: number of scenes of the split ``test``, per data set.
