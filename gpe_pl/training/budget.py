@@ -27,7 +27,8 @@ from gpe_pl.data.sampling import NUM_LANES, BatchSampler, BatchSize, PushForward
 from gpe_pl.errors import GpeError
 from gpe_pl.files import sealed
 from gpe_pl.system.machine import gemm_rate
-from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule, clipped_norm
+from gpe_pl.training.module import COMPILE_PAYS_AFTER, TrainingModule
+from gpe_pl.training.optimizer import OnePassAdam, clip
 from gpe_pl.training.run import TrainerSettings, TrainingSettings
 
 log = logging.getLogger(__name__)
@@ -96,7 +97,7 @@ def step_time(
     """
     on_gpu = next(module.parameters()).is_cuda
     clock = time.perf_counter if on_gpu else time.process_time
-    optimizer = torch.optim.Adam(module.parameters(), lr=0.0, fused=True)
+    optimizer = OnePassAdam(module.parameters(), learning_rate=0.0)
     numbers = BatchSampler(data, size, 0, lambda: 0, push_forward)
     batches = (_on(module.device, collated([data[key] for key in keys])) for keys in numbers)
 
@@ -105,7 +106,7 @@ def step_time(
         for _ in range(count):
             optimizer.zero_grad()
             module.loss(next(batches)).backward()
-            torch.nn.utils.clip_grad_norm_(module.parameters(), clipped_norm(gradient_clip))
+            clip(module.parameters(), gradient_clip)
             optimizer.step()
         if on_gpu:
             torch.cuda.synchronize()

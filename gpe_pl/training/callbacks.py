@@ -19,6 +19,7 @@ from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Start, rollouts
 from gpe_pl.system import ranks
 from gpe_pl.system.progress import progress_bar
+from gpe_pl.training import parameter_passes
 from gpe_pl.trajectory.trajectory import Trajectory
 
 
@@ -30,13 +31,33 @@ class WarmAverage(WeightAveraging):
 
     def __init__(self, decay: float = 0.999) -> None:
         def average(averaged: list[torch.Tensor], current: list[torch.Tensor], num_averaged: Any) -> None:
-            n = int(num_averaged)
             if averaged[0].is_floating_point():  # all tensors of one call have the same type
-                torch._foreach_lerp_(averaged, current, 1 - min(decay, (1 + n) / (10 + n)))
+                torch._foreach_lerp_(averaged, current, self._weight_of_next(int(num_averaged)))
             else:
                 torch._foreach_copy_(averaged, current)
 
-        super().__init__(use_buffers=False, multi_avg_fn=average)  # buffers are copied: they do not learn, and infinite values have no mean
+        super().__init__(use_buffers=False, multi_avg_fn=average)  # buffers do not learn, and infinite values have no mean
+        self.decay = decay
+        self._parameters: tuple[list[torch.Tensor], list[torch.Tensor]] = [], []
+
+    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        super().setup(trainer, pl_module, stage)
+        if self._average_model is not None:
+            self._parameters = [*self._average_model.module.parameters()], [*pl_module.parameters()]
+
+    def _weight_of_next(self, num_averaged: int) -> float:
+        return 1 - min(self.decay, (1 + num_averaged) / (10 + num_averaged))
+
+    @torch.no_grad()
+    def on_train_batch_end(self, trainer: Any, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int) -> None:
+        """Add the weights after a step to the average: on a CPU in one pass over all of them, else by the method of the base class."""
+        average = self._average_model
+        if average is None or not average.n_averaged or not parameter_passes.are_covered(*self._parameters):
+            super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+        elif trainer.global_step > self._latest_update_step:
+            parameter_passes.pull(*self._parameters, self._weight_of_next(int(average.n_averaged)))
+            average.n_averaged += 1
+            self._latest_update_step = trainer.global_step
 
 
 BODY_METRICS = ("deformation_ratio", "deformation_error", "rotation_error", "strain_energy_ratio")

@@ -22,6 +22,7 @@ from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE
 from gpe_pl.system import ranks
 from gpe_pl.system.machine import has_cpp_compiler
+from gpe_pl.training.optimizer import OnePassAdam, clip
 from gpe_pl.training.push_forward import Excursions
 
 Schedule = Literal["cosine", "exponential"]
@@ -41,11 +42,6 @@ RESUMED = {
 """Keys that a checkpoint needs for a run to resume from it."""
 
 log = logging.getLogger(__name__)
-
-
-def clipped_norm(gradient_clip: float | None) -> float:
-    """Return the largest allowed norm of a gradient. Without clipping it is infinite, so that clipping still computes the norm and changes nothing."""
-    return math.inf if gradient_clip is None else gradient_clip
 
 
 def _rows(tensor: Tensor) -> int:
@@ -99,7 +95,7 @@ class TrainingModule(L.LightningModule):
         self._skipped: deque[int] = deque(maxlen=MAX_SKIPPED)  # the last steps without an update
 
     def configure_optimizers(self) -> Any:
-        optimizer = torch.optim.Adam(self.simulator.parameters(), lr=self.learning_rate, fused=True)
+        optimizer = OnePassAdam(self.simulator.parameters(), self.learning_rate)
         # a plain function: the scheduler would store the attributes of any other callable in checkpoints
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self.learning_rate_factor(step))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
@@ -199,29 +195,31 @@ class TrainingModule(L.LightningModule):
             loss = loss + 0.0 * torch.stack([p.sum() for p in self.simulator.parameters() if p.requires_grad]).sum()
         total = ranks.summed(loss.detach())
         if not torch.isfinite(total):
-            self._skip("loss", total)
+            self._skip("loss", float(total))
             return None if ranks.num_ranks() == 1 else loss  # ranks wait for each other's gradients; clipping drops them
-        self.log("train/loss", total, batch_size=1)
+        trainer: Any = self.trainer
+        if (self.global_step + 1) % trainer.log_every_n_steps == 0:  # Lightning takes as long for a value that no logger gets
+            self.log("train/loss", total, batch_size=1)
         return loss
 
     def configure_gradient_clipping(
         self, optimizer: torch.optim.Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
     ) -> None:
         """Clip the gradient by its norm if a clip value is set. A gradient that is not finite is dropped and leaves the weights unchanged."""
-        norm = torch.nn.utils.clip_grad_norm_(self.simulator.parameters(), clipped_norm(gradient_clip_val))
-        if not torch.isfinite(norm):
+        norm = clip([p for group in optimizer.param_groups for p in group["params"]], gradient_clip_val)
+        if not math.isfinite(norm):
             if not self._skipped or self._skipped[-1] != self.global_step:  # else its loss was not finite either
                 self._skip("gradient norm", norm)
             optimizer.zero_grad(set_to_none=True)  # without gradients Adam changes neither weights nor moments
 
-    def _skip(self, name: str, value: Tensor) -> None:
+    def _skip(self, name: str, value: float) -> None:
         """Count and report a skipped batch. All ranks do so together, as ``value`` is a sum over ranks.
 
         Raises:
             TrainingError: too many of the last batches were skipped; names step, trajectories and frames.
         """
         windows = [window for part in ranks.gathered(self._windows) for window in part]
-        what = f"step {self.global_step}: the {name} is {value.item()} for (trajectory, frame) = {', '.join(map(str, windows))}"
+        what = f"step {self.global_step}: the {name} is {value} for (trajectory, frame) = {', '.join(map(str, windows))}"
         is_often = len(self._skipped) == MAX_SKIPPED and self.global_step - self._skipped[0] < SKIP_WINDOW
         before = MAX_IN_ROW - 1
         is_in_row = len(self._skipped) >= before and self.global_step - self._skipped[-before] <= before

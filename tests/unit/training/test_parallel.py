@@ -268,9 +268,9 @@ def test_numbers_that_go_bad_on_one_rank_are_skipped_on_all_and_stop_all(mixed: 
         m._trainer = SimpleNamespace(global_step=4)  # type: ignore[assignment]
         loss = torch.tensor(float("nan") if rank else 1.0)
         for _ in range(MAX_IN_ROW - 1):
-            m._skip("loss", ranks.summed(loss))
+            m._skip("loss", float(ranks.summed(loss)))
         with pytest.raises(TrainingError) as caught:
-            m._skip("loss", ranks.summed(loss))
+            m._skip("loss", float(ranks.summed(loss)))
         return str(caught.value)
 
     messages = on_ranks(tmp_path, on_rank)

@@ -1,0 +1,141 @@
+"""Passes over all parameters of a model in one call: norm and scaling of gradients, Adam, and moving averages (on a CPU).
+
+PyTorch's functions for lists of tensors spend microseconds on each tensor. A model of this package has a hundred or more small ones, for which that is longer
+than the arithmetic takes. The kernels here read the addresses of all tensors. They work on contiguous tensors of one precision, single or double.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import no_type_check
+
+import numpy as np
+import torch
+from numba import carray, njit, types
+from numba.extending import intrinsic
+from torch import Tensor
+
+from gpe_pl.nn.fused import FASTMATH
+
+
+def are_covered(*lists: Sequence[Tensor]) -> bool:
+    """Tell whether the kernels can process these lists of tensors."""
+    dtype = next((t.dtype for tensors in lists for t in tensors), torch.float32)
+    return dtype in (torch.float32, torch.float64) and all(
+        t.dtype == dtype and t.device.type == "cpu" and t.is_contiguous() for tensors in lists for t in tensors
+    )
+
+
+def norm(tensors: Sequence[Tensor]) -> float:
+    """Return the norm of all values of all tensors, summed in double precision."""
+    return float(np.sqrt(_square(*_places(tensors), _like(tensors))))
+
+
+def scale(tensors: Sequence[Tensor], factor: float) -> None:
+    """Multiply all tensors by a factor, in place."""
+    _scale(*_places(tensors), _like(tensors), factor)
+
+
+def pull(tensors: Sequence[Tensor], towards: Sequence[Tensor], weight: float) -> None:
+    """Move tensors towards others of the same shapes, in place: x ← x + weight (y − x)."""
+    _pull(*_places(tensors), _addresses(towards), _like(tensors), weight)
+
+
+def adam(
+    parameters: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    means: Sequence[Tensor],
+    squares: Sequence[Tensor],
+    steps: Sequence[Tensor],
+    learning_rate: float,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """Apply a step of Adam to all parameters, in place.
+
+    Args:
+        parameters: parameters θ.
+        gradients: their gradients g.
+        means: moving averages of g.
+        squares: moving averages of g².
+        steps: number of steps of each parameter, in single precision; it is raised by one.
+        learning_rate, betas, eps: as in ``torch.optim.Adam``.
+    """
+    lists = (_addresses(values) for values in (gradients, means, squares, steps))
+    _adam(*_places(parameters), *lists, _like(parameters), learning_rate, *betas, eps)
+
+
+def _addresses(tensors: Sequence[Tensor]) -> np.ndarray:
+    return np.array([t.data_ptr() for t in tensors], np.int64)
+
+
+def _places(tensors: Sequence[Tensor]) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([t.numel() for t in tensors], np.int64), _addresses(tensors)
+
+
+def _like(tensors: Sequence[Tensor]) -> np.ndarray:
+    """Return an empty array of the precision of the tensors, from which the kernels take their type."""
+    return np.empty(0, np.float64 if tensors and tensors[0].dtype == torch.float64 else np.float32)
+
+
+@intrinsic
+@no_type_check
+def _pointer(_, address):
+    def convert(context, builder, signature, arguments):
+        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+    return types.voidptr(address), convert
+
+
+@njit(cache=True, error_model="numpy", fastmath=FASTMATH | {"reassoc"})
+@no_type_check
+def _square(sizes, addresses, like):
+    total = 0.0
+    for k in range(len(sizes)):
+        x, part = carray(_pointer(addresses[k]), sizes[k], like.dtype), 0.0
+        for c in range(sizes[k]):
+            part += np.float64(x[c]) * np.float64(x[c])
+        total += part
+    return total
+
+
+@njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@no_type_check
+def _scale(sizes, addresses, like, factor):
+    factor = like.dtype.type(factor)
+    for k in range(len(sizes)):
+        x = carray(_pointer(addresses[k]), sizes[k], like.dtype)
+        for c in range(sizes[k]):
+            x[c] *= factor
+
+
+@njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@no_type_check
+def _pull(sizes, addresses, others, like, weight):
+    weight = like.dtype.type(weight)
+    for k in range(len(sizes)):
+        x = carray(_pointer(addresses[k]), sizes[k], like.dtype)
+        y = carray(_pointer(others[k]), sizes[k], like.dtype)
+        for c in range(sizes[k]):
+            x[c] += weight * (y[c] - x[c])
+
+
+@njit(cache=True, error_model="numpy", fastmath=FASTMATH)
+@no_type_check
+def _adam(sizes, addresses, gradients, means, squares, steps, like, learning_rate, beta, beta_square, eps):
+    number = like.dtype.type
+    keep, keep_square = number(beta), number(beta_square)
+    add, add_square, small = number(1 - beta), number(1 - beta_square), number(eps)
+    for k in range(len(sizes)):
+        step = carray(_pointer(steps[k]), 1, np.float32)
+        step[0] += 1
+        rate = number(learning_rate / (1 - beta ** step[0]))
+        root = number(1 / np.sqrt(1 - beta_square ** step[0]))
+        x = carray(_pointer(addresses[k]), sizes[k], like.dtype)
+        g = carray(_pointer(gradients[k]), sizes[k], like.dtype)
+        m = carray(_pointer(means[k]), sizes[k], like.dtype)
+        v = carray(_pointer(squares[k]), sizes[k], like.dtype)
+        for c in range(sizes[k]):
+            m[c] = keep * m[c] + add * g[c]
+            v[c] = keep_square * v[c] + add_square * g[c] * g[c]
+            x[c] -= rate * m[c] / (np.sqrt(v[c]) * root + small)
