@@ -83,7 +83,7 @@ class TrainedValues:
 
     @property
     def middle(self) -> Values:
-        """The trained values of each material nearest to the middle of the trained ranges, by the parameter that differs most from it."""
+        """The trained values of each material nearest to the middle of the trained ranges, by the largest difference of a parameter."""
         return self._chosen({m: np.argmin(np.abs(self._scaled(m, v) - 0.5).max(axis=1)) for m, v in self._vectors.items()})
 
     def end(self, name: str) -> Values:
@@ -106,7 +106,7 @@ class TrainedValues:
         }
 
     def _scaled(self, material: str, vectors: np.ndarray) -> np.ndarray:
-        """Return vectors [vector, param] with each parameter on its scale, moved and divided so that the trained values reach from 0 to 1."""
+        """Return vectors [vector, param] with each parameter on its scale, normalised so that its trained values range from 0 to 1."""
         is_log = [p.scale == "log" for p in MATERIALS[material] if p.name in self._names[material]]
         trained, given = (np.log(v, out=np.array(v, np.float64), where=is_log) for v in (self._vectors[material], vectors))
         low, high = trained.min(axis=0), trained.max(axis=0)
@@ -141,7 +141,12 @@ class ControlRuns:
         return {NEAREST: self.trained.nearest(own), **{name: self.trained.end(name) for name in (LOWEST, HIGHEST)}}
 
     def generate(self, indices: Sequence[int], num_workers: int = 1, on_progress: Progress | None = None) -> None:
-        """Compute the missing runs of these scenes. Waits while another process computes them.
+        """Compute the missing runs of some scenes. Waits while another process computes them.
+
+        Args:
+            indices: numbers of the scenes in the split.
+            num_workers: number of processes; 1 computes in this process.
+            on_progress: called with the number of finished scenes and their total, at the start and after each scene.
 
         Raises:
             GenerationError: a scene is impossible, or the solver stopped.

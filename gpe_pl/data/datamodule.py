@@ -30,7 +30,8 @@ from gpe_pl.trajectory.store import StoreError
 from gpe_pl.trajectory.trajectory import Trajectory
 
 NUM_VAL_GRAPHS = 8
-"""Graphs in a validation batch, if no number of nodes limits it. The error does not depend on batches, because it is a quotient of sums over all nodes."""
+"""Number of graphs in a validation batch, unless ``BatchSize.max_nodes`` limits it. The validation error does not depend on it: the error is a quotient of sums
+over all nodes."""
 
 
 ENOUGH = 0.25
@@ -70,8 +71,8 @@ class TrajectoryDataModule(L.LightningDataModule):
         root: folder of the data set.
         graph: settings of the graphs.
         noise: noise on training inputs.
-        batch_size: samples per step over all ranks. Its number of nodes also limits batches of validation windows.
-        seed: seed of order and noise.
+        batch_size: samples per step over all ranks. Its ``max_nodes`` also limits batches of validation windows.
+        seed: seed of order, noise and mirroring.
         num_workers: number of processes that build graphs; 0 builds them in the training process.
         num_val_windows: number of windows of the one-step validation loss, evenly spread over the ``val`` split.
         stress: add the stress to samples; see ``WindowDataset``.
@@ -195,7 +196,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         return {m: torch.tensor(values, dtype=torch.float32) for m, values in ranges.items()}
 
     def trained_scene(self) -> np.ndarray:
-        """Return ranges of gravity and of boundary nodes over all training trajectories; see ``scene_ranges``."""
+        """Return the range [2, channel] of gravity and boundary nodes over all training trajectories; see ``trajectory.scene_ranges``."""
         return united(map(_scene, self.train_set.trajectories))
 
     def val_trajectories(self, count: int) -> list[Trajectory]:

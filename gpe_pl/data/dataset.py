@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 
 class StartKey(NamedTuple):
-    """Key of a push-forward sample. Batches in one lane continue the previous unroll.
+    """Key of a push-forward sample. Successive batches of a lane continue the same unrolls, until the lane takes other windows.
 
     Attributes:
         sample: sample number.
@@ -55,8 +55,8 @@ Key = int | tuple[int, int] | StartKey
 """The number of a window, or sample number and window, or the key of a push-forward sample."""
 
 CACHE_BYTES = 2 * 1024**3
-"""Splits are cached in memory if twice the size of their files, which are compressed, is at most this [bytes]. Larger splits are read from disk window by
-window. It is also the maximum memory for cached graphs."""
+"""A split is cached in memory if its compressed files have at most half this size [bytes]. Larger splits are read from disk window by window. Cached graphs may
+take this much memory, too."""
 
 
 MIRROR_STREAM = 1
@@ -232,7 +232,7 @@ class Start:
             ``WindowDataset`` leaves it out.
         position_correction: fraction of the deviation from the true position that the target removes within one step; see ``Noise``.
         velocity_correction: fraction of the deviation from the true velocity that the target removes within one step, after the unroll; as in ``StartKey``.
-        about: numbers of trajectory and frame, and the weight in the loss if there is one.
+        about: attributes of the graphs: numbers of trajectory and frame, and the weight in the loss if there is one.
         sample, lane: as in ``StartKey``.
         solver_targets: the targets of the solver, which replace the corrections; None without them.
     """
@@ -326,7 +326,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         builder: builder of the graphs.
         noise: noise on inputs; None for evaluation.
         velocity_unit: root mean square acceleration × frame interval [m/s], the unit of velocity noise.
-        seed: seed of the noise.
+        seed: seed of noise and mirroring.
         solver: gives the targets of noisy and unrolled states; None takes those that lead back to the trajectory.
         mirror: mirror each window at random. Every axis without gravity is mirrored with probability 1/2, independently of the others.
         stress: also give the Cauchy stress at t+1 of materials that have one, as ``stress_target`` [node, component] in Pa.

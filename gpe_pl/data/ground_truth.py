@@ -46,7 +46,16 @@ class GenerationError(GpeError):
 
 @runtime_checkable
 class Solver(Simulator, Protocol):
-    """A simulator whose results depend only on its settings, name and version."""
+    """A simulator whose results depend only on the state and on its own settings, name and version.
+
+    Attributes:
+        name, version: identify the solver. A version other than that of stored data has other results.
+        stores_stress: whether its states have a stress.
+        frame_dt: frame interval [s].
+        solver_dt: largest substep [s].
+        bounds: ``(low, high)`` of the domain per axis [m].
+        materials: materials in its states.
+    """
 
     name: ClassVar[str]
     version: ClassVar[str]
@@ -64,7 +73,13 @@ class Solver(Simulator, Protocol):
     @property
     def materials(self) -> tuple[str, ...]: ...
 
-    def compile_kernels(self) -> None: ...
+    def compile_kernels(self) -> None:
+        """Compile everything that ``step`` needs, or load it from the cache on disk.
+
+        Raises:
+            SimulationError: the settings are impossible.
+        """
+        ...
 
 
 @dataclass(frozen=True, config={"extra": "forbid"})
@@ -103,7 +118,9 @@ class ParameterValues(ValueGroups):
     further: dict[str, ValueGroups] = field(default_factory=dict)
 
     def of(self, material: str) -> Iterator[tuple[MaterialParameter, str, ValueGroups]]:
-        """Yield each stored parameter in schema order, the end of its configuration key after the material's (empty for the first parameter), and its values.
+        """Yield each stored parameter in schema order, with a key and its values.
+
+        The key is what the parameter adds to the material's configuration key: nothing for the first parameter, ``.further.NAME`` for the others.
 
         Raises:
             ValueError: ``further`` names a parameter that the material does not have.
@@ -228,8 +245,8 @@ def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[st
     The values of the first parameter of the first material are used in turn. Those of any other parameter are also used in turn, but each round has a random
     order that follows from the seed, so that parameters are independent. Rounds of parameters with equally many values form a Latin hypercube.
 
-    Scenes of ``interpolated`` take the interpolated values of all parameters that have any, those of ``extrapolated`` the extrapolated ones. Other parameters
-    have seen values there. A scene is therefore unseen if any parameter is, and extrapolated if any parameter is outside the range of its seen values.
+    In the group ``interpolated``, a parameter has interpolated values if there are any, else seen ones. The group ``extrapolated`` is alike. A scene is
+    therefore unseen if any parameter is, and extrapolated if any parameter is outside the range of its seen values.
     """
     group: ParameterGroup = "seen"
     if split == "test_unseen":
@@ -247,7 +264,7 @@ def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[st
 
 
 def named_values(spec: DatasetSpec, values: Mapping[str, MaterialValues]) -> dict[str, dict[str, float]]:
-    """Return other values of all stored parameters by name, for ``generate_trajectory``.
+    """Return the given values of all stored parameters by material and name. A number is the value of a material's first parameter.
 
     Raises:
         ValueError: a stored parameter is missing, or another one is named.

@@ -52,8 +52,8 @@ class PushForward:
         first_step: first optimiser step with unrolls.
         max_steps: maximum number of steps of an unroll. A batch is trained on at its true state and after each step of its unroll; then the next batch takes
             its lane.
-        correction: fraction of the velocities' deviation that the target removes within one step. The original trick removes all of it, which suits material
-            that friction slows down anyway. For swinging bodies the target would contain forces that do not exist.
+        correction: fraction of the velocities' deviation that the target removes within one step. The original trick has 1, which suits material that friction
+            slows down anyway. For swinging bodies, 1 puts forces into the target that do not exist.
     """
 
     first_step: Annotated[int, Field(ge=0)]
@@ -116,7 +116,7 @@ class BatchSize:
     max_nodes: Annotated[int, Field(ge=1)] | None = None
 
     def batches(self, data: WindowDataset, seed: int, step: int) -> Iterator[list[tuple[int, int]]]:
-        """Yield the samples of each optimiser step, from ``step`` on, without end."""
+        """Yield the samples of each optimiser step as (sample number, window), from ``step`` on, without end."""
         if self.max_nodes is None:
             samples = iter(StepSampler(len(data), seed, lambda: step * self.num_graphs, data.probability))
             while True:

@@ -36,7 +36,7 @@ class SolverTargets:
         vel: true velocities at the frames [num_steps + 1, node, dim] in m/s, from the start's on.
         stress: true stress of nodes [num_steps + 1, node, component] in Pa, from the frame after the start's on; None if the data have none.
         frame_dt: frame interval [s].
-        reflection: between the coordinates of the data set and those of the unroll, which may be a mirror image.
+        reflection: takes the coordinates of the data set to those of the unroll, which may be a mirror image, and back.
     """
 
     solver: Restartable

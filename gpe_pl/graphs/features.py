@@ -48,7 +48,7 @@ class GraphConfig:
     Attributes:
         features: edge features, ``paper`` or ``contact``.
         boundary_condition: boundary nodes have velocity, normal, friction and restitution. If false, they have only the velocity (paper).
-        history: velocities per node.
+        history: number of past velocities per node.
         connectivity_spacings: radius of the edges between nodes in rest spacings; None takes the data set's radius.
         parameter_scale: ``linear`` gives models the physical value of every material parameter, as the paper does. None takes the scale of each parameter
             in ``schema.MATERIALS``, which is logarithmic where values span decades.
@@ -179,7 +179,7 @@ def edge_features(
         displacement: x_target − x_source [m].
         relative_velocity: v_target − v_source [m/s].
         normal: wall normal at the source for ``boundary`` edges, None between dynamic nodes.
-        scales: units.
+        scales: scales of the data set.
     """
     relative = displacement / scales.radius
     if features == "paper":
@@ -231,7 +231,7 @@ def mesh_features(
         rest_displacement: displacement at rest [m].
         relative_velocity: v_target − v_source [m/s].
         level: level of the source; None for cell edges, whose width is one spacing.
-        scales: units.
+        scales: scales of the data set.
     """
     width = scales.spacing if level is None else scales.spacing * torch.exp2(level.double())[:, None]
     relative, rest = _without_rounding(displacement / width), _without_rounding(rest_displacement / width)

@@ -20,7 +20,10 @@ NUM_SAMPLED = 64
 
 
 def pairs_at_rest(num_nodes: int, radius: float, spacing: float, dim: int) -> float:
-    """Return the number of pairs within the radius R in a cloud with one node per spacing^dim: N/2 V_dim (R / spacing)^dim, V_dim the unit ball."""
+    """Return the number of pairs within the radius R in a cloud with one node per spacing^dim.
+
+    It is N/2 V_dim (R / spacing)^dim, where V_dim is the volume of the unit ball.
+    """
     ball = {1: 2.0, 2: np.pi, 3: 4 / 3 * np.pi}[dim]
     return num_nodes / 2 * ball * (radius / spacing) ** dim
 

@@ -26,8 +26,8 @@ class MeshTopology:
 
     Attributes:
         num_virtual: number of virtual nodes of each level, lowest level first.
-        descent: pairs of a virtual node of any level (row 0, numbered from the lowest level up) and a node of the state below it (row 1). A pair whose number
-            in row 0 is that of all virtual nodes stands for no virtual node; ``descent_of`` adds one for each level above which a node has no ancestor.
+        descent: pairs of a virtual node of any level (row 0, numbered from the lowest level up) and a node of the state below it (row 1). ``descent_of`` has a
+            pair for every node and level; if the node has no ancestor in that level, row 0 has the total number of virtual nodes.
         rest_pos: undeformed positions of the nodes of the state [m]; in periodic domains the images that keep each body together.
         shift: vector to add to each position so that meshes stay in one piece at the seams of a periodic domain [m]; None stands for zero.
     """

@@ -69,7 +69,7 @@ def check_pickle(content: bytes) -> None:
     """Interpret a pickle as far as needed to find the functions that it calls and the depth of its tuples.
 
     Raises:
-        ValueError: the pickle has anything that tensors do not need.
+        ValueError: the pickle has an opcode, a function or deeper tuples than tensors need, or is damaged; the message names it.
     """
     stack: list[tuple[int, str]] = []  # levels of tuples in each value, and its name where it is a global
     memo: dict[int, tuple[int, str]] = {}

@@ -140,7 +140,7 @@ class LearnedSimulator(nn.Module):
 
     @property
     def num_hops(self) -> int:
-        """Number of edges to the farthest node that can influence a prediction."""
+        """Number of ``radius`` edges to the farthest node that can influence a prediction, apart from paths inside meshes."""
         return self.model.num_hops
 
     @torch.no_grad()
@@ -153,7 +153,8 @@ class LearnedSimulator(nn.Module):
         statistics.
 
         Args:
-            graphs: sample of the training data; a ``StatisticsSample`` can provide more graphs of rare materials and contacts.
+            graphs: sample of the training data, which also gives the trained range of masses. A ``StatisticsSample`` can provide more graphs of rare materials
+                and contacts.
             parameter_ranges: lowest and highest value [2, param] of each material's parameters in all training data; None takes those of the sample.
             trained_scene: range of gravity and boundary nodes in all training scenes, as in ``scene_ranges``; None leaves it unlimited.
 

@@ -9,7 +9,8 @@ Filters have 4^d points and the radius of the graph. A particle is not a neighbo
 
 Differences from the paper, because all models here share graphs, inputs and targets:
 
-- The output is the acceleration without gravity in units of its standard deviation. The paper's is 1/128 of a position correction after a step with gravity.
+- The output is the acceleration without gravity in units of its standard deviation. In the paper, the output divided by 128 corrects positions after a step
+  with gravity.
 - Particles have the standardised features of the graph (velocity history, gravity, material parameter) and one column per material. With one material this
   column is the constant 1 of the paper. Boundary nodes have velocity, normal and boundary condition; in the paper they have the normal only.
 - All materials use the same filters. Edges connect all pairs within the radius, which is 4.5 particle radii in the paper.
@@ -135,7 +136,7 @@ class ContinuousConvNet(Model):
 
 
 def _dense(in_channels: int, out_channels: int) -> nn.Linear:
-    """Return a linear layer with the authors' initial values: Xavier-uniform weights, no bias."""
+    """Return a linear layer with the authors' initial values: Xavier-uniform weights and zero biases."""
     layer = nn.Linear(in_channels, out_channels)
     nn.init.xavier_uniform_(layer.weight)
     nn.init.zeros_(layer.bias)

@@ -180,8 +180,8 @@ class GPE(Model):
         level_weights: ``shared`` has one set of weights for all levels of virtual nodes, which allows any number of levels; ``separate`` has one set per level
             (paper).
         stress: also decode the stress of materials that have one.
-        node_norm: ``layer`` normalises the encoded state of every node and the update of each step, as GNS does. Accelerations then stay bounded in any
-            rollout. ``none`` follows the paper.
+        node_norm: ``layer`` normalises the encoded state of every node and the update of each step, as GNS does. With the ``node`` decoder, accelerations then
+            stay bounded in any rollout. ``none`` follows the paper.
         island_momentum: conserve the ``linear``, or also the ``angular``, momentum of freely flying islands exactly (see ``nn.island_momentum``); or
             ``ignored``.
 

@@ -38,7 +38,7 @@ class MLP(nn.Sequential):
 
 
 class ReluMLP(nn.Sequential):
-    """Hidden linear layers with a ReLU after each, a linear layer, then an optional LayerNorm: the networks of the baselines."""
+    """Hidden linear layers with a ReLU after each, a linear layer, then an optional LayerNorm. The functions of GNS and DPI-Net have this form."""
 
     def __init__(self, in_channels: int, hidden_channels: int, out_channels: int, num_hidden_layers: int, norm: bool = False) -> None:
         layers: list[nn.Module] = []

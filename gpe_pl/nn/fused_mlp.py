@@ -134,7 +134,10 @@ def fused_mlp(
     out_bias: Float[Tensor, " out"],
     residual: Float[Tensor, "row out"] | None = None,
 ) -> Float[Tensor, "row out"]:
-    """Return y of the module's docstring, on the CPU in single or double precision; differentiable."""
+    """Return y of the module's docstring, on the CPU in single or double precision; differentiable.
+
+    The arguments are x, A, b, p, C, c and r, in this order.
+    """
     weights = weight, bias, slope, out_weight, out_bias
     if not torch.is_grad_enabled():
         return _forward(x.detach().contiguous(), weights, residual, keeps=False)[0]

@@ -28,7 +28,7 @@ Interaction = Literal["directed", "negated", "odd", "odd_even"]
 EdgeState = Literal["latent", "geometry"]
 Implementation = Literal["factored", "plain"]
 RAW = 32
-"""Number of edge channels up to which the product is computed where it is used; more channels go through a matrix product."""
+"""Maximum number of edge channels for ``fused_messages``, which computes W e edge by edge. With more channels, matrix products are faster."""
 MaybeTensor = Optional[Tensor]  # noqa: UP045 - PyG's code generator reads the signatures below and does not understand unions written with |
 
 Ends = tuple[Tensor, MaybeTensor]

@@ -104,6 +104,8 @@ class TrainerSettings:
 
     Attributes:
         devices: number of devices on each of the ``num_nodes`` machines.
+        num_threads: PyTorch's threads in each process; None leaves PyTorch's choice.
+        num_workers: number of processes that build graphs; 0 builds them in the training process.
         matmul_precision: PyTorch's precision of matrix products in float32. ``high`` and ``medium`` may use TensorFloat-32 or bfloat16 inside where the
             processor or GPU is faster with them.
         checkpoint_minutes: time between checkpoints, apart from those of validations [min].
@@ -173,6 +175,7 @@ def train(
     Raises:
         RunError: the accelerator or devices are not available, or training was interrupted; says how to resume.
         TrainingError: losses are not finite; names the last checkpoint.
+        CheckpointError: training cannot resume from ``last.ckpt``.
     """
     datamodule.push_forward = training.push_forward  # known only now, as it depends on the number of steps within a time budget
     interruption = Interruption()

@@ -70,7 +70,11 @@ SCALARS = ("frame_dt", "spacing", "connectivity_radius")
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
-    """Open a data set in this format; raises ``ImportFailure`` if it cannot be read."""
+    """Return the data set at ``path`` in the format of this module.
+
+    Raises:
+        ImportFailure: there are no such files.
+    """
     folders, warnings = split_folders(path)
     files = {
         split: sorted(folder.glob("*.npz"), key=lambda file: natural(file.name)) for split, folder in (folders or {"train": path}).items()

@@ -53,7 +53,11 @@ MOST = {"max_array_len": 2**16, "max_map_len": 2**10, "max_str_len": 2**16, "max
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
-    """Open a data set in this format; raises ``ImportFailure`` if it cannot be read."""
+    """Return the data set at ``path`` in the format of this module.
+
+    Raises:
+        ImportFailure: there are no such files, or a package is missing.
+    """
     _libraries()
     if path.is_file():
         scenes, warnings = {"train": [[path]]}, tuple[str, ...]()

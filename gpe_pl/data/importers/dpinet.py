@@ -45,7 +45,11 @@ GROUND_FRICTION = 0.5
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
-    """Open a data set in this format; raises ``ImportFailure`` if it cannot be read."""
+    """Return the data set at ``path`` in the format of this module.
+
+    Raises:
+        ImportFailure: there are no such folders, or they hold no rollouts.
+    """
     folders, warnings = split_folders(path)
     if not folders:
         raise ImportFailure(f"{path}: {'no such folder' if not path.exists() else 'holds no folder train or valid'}")

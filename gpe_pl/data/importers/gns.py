@@ -52,7 +52,11 @@ PACKED = "gns_data"
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
-    """Open a data set in this format; raises ``ImportFailure`` if it cannot be read."""
+    """Return the data set at ``path`` in the format of this module.
+
+    Raises:
+        ImportFailure: there are no such files, one is damaged, or ``metadata.json`` lacks a value.
+    """
     files = split_files(path, (".tfrecord", ".npz", ".h5"))
     described = (path if path.is_dir() else path.parent) / "metadata.json"
     values = read_json(described)

@@ -2,7 +2,7 @@
 
 ``source`` is a folder with ``metadata.json`` and ``train.h5``, ``valid.h5`` and ``test.h5``. A file has a group per trajectory with ``position`` (float32
 [frame, node, dim]) and ``particle_type`` ([node]; −1 padding, 0 fluid, 1 solid wall, 2 moving wall, 3 rigid body). The time between frames is
-``dt × write_every``. Lengths are in units of the case. The reference density is 1, so ``viscosity`` is kinematic.
+``dt × write_every``. Lengths and times are in units of the case, which are stored as m and s. The reference density is 1, so ``viscosity`` is kinematic.
 
 Moving walls slide steadily along a periodic axis. They are stored at their first position, with their velocity. A file ``force.py`` in the folder is code and
 is never run. The force of a dam break is gravity. Other forces, whose magnitude is ``g_ext_magnitude``, depend on the place and are not stored. Models without
@@ -46,7 +46,11 @@ DAM_BREAKS = ("DAM", "DB")
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
-    """Open a data set in this format; raises ``ImportFailure`` if it cannot be read."""
+    """Return the data set at ``path`` in the format of this module.
+
+    Raises:
+        ImportFailure: there are no such files, one is damaged, or ``metadata.json`` lacks a value.
+    """
     files = split_files(path, (".h5",))
     folder = path if path.is_dir() else path.parent
     described = folder / "metadata.json"

@@ -45,7 +45,11 @@ NEEDED = ("world_pos", "mesh_pos", "cells", "node_type")
 
 
 def open_source(path: Path, settings: ImportSettings) -> Source:
-    """Open a data set in this format; raises ``ImportFailure`` if it cannot be read."""
+    """Return the data set at ``path`` in the format of this module.
+
+    Raises:
+        ImportFailure: there are no such files, one is damaged, ``meta.json`` lacks a value, or the meshes do not move or change their nodes.
+    """
     files = split_files(path, (".tfrecord", ".h5"))
     described = (path if path.is_dir() else path.parent) / "meta.json"
     meta = read_json(described)

@@ -51,7 +51,7 @@ class SplitCounts:
 
 @dataclass
 class Report:
-    """The result of an import; lengths in m, times in s.
+    """The result of an import; lengths in m, times in s. Without training trajectories, the first split takes their place.
 
     Attributes:
         name: name of the data set.
@@ -64,11 +64,10 @@ class Report:
         materials: by material, its number of ``nodes``, and ``parameters``, the smallest and largest value of each by name.
         splits: counts by split.
         neighbours: number of dynamic neighbours of a dynamic node within the radius (``mean``, ``min``, ``max``), and mean number of ``boundary``
-            neighbours; in some frames of the first ``assemble.NUM_SAMPLED`` trajectories.
-        velocity_std, acceleration_std: rms per component in the train split [m/s, m/s²], the latter without gravity. Without a train split, these and what
-            follows from samples describe the first split.
-        max_speed, mean_acceleration: largest speed [m/s], and mean acceleration with gravity per axis [m/s²], of the same trajectories. In free fall the
-            acceleration is gravity.
+            neighbours; in some frames of the first ``assemble.NUM_SAMPLED`` training trajectories.
+        velocity_std, acceleration_std: rms per component in the train split [m/s, m/s²], the latter without gravity.
+        max_speed, mean_acceleration: largest speed [m/s], and mean acceleration with gravity per axis [m/s²], of the first ``assemble.NUM_SAMPLED`` training
+            trajectories. In free fall the acceleration is gravity.
         free_groups: number of groups of nodes in free flight, over the examined frames.
         free_acceleration: median acceleration of these groups per axis [m/s²]; empty if there are none.
         step_in_spacings: displacement in one frame at ``max_speed``, in spacings.

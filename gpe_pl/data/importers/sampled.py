@@ -1,4 +1,4 @@
-"""What some stored trajectories of an import show: neighbours and motion of nodes."""
+"""Neighbours and motion of nodes in some stored trajectories of an import."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FRAMES_SAMPLED = 3
 
 
 def degrees_of(trajectory: Trajectory) -> Iterator[tuple[Int64[np.ndarray, " node"], Int64[np.ndarray, " node"]]]:
-    """Yield two arrays for each of some frames: the number of dynamic neighbours and of boundary neighbours of each dynamic node [node]."""
+    """Yield two arrays for each of ``FRAMES_SAMPLED`` frames: the numbers of dynamic neighbours and of boundary neighbours of each dynamic node [node]."""
     m, count = trajectory.metadata, trajectory.num_nodes
     for frame in np.unique(np.linspace(0, trajectory.num_frames - 1, FRAMES_SAMPLED).astype(int)).tolist():
         walls = np.ascontiguousarray(trajectory.boundary.at(frame).pos, dtype=np.float64)

@@ -41,7 +41,7 @@ STILL = 1e-2
 """Boundary nodes are still, or slide steadily, if they never deviate from this motion by more than this fraction of the spacing."""
 
 WIDEST = 1.05
-"""A warning is given if the nodes of the first frame extend over more than this number of periods."""
+"""A warning is given if the nodes of the first frame extend over more than this number of periods along a periodic axis."""
 
 MAX_JSON_BYTES = 2**24
 MAX_TRAJECTORIES = 100_000

@@ -88,7 +88,7 @@ class Record:
     fault: str = ""
 
     def read(self) -> bytes:
-        """Read the data; raises ``Refusal`` if they do not match their checksum."""
+        """Read the data; raises ``Refusal`` if the record has a ``fault``, or if the data do not match their checksum."""
         if self.fault:
             raise Refusal(self.fault)
         with open(self.path, "rb") as file:
