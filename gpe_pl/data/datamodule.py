@@ -37,9 +37,9 @@ over all nodes."""
 ENOUGH = 0.25
 """Fraction of the statistics windows. Node types that occur in fewer windows get this many additional windows."""
 FEW_CONTACTS = 1 / 16
-"""Fraction of the statistics windows. Contacts that occur in fewer windows are searched for in additional windows."""
+"""Fraction of the statistics windows. A ``radius`` relation that has edges in fewer windows is searched for in additional windows."""
 MOST_SEARCHED = 8
-"""Maximum number of windows searched for rare contacts, as a multiple of the number of statistics windows."""
+"""Maximum number of windows searched for a rare relation, as a multiple of the number of statistics windows."""
 
 
 def data_statistics(root: Path | str) -> dict[str, float]:
@@ -128,7 +128,7 @@ class TrajectoryDataModule(L.LightningDataModule):
     def statistics_sample(self) -> StatisticsSample:
         """Sample training graphs with noise for the standardisation of features.
 
-        They are evenly spread over the split. Rare node types and contacts get additional graphs.
+        They are evenly spread over the split. Rare node types and rare ``radius`` relations get additional graphs.
         """
         windows = _spread(len(self.train_set), self.num_statistics_windows)
         return StatisticsSample([self.train_set[int(window)] for window in windows], self._rare_graphs, self._touching_graphs)

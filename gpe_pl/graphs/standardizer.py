@@ -31,8 +31,9 @@ class StatisticsSample:
 
     Attributes:
         graphs: graphs evenly spread over the split.
-        rare: function that returns graphs of trajectories with nodes of all given roles (see ``schema.role``) if ``graphs`` has too few of them, else none.
-        touching: function of a relation of contacts and of graphs. It returns these graphs, or others with such contacts if too few of these have any.
+        rare: function of roles (see ``schema.role``). It returns graphs of trajectories with nodes of all these roles if too few of ``graphs`` have them, else
+            an empty list.
+        touching: function of a ``radius`` relation and of graphs. It returns these graphs, or others with edges of the relation if too few of these have any.
     """
 
     graphs: list[HeteroData]
@@ -92,11 +93,11 @@ class GraphStandardizer(nn.Module):
         return torch.stack([c.log() if log else c for c, log in zip(columns, is_log, strict=True)], dim=1)
 
     def fit(self, graphs: Iterable[HeteroData]) -> list[str]:
-        """Set all statistics from graphs of the training split; a ``StatisticsSample`` adds graphs of rare materials and contacts.
+        """Set all statistics from graphs of the training split; a ``StatisticsSample`` adds graphs of rare materials and relations.
 
         Returns:
-            Materials without nodes in any graph, and contacts without edges between node types that occur. These are not standardised. Relations of meshes
-                are never listed.
+            Materials without nodes in any graph, and ``radius`` relations without edges between node types that occur. These are not standardised. Relations of
+                meshes are never listed.
         """
 
         def fit(module: nn.Module, values: Iterable[Tensor]) -> bool:

@@ -154,7 +154,7 @@ class LearnedSimulator(nn.Module):
 
         Args:
             graphs: sample of the training data, which also gives the trained range of masses. A ``StatisticsSample`` can provide more graphs of rare materials
-                and contacts.
+                and relations.
             parameter_ranges: lowest and highest value [2, param] of each material's parameters in all training data; None takes those of the sample.
             trained_scene: range of gravity and boundary nodes in all training scenes, as in ``scene_ranges``; None leaves it unlimited.
 
