@@ -141,7 +141,7 @@ class ControlRuns:
         return {NEAREST: self.trained.nearest(own), **{name: self.trained.end(name) for name in (LOWEST, HIGHEST)}}
 
     def generate(self, indices: Sequence[int], num_workers: int = 1, on_progress: Progress | None = None) -> None:
-        """Compute the missing runs of some scenes. Waits while another process computes them.
+        """Compute the missing runs of some scenes; wait first while another process computes them.
 
         Args:
             indices: numbers of the scenes in the split.

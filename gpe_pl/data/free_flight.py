@@ -38,7 +38,7 @@ class FreeFlight:
         acceleration: mass-weighted mean acceleration of each free group [group, dim] in m/s², from second differences of positions.
         gravity: gravity of the group's trajectory [group, dim] in m/s².
         resolution: uncertainty of ``acceleration`` due to rounding of positions [group] in m/s².
-        scale: rms acceleration of all nodes in the group's frame [group] in m/s².
+        scale: rms acceleration of all nodes in the group's frame, gravity included [group] in m/s².
     """
 
     num_islands: int

@@ -258,7 +258,7 @@ def generate(
 ) -> Path:
     """Generate the missing part of a data set.
 
-    Waits while another process generates the same data. A complete data set is only read.
+    It waits while another process generates the same data. A complete data set is only read.
 
     Args:
         root: folder of all data sets.

@@ -34,8 +34,8 @@ def check_crowding(pos: Float64[np.ndarray, "node dim"], radius: float, spacing:
     Pairs are counted before they are listed, because counting needs no memory. If no box contains enough nodes for a collapse, counting is skipped.
 
     Raises:
-        SimulationError: with reason ``clustering``, if ``CROWDING_LIMIT`` times as many pairs lie within the radius [m] as at rest; names the most crowded
-            node.
+        SimulationError: with reason ``clustering``, if more than ``CROWDING_LIMIT`` times as many pairs lie within the radius [m] as at rest; names the most
+            crowded node.
     """
     num_nodes, dim = pos.shape
     if num_nodes < 2:

@@ -40,14 +40,14 @@ class NotAParticleGraphError(GpeError, ValueError):
 
 
 class ContinuousConvNet(Model):
-    """Network of the paper.
+    """Network of Ummenhofer et al. 2020 ("the paper"); see the module's docstring for equations and differences.
 
     Args:
         spec: channels of the graphs, which have ``radius`` relations only.
         num_convolutions: number of layers, the first and the last included; 4 in the paper.
         hidden_channels: width between layers; 64 in the paper. Each of the three parts of the first layer has half this width.
         kernel_size: filter points per axis; 4 in the paper.
-        material_embedding: ``feature``: the material parameter is a feature of nodes like the others; ``none`` leaves it out, as a control.
+        material_embedding: ``feature`` makes material parameters features of nodes like the others; ``none`` leaves them out, as a control.
 
     Raises:
         NotAParticleGraphError: the graphs have relations of meshes.

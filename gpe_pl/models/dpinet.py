@@ -71,13 +71,13 @@ class Stage(nn.Module):
 
 
 class DPINet(Model):
-    """Model of the paper.
+    """Model of Li et al. 2019; see the module's docstring for equations and differences.
 
     Args:
         spec: channels of the graphs.
         num_propagation_steps: L; 2 in the authors' code.
         hidden_channels: width of particle codes and effects; relation codes are 1.5 times as wide; 200 and 300 in the authors' code.
-        material_embedding: ``feature``: the material parameter is a feature of nodes like the others; ``none`` leaves it out, as a control.
+        material_embedding: ``feature`` makes material parameters features of nodes like the others; ``none`` leaves them out, as a control.
     """
 
     def __init__(

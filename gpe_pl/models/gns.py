@@ -50,7 +50,7 @@ class InteractionNetwork(nn.Module):
 
 
 class GNS(Model):
-    """Model of the paper.
+    """Model of Sanchez-Gonzalez et al. 2020 ("the paper"); see the module's docstring for equations and differences.
 
     Args:
         spec: channels of the graphs.
@@ -58,7 +58,7 @@ class GNS(Model):
         hidden_channels: width of all hidden states and layers; 128 in the paper.
         num_hidden_layers: number of hidden layers of every MLP; 2 in the paper, 1 in LagrangeBench's GNS-10-128.
         type_channels: width of the embedding of the particle type; 16 in the paper.
-        material_embedding: ``feature``: the material parameter is a feature of nodes like the others; ``none`` leaves it out, as a control.
+        material_embedding: ``feature`` makes material parameters features of nodes like the others; ``none`` leaves them out, as a control.
     """
 
     def __init__(

@@ -163,7 +163,7 @@ def _grouped(data: HeteroData, materials: Iterable[str], name: str, count: Tenso
 
 
 class GPE(Model):
-    """Model of the paper and its variants.
+    """Model of Yang et al. 2022 ("the paper") and its variants; see the module's docstring for the equations.
 
     Args:
         spec: channels of the graphs.
@@ -173,7 +173,7 @@ class GPE(Model):
             nodes only deform it. Such edges exist only at contacts. Nodes without a cell belong to the body beside them. Forces between bodies sum to zero.
             Materials without a mesh have an acceleration per node; beside meshes they need ``island_momentum``, so that the total momentum is conserved.
         edge_state: ``latent`` updates a hidden state per edge (Algorithm 1); ``geometry`` feeds the raw edge features to every layer.
-        material_embedding: ``affine`` (the paper's interpolation rule) or ``mlp``; ``none`` leaves the parameter out, as a control.
+        material_embedding: ``affine`` (the paper's interpolation rule) or ``mlp`` (see ``MaterialEmbedding``); ``none`` leaves parameters out, as a control.
         num_message_passing_steps: number of processor layers; 12 in the paper.
         hidden_channels: width of all hidden states and layers; 128 in the paper.
         implementation: ``factored`` or ``plain``; both compute the same function of the same parameters.

@@ -17,7 +17,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl.schema import EdgeType, FeatureSpec, role
 
 MaterialEmbeddingKind = Literal["feature", "none"]
-"""Whether the material parameter is a feature of nodes like the others, or left out as a control."""
+"""Whether material parameters are features of nodes like the others, or left out as a control."""
 
 Edges = dict[EdgeType, tuple[Tensor, Tensor, Tensor]]
 """``edge_index``, ``odd`` and ``even`` of each relation that has edges."""
@@ -29,10 +29,10 @@ class Homogeneous:
     Args:
         spec: channels of the typed graphs.
         node_types: node types that take part, all materials among them.
-        material_embedding: how the material parameter enters.
+        material_embedding: whether material parameters are features.
 
     Attributes:
-        kind: number of each node type in the model; virtual nodes of all levels have the same number.
+        kind: integer code of each node type; virtual nodes of all levels have the same code.
         num_kinds: number of different kinds.
         node_channels: number of columns of ``nodes``.
         edge_channels: number of columns of ``edges``.
@@ -63,7 +63,7 @@ class Homogeneous:
         self.edge_channels = sum(edge_widths.values())
 
     def nodes(self, x: dict[str, Tensor], params: dict[str, Tensor]) -> tuple[Float[Tensor, "node channel"], Int64[Tensor, " node"]]:
-        """Return features and kinds of all nodes."""
+        """Return features and kinds of all nodes, from the features of each node type and the parameters of each material."""
         rows, kinds = [], []
         for t, features in x.items():
             row = _place(features, self._x[t], self.node_channels)

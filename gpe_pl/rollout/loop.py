@@ -141,9 +141,9 @@ class Start:
 
 
 def frames(simulator: Simulator, starts: Sequence[Start]) -> Iterator[tuple[int, int, State | Termination]]:
-    """Advance all scenes together. Yields (scene, frame, new state); the last item of a stopped scene has a ``Termination`` instead of a state.
+    """Advance all scenes together, and yield (scene, frame, new state) for each step of each.
 
-    Only one state per scene is kept in memory.
+    The last item of a scene that stops early has a ``Termination`` instead of a state. Only one state per scene is kept in memory.
     """
     live, num_steps, guards = dict[int, State](), dict[int, int](), dict[int, Guard]()
     for scene, start in enumerate(starts):

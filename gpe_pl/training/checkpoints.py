@@ -114,7 +114,7 @@ class Checkpoints(Checkpoint):
         return {"best_score": self.best_score, "best_step": self.best_step}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the best score and its step from the result of ``state_dict``.
+        """Restore the best score and its step from the result of ``state_dict``, unless ``best.ckpt`` is missing.
 
         Raises:
             CheckpointError: ``state_dict`` holds something else.

@@ -13,7 +13,9 @@ from gpe_pl.training import parameter_passes
 
 
 class OnePassAdam(torch.optim.Adam):
-    """``torch.optim.Adam`` with the same state, updates and checkpoints; a parameter without a gradient keeps its value and moments.
+    """``torch.optim.Adam`` in one pass on a CPU. State and checkpoints are the same, and updates are the same up to rounding.
+
+    A parameter without a gradient keeps its value and moments.
 
     Args:
         parameters: parameters to optimise.
@@ -48,7 +50,7 @@ class OnePassAdam(torch.optim.Adam):
 
 
 def clip(parameters: Iterable[nn.Parameter], largest: float | None) -> float:
-    """Scale the gradients down if their norm exceeds ``largest``, and return the norm before."""
+    """Scale the gradients down if their norm exceeds ``largest`` (None: no limit) and is finite, and return the norm that they had."""
     with_gradient, gradients = _with_gradients(parameters)
     if not parameter_passes.are_covered(gradients):
         return float(torch.nn.utils.clip_grad_norm_(with_gradient, math.inf if largest is None else largest))

@@ -164,7 +164,7 @@ def train(
     run_dir: Path,
     callbacks: Sequence[Callback] = (),
 ) -> Path:
-    """Train to ``num_steps``. Resumes from ``checkpoints/last.ckpt`` if there is one.
+    """Train up to step ``num_steps``, from ``checkpoints/last.ckpt`` if there is one, else from the start.
 
     With several processes, each of them returns; call ``end_later_processes`` to continue with the first alone. Unless ``torchrun`` or Slurm starts the
     processes, each runs the same command.

@@ -66,7 +66,7 @@ def array(group: h5py.Group, name: str, axes: str, kinds: str = "fiu") -> np.nda
         group: file or group.
         name: name of the array in the group.
         axes: names of the axes, separated by commas. The array must have this number of axes.
-        kinds: NumPy's letters for the allowed types.
+        kinds: letters of the allowed types, as in ``numpy.dtype.kind``.
 
     Raises:
         Refusal: the array is missing, damaged, of another type or shape, larger than its file, or needs far more memory or time to read than its size.

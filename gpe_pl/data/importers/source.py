@@ -419,7 +419,7 @@ def _sliding(pos: np.ndarray, facts: Facts, repairs: list[Repair]) -> tuple[np.n
 
 
 def typed(pos: np.ndarray, types: np.ndarray, table: Mapping[int, str], settings: ImportSettings, **arrays: Any) -> Nodes:
-    """Convert a source's integer types to node types.
+    """Return ``Nodes`` whose node types are those of a source's integer types.
 
     Args:
         pos: positions [frame, node, dim] in m.
