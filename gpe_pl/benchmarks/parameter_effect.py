@@ -19,13 +19,14 @@ from matplotlib.figure import Figure
 from pydantic import Field
 
 from gpe_pl.benchmarks.finished_parts import PARTS, FinishedParts
+from gpe_pl.benchmarks.half_steps import HalfSteps
 from gpe_pl.benchmarks.trained import Case
 from gpe_pl.data.control_runs import HIGHEST, LOWEST, TrainedValues, Values, scene_values, with_values
-from gpe_pl.data.ground_truth import DatasetSpec, Solver, initial_state, parameter_values
+from gpe_pl.data.ground_truth import DatasetSpec, initial_state, parameter_values
 from gpe_pl.errors import GpeError
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio
-from gpe_pl.rollout.loop import SimulationError, steps
+from gpe_pl.rollout.loop import SimulationError, Simulator, steps
 from gpe_pl.system.progress import progress_bar
 from gpe_pl.system.workers import pool, results
 from gpe_pl.trajectory.state import State
@@ -93,18 +94,9 @@ def recorded(values: Values) -> dict[str, Any]:
     return {material: dict(own) if len(own) > 1 else next(iter(own.values())) for material, own in values.items()}
 
 
-def with_half_steps(solver: Any) -> Any:
-    """Return a solver with half the frame interval and half the ``cfl``.
-
-    It takes as many substeps in half a frame as the given one in a frame, unless gravity or viscosity limits them.
-    """
-    return replace(solver, frame_dt=solver.frame_dt / 2, cfl=solver.cfl / 2)
-
-
-def positions(solver: Solver, state: State, num_frames: int, stride: int = 1) -> np.ndarray:
-    """Return positions [frame, node, dim] in m after the initial state, one frame for every ``stride`` steps."""
-    states = steps(solver, state, num_frames * stride)
-    return np.stack([np.array(later.pos) for k, later in enumerate(states, start=1) if k % stride == 0])
+def positions(solver: Simulator, state: State, num_frames: int) -> np.ndarray:
+    """Return positions [frame, node, dim] in m of the frames after the initial state."""
+    return np.stack([np.array(later.pos) for later in steps(solver, state, num_frames)])
 
 
 def scene_changes(spec: DatasetSpec, index: int) -> dict[str, list[float]]:
@@ -121,7 +113,7 @@ def scene_changes(spec: DatasetSpec, index: int) -> dict[str, list[float]]:
         for name, values in trained_values(spec, index).items():
             params = with_values(start.material_params, start.node_type, names, values)
             others[name] = positions(spec.solver, replace(start, material_params=params), num_frames)
-        others["half_step"] = positions(with_half_steps(spec.solver), start, num_frames, stride=2)
+        others["half_step"] = positions(HalfSteps(spec.solver), start, num_frames)
         rounded = replace(start, pos=np.asarray(start.pos).astype(np.float32).astype(np.float64))
         others["rounded"] = positions(spec.solver, rounded, num_frames)
     except SimulationError as error:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from gpe_pl.benchmarks.acceptance.scenes import material_of, values_of
+from gpe_pl.benchmarks.half_steps import HalfSteps
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.learned.acceptance import Check
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -80,8 +81,7 @@ class Trial:
     Attributes:
         value: material parameter.
         truth: rollout of the solver.
-        finer: rollout of the solver with half the ``cfl``, whose difference from ``truth`` is the solver's own uncertainty. It equals ``truth`` where one
-            substep takes a whole frame, as for slow liquids.
+        finer: rollout of the solver with half the time step (``HalfSteps``), whose difference from ``truth`` is the solver's own uncertainty.
         model: rollout of the model with containment.
         corrected: fraction of particle-steps that containment corrected.
     """
@@ -104,7 +104,7 @@ def tried(candidate: Candidate, value: float, start: State, seconds: float) -> T
     history, metadata = candidate.simulator.builder.config.history, candidate.metadata()
     num_frames = max(2, round(seconds / solver.frame_dt))
     whole = rollout(solver, start, history + num_frames, metadata)
-    finer = rollout(replace(solver, cfl=solver.cfl / 2), start, history + num_frames, metadata).frames(history)
+    finer = rollout(HalfSteps(solver), start, history + num_frames, metadata).frames(history)
     truth = whole.frames(history)
     model, corrected = predicted(candidate, candidate.simulator.initial_state(whole, history), truth)
     return Trial(value, truth, finer, model, corrected)

@@ -23,14 +23,12 @@ from gpe_pl.benchmarks.parameter_effect import (
     scene_changes,
     stored_changes,
     trained_values,
-    with_half_steps,
 )
 from gpe_pl.benchmarks.trained import Case
 from gpe_pl.config.datasets import dataset
 from gpe_pl.config.folder import CONF
 from gpe_pl.data.ground_truth import DatasetSpec, initial_state, parameter_values
 from gpe_pl.files import sealed
-from gpe_pl.rollout.loop import steps
 
 TINY = ("data=sand", "size=tiny", "data.sizes.tiny.num_frames=5", "data.sizes.tiny.d2.num_particles=30", "data.scene.max_speed=4")
 DOMAINS = ("sand", "snow", "elastomer", "fem", "fluid")
@@ -45,16 +43,6 @@ def test_the_other_values_are_trained_ones() -> None:
     found = trained_values(tiny(), 0)
     assert {name: values["sand"]["friction_angle"] for name, values in found.items()} == {"lowest": 20.0, "highest": 42.5, "nearest": 20.0}
     assert [group_of(value, (20.0, 42.5)) for value in (15.0, 31.0, 47.5)] == ["below", "between", "above"]
-
-
-@pytest.mark.parametrize("data", ["sand", "fem", pytest.param("fluid", marks=pytest.mark.slow)])
-def test_half_the_time_step_is_half_of_every_substep(data: str) -> None:
-    spec = dataset(f"data={data}", "size=tiny")
-    start = initial_state(spec, "test_unseen", 0)
-    whole = [state.num_substeps for state in steps(spec.solver, start, 3)]
-    halved = list(steps(with_half_steps(spec.solver), start, 6))
-    assert sum(state.num_substeps for state in halved) == 2 * sum(whole)
-    assert halved[-1].time == pytest.approx(3 * spec.solver.frame_dt)
 
 
 def test_changes_are_against_the_own_value() -> None:

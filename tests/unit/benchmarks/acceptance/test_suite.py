@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -24,12 +25,16 @@ def spec() -> DatasetSpec:
     return dataset("data=sand", "size=tiny")
 
 
+def untrained(spec: DatasetSpec) -> LearnedSimulator:
+    torch.manual_seed(0)
+    build = GraphBuilder(GraphConfig(history=2, islands=True), trajectory_metadata(spec, "train", 0))
+    return LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=8), build)
+
+
 @pytest.fixture
 def checkpoint(spec: DatasetSpec, tmp_path: Path) -> Path:
     """An untrained model, which passes nothing but free flight."""
-    torch.manual_seed(0)
-    build = GraphBuilder(GraphConfig(history=2, islands=True), trajectory_metadata(spec, "train", 0))
-    simulator = LearnedSimulator(GPE(build.spec, num_message_passing_steps=1, hidden_channels=8), build)
+    simulator = untrained(spec)
     for _, trained in simulator.trained_ranges():
         trained.copy_(torch.tensor([[20.0], [40.0]]))
     path = tmp_path / "own" / "checkpoints" / "best.ckpt"
@@ -85,3 +90,12 @@ def test_every_domain_has_scenes() -> None:
     cases = {"sand": "sand", "snow": "snow", "elastomer": "elastomer", "fluid": "fluid", "fem": "solid"}
     for name, material in cases.items():
         assert sum(material in materials for materials in suite.SCENES.values()) >= 2, name
+
+
+@pytest.mark.slow
+def test_a_solver_with_one_substep_per_frame_has_an_uncertainty_too() -> None:
+    spec = dataset("data=fluid", "size=tiny")
+    start = scenes.pool(spec, 0.01, one_side=True)
+    trial = tried(Candidate("own", untrained(spec), spec), 0.01, start, 0.05)
+    assert spec.solver.step(start).num_substeps == 1
+    assert 0 < np.abs(trial.finer.pos - trial.truth.pos).max() < spec.scene.spacing
