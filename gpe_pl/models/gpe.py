@@ -12,7 +12,7 @@ Virtual nodes above meshes are nodes of separate types. They pass messages, and 
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Annotated, Literal, NamedTuple, cast
+from typing import Annotated, Any, Literal, NamedTuple, cast
 
 import torch
 from jaxtyping import Float
@@ -22,10 +22,12 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.errors import GpeError
 from gpe_pl.models.base import Model, Prediction
-from gpe_pl.nn.blocks import MLP
+from gpe_pl.nn.blocks import MLP, NORM_EPS
 from gpe_pl.nn.connected import Edges, order_of_edges, renumbered, reordered, touched
+from gpe_pl.nn.fused import works_on
+from gpe_pl.nn.fused_processor import Conv, Relation, Step, Update, fused_processor
 from gpe_pl.nn.island_momentum import IslandMomentum, conserve, rigid_part
-from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction, MomentumConv, orient
+from gpe_pl.nn.momentum_conv import RAW, EdgeState, Implementation, Interaction, MomentumConv, orient
 from gpe_pl.schema import CELL, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
 
 Decoder = Literal["node", "pair", "contact"]
@@ -152,6 +154,17 @@ def _merge_levels(x: dict[str, Tensor], edges: Edges) -> tuple[dict[str, Tensor]
         indices, odds, evens = zip(*stores, strict=True)
         joined[relation] = torch.cat(indices, dim=1), torch.cat(odds), torch.cat(evens)
     return {t: torch.cat(parts) for t, parts in nodes.items()}, joined
+
+
+def _conv(conv: Any) -> Conv:
+    """Return the parameters of a layer; ``parameters()`` would search for them."""
+    return Conv(conv.lin_in.weight, conv.lin_in.bias, conv.act.weight, conv.lin_out.weight, conv.lin_out.bias)
+
+
+def _update(mlp: Any) -> Update:
+    first, act, last, *norm = mlp
+    gain, shift = (norm[0].weight, norm[0].bias) if norm else (None, None)
+    return Update(first.weight, first.bias, act.weight, last.weight, last.bias, gain, shift)
 
 
 def _grouped(data: HeteroData, materials: Iterable[str], name: str, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -421,8 +434,11 @@ class GPE(Model):
         chunk = self.skips.edges_at_once if is_inference else None
         h = {t: self._encode_node(t, x[t], params.get(t)) for t in x}
         e = {r: self._encode_edges(r, odd, even, chunk) for r, (_, odd, even) in edges.items()}
+        at_once = not is_inference and self._can_process_at_once(h, e)
+        if at_once:
+            h = self._processed_at_once(h, e, edges)
 
-        for step in range(self.num_message_passing_steps):
+        for step in range(0 if at_once else self.num_message_passing_steps):
             update_edges = self.edge_state == "latent" and step < self.num_message_passing_steps - 1
             convs, updates = cast(nn.ModuleDict, self.convs[step]), cast(nn.ModuleDict, self.updates[step])
             total: dict[str, Tensor] = {}
@@ -448,6 +464,26 @@ class GPE(Model):
             return Decoded(self._pair_accelerations(h, mass, body, edges, chunk), stress, {})
         contact = self._pair_accelerations(h, {m: mass[m] for m in body}, body, edges, chunk) if body else {}
         return Decoded({m: self.node_decoder[m](h[m]) for m in mass}, stress, contact)
+
+    def _can_process_at_once(self, h: dict[str, Tensor], e: dict[EdgeType, Tensor]) -> bool:
+        """Tell whether ``nn.fused_processor`` covers the message-passing steps of training on this graph."""
+        if not self.is_fused or self.interaction != "negated" or self.edge_state != "geometry":
+            return False
+        alike = {self.type_key(t) for t in h}, {self.key(r) for r in e}
+        distinct = (len(alike[0]), len(alike[1])) == (len(h), len(e))  # else types of nodes or relations have the same weights
+        return distinct and works_on(*h.values(), *e.values()) and all(0 < f.shape[1] <= RAW and not f.requires_grad for f in e.values())
+
+    def _processed_at_once(self, h: dict[str, Tensor], e: dict[EdgeType, Tensor], edges: Edges) -> dict[str, Tensor]:
+        """Return the states of the nodes after all message-passing steps."""
+        types, relations = [*h], [*e]
+        steps = []
+        for convs, updates in zip(self.convs, self.updates, strict=True):
+            conv_of, update_of = cast(nn.ModuleDict, convs), cast(nn.ModuleDict, updates)
+            sent = {k: _conv(conv_of[self.key(r)]) for k, r in enumerate(relations) if self.key(r) in conv_of}
+            updated = {k: _update(update_of[self.type_key(t)]) for k, t in enumerate(types) if self.type_key(t) in update_of}
+            steps.append(Step(sent, updated))
+        ends = [Relation(types.index(r[0]), types.index(r[2]), edges[r][0], e[r]) for r in relations]
+        return dict(zip(types, fused_processor(ends, steps, NORM_EPS, [*h.values()]), strict=True))
 
     def _encode_node(self, node_type: str, x: Tensor, params: Tensor | None) -> Tensor:
         if params is not None:

@@ -11,6 +11,9 @@ from torch.nn import functional
 from gpe_pl.nn.fused import works_on
 from gpe_pl.nn.fused_mlp import fused_mlp
 
+NORM_EPS = 1e-5
+"""ε of all layers of normalisation."""
+
 
 class MLP(nn.Sequential):
     """Two linear layers with a PReLU between them, then an optional LayerNorm. All functions of GPE have this form (paper, section 3.2).
@@ -21,7 +24,7 @@ class MLP(nn.Sequential):
 
     def __init__(self, in_channels: int, hidden_channels: int, out_channels: int, norm: bool = False, is_fused: bool = False) -> None:
         layers = [nn.Linear(in_channels, hidden_channels), nn.PReLU(), nn.Linear(hidden_channels, out_channels)]
-        super().__init__(*layers, *([nn.LayerNorm(out_channels)] if norm else []))
+        super().__init__(*layers, *([nn.LayerNorm(out_channels, NORM_EPS)] if norm else []))
         self.is_fused = is_fused
 
     def forward(self, x: Float[Tensor, "*row in"], residual: Float[Tensor, "*row out"] | None = None) -> Float[Tensor, "*row out"]:

@@ -197,8 +197,9 @@ class TrainingModule(L.LightningModule):
         if not torch.isfinite(total):
             self._skip("loss", float(total))
             return None if ranks.num_ranks() == 1 else loss  # ranks wait for each other's gradients; clipping drops them
-        trainer: Any = self.trainer
-        if (self.global_step + 1) % trainer.log_every_n_steps == 0:  # Lightning takes as long for a value that no logger gets
+        if (self.global_step + 1) % getattr(
+            self._trainer, "log_every_n_steps", 1
+        ) == 0:  # Lightning takes as long for a value that no logger gets
             self.log("train/loss", total, batch_size=1)
         return loss
 

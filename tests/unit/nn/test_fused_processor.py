@@ -1,0 +1,105 @@
+"""All message-passing steps in one function give PyTorch's results and gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from gpe_pl.nn import fused_processor as module
+from gpe_pl.nn.fused_processor import Conv, Relation, Step, Update, fused_processor, plain_processor
+
+WIDTH, EPS = 6, 1e-5
+NODES = [9, 4, 7]
+"""Nodes of three types: type 0 exchanges messages with itself and with the others, type 1 is not updated in the last step."""
+
+
+@pytest.fixture(autouse=True)
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "EDGES", 8)
+
+
+def example(dtype: torch.dtype, norm: bool, seed: int = 0) -> tuple[list[Relation], list[Step], list[Tensor]]:
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=dtype)
+
+    def parameters(*shapes: tuple[int, ...]) -> list[Tensor]:
+        return [(random(*shape) / shape[-1] ** 0.5).requires_grad_() for shape in shapes]
+
+    relations = []
+    for source, target, count, channels in ((0, 0, 21, 3), (1, 0, 10, 2), (2, 0, 16, 4), (2, 2, 0, 4)):
+        ends = [torch.randint(NODES[t], (count,), generator=generator) for t in (source, target)]
+        relations.append(Relation(source, target, torch.stack(ends), random(count, channels)))
+    steps = []
+    for types in ((0, 1, 2), (0, 2), (0,)):
+        convs = {
+            r: Conv(*parameters((WIDTH, 2 * WIDTH + relation.features.shape[1]), (WIDTH,), (1,), (WIDTH, WIDTH), (WIDTH,)))
+            for r, relation in enumerate(relations)
+            if {relation.source, relation.target} & {*types}
+        }
+        shapes = [(WIDTH, WIDTH), (WIDTH,), (1,), (WIDTH, WIDTH), (WIDTH,), *([(WIDTH,)] * 2 if norm else [])]
+        steps.append(Step(convs, {t: Update(*parameters(*shapes)) for t in types}))
+    return relations, steps, [random(n, WIDTH).requires_grad_() for n in NODES]
+
+
+def differentiated(function: object, dtype: torch.dtype, norm: bool) -> list[Tensor]:
+    relations, steps, h = example(dtype, norm)
+    states = function(relations, steps, EPS, h)  # type: ignore[operator]
+    loss = sum((torch.sin(torch.arange(s.numel(), dtype=dtype)).view_as(s) * s).sum() for s in states)
+    return [*states, *torch.autograd.grad(loss, [*h, *(t for step in steps for t in step.tensors)])]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("norm", [True, False])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+def test_states_and_gradients_equal_the_plain_ones(dtype: torch.dtype, tolerance: float, norm: bool) -> None:
+    found, expected = (differentiated(f, dtype, norm) for f in (fused_processor, plain_processor))
+    for x, y in zip(found, expected, strict=True):
+        torch.testing.assert_close(x, y, rtol=0, atol=tolerance * max(1.0, float(y.abs().max())))
+    without_edges = 2 * len(Conv._fields)
+    assert sum(not y.any() for y in expected) == without_edges
+
+
+def test_gradients_equal_differences_of_values() -> None:
+    relations, steps, h = example(torch.float64, norm=True)
+    tensors = [t for step in steps for t in step.tensors]
+
+    def values(*inputs: Tensor) -> tuple[Tensor, ...]:
+        rest = [*inputs[3:]]
+        return tuple(fused_processor(relations, [step.of(rest) for step in steps], EPS, inputs[:3]))
+
+    assert torch.autograd.gradcheck(values, (*h, *tensors), fast_mode=True)
+
+
+def test_second_derivatives_are_those_of_the_plain_operations() -> None:
+    results = []
+    for function in (fused_processor, plain_processor):
+        relations, steps, h = example(torch.float64, norm=True)
+        weight = steps[0].convs[0].weight
+        loss = torch.cat([s.sin() for s in function(relations, steps, EPS, h)]).sum()
+        first = torch.autograd.grad(loss, [h[0], weight], create_graph=True)
+        results.append(torch.autograd.grad(first[0].square().sum() + first[1].square().sum(), [h[0], weight]))
+    for x, y in zip(*results, strict=True):
+        torch.testing.assert_close(x, y, rtol=1e-10, atol=1e-10)
+
+
+def test_inputs_are_read_as_they_are_and_not_written_to() -> None:
+    relations, steps, h = example(torch.float64, norm=True)
+    views = [rows.detach().t().contiguous().t().requires_grad_() for rows in h]
+    before = [rows.detach().clone() for rows in views]
+    found, expected = (f(relations, steps, EPS, rows) for f, rows in ((fused_processor, views), (plain_processor, h)))
+    sum(s.square().sum() for s in found).backward()  # type: ignore[union-attr]
+    for x, y in zip(found, expected, strict=True):
+        torch.testing.assert_close(x, y, rtol=1e-12, atol=1e-12)
+    for x, y in zip(views, before, strict=True):
+        assert torch.equal(x, y)
+
+
+def test_not_a_number_stays_one() -> None:
+    relations, steps, h = example(torch.float64, norm=True)
+    with torch.no_grad():
+        h[1][2] = torch.nan
+    states = fused_processor(relations, steps, EPS, h)
+    reached = relations[1].edge_index[1][relations[1].edge_index[0] == 2]
+    assert len(reached) and states[0][reached].isnan().all()
