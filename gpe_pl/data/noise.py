@@ -36,8 +36,8 @@ class Noise:
 
     Attributes:
         position_of_domain: standard deviation of the position noise, as a fraction of the domain's longest side.
-        velocity_of_change: standard deviation of the velocity noise in units of one frame's velocity change, which is the root mean square acceleration
-            without gravity × frame interval.
+        velocity_of_change: standard deviation of the noise on the last velocity of a window, in units of one frame's velocity change, which is the root mean
+            square acceleration without gravity × frame interval.
         correction: fraction of the noise on the last position that the target removes within the step [γ of Pfaff et al. 2021, appendix A.2.2]. With a value
             above 0, a model learns to correct positions. The paper uses 0.
     """

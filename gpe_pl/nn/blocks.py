@@ -12,7 +12,7 @@ from gpe_pl.nn.fused import works_on
 from gpe_pl.nn.fused_mlp import fused_mlp
 
 NORM_EPS = 1e-5
-"""ε of all layers of normalisation."""
+"""ε of the LayerNorm in ``MLP``."""
 
 
 class MLP(nn.Sequential):

@@ -54,7 +54,7 @@ def reordered(edges: Edges, order: dict[str, Tensor]) -> Edges:
 
 
 def renumbered(edges: Edges, masks: dict[str, Tensor]) -> Edges:
-    """Return the edges between the nodes that ``masks`` keep, with their new numbers."""
+    """Return the edges with the numbers that nodes have after only those in ``masks`` are kept. All ends of edges must be kept."""
     return _with_numbers(edges, {t: torch.cumsum(mask, dim=0) - 1 for t, mask in masks.items()})
 
 

@@ -4,7 +4,7 @@ For node states h of each type, edge features f, and every relation from j to i 
 
     x_k = φ(A h_i + B h_j + W f_k + b),   φ(z) = max(z, 0) + p min(z, 0)
     X_i = Σ_k x_k over edges into i,      Y_j = −Σ_k x_k over edges out of j
-    t_i = Σ C X_i + d_i c                 over the relations of a type of nodes, both ends; d_i is the number of edges into i minus that out of i
+    t_i = Σ C (X_i + Y_i) + d_i c         over the relations of a type of nodes; d_i is the number of edges into i minus that out of i
     h_i ← h_i + N(R φ(Q t_i + q) + r)     N is a LayerNorm, or the identity
 
 PyTorch would run several hundred small operations per training step, each with a node in the graph of autograd. Here the backward pass is written out. It keeps
@@ -27,7 +27,7 @@ from torch.nn import functional
 from gpe_pl.nn.fused import FASTMATH, plain_gradients
 
 EDGES = 512
-"""Number of edges whose gradients are kept for a product with their features."""
+"""Number of edges in a block of the backward pass, whose gradients are multiplied by their features together."""
 OPTIONS = {"cache": True, "error_model": "numpy"}
 
 
@@ -398,7 +398,7 @@ def _parts(conv: Conv) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def plain_processor(relations: Sequence[Relation], steps: Sequence[Step], eps: float, h: Sequence[Tensor]) -> list[Tensor]:
-    """Return the final states by PyTorch's operations."""
+    """Return the result of ``fused_processor`` by PyTorch's operations, for comparison and for second derivatives."""
     h = [*h]
     for step in steps:
         total = {t: torch.zeros_like(h[t]) for t in step.updates}
@@ -451,7 +451,7 @@ def _plain(ctx: Any, *tensors: Tensor) -> list[Tensor]:
 def fused_processor(relations: Sequence[Relation], steps: Sequence[Step], eps: float, h: Sequence[Tensor]) -> list[Tensor]:
     """Return the states of all types of nodes after all steps, on the CPU in single or double precision; differentiable in states and parameters.
 
-    Every type must be updated in a step. Indices must name existing rows; nothing is checked.
+    Every type must be updated in at least one step. Indices must name existing rows; nothing is checked.
 
     Args:
         relations: edges, whose features are not differentiated.

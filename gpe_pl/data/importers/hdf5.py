@@ -20,7 +20,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
     Raises:
         ImportFailure: the file does not exist.
-        Refusal: the file is damaged. This replaces the various errors that HDF5 raises.
+        Refusal: the file is damaged. This replaces the various errors that HDF5 raises while the file is open.
     """
     if not path.is_file():
         raise ImportFailure(f"{path}: no such file")
