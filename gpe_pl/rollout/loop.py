@@ -298,7 +298,7 @@ def rollout(
 
 
 def share_outside(trajectory: Trajectory, tolerance: float = 0.0) -> float:
-    """Return the fraction of particle-frames more than ``tolerance`` [m] inside a wall or obstacle."""
+    """Return the fraction of positions, over all frames and nodes, that lie more than ``tolerance`` [m] inside a wall or obstacle."""
     if not trajectory.boundary.shapes or trajectory.pos.size == 0:
         return 0.0
     distance = signed_distance(trajectory.boundary.shapes, trajectory.pos.astype(np.float64))
