@@ -9,13 +9,15 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpe_pl.config.entry_point import ConfigError, construct, entry_point
+from gpe_pl.config.entry_point import ConfigError, compose, construct, entry_point
 from gpe_pl.config.folder import CONF
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.printable import one_line
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
+
+    from gpe_pl.training.run import TrainingSettings
 
 
 NAMED = 5
@@ -37,6 +39,13 @@ def _suite(name: str) -> Any:
     """Import the module of a suite: ``benchmarks.{name}``, or ``benchmarks.{name}.suite`` if ``benchmarks.{name}`` is a package."""
     package = importlib.import_module(f"gpe_pl.benchmarks.{name}")
     return importlib.import_module(f"{package.__name__}.suite") if hasattr(package, "__path__") else package
+
+
+def _training(*overrides: str) -> TrainingSettings:
+    """Return the settings of ``python -m gpe_pl.fit`` with these overrides of the command line."""
+    from gpe_pl.training.run import TrainingSettings
+
+    return construct(TrainingSettings, compose("fit", overrides).training, "training")
 
 
 def benchmark(cfg: DictConfig) -> None:
@@ -64,7 +73,9 @@ def benchmark(cfg: DictConfig) -> None:
     cases = getattr(settings, "cases", None)  # data sets by name, in suites that need some
     folder = Path(cfg.paths.runs) / "benchmark" / cfg.suite.name
     with locked(folder), recorded(folder, "benchmark", sys.argv[1:], cfg.paths.runs):
-        inputs = [{k: dataset(*c.overrides) for k, c in cases.items()}] if cases is not None else []
+        inputs: list[dict[str, Any]] = [{k: dataset(*c.overrides) for k, c in cases.items()}] if cases is not None else []
+        if cases is not None and getattr(suite, "TRAINS", False):
+            inputs.append({k: _training(*c.overrides) for k, c in cases.items()})
         records, table = suite.run(settings, *inputs, *([folder] if getattr(suite, "RESUMES", False) else []))
         for name, figure in getattr(suite, "figures", lambda _: {})(records).items():
             save_figure(figure, folder / f"{name}.png", dpi=150)

@@ -1,7 +1,7 @@
 """Benchmark of speed: times of a forward pass and of a training step of all models on the same graph.
 
 The models are GPE with every interaction, with and without fused passes, and the baselines. The time of a whole rollout step of the shipped models is reported
-over the time of its matrix products, see ``step_ratio``.
+over the time of its matrix products, see ``step_ratio``; so is that of a training step, see ``training_step_ratio``.
 
 Two lower bounds (floors) are reported for GPE in full precision. The first is the time of its matrix products at the machine's measured rate. The second is
 the time for moving every edge state in and out of memory once per layer.
@@ -25,6 +25,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.benchmarks.step_ratio import step_records, step_table
 from gpe_pl.benchmarks.trained import Case as Trained
+from gpe_pl.benchmarks.training_step_ratio import training_records, training_table
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.files.markdown import table_row
 from gpe_pl.graphs.features import GraphConfig
@@ -40,12 +41,15 @@ from gpe_pl.nn.momentum_conv import EdgeState, Implementation, Interaction
 from gpe_pl.schema import FeatureSpec
 from gpe_pl.system.machine import copy_rate, gemm_rate, has_cpp_compiler, peak_memory, peak_on_gpu, reduces_precision, synchronized
 from gpe_pl.system.timing import apart, paired_ratio, paired_times
+from gpe_pl.training.run import TrainingSettings
 
 log = logging.getLogger(__name__)
 
 INTERACTIONS: tuple[Interaction, ...] = ("directed", "negated", "odd", "odd_even")
 REFERENCE = "directed, plain"
 """Reference case: concatenated features and one product per directed edge, the usual form of message passing."""
+TRAINS = True
+"""Whether the suite also takes the settings of a training on each data set."""
 SAND = "sand"
 MEDIUM = ", medium"
 STEP_ROUNDS = 5
@@ -208,7 +212,7 @@ def _compiled(model: Model, device: str) -> Model:
     return model
 
 
-def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
+def run(settings: Settings, specs: dict[str, DatasetSpec], trainings: dict[str, TrainingSettings]) -> tuple[list[dict[str, Any]], str]:
     """Return records of times [s], paired ratios, floors and memory, and a Markdown table."""
     torch.set_num_threads(settings.num_threads)
     device = settings.device
@@ -254,7 +258,9 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
         records += [{"metric": metric, "case": name, "value": value, "unit": unit} for metric, (value, unit) in values.items()]
     records += _graph_records(settings)
     steps = step_records(specs, STEP_ROUNDS * settings.num_rounds)
-    return records + steps, "\n\n".join([table(settings, num_edges, records), *([step_table(steps)] if steps else [])])
+    training_steps = training_records(specs, trainings, settings.num_rounds)
+    tables = [table(settings, num_edges, records), *([step_table(steps), training_table(training_steps)] if steps else [])]
+    return records + steps + training_steps, "\n\n".join(tables)
 
 
 @dataclass(frozen=True)

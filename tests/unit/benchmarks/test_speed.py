@@ -62,7 +62,7 @@ def test_every_case_has_its_records_and_its_row(monkeypatch: pytest.MonkeyPatch)
         "gpe_pl.benchmarks.speed.apart", lambda factories: nullcontext({name: factory() for name, factory in factories.items()})
     )
     monkeypatch.setattr("gpe_pl.benchmarks.speed.reduces_precision", lambda _: True)
-    records, table = run(SMALL, {})
+    records, table = run(SMALL, {}, {})
     found = {(r["metric"], r["case"]): r["value"] for r in records}
     for name, case in cases(compiled=False, reduced=True).items():
         wanted = {"forward_time", "training_time", "forward_speedup", "forward_speedup_vs_gns", "training_speedup"}
@@ -129,5 +129,5 @@ def test_without_a_compiler_nothing_is_compiled(monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setattr("gpe_pl.benchmarks.speed.cases", see)
     monkeypatch.setattr("gpe_pl.benchmarks.speed.has_cpp_compiler", lambda: False)
     with pytest.raises(Chosen, match="False"):
-        run(replace(SMALL, compile=True), {})
+        run(replace(SMALL, compile=True), {}, {})
     assert "no C++ compiler" in caplog.text
