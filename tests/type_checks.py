@@ -2,7 +2,8 @@
 
 ``--jaxtyping-packages`` decorates every function of the package with ``jaxtyping.jaxtyped``. For each function this makes two further functions with checked
 arguments, and each call binds its arguments once more and checks them twice. This takes a third of the time of the tests. The decorator here checks arguments
-and result once. Only functions with a shape in their annotations get a scope for the names of lengths.
+and result once. Only functions with a shape in their annotations get a scope for the names of lengths. The check of a function is made at its first call.
+Functions within functions are not checked, because each call of the outer function would make their checks again.
 """
 
 from __future__ import annotations
@@ -31,27 +32,40 @@ def checked(thing: Any = None, *, typechecker: Callable[[Any], Any]) -> Any:
         if dataclasses.is_dataclass(thing) and not hasattr(thing.__init__, "__wrapped__"):
             thing.__init__ = checked(thing.__init__, typechecker=typechecker)  # type: ignore[method-assign]
         return thing
+    if "<locals>" in thing.__qualname__:
+        return thing
     if not isinstance(thing, FunctionType) or inspect.isgeneratorfunction(thing):
         return whole(thing, typechecker=typechecker)
     return _checked_function(thing, typechecker)
 
 
 def _checked_function(function: FunctionType, typechecker: Callable[[Any], Any]) -> Callable[..., Any]:
-    written, known = function.__annotations__, _known_annotations(function)
+    known = _known_annotations(function)
     if not known:
         return function
-    function.__annotations__ = known
-    checking = typechecker(function)
-    function.__annotations__ = written
-    if any(map(_has_shape, known.values())):
-        checking = whole(checking, typechecker=None)
+    checking: Callable[..., Any] | None = None
 
     @wraps(function)
     def called(*args: Any, **kwargs: Any) -> Any:
         __tracebackhide__ = True
-        return (function if jaxtyping.config.jaxtyping_disable else checking)(*args, **kwargs)
+        nonlocal checking
+        if jaxtyping.config.jaxtyping_disable:
+            return function(*args, **kwargs)
+        if checking is None:
+            checking = _checking(function, known, typechecker)
+        return checking(*args, **kwargs)
 
     return called
+
+
+def _checking(function: FunctionType, known: dict[str, Any], typechecker: Callable[[Any], Any]) -> Callable[..., Any]:
+    """Return the function with checks of these annotations."""
+    written, function.__annotations__ = function.__annotations__, known
+    try:
+        checking = typechecker(function)
+    finally:
+        function.__annotations__ = written
+    return whole(checking, typechecker=None) if any(map(_has_shape, known.values())) else checking
 
 
 def _known_annotations(function: FunctionType) -> dict[str, Any]:
