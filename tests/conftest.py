@@ -17,6 +17,7 @@ from gpe_pl.schema import node_code
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.store import write_shard
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
+from tests import settings_files as settings_files
 
 gc.disable()  # until the tests begin: modules and tests are never freed, and to look for cycles among them takes seconds
 

@@ -29,10 +29,16 @@ RUN = [
 
 
 def compose(name: str, *overrides: str, hydra_config: bool = False) -> DictConfig:
-    """Return a config as an entry point receives it."""
+    """Return a config as an entry point receives it.
+
+    Folders are set afterwards, so that configs which differ only in them are composed once (``tests.settings_files``).
+    """
+    folders = [] if hydra_config else [each for each in overrides if each.startswith("paths.")]
     GlobalHydra.instance().clear()
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = hydra.compose(name, list(overrides), return_hydra_config=hydra_config)
+        cfg = hydra.compose(name, [each for each in overrides if each not in folders], return_hydra_config=hydra_config)
+    for key, folder in (each.split("=", 1) for each in folders):
+        OmegaConf.update(cfg, key, folder)
     if not hydra_config:
         OmegaConf.resolve(cfg)
     return cfg
