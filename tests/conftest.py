@@ -42,6 +42,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection() -> Generator[None, object, object]:
     result = yield
     gc.freeze()
+    gc.set_threshold(20_000)  # graphs and configurations are many small objects, and few of them are in cycles
     gc.enable()
     return result
 

@@ -156,7 +156,11 @@ def caps(radius, spacing, count):
 
 @pytest.mark.parametrize(
     ("size", "cells", "count", "limits"),
-    [("tiny", 10, 500, (0.03, 0.15)), ("small", 12, 1200, (0.02, 0.08)), ("paper", 18, 4000, (0.02, 0.02))],
+    [
+        ("tiny", 10, 500, (0.03, 0.15)),
+        pytest.param("small", 12, 1200, (0.02, 0.08), marks=pytest.mark.slow),
+        pytest.param("paper", 18, 4000, (0.02, 0.02), marks=pytest.mark.slow),
+    ],
 )
 def test_volume_at_rest_in_the_bowl_of_the_data(physics, size, cells, count, limits):
     """Scenes of ``data=fluid`` after the liquid has come to rest; its volume in two ways, the worst of two scenes.

@@ -120,7 +120,8 @@ def test_a_configuration_of_other_types_is_named(runs: Path, change: dict[str, A
 @pytest.mark.parametrize(
     "content", [b"step,val/one_step_nmse\n9,x\n", b"step,val/one_step_nmse\nlast,0.5\n", b"val/one_step_nmse\n0.5\n", b"\xff\n"]
 )
-def test_a_damaged_log_of_the_training_is_named(runs: Path, content: bytes) -> None:
+def test_a_damaged_log_of_the_training_is_named(runs: Path, content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep_table, "save_figure", lambda *_, **__: None)
     (runs / "odd" / "0" / "log" / "version_mine").mkdir()
     (runs / "odd" / "0" / "log" / "version_mine" / "metrics.csv").touch()  # of somebody else
     sweep_table.report_sweep(runs, finished_runs(runs))
