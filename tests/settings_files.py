@@ -42,4 +42,4 @@ def compose_once(config_name: str | None = None, overrides: Sequence[str] = (), 
 
 
 ConfigRepository.load_config = load_once  # type: ignore[method-assign]
-hydra.compose = compose_once
+hydra.compose = compose_once  # type: ignore[assignment]

@@ -39,7 +39,6 @@ from tests import scenes
 
 NUM_FRAMES, FRAME_DT, SPACING = 16, 0.01, 0.1
 STEPS, INTERVAL = 6, 2
-SEEDS = {"train": (0, 1), "val": (2,), "test": (4, 5)}
 UNIT_OF = {**UNITS, "skipping_mse": "m^2"}
 """Units of metrics; those without an entry have no unit."""
 
@@ -100,11 +99,11 @@ class Recorded(TrainingModule):
 
 
 @cache
-def stored(root: Path, length: float, time: float, dim: int, mesh: bool) -> Path:
+def stored(root: Path, length: float, time: float, dim: int, mesh: bool) -> str:
     """Make two scenes for training, two for tests and one for validation."""
     folder = root / f"{length}_{time}_{dim}_{mesh}"
-    splits = {split: [scene(seed, length, time, dim, mesh) for seed in seeds] for split, seeds in SEEDS.items()}
-    return save_dataset(folder, "scaled", **splits).folder
+    train, val, test = ([scene(seed, length, time, dim, mesh) for seed in seeds] for seeds in ((0, 1), (2,), (4, 5)))
+    return save_dataset(folder, "scaled", train=train, val=val, test=test).folder
 
 
 def data(root: Path, length: float, time: float, dim: int = 2, mesh: bool = False) -> TrajectoryDataModule:
