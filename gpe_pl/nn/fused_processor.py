@@ -434,7 +434,8 @@ class _FusedProcessor(torch.autograd.Function):
         ctx.relations, ctx.steps, ctx.eps, ctx.num_types = relations, steps, eps, num_types
         ctx.save_for_backward(*tensors)
         ctx.processor = _Processor(relations, _given(steps, [t.detach() for t in tensors[num_types:]]), eps, tensors[:num_types])
-        return tuple(ctx.processor.forward())
+        # other tensors than those that the processor keeps: an output that its own node in autograd's graph holds would never be freed
+        return tuple(states.detach() for states in ctx.processor.forward())
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:  # type: ignore[override]
