@@ -39,6 +39,7 @@ class WarmAverage(WeightAveraging):
         super().__init__(use_buffers=False, multi_avg_fn=average)  # buffers do not learn, and infinite values have no mean
         self.decay = decay
         self._parameters: tuple[list[torch.Tensor], list[torch.Tensor]] = [], []
+        self._is_covered: bool | None = None
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         super().setup(trainer, pl_module, stage)
@@ -52,7 +53,9 @@ class WarmAverage(WeightAveraging):
     def on_train_batch_end(self, trainer: Any, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int) -> None:
         """Add the weights after a step to the average: on a CPU in one pass over all of them, else by the method of the base class."""
         average = self._average_model
-        if average is None or not average.n_averaged or not parameter_passes.are_covered(*self._parameters):
+        if self._is_covered is None:  # asked now, because the weights may have moved to another device after ``setup``
+            self._is_covered = parameter_passes.are_covered(*self._parameters)
+        if average is None or not average.n_averaged or not self._is_covered:
             super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
         elif trainer.global_step > self._latest_update_step:
             parameter_passes.pull(*self._parameters, self._weight_of_next(int(average.n_averaged)))

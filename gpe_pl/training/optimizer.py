@@ -24,6 +24,16 @@ class OnePassAdam(torch.optim.Adam):
 
     def __init__(self, parameters: Iterable[nn.Parameter], learning_rate: float) -> None:
         super().__init__(parameters, lr=learning_rate, fused=True)
+        self._is_covered = parameter_passes.are_covered(*(group["params"] for group in self.param_groups))
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Remove all gradients, or set them to zero."""
+        if not set_to_none:
+            super().zero_grad(set_to_none=False)
+            return
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
 
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
         """Update all parameters, and return the result of ``closure``, which computes the gradients."""
@@ -31,11 +41,11 @@ class OnePassAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        if not all(parameter_passes.are_covered(*_with_gradients(group["params"])) for group in self.param_groups):
+        pairs = [_with_gradients(group["params"]) for group in self.param_groups]
+        if not (self._is_covered and all(g.is_contiguous() for _, gradients in pairs for g in gradients)):
             super().step()
             return loss
-        for group in self.param_groups:
-            parameters, gradients = _with_gradients(group["params"])
+        for group, (parameters, gradients) in zip(self.param_groups, pairs, strict=True):
             states = [self._state_of(p) for p in parameters]
             means, squares, steps = ([state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step"))
             parameter_passes.adam(parameters, gradients, means, squares, steps, float(group["lr"]), group["betas"], group["eps"])

@@ -20,10 +20,8 @@ from gpe_pl.nn.fused import FASTMATH
 
 def are_covered(*lists: Sequence[Tensor]) -> bool:
     """Tell whether the kernels can process these lists of tensors."""
-    dtype = next((t.dtype for tensors in lists for t in tensors), torch.float32)
-    return dtype in (torch.float32, torch.float64) and all(
-        t.dtype == dtype and t.device.type == "cpu" and t.is_contiguous() for tensors in lists for t in tensors
-    )
+    kinds = {(t.dtype, t.device.type, t.is_contiguous()) for tensors in lists for t in tensors}
+    return len(kinds) <= 1 and kinds <= {(torch.float32, "cpu", True), (torch.float64, "cpu", True)}
 
 
 def norm(tensors: Sequence[Tensor]) -> float:

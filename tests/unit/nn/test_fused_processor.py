@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
@@ -94,6 +98,24 @@ def test_inputs_are_read_as_they_are_and_not_written_to() -> None:
         torch.testing.assert_close(x, y, rtol=1e-12, atol=1e-12)
     for x, y in zip(views, before, strict=True):
         assert torch.equal(x, y)
+
+
+def test_nothing_is_kept_after_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An output that its own node in autograd's graph holds would never be freed."""
+    made = []
+
+    class Processor(module._Processor):
+        def __init__(self, *arguments: Any) -> None:
+            super().__init__(*arguments)
+            made.append(weakref.ref(self))
+
+    monkeypatch.setattr(module, "_Processor", Processor)
+    states = fused_processor(*example(torch.float64, norm=True)[:2], EPS, example(torch.float64, norm=True)[2])
+    sum(s.sum() for s in states).backward()  # type: ignore[union-attr]
+    assert made[0]() is not None
+    del states
+    gc.collect()
+    assert made[0]() is None
 
 
 def test_not_a_number_stays_one() -> None:
