@@ -4,23 +4,22 @@ from __future__ import annotations
 
 import gc
 import weakref
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from gpe_pl.nn import compiled_processor
 from gpe_pl.nn import fused_processor as module
+from gpe_pl.nn.compiled_processor import EDGES
 from gpe_pl.nn.fused_processor import Conv, Relation, Step, Update, fused_processor, plain_processor
 
 WIDTH, EPS = 6, 1e-5
 NODES = [9, 4, 7]
 """Nodes of three types: type 0 exchanges messages with itself and with the others, type 1 is not updated in the last step."""
-
-
-@pytest.fixture(autouse=True)
-def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "EDGES", 8)
 
 
 def example(dtype: torch.dtype, norm: bool, seed: int = 0) -> tuple[list[Relation], list[Step], list[Tensor]]:
@@ -33,7 +32,7 @@ def example(dtype: torch.dtype, norm: bool, seed: int = 0) -> tuple[list[Relatio
         return [(random(*shape) / shape[-1] ** 0.5).requires_grad_() for shape in shapes]
 
     relations = []
-    for source, target, count, channels in ((0, 0, 21, 3), (1, 0, 10, 2), (2, 0, 16, 4), (2, 2, 0, 4)):
+    for source, target, count, channels in ((0, 0, EDGES + 21, 3), (1, 0, 10, 2), (2, 0, 16, 4), (2, 2, 0, 4)):
         ends = [torch.randint(NODES[t], (count,), generator=generator) for t in (source, target)]
         relations.append(Relation(source, target, torch.stack(ends), random(count, channels)))
     steps = []
@@ -63,6 +62,18 @@ def test_states_and_gradients_equal_the_plain_ones(dtype: torch.dtype, tolerance
         torch.testing.assert_close(x, y, rtol=0, atol=tolerance * max(1.0, float(y.abs().max())))
     without_edges = 2 * len(Conv._fields)
     assert sum(not y.any() for y in expected) == without_edges
+
+
+def test_products_of_scipy_serve_where_pytorch_shows_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    own = compiled_processor.gemm_address(np.dtype(np.float64))
+    with monkeypatch.context() as without_library:
+        without_library.setattr(torch, "__file__", str(tmp_path / "__init__.py"))
+        address = compiled_processor.gemm_address.__wrapped__(np.dtype(np.float64))
+    monkeypatch.setattr(compiled_processor, "gemm_address", lambda _: address)
+    found, expected = (differentiated(f, torch.float64, True) for f in (fused_processor, plain_processor))
+    assert address != own
+    for x, y in zip(found, expected, strict=True):
+        torch.testing.assert_close(x, y, rtol=0, atol=1e-12 * max(1.0, float(y.abs().max())))
 
 
 def test_gradients_equal_differences_of_values() -> None:
@@ -104,12 +115,12 @@ def test_nothing_is_kept_after_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """An output that its own node in autograd's graph holds would never be freed."""
     made = []
 
-    class Processor(module._Processor):
+    class Tables(module._Tables):
         def __init__(self, *arguments: Any) -> None:
             super().__init__(*arguments)
             made.append(weakref.ref(self))
 
-    monkeypatch.setattr(module, "_Processor", Processor)
+    monkeypatch.setattr(module, "_Tables", Tables)
     states = fused_processor(*example(torch.float64, norm=True)[:2], EPS, example(torch.float64, norm=True)[2])
     sum(s.sum() for s in states).backward()  # type: ignore[union-attr]
     assert made[0]() is not None
