@@ -13,9 +13,9 @@ from typing import Any, no_type_check
 
 import numpy as np
 import torch
-from llvmlite import ir
 from numba import carray, njit, types
 from numba.core import cgutils
+from numba.core.cgutils import ir  # that of llvmlite, which numba depends on
 from numba.extending import get_cython_function_address, intrinsic
 
 from gpe_pl.nn.fused import FASTMATH
