@@ -59,6 +59,10 @@ class Mesh:
     averaging: csr_array
 
 
+MAX_CACHED = 512
+"""Largest number of meshes kept in memory; one of 400 triangles takes about 0.1 MB. Training with targets of the solver returns to the meshes of all scenes."""
+
+
 def build_mesh(rest_pos: np.ndarray, cells: np.ndarray, mass: np.ndarray) -> Mesh:
     """Prepare a mesh; the result for the same arrays is cached.
 
@@ -87,7 +91,7 @@ def build_mesh(rest_pos: np.ndarray, cells: np.ndarray, mass: np.ndarray) -> Mes
     return _build_mesh(rest_pos.tobytes(), rest_pos.shape, cells.tobytes(), cells.shape, mass.tobytes())
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=MAX_CACHED)
 def _build_mesh(rest_bytes: bytes, rest_shape: tuple[int, int], cell_bytes: bytes, cell_shape: tuple[int, int], mass_bytes: bytes) -> Mesh:
     rest_pos = np.frombuffer(rest_bytes).reshape(rest_shape)
     cells = np.frombuffer(cell_bytes, dtype=np.int64).reshape(cell_shape)

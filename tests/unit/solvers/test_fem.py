@@ -356,3 +356,10 @@ def test_leaving_through_an_open_side(case):
 def test_invalid_settings_are_refused(change):
     with pytest.raises(ValueError):
         FEM(**{"bounds": SQUARE, **change})
+
+
+def test_meshes_of_many_scenes_are_prepared_once():
+    """Training with targets of the solver steps scenes in random order."""
+    triangle, cells, mass = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), np.array([[0, 1, 2]]), np.ones(3)
+    first, again = ([build_mesh(triangle * (1 + k / 50), cells, mass) for k in range(50)] for _ in range(2))
+    assert all(mesh is other for mesh, other in zip(first, again, strict=True))
