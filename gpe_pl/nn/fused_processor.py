@@ -25,6 +25,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gpe_pl.nn import compiled_processor
+from gpe_pl.nn.compiled_processor import C_AT_SOURCE, C_AT_TARGET, C_G_SOURCE, C_G_TARGET
 from gpe_pl.nn.fused import plain_gradients
 
 
@@ -186,11 +187,10 @@ class _Tables:
         for t, update in step.updates.items():
             first, n = len(self.incoming), self.sizes[t]
             for r, row in rows.items():
-                for end, sums in ((relations[r].target, 17), (relations[r].source, 18)):
-                    if end == t:
-                        offset, of_sums = self.convs[row][sums], self.convs[row][sums + 2]
-                        self.incoming.append([row, offset, of_sums, self._matrix(self.width), self.degrees[r][t]])
-                        break
+                columns = (C_AT_TARGET, C_G_TARGET) if relations[r].target == t else (C_AT_SOURCE, C_G_SOURCE)
+                if t in self.degrees[r]:
+                    sums = [self.convs[row][column] for column in columns]
+                    self.incoming.append([row, *sums, self._matrix(self.width), self.degrees[r][t]])
             there = [0 if x is None else x.data_ptr() for x in update]
             offsets = self._grads(*(x for x in update if x is not None))
             offsets += [0] * (7 - len(offsets))
@@ -250,8 +250,9 @@ class _FusedProcessor(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:  # type: ignore[override]
+        inputs = ctx.saved_tensors  # also checks that they have not changed, as the tables refer to them
         if torch.is_grad_enabled():
-            return None, None, None, None, *plain_gradients(partial(_plain, ctx), ctx.saved_tensors, grads)
+            return None, None, None, None, *plain_gradients(partial(_plain, ctx), inputs, grads)
         return None, None, None, None, *ctx.tables.backward(grads)
 
 

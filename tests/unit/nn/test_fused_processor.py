@@ -111,6 +111,21 @@ def test_inputs_are_read_as_they_are_and_not_written_to() -> None:
         assert torch.equal(x, y)
 
 
+def test_weights_that_change_before_the_backward_pass_are_noticed() -> None:
+    relations, steps, h = example(torch.float64, norm=True)
+    loss = torch.cat(fused_processor(relations, steps, EPS, h)).sum()
+    loss.backward(retain_graph=True)
+    before = h[0].grad
+    assert before is not None
+    h[0].grad = None
+    loss.backward(retain_graph=True)
+    assert torch.equal(h[0].grad, before)  # type: ignore[arg-type]
+    with torch.no_grad():
+        steps[0].updates[0].weight.mul_(2)
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        loss.backward()
+
+
 def test_nothing_is_kept_after_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """An output that its own node in autograd's graph holds would never be freed."""
     made = []
