@@ -19,6 +19,7 @@ import numpy as np
 from array_api_compat import array_namespace, device
 
 from gpe_pl.errors import GpeError
+from gpe_pl.geometry.compiled_distance import compiled_distance
 
 Array = Any
 
@@ -493,7 +494,11 @@ def _thin(points: np.ndarray, normals: np.ndarray, distance: float) -> np.ndarra
 
 def signed_distance(shapes: tuple[Shape, ...], points: Array) -> Array:
     """Return the signed distance [m] to the nearest of several shapes, negative inside any of them; +inf without shapes."""
+    if isinstance(points, np.ndarray) and points.ndim == 2 and points.dtype == np.float64:
+        return compiled_distance(shapes, points)
     xp = array_namespace(points)
+    if points.ndim == 2 and points.dtype == xp.float64 and str(device(points)) == "cpu" and not getattr(points, "requires_grad", False):
+        return xp.asarray(compiled_distance(shapes, np.asarray(points)))
     distance = xp.full(points.shape[:-1], math.inf, dtype=points.dtype, device=device(points))
     for shape in shapes:
         distance = xp.minimum(distance, shape.signed_distance(points))

@@ -12,11 +12,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
+from gpe_pl.graphs import compiled_graph
+from gpe_pl.graphs.compiled_graph import CompiledGraph
 from gpe_pl.graphs.features import (
     GraphConfig,
     Scales,
@@ -30,8 +34,9 @@ from gpe_pl.graphs.features import (
     scales_of,
     virtual_features,
 )
-from gpe_pl.graphs.neighbors import check_crowding
+from gpe_pl.graphs.neighbors import Points, check_crowding
 from gpe_pl.graphs.search import as_array, find_topology, rows_of
+from gpe_pl.graphs.standards import Standards, raw
 from gpe_pl.graphs.topology import GraphError as GraphError
 from gpe_pl.graphs.topology import MeshTopology, Topology
 from gpe_pl.rollout.loop import SimulationError
@@ -67,6 +72,7 @@ class GraphBuilder:
         config: settings of the graph.
         metadata: metadata of the data set.
         skips: computations to leave out. They do not change the graph.
+        precision: precision of features, masses and lever arms.
 
     Raises:
         PeriodicityError: the connectivity radius is half a period or more.
@@ -75,6 +81,7 @@ class GraphBuilder:
     config: GraphConfig
     metadata: Metadata
     skips: Skips = field(default_factory=Skips)
+    precision: ClassVar[torch.dtype] = torch.float32
 
     def __post_init__(self) -> None:
         for radius in (self.scales.radius, self.metadata.connectivity_radius):
@@ -106,7 +113,7 @@ class GraphBuilder:
             SimulationError: a position or velocity is not finite or beyond ``LARGEST``, or so many nodes lie within each other's radius that the material has
                 collapsed.
         """
-        self._check(state)
+        points = self._checked(state)
         rows = rows_of(state, self.spec.materials)
         if sum(len(r) for r in rows.values()) != state.num_nodes:
             present = {NODE_TYPES[code] for code in state.node_type.unique().tolist()}
@@ -114,9 +121,10 @@ class GraphBuilder:
             raise GraphError(
                 f"state has nodes of {unknown}; the data set {self.metadata.dataset!r} has {known}; take a model that was trained on {unknown}"
             )
-        return find_topology(state, rows, self.config, self.spec, self.scales, self.skips)
+        return find_topology(state, points, rows, self.config, self.spec, self.scales, self.skips)
 
-    def _check(self, state: State) -> None:
+    def _checked(self, state: State) -> Points:
+        """Check that a state fits the data set and can have a graph; return its positions."""
         if state.pos.dtype != torch.float64:
             raise GraphError(f"positions are {state.pos.dtype}; convert the state with State.to_torch, which makes them float64")
         if state.periodicity.axes != self.metadata.periodicity.axes:
@@ -130,18 +138,22 @@ class GraphBuilder:
                 f"state has a history of {history.shape[1]} velocities, the graph needs {self.config.history}; "
                 "make the state with initial_state of the simulator"
             )
-        bad = ~(torch.cat([state.pos, history.flatten(1)], dim=1).abs() < LARGEST).all(dim=1)
-        if bad.any():
-            node = int(bad.nonzero()[0])
-            is_finite = bool(torch.isfinite(torch.cat([state.pos[node], history[node].flatten()])).all())
-            what, reason = ("beyond all measure", "explosion") if is_finite else ("not finite", "nan")
+        pos, motion = as_array(state.pos), as_array(history)
+        if not ((np.abs(pos) < LARGEST).all() and (np.abs(motion) < LARGEST).all()):
+            values = np.concatenate([pos, motion.reshape(len(pos), -1)], axis=1)
+            node = int(np.argmin((np.abs(values) < LARGEST).all(axis=1)))
+            what, reason = ("beyond all measure", "explosion") if np.isfinite(values[node]).all() else ("not finite", "nan")
             raise SimulationError(f"node {node} has a position or velocity that is {what}", reason=reason, node=node)
-        check_crowding(as_array(state.pos), self.scales.radius, self.scales.spacing, state.periodicity)
+        points = Points(pos, self.scales.radius, state.periodicity)
+        check_crowding(points, self.scales.spacing)
+        return points
 
     # --- features of indices and state; torch.export traces what follows, so lengths are symbols and no branch depends on values ---------------
 
     def graph(self, topology: Topology, state: State) -> HeteroData:
         """Return the graph of a state whose topology is known."""
+        if compiled_graph.works_on(state) and (topology.mesh is None or topology.mesh.edges is not None):
+            return self._compiled(self._raw)(topology, state)
         data, history, boundary = HeteroData(), history_of(state), state.boundary
         for material, r in topology.rows.items():
             store = data[material]
@@ -154,7 +166,7 @@ class GraphBuilder:
         data[BOUNDARY].x = self._rounded(boundary_features(self.config, boundary, self.scales))
         features = self._radius_features(topology, state, boundary)
         levels = [grid(level) for level in range(1, self.spec.num_levels + 1)]
-        virtual = [torch.empty(0, self.spec.node_channels[name], device=state.pos.device) for name in levels]
+        virtual = [torch.empty(0, self.spec.node_channels[name], dtype=self.precision, device=state.pos.device) for name in levels]
         if topology.mesh is not None:
             virtual, of_mesh = self._mesh_features(topology, topology.mesh, state)
             features |= of_mesh
@@ -175,9 +187,24 @@ class GraphBuilder:
                 data.num_bodies = torch.full((1,), islands.num_bodies, device=arm.device)
         return data
 
+    def standardized(self, state: State, standards: Standards) -> HeteroData:
+        """Return the graph of a state with features that are already standardised; ``compiled_graph.works_on`` tells of which states it can.
+
+        Raises:
+            GraphError: as ``topology``.
+            SimulationError: as ``topology``.
+        """
+        return self._compiled(standards)(self.topology(state), state)
+
+    def _compiled(self, standards: Standards) -> CompiledGraph:
+        return CompiledGraph(self.config, self.metadata, self.spec, self.scales, standards)
+
+    @cached_property
+    def _raw(self) -> Standards:
+        return raw(self.spec, np.dtype(str(self.precision).removeprefix("torch.")))
+
     def _rounded(self, values: Tensor) -> Tensor:
-        """Return values in the network's precision."""
-        return values.float()
+        return values.to(self.precision)
 
     def _add_edges(
         self, data: HeteroData, relation: EdgeType, edge_index: Tensor | None, features: EdgeFeatures | None, device: torch.device
@@ -186,7 +213,10 @@ class GraphBuilder:
         if edge_index is None or features is None:
             edge_index = torch.empty(2, 0, dtype=torch.int64, device=device)
             channels = self.spec.odd_channels[relation], self.spec.even_channels[relation]
-            features = torch.empty(0, channels[0], device=device), torch.empty(0, channels[1], device=device)
+            features = (
+                torch.empty(0, channels[0], dtype=self.precision, device=device),
+                torch.empty(0, channels[1], dtype=self.precision, device=device),
+            )
         store = data[relation]
         store.edge_index, (store.odd, store.even) = edge_index, features
         if relation[1] == RADIUS:

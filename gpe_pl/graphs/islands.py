@@ -8,10 +8,9 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numba import njit
-from scipy.spatial import cKDTree
 
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
-from gpe_pl.graphs.neighbors import radius_between, radius_pairs
+from gpe_pl.graphs.neighbors import Points, radius_between, radius_pairs
 
 
 @dataclass(frozen=True)
@@ -78,17 +77,17 @@ def _components(num_nodes, edge_index):
 def islands_within(
     radius: float,
     pos: Float64[np.ndarray, "node dim"],
-    boundary: Float64[np.ndarray, "boundary dim"] | cKDTree,
+    boundary: Float64[np.ndarray, "boundary dim"] | Points,
     mesh_edges: Int64[np.ndarray, "2 edge"],
     periodicity: Periodicity = NOWHERE,
 ) -> Islands:
     """Return the islands of nodes that lie within a radius [m] of each other or that mesh edges connect.
 
-    An island is free if no boundary node lies within the radius. ``boundary`` is the positions of boundary nodes [m], or a search tree of them.
+    An island is free if no boundary node lies within the radius. ``boundary`` is the positions of boundary nodes [m], or ``Points`` of them.
     """
-    touches = np.zeros(len(pos), dtype=bool)
-    touches[radius_between(boundary, pos, radius, periodicity)[1]] = True
-    return find_islands(len(pos), np.concatenate([radius_pairs(pos, radius, periodicity), mesh_edges], axis=1), touches)
+    points, touches = Points(pos, radius, periodicity), np.zeros(len(pos), dtype=bool)
+    touches[radius_between(boundary, points, radius, periodicity)[1]] = True
+    return find_islands(len(pos), np.concatenate([radius_pairs(points, radius, periodicity), mesh_edges], axis=1), touches)
 
 
 def unwrapped(

@@ -1,22 +1,68 @@
 """Exact neighbour search: every pair within the radius, each once, none dropped.
 
-The search uses a k-d tree on the CPU [Maneewongvatana & Mount 1999, as in SciPy]. It takes a few per cent of a model step, so neighbour lists are not kept
-between steps. Along periodic axes, the distance of two nodes is that of their nearest images. The radius must be below half the period.
+Compiled cell lists find the pairs (``cell_lists``). A k-d tree [Maneewongvatana & Mount 1999, as in SciPy] finds them if nodes are too scattered for a grid,
+and for comparison inside ``system.compiled.unfused``. Both return the same pairs in the same order. The search takes a few per cent of a model step, so
+neighbour lists are not kept between steps. Along periodic axes, the distance of two nodes is that of their nearest images. The radius must be below half the
+period.
 """
+
+from __future__ import annotations
+
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from scipy.spatial import cKDTree
 
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
-from gpe_pl.rollout.guard import CROWDING_LIMIT, crowding
+from gpe_pl.graphs import cell_lists
+from gpe_pl.rollout.guard import CROWDING_LIMIT
 from gpe_pl.rollout.loop import SimulationError
+from gpe_pl.system.compiled import is_wanted
 from gpe_pl.trajectory.boundary import search_tree
 
 MOST_PAIRS = 2**26
 """Largest number of pairs that a search lists: a gigabyte of indices."""
 NUM_SAMPLED = 64
 """Number of nodes whose neighbours serve to estimate the number of all pairs."""
+ROUNDING = 1e-9
+"""Fraction by which the radius of a tree is larger; exact distances decide afterwards."""
+
+
+class Points:
+    """Positions to search among, sorted once for all searches.
+
+    Args:
+        pos: positions [node, dim] in m.
+        radius: radius of all searches [m].
+        periodicity: axes along which space repeats.
+    """
+
+    def __init__(self, pos: Float64[np.ndarray, "node dim"], radius: float, periodicity: Periodicity = NOWHERE) -> None:
+        periodicity.check_radius(radius)
+        self.pos, self.radius, self.periodicity = pos, radius, periodicity
+
+    def __len__(self) -> int:
+        return len(self.pos)
+
+    @cached_property
+    def cells(self) -> cell_lists.CellList | None:
+        """Cell list, or None where trees have to be used."""
+        return cell_lists.cell_list(self.pos, self.radius, self.periodicity)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        return search_tree(self.pos, self.periodicity)
+
+    @cached_property
+    def places(self) -> Int64[np.ndarray, " node"]:
+        """Place of each node in the order of a cell list."""
+        x, place = self.tree.data, np.empty(len(self), np.int64)
+        side, around, _ = cell_lists.grid(self.radius, self.periodicity, x.shape[1])
+        cells = np.floor(x / side[: x.shape[1]])
+        cells = np.where(around[: x.shape[1]] > 0, np.minimum(cells, around[: x.shape[1]] - 1), cells)
+        place[np.lexsort(cells.T[::-1])] = np.arange(len(self))
+        return place
 
 
 def pairs_at_rest(num_nodes: int, radius: float, spacing: float, dim: int) -> float:
@@ -28,74 +74,98 @@ def pairs_at_rest(num_nodes: int, radius: float, spacing: float, dim: int) -> fl
     return num_nodes / 2 * ball * (radius / spacing) ** dim
 
 
-def check_crowding(pos: Float64[np.ndarray, "node dim"], radius: float, spacing: float, periodicity: Periodicity = NOWHERE) -> None:
+def check_crowding(points: Points, spacing: float) -> None:
     """Raise an error if a cloud of nodes has collapsed.
 
-    Pairs are counted before they are listed, because counting needs no memory. If no box contains enough nodes for a collapse, counting is skipped.
+    Pairs are counted before they are listed, because counting needs no memory. If no cell contains enough nodes for a collapse, counting is skipped.
 
     Raises:
-        SimulationError: with reason ``clustering``, if more than ``CROWDING_LIMIT`` times as many pairs lie within the radius [m] as at rest; names the most
+        SimulationError: with reason ``clustering``, if more than ``CROWDING_LIMIT`` times as many pairs lie within the radius as at rest; names the most
             crowded node.
     """
-    num_nodes, dim = pos.shape
+    num_nodes, dim = points.pos.shape
     if num_nodes < 2:
         return
-    limit = CROWDING_LIMIT * pairs_at_rest(num_nodes, radius, spacing, dim)
-    boxes = 4**dim if periodicity else 3**dim  # that the neighbours of a node lie in; at a seam some boxes are narrower
-    if boxes / 2 * float(crowding(periodicity.wrapped(pos), radius).sum()) <= limit:  # no fewer than there are
+    limit = CROWDING_LIMIT * pairs_at_rest(num_nodes, points.radius, spacing, dim)
+    if num_nodes**2 / 2 <= limit or (points.cells is not None and cell_lists.num_near(points.cells, dim) <= limit):
         return
-    tree = search_tree(pos, periodicity)
-    num_pairs = (int(tree.count_neighbors(tree, radius)) - num_nodes) // 2
+    tree = points.tree
+    num_pairs = (int(tree.count_neighbors(tree, points.radius)) - num_nodes) // 2
     if num_pairs > limit:
-        node = int(np.argmax(tree.query_ball_point(tree.data, radius, return_length=True)))
+        node = int(np.argmax(tree.query_ball_point(tree.data, points.radius, return_length=True)))
         raise SimulationError(
-            f"{num_pairs} pairs of nodes within the radius of {radius:.3g} m, most at node {node}; nodes {spacing:.3g} m apart would have "
+            f"{num_pairs} pairs of nodes within the radius of {points.radius:.3g} m, most at node {node}; nodes {spacing:.3g} m apart would have "
             f"{limit / CROWDING_LIMIT:.0f}: the material has collapsed onto itself",
             reason="clustering",
             node=node,
         )
 
 
-def radius_pairs(pos: Float64[np.ndarray, "node dim"], radius: float, periodicity: Periodicity = NOWHERE) -> Int64[np.ndarray, "2 edge"]:
-    """Return the unordered pairs of distinct nodes at most ``radius`` [m] apart, each once; row 0 is the source, row 1 the target.
+def radius_pairs(
+    pos: Float64[np.ndarray, "node dim"] | Points, radius: float, periodicity: Periodicity = NOWHERE
+) -> Int64[np.ndarray, "2 edge"]:
+    """Return the unordered pairs of distinct nodes at most ``radius`` [m] apart, each once, in the order of ``cell_lists``.
+
+    Row 0 is the source, row 1 the target; the source is the lower node.
 
     Raises:
         SimulationError: there are more pairs than memory can hold.
     """
-    if len(pos) < 2:
+    points = pos if isinstance(pos, Points) else Points(pos, radius, periodicity)
+    if len(points) < 2:
         return np.empty((2, 0), dtype=np.int64)
-    periodicity.check_radius(radius)
-    tree = search_tree(pos, periodicity)
-    _check_number(tree, tree, radius)
-    pairs = tree.query_pairs(radius, output_type="ndarray")
-    return np.ascontiguousarray(pairs.T, dtype=np.int64)
+    if is_wanted() and points.cells is not None:
+        pairs = cell_lists.pairs_within(points.cells, radius, MOST_PAIRS)
+        if pairs is not None:
+            return pairs
+    _check_number(points.tree, points.tree, radius)
+    i, j = points.tree.query_pairs(radius * (1 + ROUNDING), output_type="ndarray").T
+    return _exact(np.minimum(i, j), np.maximum(i, j), points, points)
 
 
 def radius_between(
-    source: Float64[np.ndarray, "source dim"] | cKDTree,
-    target: Float64[np.ndarray, "target dim"],
+    source: Float64[np.ndarray, "source dim"] | Points,
+    target: Float64[np.ndarray, "target dim"] | Points,
     radius: float,
     periodicity: Periodicity = NOWHERE,
 ) -> Int64[np.ndarray, "2 edge"]:
-    """Return the pairs of a source node and a target node of two different sets at most ``radius`` [m] apart.
+    """Return the pairs of a source node and a target node of two different sets at most ``radius`` [m] apart, in the order of ``cell_lists``.
 
     Args:
-        source: positions [m], or ``search_tree`` of them with the same periodicity.
-        target: positions [m].
+        source: positions [m]; or ``Points`` with the same radius and periodicity.
+        target: as ``source``.
         radius: largest distance of a pair [m].
-        periodicity: axes along which space repeats; a tree given as ``source`` must have been built for it.
+        periodicity: axes along which space repeats.
 
     Raises:
         SimulationError: there are more pairs than memory can hold.
     """
-    tree = source if isinstance(source, cKDTree) else search_tree(source, periodicity)
-    if tree.n == 0 or len(target) == 0:
+    sources, targets = (x if isinstance(x, Points) else Points(x, radius, periodicity) for x in (source, target))
+    if len(sources) == 0 or len(targets) == 0:
         return np.empty((2, 0), dtype=np.int64)
-    periodicity.check_radius(radius)
-    other = search_tree(target, periodicity)
-    _check_number(tree, other, radius)
-    found = tree.sparse_distance_matrix(other, radius, output_type="ndarray")
-    return np.stack([found["i"], found["j"]]).astype(np.int64)
+    if is_wanted() and sources.cells is not None and targets.cells is not None:
+        pairs = cell_lists.pairs_between(sources.cells, targets.cells, radius, 2 * MOST_PAIRS)
+        if pairs is not None:
+            return pairs
+    _check_number(sources.tree, targets.tree, radius)
+    found = sources.tree.sparse_distance_matrix(targets.tree, radius * (1 + ROUNDING), output_type="ndarray")
+    return _exact(found["i"], found["j"], sources, targets)
+
+
+def _exact(j: np.ndarray, i: np.ndarray, sources: Points, targets: Points) -> Int64[np.ndarray, "2 edge"]:
+    """Return the pairs of a source j and a target i within the radius, in the order of ``cell_lists``."""
+    squared, space = np.zeros(len(j)), sources.periodicity
+    for axis in range(sources.pos.shape[1]):
+        d = np.abs(sources.tree.data[j, axis] - targets.tree.data[i, axis])
+        if axis in space.axes:
+            d = np.where(d > 0.5 * space.period[axis], space.period[axis] - d, d)
+        squared += d * d
+    near = squared <= sources.radius * sources.radius
+    pairs = np.stack([j[near], i[near]]).astype(np.int64)
+    first, second = targets.places[pairs[1]], sources.places[pairs[0]]
+    if sources is targets:
+        first, second = np.minimum(first, second), np.maximum(first, second)
+    return np.ascontiguousarray(pairs[:, np.lexsort((second, first))])
 
 
 def _check_number(tree: cKDTree, other: cKDTree, radius: float) -> None:

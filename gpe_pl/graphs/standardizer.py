@@ -6,13 +6,15 @@ import copy
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
-from typing import cast
+from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
 from gpe_pl.graphs.features import ParameterScale
+from gpe_pl.graphs.standards import ParameterStandards, Standards
 from gpe_pl.nn.blocks import Standardize
 from gpe_pl.schema import RADIUS, EdgeType, FeatureSpec, role
 
@@ -68,6 +70,8 @@ class GraphStandardizer(nn.Module):
         self.odd = nn.ModuleDict({self._key(r): Standardize(spec.odd_channels[r], centered=False) for r in spec.relations})
         self.even = nn.ModuleDict({self._key(r): Standardize(spec.even_channels[r]) for r in spec.relations})
         self.register_buffer("mass", torch.ones(()))
+        self._buffers_of_all = [module._buffers for module in self.modules()]
+        self._standards: tuple[list[Any], list[Tensor], Standards] | None = None
 
     @staticmethod
     def _key(relation: EdgeType) -> str:
@@ -141,6 +145,36 @@ class GraphStandardizer(nn.Module):
             if isinstance(module, Standardize) and not module.is_identity:
                 own[name].load_state_dict(module.state_dict())
         self.mass.copy_(other.mass)
+
+    def standards(self, limits: dict[str, Tensor] | None = None) -> Standards:
+        """Return the statistics as arrays for compiled features on the CPU. They are kept until a statistic changes.
+
+        Args:
+            limits: as in ``forward``.
+        """
+        tensors = [t for buffers in self._buffers_of_all for t in buffers.values() if t is not None] + [*(limits or {}).values()]
+        if any(t.is_inference() for t in tensors):  # their changes are not counted
+            return self._new_standards(limits)
+        versions = [(id(t), t._version) for t in tensors]
+        if self._standards is None or self._standards[0] != versions:
+            self._standards = versions, tensors, self._new_standards(limits)  # keeps the tensors, so that no other gets their id
+        return self._standards[2]
+
+    def _new_standards(self, limits: dict[str, Tensor] | None) -> Standards:
+        def statistics(module: nn.Module) -> tuple[np.ndarray, np.ndarray]:
+            standard = cast(Standardize, module)
+            return standard.mean.detach().numpy().copy(), (1 / standard.std.detach()).numpy()
+
+        keys = {r: self._key(r) for r in self.spec.relations}
+        bounds = {m: None if limits is None else limits[m].detach().numpy().astype(np.float32) for m in self.spec.materials}
+        return Standards(
+            node={t: statistics(self.node[role(t)]) for t in self.spec.node_types},
+            odd={r: statistics(self.odd[key])[1] for r, key in keys.items()},
+            even={r: statistics(self.even[key]) for r, key in keys.items()},
+            params={m: ParameterStandards(statistics(self.params[m]), self._is_log(m), bounds[m]) for m in self.spec.materials},
+            mass=float(self.mass),
+            precision=self.mass.detach().numpy().dtype,
+        )
 
     def forward(self, data: HeteroData, skip_absent: bool = True, limits: dict[str, Tensor] | None = None) -> HeteroData:
         """Return a graph with standardised features; the input does not change.

@@ -6,18 +6,50 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
-from gpe_pl.schema import EdgeType
+from gpe_pl.schema import CELL, EdgeType, level_of
 
 
 class GraphError(GpeError, ValueError):
     """Raised when a state does not fit the data set of the builder; the message says why."""
+
+
+@dataclass(frozen=True)
+class MeshEdges:
+    """Edges of meshes between points: the nodes of the state, followed by the virtual nodes in the order of their levels.
+
+    Attributes:
+        relations: relations in the order of their edges, those along cells first.
+        counts: number of edges of each relation.
+        ends: source (row 0) and target (row 1) of the edges of all relations.
+    """
+
+    relations: tuple[EdgeType, ...]
+    counts: tuple[int, ...]
+    ends: Int64[Tensor, "2 edge"]
+
+    @property
+    def num_cell_relations(self) -> int:
+        """Number of relations along cells, which come first."""
+        return sum(name == CELL for _, name, _ in self.relations)
+
+    @cached_property
+    def starts(self) -> Int64[np.ndarray, " _"]:
+        """First edge of each relation, and the number of edges."""
+        return np.cumsum([0, *self.counts])
+
+    @cached_property
+    def levels(self) -> Float64[np.ndarray, " relation"]:
+        """Level of the sources of each relation; 0 for edges along cells."""
+        return np.array([0.0 if name == CELL else float(level_of(source)) for source, name, _ in self.relations])
 
 
 @dataclass(frozen=True)
@@ -30,12 +62,21 @@ class MeshTopology:
             pair for every node and level; if the node has no ancestor in that level, row 0 has the total number of virtual nodes.
         rest_pos: undeformed positions of the nodes of the state [m]; in periodic domains the images that keep each body together.
         shift: vector to add to each position so that meshes stay in one piece at the seams of a periodic domain [m]; None stands for zero.
+        edges: edges between points, for the compiled features; None where they are not needed.
     """
 
     num_virtual: tuple[int, ...]
     descent: Int64[Tensor, "2 pair"]
     rest_pos: Float64[Tensor, "node dim"]
     shift: Float64[Tensor, "node dim"] | None = None
+    edges: MeshEdges | None = None
+
+    def to(self, device: torch.device) -> MeshTopology:
+        """Return the same virtual nodes on a device, without the edges between points unless it is the CPU."""
+        if device.type == "cpu":
+            return self
+        shift = None if self.shift is None else self.shift.to(device)
+        return MeshTopology(self.num_virtual, self.descent.to(device), self.rest_pos.to(device), shift)
 
 
 @dataclass(frozen=True)
@@ -56,6 +97,15 @@ class IslandTopology:
     body: dict[str, Int64[Tensor, " _"]]
     num_bodies: int
     arm: Float64[Tensor, "node dim"] | None = None
+
+    def to(self, device: torch.device) -> IslandTopology:
+        """Return the same islands on a device."""
+        if device.type == "cpu":
+            return self
+        body = {m: b.to(device) for m, b in self.body.items()}
+        return IslandTopology(
+            self.label.to(device), self.is_free.to(device), body, self.num_bodies, None if self.arm is None else self.arm.to(device)
+        )
 
 
 @dataclass(frozen=True)

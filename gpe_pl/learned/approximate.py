@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gpe_pl.graphs.islands import islands_within
 from gpe_pl.graphs.neighbors import radius_between
+from gpe_pl.graphs.search import walls_of
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
 from gpe_pl.trajectory import integrators
@@ -93,7 +94,7 @@ class Sleeping(Batched):
         is_calm &= ~self._are_near_a_moving_wall(state, pos)
         cells = np.empty((0, 2), np.int64) if state.cells is None else state.cells.cpu().numpy()
         edges, space = cell_edges(cells, len(pos)), state.periodicity
-        islands = islands_within(self.radius, pos, state.boundary.tree(space), edges, space)
+        islands = islands_within(self.radius, pos, walls_of(state, self.radius), edges, space)
         awake = _in_the_same_island(~is_calm, islands.label)
         seen = awake.copy()
         if awake.any() and not awake.all():

@@ -26,9 +26,13 @@ from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replace_bytes
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
+from gpe_pl.graphs.compiled_graph import works_on
 from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.graphs.standardizer import GraphStandardizer, StatisticsSample, named
+from gpe_pl.graphs.standards import Standards
+from gpe_pl.learned import motion
 from gpe_pl.learned.checkpoint_archive import check_archive, check_values
+from gpe_pl.learned.motion import per_scene
 from gpe_pl.learned.pretrained import checkpoint_path, names
 from gpe_pl.learned.training_ranges import outside_masses, outside_parameters, stored_ranges
 from gpe_pl.models.base import Model, Prediction
@@ -39,9 +43,8 @@ from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, EdgeType, node_code, param_names
 from gpe_pl.system.signatures import check_plain, checked
 from gpe_pl.trajectory import integrators
-from gpe_pl.trajectory.cells import mean_over_corners
 from gpe_pl.trajectory.scene_ranges import described, outside, scene_range, united, unlimited
-from gpe_pl.trajectory.state import State, Stress
+from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 log = logging.getLogger(__name__)
@@ -352,7 +355,8 @@ class LearnedSimulator(nn.Module):
 
     @torch.inference_mode()
     def step(self, state: State) -> State:
-        return self._advance_all([state], [self.builder(state)])[0]
+        standards = self._standards([state])
+        return self._advance_all([state], [self._graph(state, standards)], standards is not None)[0]
 
     @torch.inference_mode()
     def step_all(self, states: list[State]) -> list[State | SimulationError]:
@@ -361,17 +365,28 @@ class LearnedSimulator(nn.Module):
 
     def next_states(self, states: list[State]) -> list[State | SimulationError]:
         """Return the result of ``step_all`` as tensors that autograd can use in training."""
-        graphs = [self._graph(state) for state in states]
+        standards = self._standards(states)
+        graphs = [self._graph_or_error(state, standards) for state in states]
         sound = [k for k, graph in enumerate(graphs) if not isinstance(graph, SimulationError)]
         new: list[Any] = list(graphs)
         if sound:
-            for k, state in zip(sound, self._advance_all([states[k] for k in sound], [new[k] for k in sound]), strict=True):
+            advanced = self._advance_all([states[k] for k in sound], [new[k] for k in sound], standards is not None)
+            for k, state in zip(sound, advanced, strict=True):
                 new[k] = state
         return new
 
-    def _graph(self, state: State) -> HeteroData | SimulationError:
+    def _standards(self, states: list[State]) -> Standards | None:
+        """Return the statistics with which compiled features of these states are standardised; None if features have to be standardised afterwards."""
+        if self.static_friction or self.standardizer.mass.dtype != self.builder.precision or not all(map(works_on, states)):
+            return None  # static friction reads velocities of walls from the graph
+        return self.standardizer.standards(dict(self.trained_ranges()) if self.clamps_parameters else None)
+
+    def _graph(self, state: State, standards: Standards | None) -> HeteroData:
+        return self.builder(state) if standards is None else self.builder.standardized(state, standards)
+
+    def _graph_or_error(self, state: State, standards: Standards | None) -> HeteroData | SimulationError:
         try:
-            return self.builder(state)
+            return self._graph(state, standards)
         except SimulationError as error:
             return error
 
@@ -384,15 +399,17 @@ class LearnedSimulator(nn.Module):
                 log.warning("outside the training data: %s has no statistics; its features are not standardised", named(kind))
                 self._unknown.remove(kind)
 
-    def _advance_all(self, states: list[State], graphs: list[HeteroData]) -> list[State]:
+    def _advance_all(self, states: list[State], graphs: list[HeteroData], is_standardized: bool) -> list[State]:
         self._warn_of_unknown(graphs)
         data = graphs[0] if len(graphs) == 1 else batched(graphs)
-        predicted = self(data)
+        predicted = self.model(data) if is_standardized else self(data)
         new = self.moved(states, graphs, predicted.acceleration)
-        return self._with_stress(new, predicted.stress, graphs) if predicted.stress else new
+        return self._with_stress(new, graphs, predicted.stress) if predicted.stress else new
 
     def moved(self, states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor]) -> list[State]:
         """Return the next states. Arguments are those of ``accelerations``."""
+        if not self.static_friction and motion.works_on_all(states, predicted):
+            return motion.moved(states, graphs, predicted, float(self.acceleration_std), self.builder.metadata.frame_dt)
         acc = self.accelerations(states, graphs, predicted)
         return [self.integrated(*parts) for parts in zip(states, graphs, acc, strict=True)]
 
@@ -405,7 +422,7 @@ class LearnedSimulator(nn.Module):
             predicted: accelerations without gravity that the model predicts for the batch, per material, in units of ``acceleration_std``.
         """
         acc = [state.gravity.expand_as(state.pos).clone() for state in states]
-        for scene, rows, part in _per_scene(predicted, graphs):
+        for scene, rows, part in per_scene(predicted, graphs):
             acc[scene][rows] += part.double() * self.acceleration_std
         return acc
 
@@ -434,15 +451,9 @@ class LearnedSimulator(nn.Module):
         edges = [(graph[relation].edge_index, graph[relation[2]].island) for relation in walls]
         return supported(graph.island_is_free, [(island[i], moves[j]) for (j, i), island in edges])
 
-    def _with_stress(self, states: list[State], predicted: dict[str, Tensor], graphs: list[HeteroData]) -> list[State]:
+    def _with_stress(self, states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor]) -> list[State]:
         components = next(iter(self.builder.spec.stress_channels.values()))
-        node = [state.pos.new_zeros(state.num_nodes, components) for state in states]
-        for scene, rows, part in _per_scene(predicted, graphs):
-            node[scene][rows] = part.double() * self.stress_std
-        return [
-            state if state.cells is None else replace(state, stress=Stress(n, mean_over_corners(n, state.cells)))
-            for state, n in zip(states, node, strict=True)
-        ]
+        return motion.with_stress(states, graphs, predicted, self.stress_std, components)
 
     def advance(self, state: State, acc: Tensor) -> State:
         """Return the next state under an acceleration [node, dim] in m/s² that includes gravity, without static friction."""
@@ -580,14 +591,6 @@ def _materials(metadata: Metadata) -> str:
     """Return the materials, and the parameters that the data set stores besides the first of each."""
     further = set(metadata.param_names) - set(param_names(metadata.materials))
     return ", ".join(metadata.materials) + (f" with {', '.join(sorted(further))}" if further else "")
-
-
-def _per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """Yield the predictions for a batch as (number of the scene, rows of its state, values)."""
-    for material, values in predicted.items():
-        rows = [graph[material].node_id for graph in graphs]
-        for scene, part in enumerate(values.split([r.shape[0] for r in rows])):
-            yield scene, rows[scene], part
 
 
 def reason(error: Exception) -> str:

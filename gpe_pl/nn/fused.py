@@ -3,32 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
 
 import torch
 from torch import Tensor
+
+from gpe_pl.system.compiled import is_wanted
+from gpe_pl.system.compiled import unfused as unfused
 
 BLOCK = 512
 """Number of rows in a block. At 128 channels in single precision an array takes 256 KiB, and a few of them fit a core's second-level cache."""
 FASTMATH = {"contract", "nsz", "arcp"}
 """Optimisations of sums and products that compiled loops may apply; NaN and infinity are preserved."""
-_is_wanted = ContextVar("_is_wanted", default=True)
-
-
-@contextmanager
-def unfused() -> Iterator[None]:
-    """Use only PyTorch's operations in forward passes inside this block, and in their backward passes, for comparison."""
-    token = _is_wanted.set(False)
-    try:
-        yield
-    finally:
-        _is_wanted.reset(token)
 
 
 def works_on(*tensors: Tensor) -> bool:
     """Tell whether the fused passes can process these tensors in the present context."""
-    if torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu") or not _is_wanted.get():
+    if torch.compiler.is_compiling() or torch.is_autocast_enabled("cpu") or not is_wanted():
         return False
     first = tensors[0]
     alike = all(t.device.type == "cpu" and t.dtype == first.dtype for t in tensors)

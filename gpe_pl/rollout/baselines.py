@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from array_api_compat import array_namespace
 
-from gpe_pl.geometry.shapes import signed_distance, surface_tolerance
+from gpe_pl.geometry.shapes import Shape, signed_distance, surface_tolerance
 from gpe_pl.rollout.loop import Simulator
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.boundary import Array
@@ -72,18 +72,20 @@ def _sticking(state: State, dt: float, acceleration: Array) -> State:
     stuck = xp.all(state.vel == 0, axis=-1) & (signed_distance(shapes, state.pos) < surface_tolerance(shapes))
     hit = (signed_distance(shapes, pos) <= 0) & ~stuck
     if bool(xp.any(hit)):
-        pos = xp.where(hit[:, None], _touchdown(state, pos), pos)
+        rows = xp.nonzero(hit)[0]
+        pos = xp.asarray(pos, copy=True)
+        pos[rows] = _touchdown(shapes, state.pos[rows], pos[rows])
     pos = xp.where(stuck[:, None], state.pos, pos)
     vel = xp.where((hit | stuck)[:, None], xp.zeros_like(vel), vel)
     return state.later(dt, pos, vel)
 
 
-def _touchdown(state: State, end: Array) -> Array:
-    """Return the last free points [node, dim] on the straight paths from the state's positions to ``end``, found by bisection."""
+def _touchdown(shapes: tuple[Shape, ...], start: Array, end: Array) -> Array:
+    """Return the last free points [node, dim] on the straight paths between two points each, found by bisection."""
     xp = array_namespace(end)
-    free, inside = state.pos, end
+    free, inside = start, end
     for _ in range(NUM_BISECTIONS):
         middle = (free + inside) / 2
-        is_free = (signed_distance(state.boundary.shapes, middle) >= 0)[:, None]
+        is_free = (signed_distance(shapes, middle) >= 0)[:, None]
         free, inside = xp.where(is_free, middle, free), xp.where(is_free, inside, middle)
     return free

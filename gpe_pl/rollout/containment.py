@@ -70,4 +70,5 @@ class Contained:
 
     def _contain(self, state: State) -> State:
         contained, corrected = contain(state, self.dt)
-        return replace(contained, num_corrected=int(corrected.sum()))
+        num_corrected = 0 if contained is state else int(corrected.sum())
+        return contained if num_corrected == state.num_corrected else replace(contained, num_corrected=num_corrected)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import no_type_check
 
 import numpy as np
 from array_api_compat import array_namespace
+from numba import njit
 
 from gpe_pl.geometry.shape_values import shapes_fault
 from gpe_pl.geometry.shapes import signed_distance
@@ -56,10 +59,26 @@ class Guard:
         """Return the first violated limit of a state, or None; ``before`` is the state one frame earlier."""
         if state.num_nodes == 0:
             return None
-        found = self._not_finite(state, frame) or self._escape(state, frame) or self._explosion(state, frame)
-        if found is None and self.spacing > 0:
-            found = self._clustering(state, frame) or self._tunnelling(before, state, frame)
-        return found
+        if not self._is_far_from_limits(state):
+            found = self._not_finite(state, frame) or self._escape(state, frame) or self._explosion(state, frame)
+            if found is None and self.spacing > 0:
+                found = self._clustering(state, frame)
+            if found is not None:
+                return found
+        return self._tunnelling(before, state, frame) if self.spacing > 0 else None
+
+    def _is_far_from_limits(self, state: State) -> bool:
+        """Tell in one compiled pass whether no node can be beyond a limit of its own. If not, the checks one by one find the limit and the node."""
+        low, high = self._box
+        pos, vel = (np.ascontiguousarray(as_numpy(x), np.float64) for x in (state.pos, state.vel))
+        within: bool = _within(pos, vel, low, high, self.max_speed**2, self.spacing, self.max_crowding)
+        return within
+
+    @cached_property
+    def _box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners [axis] of the box that nodes may not leave [m]."""
+        bounds = np.array(self.bounds or ((-math.inf, math.inf),) * 3, dtype=np.float64)
+        return bounds[:, 0] - self.margin, bounds[:, 1] + self.margin
 
     def _not_finite(self, state: State, frame: int) -> Termination | None:
         xp = array_namespace(state.pos)
@@ -102,16 +121,20 @@ class Guard:
         shapes, end = state.boundary.shapes, as_numpy(state.pos)
         if not shapes:
             return None
-        depth = -signed_distance(shapes, end)
-        node = int(np.argmax(depth))
-        if 0 < self.margin < depth[node]:
-            return Termination("tunnelling", frame, node, f"frame {frame}: node {node} is {depth[node]:.3g} m deep in a wall or obstacle")
+        distance = signed_distance(shapes, end)
+        node = int(np.argmin(distance))
+        if 0 < self.margin < -distance[node]:
+            return Termination(
+                "tunnelling", frame, node, f"frame {frame}: node {node} is {-distance[node]:.3g} m deep in a wall or obstacle"
+            )
         if before is None:
             return None
-        start = as_numpy(before.pos)
+        start, tolerance = as_numpy(before.pos), TUNNEL_DEPTH * self.spacing
         way = state.periodicity.shortest(end - start)
-        length, clearance = np.linalg.norm(way, axis=-1), signed_distance(shapes, start)
-        tolerance = TUNNEL_DEPTH * self.spacing
+        length = np.sqrt(np.einsum("nd,nd->n", way, way))
+        if not length.max() > 2 * tolerance:
+            return None
+        clearance, depth = signed_distance(shapes, start), -distance
         suspects = np.flatnonzero((length > clearance) & (length > 2 * tolerance) & (clearance > -tolerance) & (depth < tolerance))
         suspects = suspects[np.argsort(length[suspects])]
         deepest = np.zeros(len(end))
@@ -137,6 +160,40 @@ class Guard:
         if crowding(pos, FINEST * self.spacing).max() > self.max_crowding:
             return self
         return replace(self, max_crowding=max(self.max_crowding, 2 * int(crowding(pos, self.spacing).max())))
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _within(pos, vel, low, high, squared_speed, spacing, max_crowding):
+    """Return whether all nodes are finite, between ``low`` and ``high``, not too fast, and surely not too many in a cell of side ``spacing``.
+
+    Cells that share an entry of a small table count as one, so their number of nodes is at least that of each of them.
+    """
+    num_nodes, dim = pos.shape
+    size = 64
+    while size < 4 * num_nodes:
+        size *= 2
+    crowd = np.zeros(size if spacing > 0 else 1, np.int32)
+    for n in range(num_nodes):
+        squared, key = 0.0, np.int64(0)
+        for a in range(dim):
+            x, v = pos[n, a], vel[n, a]
+            if not (low[a] <= x <= high[a] and abs(x) < math.inf):
+                return False
+            squared += v * v
+            if spacing > 0:
+                place = x / spacing
+                if not abs(place) < 2.0**53:
+                    return False
+                key = key * 92_837_111 + np.int64(math.floor(place))
+        if not (squared <= squared_speed and squared < math.inf):
+            return False
+        if spacing > 0:
+            entry = (key ^ (key >> 17)) & (size - 1)
+            crowd[entry] += 1
+            if crowd[entry] > max_crowding:
+                return False
+    return True
 
 
 def crowding(pos: np.ndarray, width: float) -> np.ndarray:

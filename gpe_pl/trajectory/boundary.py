@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -215,10 +216,14 @@ class Boundary:
 
     def tree(self, periodicity: Periodicity) -> Any:
         """Return ``search_tree`` of the positions. It is built once, as the positions of a ``Boundary`` never change."""
-        kept: dict[Periodicity, Any] = self.__dict__.setdefault("_trees", {})  # not a field, so neither compared nor stored
-        if periodicity not in kept:
-            kept[periodicity] = search_tree(self.pos, periodicity)
-        return kept[periodicity]
+        return self.made_once(periodicity, lambda: search_tree(self.pos, periodicity))
+
+    def made_once(self, key: Hashable, make: Callable[[], Any]) -> Any:
+        """Return what ``make`` returned at the first call with this key."""
+        kept: dict[Hashable, Any] = self.__dict__.setdefault("_made", {})  # not a field, so neither compared nor stored
+        if key not in kept:
+            kept[key] = make()
+        return kept[key]
 
 
 def search_tree(pos: Array, periodicity: Periodicity = NOWHERE) -> Any:

@@ -198,7 +198,12 @@ class State:
         return replace(self, **tensors(self) | {"boundary": boundary, "stress": stress, "internal": None})
 
 
+_defaults: dict[Any, dict[str, Any]] = {}
+
+
 def _nothing_known(state: State) -> dict[str, Any]:
-    """Return the defaults of the fields of kind ``STEP``."""
-    defaults = {declared.name: declared.default for declared in fields(state)}
-    return {name: defaults[name] for name in names_of(state, STEP)}
+    """Return the defaults of the fields of kind ``STEP``, found once per class of states."""
+    kind = type(state)
+    if kind not in _defaults:
+        _defaults[kind] = {declared.name: declared.default for declared in fields(state) if declared.metadata == STEP}
+    return _defaults[kind]

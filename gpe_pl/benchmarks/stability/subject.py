@@ -164,8 +164,7 @@ def relative_change(new: Tensor, old: Tensor) -> float:
 class _DoubleBuilder(GraphBuilder):
     """Graph builder with features, masses and lever arms in double precision."""
 
-    def _rounded(self, values: Tensor) -> Tensor:
-        return values
+    precision = torch.float64
 
 
 class _DoubleSimulator(LearnedSimulator):

@@ -1,0 +1,119 @@
+"""From the predictions of a model for a batch to the next states and stresses of its scenes.
+
+On the CPU and without gradients, NumPy and compiled loops do what ``LearnedSimulator.accelerations`` and ``advance`` do in PyTorch. For the arrays of a scene,
+PyTorch's operations take longer to start than to compute.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import no_type_check
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+from torch_geometric.data import HeteroData
+
+from gpe_pl.graphs.compiled_graph import works_on
+from gpe_pl.trajectory import integrators
+from gpe_pl.trajectory.cells import mean_over_corners
+from gpe_pl.trajectory.state import State, Stress
+
+
+def works_on_all(states: list[State], predicted: dict[str, Tensor]) -> bool:
+    """Tell whether ``moved`` can process these states and predictions."""
+    return all(map(works_on, states)) and not any(values.requires_grad for values in predicted.values())
+
+
+def moved(states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor], unit: float, dt: float) -> list[State]:
+    """Return the next states under the accelerations that a model predicts.
+
+    Args:
+        states: states of the scenes of a batch.
+        graphs: their graphs.
+        predicted: accelerations without gravity for the batch, by material.
+        unit: unit of these accelerations [m/s²].
+        dt: frame interval [s].
+    """
+    acc = [np.tile(state.gravity.numpy(), (state.num_nodes, 1)) for state in states]
+    for scene, rows, part in per_scene(predicted, graphs):
+        _add(part.contiguous().numpy(), rows.numpy(), unit, acc[scene])
+    new = []
+    for state, a in zip(states, acc, strict=True):
+        pos, vel = integrators.advance(state.pos.numpy(), state.vel.numpy(), a, dt)
+        values = {}
+        if state.velocity_history is not None:
+            past = state.velocity_history.numpy()
+            values["velocity_history"] = torch.from_numpy(np.concatenate([past[:, 1:], vel[:, None]], axis=1))
+        new.append(state.later(dt, torch.from_numpy(pos), torch.from_numpy(vel), **values))
+    return new
+
+
+def with_stress(states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor], unit: Tensor, components: int) -> list[State]:
+    """Return the states of scenes with cells with the stresses that a model predicts.
+
+    Args:
+        states: next states of the scenes of a batch.
+        graphs: their graphs.
+        predicted: stresses for the batch, by material [node, component].
+        unit: unit of these stresses [Pa].
+        components: number of components.
+    """
+    node = [state.pos.new_zeros(state.num_nodes, components) for state in states]
+    compiled = works_on_all(states, predicted)
+    for scene, rows, part in per_scene(predicted, graphs):
+        if compiled:
+            _add(part.contiguous().numpy(), rows.numpy(), float(unit), node[scene].numpy())
+        else:
+            node[scene][rows] = part.double() * unit
+    means = _mean_over_corners if compiled else mean_over_corners
+    return [
+        state if state.cells is None else replace(state, stress=Stress(n, means(n, state.cells)))
+        for state, n in zip(states, node, strict=True)
+    ]
+
+
+def per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterator[tuple[int, Tensor, Tensor]]:
+    """Yield the predictions for a batch as (number of the scene, rows of its state, values)."""
+    for material, values in predicted.items():
+        rows = [graph[material].node_id for graph in graphs]
+        if len(rows) == 1:
+            yield 0, rows[0], values
+            continue
+        for scene, part in enumerate(values.split([r.shape[0] for r in rows])):
+            yield scene, rows[scene], part
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _add(values, rows, unit, total):
+    """Add values [row, channel] times a unit to the rows of the total."""
+    for k in range(rows.shape[0]):
+        for c in range(values.shape[1]):
+            total[rows[k], c] += np.float64(values[k, c]) * unit
+
+
+def _mean_over_corners(values: Tensor, cells: Tensor) -> Tensor:
+    """Return ``cells.mean_over_corners`` of values [node, channel]."""
+    mean = values.new_empty(cells.shape[0], values.shape[1])
+    _write_means(values.numpy(), cells.contiguous().numpy(), mean.numpy())
+    return mean
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _write_means(values, cells, mean):
+    for k in range(cells.shape[0]):
+        corners = 1
+        for c in range(values.shape[1]):
+            mean[k, c] = values[cells[k, 0], c]
+        for corner in range(1, cells.shape[1]):
+            if cells[k, corner] == cells[k, corner - 1]:  # repeats the last corner
+                continue
+            corners += 1
+            for c in range(values.shape[1]):
+                mean[k, c] += values[cells[k, corner], c]
+        for c in range(values.shape[1]):
+            mean[k, c] /= corners
