@@ -191,8 +191,7 @@ class GraphBuilder:
         """Return the graph of a state with features that are already standardised; ``compiled_graph.works_on`` tells of which states it can.
 
         Raises:
-            GraphError: as ``topology``.
-            SimulationError: as ``topology``.
+            GraphError, MeshError, SimulationError: as ``topology``.
         """
         return self._compiled(standards)(self.topology(state), state)
 

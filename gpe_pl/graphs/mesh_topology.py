@@ -70,6 +70,7 @@ def mesh_parts(state: State, spec: FeatureSpec, scales: Scales) -> MeshParts | N
 
     Raises:
         GraphError: the cells do not fit the nodes.
+        MeshError: a cell has a node that does not exist, or a rest position is not finite.
     """
     if not spec.meshes or state.cells is None or state.cells.shape[0] == 0:
         return None
