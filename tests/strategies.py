@@ -140,7 +140,7 @@ def graphs(draw: Callable[..., Any], materials: tuple[str, ...] = PARTICLES, dim
 def damages() -> st.SearchStrategy[Callable[[bytes], bytes]]:
     """Draw damage to the bytes of a file: a truncated end, a flipped bit or an overwritten block."""
     return st.one_of(
-        st.floats(0.0, 1.0, exclude_max=True).map(lambda share: partial(truncated, share)),
+        st.floats(0.0, 1.0, exclude_max=True).map(lambda fraction: partial(truncated, fraction)),
         seeds.map(lambda seed: partial(flipped, seed)),
         seeds.map(lambda seed: partial(overwritten, seed)),
     )

@@ -64,7 +64,7 @@ class Settings:
         runs: folders of finished runs; their models take part in the case whose data set they were trained on.
         factors: factors by which the solver is also run at a coarser spacing than the data.
         step_factors: factors by which the solver's steps may also be longer, at the spacing of the data.
-        holds: numbers of frames for which predictions are repeated, each a further variant of every model (``Skips.hold``).
+        repeats: numbers of frames for which predictions are repeated, each a further variant of every model (``Skips.repeat_frames``).
         split, num_trajectories: split and number of the scenes.
         horizons: numbers of frames over which errors are averaged; the full length is always added.
         num_threads: threads of PyTorch; the solvers use one.
@@ -75,7 +75,7 @@ class Settings:
     runs: list[str]
     factors: list[Annotated[float, Field(gt=1)]] = field(default_factory=lambda: [1.5, 2.0, 3.0])
     step_factors: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
-    holds: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
+    repeats: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
     split: Split = "test_unseen"
     num_trajectories: Annotated[int, Field(ge=1)] = 5
     horizons: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [20, 50, 100])
@@ -146,9 +146,9 @@ def _models(runs: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[
     for label, (simulator, run) in trained_on(spec, runs).items():
         seconds = training_seconds(run)
         found[label] = simulator.to(settings.device), seconds
-        for hold in settings.holds:
-            repeating = simulator.configured(skips=replace(simulator.skips, hold=hold))
-            found[f"{label}{REPEATED} × {hold}"] = repeating, seconds
+        for repeats in settings.repeats:
+            repeating = simulator.configured(skips=replace(simulator.skips, repeat_frames=repeats))
+            found[f"{label}{REPEATED} × {repeats}"] = repeating, seconds
     return found
 
 

@@ -43,7 +43,7 @@ class Settings:
         num_boundary: number of boundary nodes out of reach.
         num_falling: number of particles in free fall without neighbours.
         num_settled: number of copies of the scene at rest, far from each other.
-        holds: numbers of frames for which one prediction is repeated.
+        repeats: numbers of frames for which one prediction is repeated.
         seed: seed of the weights.
     """
 
@@ -55,7 +55,7 @@ class Settings:
     num_boundary: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [5000, 50000])
     num_falling: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=1)] = field(default_factory=lambda: [2500, 10000])
     num_settled: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [1, 4])
-    holds: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
+    repeats: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
     num_rounds: Annotated[int, Field(ge=1)] = 11
     num_threads: Annotated[int, Field(ge=1, le=1024)] = 1
     accelerator: Literal["cpu", "gpu"] = "cpu"
@@ -188,9 +188,9 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
                 cells += [f"{1e3 * np.median(times[level]):.1f}", f"{100 * overhead:+.1f} %"]
             cells.insert(2, f"{1e3 * np.median(times['small']):.1f}")
             lines.append(table_row(cells))
-        for hold in settings.holds:
-            ratio = _hold_time_ratio(settings, edge_state, builder, scene, hold)
-            records.append({"metric": "hold_time_ratio", "case": f"{hold} frames, {edge_state}", "value": ratio, "unit": "1"})
+        for repeats in settings.repeats:
+            ratio = _repeat_time_ratio(settings, edge_state, builder, scene, repeats)
+            records.append({"metric": "repeat_time_ratio", "case": f"{repeats} frames, {edge_state}", "value": ratio, "unit": "1"})
     for level, skips in (("on", Skips()), ("off", Skips(isolated_nodes=False))):
         calls = message_passing_calls(settings, builder, scene, skips)
         records.append({"metric": "falling_message_passing_calls", "case": level, "value": calls, "unit": "1"})
@@ -202,25 +202,25 @@ def run(settings: Settings) -> tuple[list[dict[str, Any]], str]:
     return records, _table(settings, num_edges, lines, records)
 
 
-def _hold_time_ratio(settings: Settings, edge_state: EdgeState, builder: GraphBuilder, scene: State, hold: int) -> float:
-    """Return the time of ``hold`` frames with one repeated prediction over that with a prediction for each frame."""
+def _repeat_time_ratio(settings: Settings, edge_state: EdgeState, builder: GraphBuilder, scene: State, repeats: int) -> float:
+    """Return the time of ``repeats`` frames with one repeated prediction over that with a prediction for each frame."""
 
     def frames(skips: Skips) -> Callable[[], State]:
         runner = approximate(simulator(settings, edge_state, builder, skips))
 
         def call() -> State:
-            *_, last = steps(runner, scene, hold)
+            *_, last = steps(runner, scene, repeats)
             return last
 
         return synchronized(call, settings.device)
 
-    times = paired_times({"repeated": frames(Skips(hold=hold)), "exact": frames(Skips())}, settings.num_rounds)
+    times = paired_times({"repeated": frames(Skips(repeat_frames=repeats)), "exact": frames(Skips())}, settings.num_rounds)
     return paired_ratio(times, "repeated", "exact")
 
 
 def _table(settings: Settings, num_edges: int, lines: list[str], records: list[dict[str, Any]]) -> str:
     calls = {(r["metric"], r["case"]): r["value"] for r in records if r["metric"].endswith("_calls")}
-    fractions = [f"{r['case']} {100 * r['value']:.0f} %" for r in records if r["metric"] == "hold_time_ratio"]
+    fractions = [f"{r['case']} {100 * r['value']:.0f} %" for r in records if r["metric"] == "repeat_time_ratio"]
     repeated = (
         f" Repeated predictions, another approximate level, take these fractions of the time: {', '.join(fractions)}." if fractions else ""
     )

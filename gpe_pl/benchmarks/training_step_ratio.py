@@ -48,10 +48,10 @@ def training_records(specs: dict[str, DatasetSpec], settings: dict[str, Training
         data, size = _windows(simulator, spec, training), BatchSize(training.batch_size)
         floor = _seconds_of_products(simulator, data, size, num_rounds)
         seconds = min(loop_times(simulator, data, size, training, None, num_rounds))
-        if training.push_share:
+        if training.push_fraction:
             push = PushForward(0, training.push_steps, training.push_correction)
             late = min(loop_times(simulator, data, size, training, push, num_rounds))
-            seconds = (1 - training.push_share) * seconds + training.push_share * late
+            seconds = (1 - training.push_fraction) * seconds + training.push_fraction * late
         log.info("%s: a training step takes %.2f ms, %.1f times its products", name, 1e3 * seconds, seconds / floor)
         values = {
             "training_step_time": (seconds, "s"),

@@ -31,7 +31,7 @@ from gpe_pl.metrics import OneStepNMSE, per_frame_mse, rollout_metrics
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.guard import Guard
-from gpe_pl.rollout.loop import Simulator, Start, rollout, rollouts, share_outside
+from gpe_pl.rollout.loop import Simulator, Start, fraction_outside, rollout, rollouts
 from gpe_pl.schema import SPLITS, ParameterGroup, Split, param_names
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -69,7 +69,7 @@ class EvaluationSettings:
             enough history.
         containment: put particles that cross a wall back on its surface.
         num_uncontained: number of trajectories per split that are also rolled out without containment, which shows what it corrects; None takes all.
-        hold_parameters: clamp material parameters outside the trained range to the nearest trained value.
+        clamp_parameters: clamp material parameters outside the trained range to the nearest trained value.
         static_friction: nodes that walls support stay in place if they are slower than this fraction of the speed that gravity gives in one frame (see
             ``nn.static_friction``); None takes the model's own value.
         material_controls: roll scenes with unseen parameters out with other parameters, too (see ``material_controls``).
@@ -84,7 +84,7 @@ class EvaluationSettings:
     start_frame: Annotated[int, Field(ge=1)] | None = None
     containment: bool = True
     num_uncontained: Annotated[int, Field(ge=0)] | None = None
-    hold_parameters: bool = True
+    clamp_parameters: bool = True
     static_friction: Annotated[float, Field(ge=0, lt=1)] | None = None
     material_controls: bool = False
     num_pictures: Annotated[int, Field(ge=0)] = 2
@@ -139,12 +139,12 @@ def evaluate(
 
     - ``one_step_nmse``: one value for each split (see ``one_step_nmse``).
     - ``num_good_frames``: number of frames that the rollout reached.
-    - ``share_outside_at_end``: fraction of particles inside a wall or obstacle in the last frame.
-    - ``share_corrected``: fraction of particle-steps that containment corrects.
-    - ``share_outside_uncontained``: fraction of particle-frames inside a wall or obstacle with containment off, for the first ``settings.num_uncontained``
+    - ``fraction_outside_at_end``: fraction of particles inside a wall or obstacle in the last frame.
+    - ``fraction_corrected``: fraction of particle-steps that containment corrects.
+    - ``fraction_outside_uncontained``: fraction of particle-frames inside a wall or obstacle with containment off, for the first ``settings.num_uncontained``
       rollouts of a split. These three are not reported for a boundary that consists of nodes only.
     - ``skipping_mse`` [m²]: position MSE between the rollouts with and without the approximate levels of ``simulator.skips``, over the frames of both.
-    - ``share_asleep``: fraction of particle-steps that the approximate levels did not compute.
+    - ``fraction_asleep``: fraction of particle-steps that the approximate levels did not compute.
     - ``lost_impulse`` [kg m/s]: momentum that was lost when nodes fell asleep. The last three are reported if approximate levels are on. The rollout without
       these levels is then evaluated, too.
 
@@ -168,7 +168,7 @@ def evaluate(
         raise ExportError(
             "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
         )
-    simulator = simulator.configured(clamps_parameters=settings.hold_parameters, static_friction=settings.static_friction)
+    simulator = simulator.configured(clamps_parameters=settings.clamp_parameters, static_friction=settings.static_friction)
     run_dir.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     for split in settings.splits:
@@ -247,14 +247,16 @@ def _predict(
         num_steps = truth.num_nodes * max(1, prediction.num_frames - 1)
         extra = {"num_good_frames": float(prediction.num_frames - 1)}
         if truth.boundary.shapes:  # a boundary of nodes alone has no inside
-            extra["share_outside_at_end"] = _share_outside(prediction, steps, steps, tolerance=surface_tolerance(truth.boundary.shapes))
-            extra["share_corrected"] = totals[scene]["num_corrected"] / num_steps
+            extra["fraction_outside_at_end"] = _fraction_outside(
+                prediction, steps, steps, tolerance=surface_tolerance(truth.boundary.shapes)
+            )
+            extra["fraction_corrected"] = totals[scene]["num_corrected"] / num_steps
             if scene < len(free):
-                extra["share_outside_uncontained"] = _share_outside(free[scene], 1, steps, tolerance=1e-3 * spacing)
+                extra["fraction_outside_uncontained"] = _fraction_outside(free[scene], 1, steps, tolerance=1e-3 * spacing)
         if exact is not None:
             shared = prediction.frames(0, min(prediction.num_frames, exact[scene].num_frames))
             extra["skipping_mse"] = float(per_frame_mse(shared, exact[scene])[1:].mean())
-            extra["share_asleep"], extra["lost_impulse"] = totals[scene]["num_asleep"] / num_steps, totals[scene]["lost_impulse"]
+            extra["fraction_asleep"], extra["lost_impulse"] = totals[scene]["num_asleep"] / num_steps, totals[scene]["lost_impulse"]
         yield predictions, extra
 
 
@@ -277,7 +279,7 @@ def start_of(simulator: LearnedSimulator, start_frame: int, trajectory: Trajecto
     return Start(simulator.initial_state(trajectory, start_frame), truth.num_frames - 1, truth.metadata, guard)
 
 
-def _share_outside(prediction: Trajectory, first: int, last: int, tolerance: float) -> float:
+def _fraction_outside(prediction: Trajectory, first: int, last: int, tolerance: float) -> float:
     """Return the fraction of particle-frames that are inside a wall or obstacle in frames ``first … last``.
 
     All particles of the frames that a stopped rollout lacks count as inside.
@@ -288,7 +290,7 @@ def _share_outside(prediction: Trajectory, first: int, last: int, tolerance: flo
         tolerance: depth [m] up to which a particle is not counted.
     """
     wanted, good = last - first + 1, prediction.frames(first, last + 1)
-    return (share_outside(good, tolerance) * good.num_frames + wanted - good.num_frames) / wanted
+    return (fraction_outside(good, tolerance) * good.num_frames + wanted - good.num_frames) / wanted
 
 
 def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windows: int = ONE_STEP_WINDOWS) -> float:

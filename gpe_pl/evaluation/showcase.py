@@ -117,11 +117,11 @@ def run(
         Numbers of nodes, boundary nodes and steps done with and without containment; median time per step [s] and peak memory of the process [B]; largest
         speed [m/s]; and these fractions:
 
-        - ``share_corrected``: particle-steps that containment corrected.
-        - ``share_too_fast``: particle-steps faster than ``MAX_SPEED_FACTOR`` times the speed after a free fall through the domain.
-        - ``share_outside_at_end``: particles in a wall at the end.
-        - ``share_outside_uncontained``: particle-frames in a wall without containment, from the same start.
-        - ``share_asleep``: particle-steps that approximate skipping did not compute; with it, ``lost_impulse`` is the momentum that it lost [kg m/s].
+        - ``fraction_corrected``: particle-steps that containment corrected.
+        - ``fraction_too_fast``: particle-steps faster than ``MAX_SPEED_FACTOR`` times the speed after a free fall through the domain.
+        - ``fraction_outside_at_end``: particles in a wall at the end.
+        - ``fraction_outside_uncontained``: particle-frames in a wall without containment, from the same start.
+        - ``fraction_asleep``: particle-steps that approximate skipping did not compute; with it, ``lost_impulse`` is the momentum that it lost [kg m/s].
     """
     folder.mkdir(parents=True, exist_ok=True)
     runner, total = approximate(simulator), settings.num_steps + settings.num_uncontained_steps
@@ -136,7 +136,7 @@ def run(
             on_progress(frame, total)
         tally.resume()
     for frame, item in _frames(runner, state, settings.num_uncontained_steps, metadata):
-        outside.append(1.0 if isinstance(item, Termination) else _share_deeper(item, DEPTH * metadata.spacing))
+        outside.append(1.0 if isinstance(item, Termination) else _fraction_deeper(item, DEPTH * metadata.spacing))
         if on_progress is not None:
             on_progress(settings.num_steps + frame, total)
     records = tally.records()
@@ -144,7 +144,7 @@ def run(
         records += tally.skipped()
     if outside:
         records.append(Record("num_uncontained_steps", float(len(outside)), "1"))
-        records.append(Record("share_outside_uncontained", float(np.mean(outside)), "1"))
+        records.append(Record("fraction_outside_uncontained", float(np.mean(outside)), "1"))
     finite = [vars(r) | {"value": r.value if math.isfinite(r.value) else None} for r in records]  # nan after no step; JSON has none
     written = {"environment": environment(), "records": finite, "stopped": stop}
     replace_text(folder / "showcase.json", json.dumps(written, indent=1, allow_nan=False))
@@ -179,7 +179,7 @@ class _Tally:
 
     def skipped(self) -> list[Record]:
         particle_steps = len(self.seconds) * self.end.num_nodes or math.nan
-        return [Record("share_asleep", self.num_asleep / particle_steps, "1"), Record("lost_impulse", self.lost_impulse, "kg m/s")]
+        return [Record("fraction_asleep", self.num_asleep / particle_steps, "1"), Record("lost_impulse", self.lost_impulse, "kg m/s")]
 
     def records(self) -> list[Record]:
         num_steps, size = len(self.seconds), self.end.num_nodes
@@ -190,9 +190,9 @@ class _Tally:
             "num_steps": (num_steps, "1"),
             "seconds_per_step": (float(np.median(self.seconds)) if num_steps else math.nan, "s"),
             "peak_memory": (peak_resident(), "B"),
-            "share_corrected": (self.num_corrected / particle_steps, "1"),
-            "share_too_fast": (self.num_too_fast / particle_steps, "1"),
-            "share_outside_at_end": (_share_deeper(self.end, surface_tolerance(self.end.boundary.shapes)), "1"),
+            "fraction_corrected": (self.num_corrected / particle_steps, "1"),
+            "fraction_too_fast": (self.num_too_fast / particle_steps, "1"),
+            "fraction_outside_at_end": (_fraction_deeper(self.end, surface_tolerance(self.end.boundary.shapes)), "1"),
             "max_speed": (self.top_speed, "m/s"),
         }
         return [Record(metric, float(value), unit) for metric, (value, unit) in found.items()]
@@ -211,7 +211,7 @@ def _fall_speed(state: State, metadata: Metadata) -> float:
     return math.sqrt(2 * height + float(state.vel.norm(dim=1).max()) ** 2)
 
 
-def _share_deeper(state: State, depth: float) -> float:
+def _fraction_deeper(state: State, depth: float) -> float:
     """Return the fraction of nodes deeper than ``depth`` [m] inside a solid."""
     distance = signed_distance(state.boundary.shapes, state.pos)
     return float(cast(Any, distance < -depth).double().mean())

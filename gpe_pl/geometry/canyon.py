@@ -60,8 +60,8 @@ def canyon(seed: int, bounds: Bounds, spacing: float, friction: float = STICKY) 
     outside = np.abs(y - middle) - width
     plateau = 0.86 + 0.08 * _waves(rng, x, y, 4.0)
     bank = 0.65 * _rise(0.0, 0.06, outside) + 0.35 * _rise(0.07, 0.14, outside)  # two steps with a ledge between them
-    share = bed + (plateau - bed) * bank + 0.015 * _waves(rng, x, y, 25.0) * (0.3 + bank)
-    heights = low[2] + room[2] * np.clip(share, 0.03, 0.97)
+    fraction = bed + (plateau - bed) * bank + 0.015 * _waves(rng, x, y, 25.0) * (0.3 + bank)
+    heights = low[2] + room[2] * np.clip(fraction, 0.03, 0.97)
     terrain = DistanceGrid.from_values(low, spacing, below_heights(heights, low, spacing, counts), friction)
     # The banks enclose water up to the lowest place of their crests.
     banks = heights[: int(np.sum(x[:, 0] <= narrows))]

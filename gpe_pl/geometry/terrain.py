@@ -132,13 +132,13 @@ def _placed(
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
     if np.sum(extent > 0) < 2:
         raise TerrainError(f"{path}: all points lie on one line")
-    share = np.divide(room, extent, out=np.full(3, np.inf), where=extent > 0)
-    vertical = share[2] if relief is None or extent[2] == 0 else relief / extent[2]
+    ratio = np.divide(room, extent, out=np.full(3, np.inf), where=extent > 0)
+    vertical = ratio[2] if relief is None or extent[2] == 0 else relief / extent[2]
     if fit == "contain":
-        one = min(share) if relief is None else min(share[:2])
+        one = min(ratio) if relief is None else min(ratio[:2])
         scale = np.array([one, one, one if relief is None else vertical])
     else:
-        scale = np.array([share[0], share[1], vertical])
+        scale = np.array([ratio[0], ratio[1], vertical])
     scale = np.where(np.isfinite(scale), scale, 1.0)
     start = floor + np.array([0.5, 0.5, 0.0]) * (room - scale * extent)
     if normals is not None:

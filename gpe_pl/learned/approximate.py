@@ -30,7 +30,7 @@ def approximate(simulator: LearnedSimulator) -> Simulator:
     runner: Simulator = simulator
     if skips.sleep_after is not None:
         runner = Sleeping(simulator)
-    return runner if skips.hold == 1 else Repeating(runner, dt, skips.hold)
+    return runner if skips.repeat_frames == 1 else Repeating(runner, dt, skips.repeat_frames)
 
 
 class Batched(ABC):

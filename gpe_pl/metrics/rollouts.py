@@ -25,7 +25,7 @@ from torchmetrics import Metric
 from gpe_pl.metrics import bodies
 from gpe_pl.metrics.bodies import Bodies, body_metrics
 from gpe_pl.metrics.mirror import mirror_error, mirrors
-from gpe_pl.rollout.loop import share_outside
+from gpe_pl.rollout.loop import fraction_outside
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.state import von_mises
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
@@ -45,7 +45,7 @@ UNITS: dict[str, str] = {
     "angular_momentum_error": "m^2/s",
     "kinetic_energy_bias": "1",
     "kinetic_energy_error": "1",
-    "share_outside": "1",
+    "fraction_outside": "1",
     "mirror_error": "1",
     **bodies.UNITS,
 }
@@ -282,10 +282,10 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     kinetic_energy_error   1      the same for absolute differences
     mirror_error           1      ‖x − Mx‖ / ‖x̂ − x̂(0)‖ with Mx the mirror image of the prediction; only if the scene is symmetric about a vertical plane
                                   (``mirror.mirrors``); the largest, if it is about several
-    share_outside          1      fraction of predicted particle positions deeper than a thousandth of the spacing in a wall or obstacle
+    fraction_outside       1      fraction of predicted particle positions deeper than a thousandth of the spacing in a wall or obstacle
     ====================== ====== ====================================================================================================
 
-    Energy distance and angular momentum are undefined in periodic domains and left out. ``share_outside`` is left out if the boundary has no shapes. Meshes
+    Energy distance and angular momentum are undefined in periodic domains and left out. ``fraction_outside`` is left out if the boundary has no shapes. Meshes
     also have the metrics of ``bodies.body_metrics``.
 
     Args:
@@ -302,7 +302,7 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
     if prediction.stress is None or ground_truth.stress is None:
         undefined |= {"von_mises_error", "stress_error"}
     if not ground_truth.boundary.shapes:
-        undefined.add("share_outside")
+        undefined.add("fraction_outside")
     names = [name for name in UNITS if name not in undefined]
     planes = mirrors(ground_truth)
     if not planes:
@@ -323,8 +323,10 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
                 values["mirror_error"] = max(mirror_error(prediction, ground_truth, plane, steps) for plane in planes)
             values["rollout_mse"] = float(error[1 : steps + 1].mean())
             values |= _relative_errors(prediction, ground_truth, steps)
-            if "share_outside" in values:
-                values["share_outside"] = share_outside(prediction.frames(1, steps + 1), tolerance=1e-3 * ground_truth.metadata.spacing)
+            if "fraction_outside" in values:
+                values["fraction_outside"] = fraction_outside(
+                    prediction.frames(1, steps + 1), tolerance=1e-3 * ground_truth.metadata.spacing
+                )
             if not periodic:
                 values["energy_distance"] = _cloud_distance(prediction, ground_truth, steps)
             if own_bodies is not None and true_bodies is not None:

@@ -226,8 +226,8 @@ def _training_table(names: list[str], variants: dict[Variant, list[Run]], ratios
                     f"{np.mean(losses):.4f} ({min(losses):.4f} – {max(losses):.4f})" if losses else "–",
                     f"{ratios[key]:.2f}" if key in ratios else "–",
                     _interval(values_by_seed(runs, LEARNED, "test", "momentum_error", "full")),
-                    _percent(values_by_seed(runs, LEARNED, "test", "share_outside_uncontained", "full")),
-                    _percent(values_by_seed(runs, LEARNED, "test", "share_corrected", "full")),
+                    _percent(values_by_seed(runs, LEARNED, "test", "fraction_outside_uncontained", "full")),
+                    _percent(values_by_seed(runs, LEARNED, "test", "fraction_corrected", "full")),
                 ]
             )
         )

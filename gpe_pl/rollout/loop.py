@@ -298,7 +298,7 @@ def rollout(
     return rollouts(simulator, [Start(state, num_steps, metadata, guard)], see)[0]
 
 
-def share_outside(trajectory: Trajectory, tolerance: float = 0.0) -> float:
+def fraction_outside(trajectory: Trajectory, tolerance: float = 0.0) -> float:
     """Return the fraction of positions, over all frames and nodes, that lie more than ``tolerance`` [m] inside a wall or obstacle."""
     if not trajectory.boundary.shapes or trajectory.pos.size == 0:
         return 0.0

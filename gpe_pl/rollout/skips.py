@@ -28,7 +28,7 @@ class Skips:
         rest_step_spacings: a node at rest moves less than this distance in a frame [rest spacings]. Learned models make steps of 0.01 to 0.03 spacings where
             the ground truth rests.
         rest_step_change_spacings: the step of a node at rest differs from the step before by less than this distance [rest spacings].
-        hold: approximate. Number of frames for which one prediction is repeated.
+        repeat_frames: approximate. Number of frames for which one prediction is repeated.
     """
 
     absent_types: bool = True
@@ -40,9 +40,9 @@ class Skips:
     sleep_after: Annotated[int, Field(ge=1)] | None = None
     rest_step_spacings: Annotated[float, Field(gt=0)] = 0.03
     rest_step_change_spacings: Annotated[float, Field(gt=0)] = 0.06
-    hold: Annotated[int, Field(ge=1)] = 1
+    repeat_frames: Annotated[int, Field(ge=1)] = 1
 
     @property
     def is_exact(self) -> bool:
         """Whether a rollout with these levels equals a rollout without them, up to rounding."""
-        return self.sleep_after is None and self.hold == 1
+        return self.sleep_after is None and self.repeat_frames == 1

@@ -59,7 +59,7 @@ def step_time_key(config: dict[str, Any], training: TrainingSettings, trainer: T
     parts = {key: config[key] for key in ("graph", "model", "data", "batching")} | {
         "batch_size": training.batch_size,
         "compile": training.compile,
-        "push_forward": [training.push_share, training.push_steps] if training.push_share else None,
+        "push_forward": [training.push_fraction, training.push_steps] if training.push_fraction else None,
         "device": trainer.device,
         "matmul_precision": trainer.matmul_precision,
         "data_sha256": data,
@@ -73,13 +73,13 @@ class BudgetError(GpeError, ValueError):
 
 
 def mean_step_time(module: TrainingModule, data: WindowDataset, size: BatchSize, settings: TrainingSettings) -> float:
-    """Return the mean time per optimiser step [s] over a whole run. The fraction ``push_share`` of the steps, at the end, uses push-forward."""
+    """Return the mean time per optimiser step [s] over a whole run. The fraction ``push_fraction`` of the steps, at the end, uses push-forward."""
     limit = math.inf if settings.budget_minutes is None else FRACTION_TO_MEASURE * 60 * settings.budget_minutes
-    if not settings.push_share:
+    if not settings.push_fraction:
         return step_time(module, data, size, settings.gradient_clip, limit=limit)
     plain = step_time(module, data, size, settings.gradient_clip, limit=limit / 2)
     late = step_time(module, data, size, settings.gradient_clip, PushForward(0, settings.push_steps), limit=limit / 2)
-    return (1 - settings.push_share) * plain + settings.push_share * late
+    return (1 - settings.push_fraction) * plain + settings.push_fraction * late
 
 
 def step_time(

@@ -46,7 +46,7 @@ class TrainingSettings:
         budget_minutes: training time on one core or GPU [min]; replaces ``num_steps`` (see ``training.budget``).
         gradient_clip: largest norm of the gradient; None switches clipping off.
         ema_decay: decay of the moving average of the weights; None switches averaging off.
-        push_share: fraction of the steps, at the end of training, that use push-forward.
+        push_fraction: fraction of the steps, at the end of training, that use push-forward.
         push_steps: maximum number of steps of an unroll.
         push_correction: fraction of the velocity's deviation after an unroll that the target removes within one step, with ``targets=trajectory``.
         mirror: mirror training windows at random along axes without gravity; see ``WindowDataset``.
@@ -69,7 +69,7 @@ class TrainingSettings:
     targets: Targets = "trajectory"
     mirror: bool = False
     sampling: Sampling = "uniform"
-    push_share: Annotated[float, Field(ge=0, le=1)] = 0.0
+    push_fraction: Annotated[float, Field(ge=0, le=1)] = 0.0
     push_steps: Annotated[int, Field(ge=1)] = 20
     push_correction: Annotated[float, Field(ge=0, le=1)] = 1.0
     stress_weight: Annotated[float, Field(gt=0)] = 1.0
@@ -94,7 +94,9 @@ class TrainingSettings:
     def push_forward(self) -> PushForward | None:
         """Push-forward settings; None without push-forward."""
         return (
-            PushForward(round((1 - self.push_share) * self.num_steps), self.push_steps, self.push_correction) if self.push_share else None
+            PushForward(round((1 - self.push_fraction) * self.num_steps), self.push_steps, self.push_correction)
+            if self.push_fraction
+            else None
         )
 
 

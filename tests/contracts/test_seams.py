@@ -22,7 +22,7 @@ from gpe_pl.geometry.shape_values import moved, shape_from_dict, shape_to_dict
 from gpe_pl.geometry.shapes import Bowl, Box, DistanceGrid, Polygon, Shape, Sphere, domain_walls, outward_normal
 from gpe_pl.graphs.neighbors import radius_pairs
 from gpe_pl.rollout.containment import contain
-from gpe_pl.rollout.loop import share_outside
+from gpe_pl.rollout.loop import fraction_outside
 from gpe_pl.trajectory.arrays import ArrayError
 from gpe_pl.trajectory.boundary import Boundary
 from gpe_pl.trajectory.state import State
@@ -256,7 +256,7 @@ def test_what_enters_the_part_behind_a_seam_is_put_back_and_counted() -> None:
     after, corrected = contain(state, 0.01)
     assert corrected.tolist() == [True] + [False] * (len(pos) - 1)
     np.testing.assert_allclose(after.pos[0], [0.18, 0.2], atol=1e-4)
-    assert share_outside(Trajectory(**{**vars(trajectory), "pos": np.broadcast_to(pos, (3, *pos.shape))})) == 1 / len(pos)
+    assert fraction_outside(Trajectory(**{**vars(trajectory), "pos": np.broadcast_to(pos, (3, *pos.shape))})) == 1 / len(pos)
 
 
 def test_what_is_put_back_across_a_seam_stays_inside() -> None:

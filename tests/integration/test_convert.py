@@ -87,7 +87,7 @@ def test_a_periodic_data_set_is_imported_trained_on_and_evaluated(
     rows = list(read_rows(tmp_path / "runs" / "fit" / "metrics.csv"))
     assert {r.split for r in rows} == {"test"}
     assert {"rollout_mse", "momentum_error"} <= {r.metric for r in rows}
-    assert not any(r.metric.startswith(("share_outside", "share_corrected")) for r in rows)  # there are no walls
+    assert not any(r.metric.startswith(("fraction_outside", "fraction_corrected")) for r in rows)  # there are no walls
     assert (tmp_path / "runs" / "fit" / "rollout_test_00.png").stat().st_size > 1000
     simulator = LearnedSimulator.from_checkpoint(tmp_path / "runs" / "fit" / "checkpoints" / "best.ckpt")
     assert simulator.builder.metadata.periodic == (True, True)

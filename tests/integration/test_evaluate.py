@@ -155,7 +155,7 @@ def test_a_summary_has_a_line_per_metric_and_a_column_per_horizon() -> None:
     rows = [
         *(row("learned", "rollout_mse", h, v) for h, v in (("20", 2.0), ("100", 3.0), ("full", 4.0), ("full", 6.0))),
         row("learned", "one_step_nmse", "1", 0.25),
-        row("learned", "share_outside_uncontained", "full", 0.0),
+        row("learned", "fraction_outside_uncontained", "full", 0.0),
         *(row("ballistic", metric, "full", 7.0) for metric in ("rollout_mse", "velocity_error")),
     ]
     header, *lines = summary(table_of(rows)).splitlines()
@@ -165,7 +165,7 @@ def test_a_summary_has_a_line_per_metric_and_a_column_per_horizon() -> None:
         ["test", "one_step_nmse", "learned", "0.25"],
         ["test", "rollout_mse", "ballistic", "7"],
         ["test", "rollout_mse", "learned", "2", "3", "5"],
-        ["test", "share_outside_uncontained", "learned", "0"],
+        ["test", "fraction_outside_uncontained", "learned", "0"],
     ]
 
 
@@ -186,12 +186,12 @@ def test_levels_of_skipping_change_nothing_or_are_reported_with_what_they_cost(t
         "all", "absent_types=false", "static_boundary=false", "isolated_nodes=false", "edges_at_once=null", "sorted_from=null"
     )
     assert of_rollouts(everything) == pytest.approx(usual, rel=1e-3, abs=1e-9)
-    approximate = rows("approximate", "hold=2", "sleep_after=1", "rest_step_spacings=100", "rest_step_change_spacings=100")
+    approximate = rows("approximate", "repeat_frames=2", "sleep_after=1", "rest_step_spacings=100", "rest_step_change_spacings=100")
     shared = of_rollouts(approximate, "learned, exact")
     assert shared == pytest.approx({k: usual[k] for k in shared}, rel=1e-6, abs=1e-12) and len(shared) > 10
-    costs = {k: v for k, v in of_rollouts(approximate).items() if k[1] in ("skipping_mse", "share_asleep", "lost_impulse")}
+    costs = {k: v for k, v in of_rollouts(approximate).items() if k[1] in ("skipping_mse", "fraction_asleep", "lost_impulse")}
     assert len(costs) == 6 and all(v > 0 for v in costs.values())
-    assert not any(metric in ("skipping_mse", "share_asleep", "lost_impulse") for _, metric, _ in usual)
+    assert not any(metric in ("skipping_mse", "fraction_asleep", "lost_impulse") for _, metric, _ in usual)
 
 
 @pytest.mark.slow
@@ -200,7 +200,7 @@ def test_an_exact_rollout_that_stops_first_is_compared_as_far_as_it_came(tiny_da
     wild = LearnedSimulator.from_checkpoint(tmp_path / "fit" / "checkpoints" / "best.ckpt")
     wild.acceleration_std.mul_(300)
     wild.save(tmp_path / "wild.ckpt")
-    rows = evaluate(tiny_data, tmp_path / "runs", tmp_path / "wild.ckpt", "evaluation.num_pictures=0", "rollout.hold=3")
+    rows = evaluate(tiny_data, tmp_path / "runs", tmp_path / "wild.ckpt", "evaluation.num_pictures=0", "rollout.repeat_frames=3")
     lengths = {model: [r.value for r in rows if (r.model, r.metric) == (model, "rollout_mse")] for model in ("learned", "learned, exact")}
     assert not np.isfinite(lengths["learned, exact"]).all()
     assert sum(r.metric == "skipping_mse" for r in rows) == 2
@@ -229,4 +229,4 @@ def test_the_canyon_is_compared_with_the_solver_and_shown(tmp_path: Path, capsys
     assert {r.model for r in rows} == {"learned", "ballistic", "stops_at_walls", "constant_velocity"}
     assert (tmp_path / "evaluation_test_unseen" / "showcase.json").exists()
     printed = capsys.readouterr().out
-    assert re.search(r"rollout_mse +learned", printed) and "showcase  share_corrected" in printed
+    assert re.search(r"rollout_mse +learned", printed) and "showcase  fraction_corrected" in printed

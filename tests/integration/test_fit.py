@@ -37,8 +37,8 @@ from tests.checkpoints import assert_equal, assert_same_checkpoint
 from tests.runs import tiny
 
 STEPS = ("training.num_steps=6", "training.val_interval=2", "training.warmup_steps=2")
-PLAIN = ("training.push_share=0",)
-LATE = ("training.sampling=activity", "training.push_share=0.5", "training.push_steps=3")
+PLAIN = ("training.push_fraction=0",)
+LATE = ("training.sampling=activity", "training.push_fraction=0.5", "training.push_steps=3")
 
 
 class Killed(BaseException):
@@ -166,7 +166,7 @@ def test_progress_counts_the_steps_of_the_whole_training(tiny_data: Path, tmp_pa
         yield lambda done, total: shown.append((done, total))
 
     monkeypatch.setattr(callbacks, "progress_bar", bar)
-    cfg = tiny(tiny_data, tmp_path, *STEPS, "trainer.progress=true", "training.push_share=0")
+    cfg = tiny(tiny_data, tmp_path, *STEPS, "trainer.progress=true", "training.push_fraction=0")
     with pytest.MonkeyPatch.context() as patch:
         interrupt(patch, 5, Killed)
         with pytest.raises(Killed):
@@ -306,9 +306,9 @@ def test_bad_data_stops_the_run_and_keeps_the_last_good_checkpoint(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("push_share", [pytest.param(0.0, marks=pytest.mark.slow), 0.6])
+@pytest.mark.parametrize("push_fraction", [pytest.param(0.0, marks=pytest.mark.slow), 0.6])
 def test_one_corrupted_batch_does_not_end_a_run(
-    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, push_share: float
+    tiny_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, push_fraction: float
 ) -> None:
     """The batch is named and changes nothing: weights and moments stay those of the step before."""
     plain = TrainingModule.training_step
@@ -317,7 +317,7 @@ def test_one_corrupted_batch_does_not_end_a_run(
     def training_step(self: TrainingModule, batch: Any, batch_idx: int) -> Any:
         weights[self.global_step] = [p.detach().clone() for p in self.parameters()]
         if self.global_step == 4:
-            if push_share:
+            if push_fraction:
                 batch[0].truth[-1] = torch.nan
             else:
                 for material in self.simulator.builder.spec.materials:
@@ -325,7 +325,7 @@ def test_one_corrupted_batch_does_not_end_a_run(
         return plain(self, batch, batch_idx)
 
     monkeypatch.setattr(TrainingModule, "training_step", training_step)
-    fit(tiny(tiny_data, tmp_path, *STEPS, f"training.push_share={push_share}"))
+    fit(tiny(tiny_data, tmp_path, *STEPS, f"training.push_fraction={push_fraction}"))
     (warning,) = [r.message for r in caplog.records if "without this batch" in r.message]
     assert re.match(r"step 4: the loss is nan for \(trajectory, frame\) = \(\d+, \d+\), ", warning)
     assert all(torch.equal(a, b) for a, b in zip(weights[4], weights[5], strict=True))
@@ -365,7 +365,7 @@ def test_metrics_hold_the_model_and_the_baselines(tiny_data: Path, tmp_path: Pat
         for suffix in ("png", "gif", "html"):
             assert (tmp_path / "fit" / f"rollout_{split}_00.{suffix}").stat().st_size > 1000
     extra = {r.metric for r in rows if r.model == "learned"}
-    assert {"one_step_nmse", "share_outside_uncontained", "share_corrected", "momentum_error"} <= extra
+    assert {"one_step_nmse", "fraction_outside_uncontained", "fraction_corrected", "momentum_error"} <= extra
     ballistic = {(r.split, r.trajectory): r.value for r in rows if (r.model, r.metric, r.horizon) == ("ballistic", "rollout_mse", "full")}
     assert len(ballistic) == 3
     assert len(set(ballistic.values())) == 3
@@ -391,8 +391,12 @@ def test_models_with_other_histories_are_judged_on_the_same_frames(tiny_data: Pa
 def test_what_containment_corrects_is_looked_at_where_asked_for(tiny_data: Path, tmp_path: Path) -> None:
     fit(tiny(tiny_data, tmp_path, "evaluation.num_uncontained=1"))
     rows = list(read_rows(tmp_path / "fit" / "metrics.csv"))
-    assert [(r.split, r.trajectory) for r in rows if r.metric == "share_outside_uncontained"] == [("test", 0), ("test_unseen", 0)]
-    assert [(r.split, r.trajectory) for r in rows if r.metric == "share_corrected"] == [("test", 0), ("test_unseen", 0), ("test_unseen", 1)]
+    assert [(r.split, r.trajectory) for r in rows if r.metric == "fraction_outside_uncontained"] == [("test", 0), ("test_unseen", 0)]
+    assert [(r.split, r.trajectory) for r in rows if r.metric == "fraction_corrected"] == [
+        ("test", 0),
+        ("test_unseen", 0),
+        ("test_unseen", 1),
+    ]
 
 
 @pytest.mark.slow

@@ -68,7 +68,13 @@ def test_rollout_mse_is_the_mean_over_frames_one_to_horizon(ground_truth):
     records = rollout_metrics(shifted(ground_truth, 0.1 * np.arange(11)), ground_truth, (2, "full"))
     assert value(records, "rollout_mse", 2) == pytest.approx((0.01 + 0.04) / 2 / 2)
     assert value(records, "rollout_mse", "full") == pytest.approx(0.01 * 385 / 10 / 2)
-    assert {r.metric for r in records} == set(UNITS) - {"von_mises_error", "stress_error", "share_outside", "mirror_error", *bodies.UNITS}
+    assert {r.metric for r in records} == set(UNITS) - {
+        "von_mises_error",
+        "stress_error",
+        "fraction_outside",
+        "mirror_error",
+        *bodies.UNITS,
+    }
 
 
 def test_a_perfect_rollout_is_zero_everywhere(ground_truth):
@@ -174,7 +180,7 @@ def test_periodic_axes_take_the_short_way():
         "angular_momentum_error",
         "von_mises_error",
         "stress_error",
-        "share_outside",
+        "fraction_outside",
     }
     assert all(r.value == pytest.approx(0, abs=1e-12) for r in records)
 
@@ -246,16 +252,16 @@ def test_kinetic_energy_over_a_resting_ground_truth():
     assert value(rollout_metrics(moving, still, (2,)), "kinetic_energy_error", 2) == math.inf
 
 
-def test_share_outside_counts_particle_frames_up_to_the_horizon():
+def test_fraction_outside_counts_particle_frames_up_to_the_horizon():
     walls = Boundary.sample((*domain_walls(((0.0, 1.0), (0.0, 1.0)), 0.5),), 0.1, 2)
     inside = np.full((5, 2, 2), 0.5)
     outside = inside.copy()
     outside[3:, 0, 1] = -0.2
     truth, prediction = (replace(trajectory(p), boundary=walls) for p in (inside, outside))
     records = rollout_metrics(prediction, truth, (2, 3, 4))
-    assert [value(records, "share_outside", h) for h in (2, 3, 4)] == pytest.approx([0, 1 / 6, 2 / 8])
+    assert [value(records, "fraction_outside", h) for h in (2, 3, 4)] == pytest.approx([0, 1 / 6, 2 / 8])
     nodes_only = replace(truth, boundary=replace(walls, shapes=()))
-    assert "share_outside" not in {r.metric for r in rollout_metrics(prediction, nodes_only, (2,))}
+    assert "fraction_outside" not in {r.metric for r in rollout_metrics(prediction, nodes_only, (2,))}
 
 
 # --- torchmetrics

@@ -154,13 +154,13 @@ def test_solvers_on_a_grid_have_longer_steps_up_to_a_cell() -> None:
     assert _with_longer_steps(dataset_spec(compose("simulate", "data=fem", "size=tiny")), 4) is None
 
 
-def test_every_model_also_holds_its_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_model_also_repeats_its_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator = untrained()
     simulator.model = GNS(simulator.builder.spec, num_message_passing_steps=1, hidden_channels=8)
     monkeypatch.setattr(module, "trained_on", lambda *_: {"GNS": (simulator, None)})
     monkeypatch.setattr(module, "training_seconds", lambda _: 120.0)
-    models = _models([], dataset_spec(compose("simulate", *OVERRIDES)), Settings({}, [], holds=[2, 4]))
-    assert {label: (s.skips.hold, seconds) for label, (s, seconds) in models.items()} == {
+    models = _models([], dataset_spec(compose("simulate", *OVERRIDES)), Settings({}, [], repeats=[2, 4]))
+    assert {label: (s.skips.repeat_frames, seconds) for label, (s, seconds) in models.items()} == {
         "GNS": (1, 120.0),
         "GNS, repeated predictions × 2": (2, 120.0),
         "GNS, repeated predictions × 4": (4, 120.0),

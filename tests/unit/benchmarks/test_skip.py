@@ -13,7 +13,7 @@ from gpe_pl.benchmarks.skip import Settings, absent_material_calls, growths, mes
 from gpe_pl.config.folder import CONF
 from gpe_pl.learned.approximate import approximate
 
-TINY = Settings(40, 150, 2, 8, ["latent"], num_boundary=[30], num_falling=[10], num_settled=[2], holds=[3], num_rounds=1)
+TINY = Settings(40, 150, 2, 8, ["latent"], num_boundary=[30], num_falling=[10], num_settled=[2], repeats=[3], num_rounds=1)
 
 
 def test_the_config_has_the_settings() -> None:
@@ -64,4 +64,4 @@ def test_the_table_has_a_row_per_growth() -> None:
     }
     assert all(r["value"] > 0 for r in records if r["metric"] == "step_time")
     assert table.count("| latent |") == 4 and "alone calls 0 layers" in table
-    assert [r["case"] for r in records if r["metric"] == "hold_time_ratio"] == ["3 frames, latent"] and "3 frames, latent" in table
+    assert [r["case"] for r in records if r["metric"] == "repeat_time_ratio"] == ["3 frames, latent"] and "3 frames, latent" in table

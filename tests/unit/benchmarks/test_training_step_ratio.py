@@ -16,8 +16,8 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("push_share", [0.0, 0.5])
-def test_every_record_has_its_place_in_the_table(push_share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("push_fraction", [0.0, 0.5])
+def test_every_record_has_its_place_in_the_table(push_fraction: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Scenes fall freely here, so that no solver is compiled."""
 
     def fall(spec: DatasetSpec, split: str, index: int, num_frames: int) -> Trajectory:
@@ -28,7 +28,7 @@ def test_every_record_has_its_place_in_the_table(push_share: float, monkeypatch:
     monkeypatch.setattr(training_step_ratio, "NUM_FRAMES", 12)
     monkeypatch.setattr(loop_times, "WARM_UP_STEPS", 2)
     monkeypatch.setattr(loop_times, "STEPS_PER_ROUND", 2)
-    specs, settings = {"sand": dataset("data=sand", "size=small")}, {"sand": TrainingSettings(1000, push_share=push_share)}
+    specs, settings = {"sand": dataset("data=sand", "size=small")}, {"sand": TrainingSettings(1000, push_fraction=push_fraction)}
     records = training_records(specs, settings, num_rounds=1)
     found = {r["metric"]: r["value"] for r in records}
     assert {r["case"] for r in records} == {"sand"}

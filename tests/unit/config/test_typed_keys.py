@@ -29,7 +29,7 @@ def unresolved(*overrides: str, hydra_config: bool = False) -> DictConfig:
         ("experiment=table1", "training.num_steps=77", "training.budget_minutes=0.5"),
         ("batching=by_nodes", "training.batch_size=4", "batching.max_nodes=20000"),
         ("recipe=paper", "training.warmup_steps=10", "training.schedule=exponential"),
-        ("recipe=paper", "training.push_correction=0.2", "training.push_share=0.0"),
+        ("recipe=paper", "training.push_correction=0.2", "training.push_fraction=0.0"),
         ("model=gns", "graph.num_levels=2", "graph.mesh=False"),
         ("data=imported", "dimension=3", "data.size=imported"),
         ("model=gns", "size.comparison.budget_minutes=3", "no other setting"),

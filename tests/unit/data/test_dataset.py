@@ -237,8 +237,8 @@ def test_windows_are_drawn_by_their_probability_and_weighed_by_its_inverse(store
     assert data.probability.sum() == pytest.approx(1)
     assert data.probability[-1] / data.probability[1] > 2
     drawn = [w for batch in itertools.islice(BatchSize(4).batches(data, seed=0, step=0), 2500) for _, w in batch]
-    share = np.bincount(drawn, minlength=len(data)) / len(drawn)
-    assert share == pytest.approx(data.probability, abs=0.02)
+    fraction = np.bincount(drawn, minlength=len(data)) / len(drawn)
+    assert fraction == pytest.approx(data.probability, abs=0.02)
     weights = np.array([data[0, k].weight for k in range(len(data))])
     assert (data.probability * weights).sum() == pytest.approx(1)
     assert weights.max() <= 1 / UNIFORM_FRACTION

@@ -520,7 +520,7 @@ def test_plan_counts_what_is_missing(folder, tmp_path):
     assert seconds_per_trajectory(SPEC, budget=0.01) > 0
 
 
-def share_settled(trajectory, time):
+def fraction_settled(trajectory, time):
     """Return the fraction of particles whose velocity differs from initial free flight by more than 0.1 m/s at ``time`` [s]."""
     frame = math.ceil(time / trajectory.metadata.frame_dt)
     elapsed = np.arange(frame + 1)[:, None, None] * trajectory.metadata.frame_dt
@@ -533,15 +533,15 @@ def test_contact_is_not_rare():
     spec = dataset_spec(compose("simulate", "size=small"))
     short = replace(spec, num_frames=52)
     time = 50 * spec.solver.frame_dt
-    shares = np.array([share_settled(generate_trajectory(short, "test", i), time) for i in range(spec.num_test)])
-    assert shares.mean() >= 0.5 and np.mean(shares >= 0.5) >= 0.9, shares
+    fractions = np.array([fraction_settled(generate_trajectory(short, "test", i), time) for i in range(spec.num_test)])
+    assert fractions.mean() >= 0.5 and np.mean(fractions >= 0.5) >= 0.9, fractions
 
 
 def test_start_is_free_flight():
     """The measure above is 0 while nothing touches, so it cannot pass by accident."""
     state_dt = SPEC.solver.frame_dt
     trajectories = [generate_trajectory(SPEC, "train", i) for i in range(5)]
-    assert min(share_settled(t, 2 * state_dt) for t in trajectories) == 0.0
+    assert min(fraction_settled(t, 2 * state_dt) for t in trajectories) == 0.0
 
 
 def test_progress_bar_reports(folder, capsys):

@@ -111,7 +111,7 @@ def test_velocity_noise_is_in_units_of_one_frames_velocity_change(history: int) 
 
 
 @pytest.mark.parametrize("correction", [0.25, 1.0])
-def test_the_target_takes_back_a_share_of_the_position_noise(correction: float) -> None:
+def test_the_target_takes_back_a_fraction_of_the_position_noise(correction: float) -> None:
     clean = window(3)
     plain, result = noisy(VELOCITY, clean), noisy(Noise(0.0, 0.5, correction), clean)
     np.testing.assert_array_equal(result[:-1], plain[:-1])  # inputs are the same

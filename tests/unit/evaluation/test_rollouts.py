@@ -11,7 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gpe_pl.evaluation.rollouts import EvaluationSettings, MetricsError, Row, StartError, _parameter, _share_outside, read_rows, write_rows
+from gpe_pl.evaluation.rollouts import (
+    EvaluationSettings,
+    MetricsError,
+    Row,
+    StartError,
+    _fraction_outside,
+    _parameter,
+    read_rows,
+    write_rows,
+)
 from gpe_pl.trajectory.trajectory import Termination, Trajectory
 
 
@@ -23,16 +32,16 @@ def inside(new_trajectory: Callable[..., Trajectory]) -> Trajectory:
 
 def test_frames_that_a_stopped_rollout_lacks_count_as_outside(inside: Trajectory) -> None:
     stopped = replace(inside.frames(0, 5), termination=Termination("nan", 5, 0, "frame 5"))
-    assert _share_outside(inside, 1, 10, 0.0) == 0.0
-    assert _share_outside(stopped, 1, 10, 0.0) == pytest.approx(6 / 10)
-    assert _share_outside(inside, 10, 10, 0.0) == 0.0
-    assert _share_outside(stopped, 10, 10, 0.0) == 1.0
+    assert _fraction_outside(inside, 1, 10, 0.0) == 0.0
+    assert _fraction_outside(stopped, 1, 10, 0.0) == pytest.approx(6 / 10)
+    assert _fraction_outside(inside, 10, 10, 0.0) == 0.0
+    assert _fraction_outside(stopped, 10, 10, 0.0) == 1.0
 
 
 def test_a_particle_inside_a_wall_counts(inside: Trajectory) -> None:
     pos = inside.pos.copy()
     pos[3, 0] = -0.5
-    assert _share_outside(replace(inside, pos=pos), 1, 10, 0.0) == pytest.approx(1 / (10 * inside.num_nodes))
+    assert _fraction_outside(replace(inside, pos=pos), 1, 10, 0.0) == pytest.approx(1 / (10 * inside.num_nodes))
 
 
 def test_rows_survive_the_file(tmp_path: Path) -> None:

@@ -49,8 +49,8 @@ def test_a_rollout_from_rest_is_counted_and_drawn(tmp_path: Path) -> None:
     records = run(simulator(), CANYON, SETTINGS, tmp_path, lambda done, total: seen.append((done, total)))
     found = values(records)
     assert found["num_nodes"] == 60 and found["num_steps"] == 3 and found["num_boundary_nodes"] > 1000
-    assert found["share_outside_at_end"] == 0 and 0 <= found["share_corrected"] < 1
-    assert found["num_uncontained_steps"] == 2 and "share_asleep" not in found
+    assert found["fraction_outside_at_end"] == 0 and 0 <= found["fraction_corrected"] < 1
+    assert found["num_uncontained_steps"] == 2 and "fraction_asleep" not in found
     assert found["max_speed"] > 0 and found["peak_memory"] > 1e6 and found["seconds_per_step"] > 0
     assert seen == [(k, 5) for k in range(1, 6)]
     written = json.loads((tmp_path / "showcase.json").read_text())
@@ -64,8 +64,8 @@ def test_a_rollout_from_rest_is_counted_and_drawn(tmp_path: Path) -> None:
 def test_without_containment_what_enters_a_wall_is_counted(tmp_path: Path) -> None:
     heavy = simulator(2000.0)  # some fly into the ground at once
     found = values(run(heavy, CANYON, SETTINGS, tmp_path))
-    assert found["share_outside_uncontained"] > 0 and found["share_corrected"] > 0
-    assert found["share_outside_at_end"] == 0
+    assert found["fraction_outside_uncontained"] > 0 and found["fraction_corrected"] > 0
+    assert found["fraction_outside_at_end"] == 0
 
 
 def test_a_rollout_that_explodes_says_so(tmp_path: Path) -> None:
@@ -80,8 +80,8 @@ def test_a_rollout_that_explodes_says_so(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_nodes_faster_than_gravity_explains_are_counted(tmp_path: Path) -> None:
     fast, slow = (values(run(simulator(a), CANYON, SETTINGS, tmp_path)) for a in (1e5, 1.0))
-    assert slow["share_too_fast"] == 0 and slow["max_speed"] < 1
-    assert fast["share_too_fast"] > 0.1 and fast["max_speed"] > 20
+    assert slow["fraction_too_fast"] == 0 and slow["max_speed"] < 1
+    assert fast["fraction_too_fast"] > 0.1 and fast["max_speed"] > 20
 
 
 def test_a_long_rollout_keeps_few_frames() -> None:
@@ -116,4 +116,4 @@ def test_what_approximate_levels_leave_out_is_counted(tmp_path: Path) -> None:
     simulated = simulator()
     simulated.skips = Skips(sleep_after=1, rest_step_spacings=1e3, rest_step_change_spacings=1e3)
     found = values(run(simulated, CANYON, SETTINGS, tmp_path))
-    assert found["share_asleep"] > 0 and found["lost_impulse"] > 0
+    assert found["fraction_asleep"] > 0 and found["lost_impulse"] > 0

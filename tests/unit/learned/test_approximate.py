@@ -169,7 +169,7 @@ def test_what_is_at_rest_sleeps_in_any_unit(length: float, time: float) -> None:
 
 
 def test_a_rollout_that_is_taken_up_again_is_the_same() -> None:
-    simulated = simulator(scenes.builder(), hold=2, rest_step_spacings=0.05, rest_step_change_spacings=5.0)
+    simulated = simulator(scenes.builder(), repeat_frames=2, rest_step_spacings=0.05, rest_step_change_spacings=5.0)
     runner, state = approximate(simulated), two_heaps(speed=0.3).to_torch()
     assert isinstance(runner, Repeating)
     through = state
@@ -196,7 +196,7 @@ def test_meshes_sleep_and_are_seen_whole(kind: str) -> None:
 
 def test_a_held_prediction_is_asked_for_once_and_moves_nodes_as_its_acceleration_says() -> None:
     build = scenes.builder()
-    simulated = simulator(build, sleep_after=None, hold=3)
+    simulated = simulator(build, sleep_after=None, repeat_frames=3)
     runner, state, dt = approximate(simulated), scenes.state().to_torch(), build.metadata.frame_dt
     asked: list[int] = []
     simulated.model.register_forward_pre_hook(lambda *_: asked.append(1))
@@ -219,7 +219,7 @@ def test_without_approximate_levels_the_simulator_is_itself() -> None:
 
 def test_scenes_side_by_side_are_as_alone_and_containment_works_around() -> None:
     build = scenes.builder()
-    simulated = simulator(build, hold=2, rest_step_spacings=0.05, rest_step_change_spacings=5.0)
+    simulated = simulator(build, repeat_frames=2, rest_step_spacings=0.05, rest_step_change_spacings=5.0)
     runner = Contained(approximate(simulated), build.metadata.frame_dt)
     states = [two_heaps(gap, speed=0.3).to_torch() for gap in (0.2, 0.6)]
     together = rollouts(runner, [Start(s, 5, build.metadata, Guard(bounds=build.metadata.bounds, margin=1.0)) for s in states])
@@ -227,10 +227,10 @@ def test_scenes_side_by_side_are_as_alone_and_containment_works_around() -> None
         np.testing.assert_allclose(rollout(runner, s, 5, build.metadata).pos, t.pos, rtol=0, atol=1e-6 * scenes.SPACING)
 
 
-@pytest.mark.parametrize("hold", [1, 2])
-def test_periodic_scenes_sleep_and_are_held_across_the_seam(hold: int) -> None:
+@pytest.mark.parametrize("repeat_frames", [1, 2])
+def test_periodic_scenes_sleep_and_are_repeated_across_the_seam(repeat_frames: int) -> None:
     space = replace(scenes.metadata(), periodic=(True, False))
-    simulated = simulator(GraphBuilder(GraphConfig(history=1, islands=True), space), hold=hold)
+    simulated = simulator(GraphBuilder(GraphConfig(history=1, islands=True), space), repeat_frames=repeat_frames)
     simulated.acceleration_std.fill_(1e4)
     s = two_heaps()
     shifted = (s.pos + np.array([0.8, 0.0])) % [1.0, 10.0]  # one heap lies across the seam

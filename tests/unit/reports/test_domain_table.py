@@ -217,7 +217,7 @@ def change(folder: Path, part: str, **values: Any) -> None:
     sealed.write(path, config | {part: config.get(part, {}) | values})
 
 
-@pytest.mark.parametrize(("part", "key"), [("training", "num_steps"), ("model", "decoder"), ("evaluation", "hold_parameters")])
+@pytest.mark.parametrize(("part", "key"), [("training", "num_steps"), ("model", "decoder"), ("evaluation", "clamp_parameters")])
 def test_runs_that_differ_in_more_than_the_seed_are_no_seeds(sweep: Path, part: str, key: str) -> None:
     change(sweep / "sand" / "GPE" / "1", part, **{key: 7})
     with pytest.raises(TableError, match=f"GPE on sand differ in {part}.{key}, not in the seed alone"):

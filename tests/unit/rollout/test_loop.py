@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from gpe_pl.rollout.guard import Guard
-from gpe_pl.rollout.loop import Replay, SimulationError, Simulator, Start, frames, rollout, rollouts, share_outside
+from gpe_pl.rollout.loop import Replay, SimulationError, Simulator, Start, fraction_outside, frames, rollout, rollouts
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Termination, Trajectory
@@ -308,10 +308,10 @@ def test_frames_do_not_share_memory_with_the_simulator(trajectory: Trajectory) -
     np.testing.assert_array_equal(result.pos, np.stack([start + k for k in range(4)]))
 
 
-def test_share_outside(trajectory: Trajectory) -> None:
+def test_fraction_outside(trajectory: Trajectory) -> None:
     pos = np.full_like(trajectory.pos, 0.3)
     pos[0, :3, 1] = -0.05  # 3 of 72 below the floor
     moved = replace(trajectory, pos=pos)
-    assert share_outside(moved) == pytest.approx(3 / 72)
-    assert share_outside(moved, tolerance=0.06) == 0.0
-    assert share_outside(replace(moved, boundary=replace(moved.boundary, shapes=()))) == 0.0
+    assert fraction_outside(moved) == pytest.approx(3 / 72)
+    assert fraction_outside(moved, tolerance=0.06) == 0.0
+    assert fraction_outside(replace(moved, boundary=replace(moved.boundary, shapes=()))) == 0.0

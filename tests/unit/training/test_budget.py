@@ -168,7 +168,7 @@ def test_a_measurement_that_fails_writes_nothing(tmp_path: Path) -> None:
         (["batching=by_nodes"], True),
         (["training.compile=auto"], True),
         (["trainer.matmul_precision=high"], True),
-        (["training.push_share=0.9"], True),
+        (["training.push_fraction=0.9"], True),
     ],
 )
 def test_a_step_is_measured_again_where_its_time_is_another(overrides: list[str], is_other: bool) -> None:
@@ -231,7 +231,7 @@ def test_steps_with_unrolls_weigh_as_they_occur_and_divide_the_time_to_measure(
 
     monkeypatch.setattr(budget, "step_time", fake)
     settings = replace(SETTINGS, budget_minutes=0.5)
-    times = [budget.mean_step_time(module, data, BatchSize(2), replace(settings, push_share=s)) for s in (0.0, 0.25)]
+    times = [budget.mean_step_time(module, data, BatchSize(2), replace(settings, push_fraction=s)) for s in (0.0, 0.25)]
     assert times == pytest.approx([0.1, 0.2])
     assert limits == [15.0, 7.5, 7.5]
 

@@ -85,7 +85,7 @@ def _signals() -> Iterator[None]:
 
 
 def trained(
-    root: Path, run: Path, push_share: float = 0.0, minutes: float = math.inf, at: dict[int, Callable[[], None]] | None = None
+    root: Path, run: Path, push_fraction: float = 0.0, minutes: float = math.inf, at: dict[int, Callable[[], None]] | None = None
 ) -> Path:
     """Train in a folder, or resume; ``at`` acts before steps."""
 
@@ -99,7 +99,13 @@ def trained(
     simulator = LearnedSimulator(GPE(module_data.builder.spec, num_message_passing_steps=1, hidden_channels=4), module_data.builder)
     simulator.fit_statistics(module_data.statistics_sample(), module_data.parameter_ranges())
     settings = TrainingSettings(
-        num_steps=STEPS, val_interval=INTERVAL, num_val_rollouts=1, val_rollout_steps=2, warmup_steps=2, push_share=push_share, push_steps=2
+        num_steps=STEPS,
+        val_interval=INTERVAL,
+        num_val_rollouts=1,
+        val_rollout_steps=2,
+        warmup_steps=2,
+        push_fraction=push_fraction,
+        push_steps=2,
     )
     module = Disturbed(simulator, STEPS, warmup_steps=2, compile="off")
     run.mkdir(parents=True, exist_ok=True)
@@ -150,19 +156,19 @@ def test_without_the_best_checkpoint_the_next_validation_makes_one(data: Path, t
     assert stored(tmp_path / "run", "best")["global_step"] == 9
 
 
-@pytest.mark.parametrize("push_share", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
+@pytest.mark.parametrize("push_fraction", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
 def test_a_checkpoint_between_validations_is_as_good_as_any(
-    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, push_share: float
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, push_fraction: float
 ) -> None:
     monkeypatch.setattr(sampling, "NUM_LANES", 1)  # every step goes on from the one before
-    trained(data, tmp_path / "whole", push_share)
+    trained(data, tmp_path / "whole", push_fraction)
     seen: list[int] = []
     with pytest.raises(Killed):
-        trained(data, tmp_path / "parts", push_share, 1e-9, at={5: stop(Killed)})
+        trained(data, tmp_path / "parts", push_fraction, 1e-9, at={5: stop(Killed)})
     found = stored(tmp_path / "parts")
     assert found["global_step"] == 5  # a step without validation before and after it
-    assert bool(found["excursions"]) == bool(push_share)
-    trained(data, tmp_path / "parts", push_share, at={step: partial(seen.append, step) for step in range(STEPS)})
+    assert bool(found["excursions"]) == bool(push_fraction)
+    trained(data, tmp_path / "parts", push_fraction, at={step: partial(seen.append, step) for step in range(STEPS)})
     assert seen == [5, 6, 7, 8]
     assert_like(tmp_path / "parts", tmp_path / "whole")
 

@@ -163,7 +163,7 @@ def trained(root: Path, run: Path, rank: int, num_ranks: int, size: BatchSize, n
     simulator = LearnedSimulator(GPE(data.builder.spec, num_message_passing_steps=2, hidden_channels=8), data.builder)
     simulator.fit_statistics(data.statistics_sample(), data.parameter_ranges())
     module = Recorded(simulator, SETTINGS.num_steps, warmup_steps=SETTINGS.warmup_steps, compile="off")
-    settings = replace(SETTINGS, num_steps=num_steps, push_share=0.5 if late else 0.0, push_steps=3)
+    settings = replace(SETTINGS, num_steps=num_steps, push_fraction=0.5 if late else 0.0, push_steps=3)
     run.mkdir(exist_ok=True)
     seen: dict[str, Any] = {"steps": module.steps, "losses": module.losses}
     try:

@@ -157,8 +157,8 @@ def test_a_start_can_be_moved(data: WindowDataset) -> None:
 def test_the_last_steps_are_unrolled() -> None:
     settings = TrainingSettings(num_steps=10, val_interval=5, push_steps=4)
     assert settings.push_forward is None
-    assert replace(settings, push_share=0.3).push_forward == PushForward(7, 4)
-    assert replace(settings, push_share=0.3, push_correction=0.2).push_forward == PushForward(7, 4, 0.2)
+    assert replace(settings, push_fraction=0.3).push_forward == PushForward(7, 4)
+    assert replace(settings, push_fraction=0.3, push_correction=0.2).push_forward == PushForward(7, 4, 0.2)
 
 
 def test_walls_that_move_go_on_moving_on_the_way(

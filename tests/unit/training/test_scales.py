@@ -124,7 +124,7 @@ def trained(folder: Path, root: Path, length: float, time: float) -> tuple[list[
     datamodule = data(folder, length, time)
     module = new_module(datamodule, "GPE")
     settings = TrainingSettings(
-        STEPS, batch_size=2, warmup_steps=2, push_share=0.5, push_steps=2, compile="off", val_interval=INTERVAL, num_val_rollouts=1,
+        STEPS, batch_size=2, warmup_steps=2, push_fraction=0.5, push_steps=2, compile="off", val_interval=INTERVAL, num_val_rollouts=1,
         val_rollout_steps=6,
     )  # fmt: skip
     best = train(module, datamodule, settings, TrainerSettings(progress=False), [CSVLogger(root, name="log")], root)
@@ -165,10 +165,10 @@ def test_powers_of_two_change_nothing_but_the_units(length: int, time: int, tmp_
     own_losses, own_step, own_rows = trained(folder, tmp_path, 2.0**length, 2.0**time)
     assert own_losses == losses
     assert own_step == step > INTERVAL
-    assert {r.metric for r in rows} >= {"share_corrected", "share_outside_uncontained", "share_outside_at_end", *UNIT_OF} - {
+    assert {r.metric for r in rows} >= {"fraction_corrected", "fraction_outside_uncontained", "fraction_outside_at_end", *UNIT_OF} - {
         "skipping_mse", "von_mises_error", "stress_error", "mirror_error", *bodies.UNITS,
     }  # fmt: skip
-    assert max(r.value for r in rows if r.metric == "share_corrected") > 0
+    assert max(r.value for r in rows if r.metric == "fraction_corrected") > 0
     for row, own in zip(rows, own_rows, strict=True):
         assert (own.model, own.metric, own.horizon, own.trajectory) == (row.model, row.metric, row.horizon, row.trajectory)
         assert own.value == row.value * in_units(row.metric, 2.0**length, 2.0**time) or math.isnan(row.value)

@@ -254,10 +254,10 @@ def test_changed_array_fails_the_digest(shard: Path) -> None:
         read_trajectory(shard, "00000", verify=True)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
-def test_truncated_file(shard: Path, share: float) -> None:
+@pytest.mark.parametrize("fraction", [0.0, 0.01, 0.3, 0.9, 0.999])
+def test_truncated_file(shard: Path, fraction: float) -> None:
     content = shard.read_bytes()
-    shard.write_bytes(content[: int(len(content) * share)])
+    shard.write_bytes(content[: int(len(content) * fraction)])
     with pytest.raises(StoreError, match=r"shard-00000\.h5"):
         read_trajectory(shard, "00000", verify=True)
 
