@@ -162,10 +162,10 @@ def test_a_summary_has_a_line_per_metric_and_a_column_per_horizon() -> None:
     assert len({len(line) for line in (header, *lines)}) == 1  # aligned
     assert header.split() == ["split", "metric", "model", "20", "100", "full"]
     assert [line.split() for line in lines] == [
+        ["test", "fraction_outside_uncontained", "learned", "0"],
         ["test", "one_step_nmse", "learned", "0.25"],
         ["test", "rollout_mse", "ballistic", "7"],
         ["test", "rollout_mse", "learned", "2", "3", "5"],
-        ["test", "fraction_outside_uncontained", "learned", "0"],
     ]
 
 
