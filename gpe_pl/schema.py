@@ -289,6 +289,7 @@ class FeatureSpec:
         stress_channels: number of components of the Cauchy stress, in the order of ``STRESS_COMPONENTS``, per material that has a stress.
         num_levels: number of levels of virtual nodes above meshes.
         islands: whether graphs contain the island of each node, and tell which islands do not touch the boundary.
+        cells: whether graphs contain the cells of meshes and their rest shape.
     """
 
     dim: int
@@ -301,6 +302,7 @@ class FeatureSpec:
     stress_channels: dict[str, int] = field(default_factory=dict)
     num_levels: int = 0
     islands: bool = False
+    cells: bool = False
 
     @property
     def param_channels(self) -> dict[str, int]:

@@ -412,6 +412,8 @@ class WindowDataset(Dataset[HeteroData | Start]):
         velocities = integrators.velocities(pos, dt, trajectory.metadata.periodicity)
         gravity = np.asarray(trajectory.metadata.gravity)
         past = np.ascontiguousarray(velocities[:-1].swapaxes(0, 1))
+        true = integrators.velocities(truth[history - 1 : history + 1], dt, trajectory.metadata.periodicity)[0]
+        at_frame = trajectory.vel[history].astype(np.float64) + (past[:, -1] - true)  # noise on the mean velocity is on this one, too
         state = State(
             pos[-2],
             past[:, -1],
@@ -427,6 +429,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
             cell_dim=trajectory.cell_dim,
             periodicity=trajectory.metadata.periodicity,
             param_names=trajectory.metadata.param_names,
+            frame_velocity=at_frame,
         ).to_torch()
         stress = None
         if self.stress and trajectory.stress is not None:

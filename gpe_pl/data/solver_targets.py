@@ -66,13 +66,15 @@ class SolverTargets:
         pos, mean = self.reflection.point(state.pos.cpu().numpy()), self.reflection.vector(state.vel.cpu().numpy())
         before, after = integrators.velocities(self.pos[step : step + 3], dt, where)
         try:
-            here = self._step(pos, self.vel[step] + mean - before, step)
+            own = state.frame_velocity
+            at_frame = self.vel[step] + mean - before if own is None else self.reflection.vector(own.cpu().numpy())
+            here = self._step(pos, at_frame, step)
             there = self._step(self.pos[step + 1], self.vel[step], step)
         except SimulationError:
             return None
-        own = integrators.velocities(np.stack([pos, here.pos]), dt, where)[0]
+        after_here = integrators.velocities(np.stack([pos, here.pos]), dt, where)[0]
         true = integrators.velocities(np.stack([self.pos[step + 1], there.pos]), dt, where)[0]
-        vel = after + own - true
+        vel = after + after_here - true
         acceleration = self.reflection.vector(integrators.acceleration(vel, mean, dt) - np.asarray(self.scene.gravity))
         target = torch.from_numpy(acceleration).to(state.pos.device)
         if self.stress is None or here.stress is None or there.stress is None:

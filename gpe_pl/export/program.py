@@ -30,6 +30,7 @@ from gpe_pl.files.atomic import replace_bytes
 from gpe_pl.graphs.features import history_of
 from gpe_pl.graphs.topology import IslandTopology, MeshTopology, Topology, descent_of
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.nn.elastic_bodies import CellError
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, DOWN, EdgeType, grid, node_code
 from gpe_pl.trajectory.boundary import Boundary
@@ -249,8 +250,11 @@ def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
 
     Raises:
         ValueError: ``path`` has another file type.
+        CellError: the model needs the cells of meshes, which a program does not take.
     """
     path = Path(path)
+    if simulator.builder.spec.cells:
+        raise CellError("exported programs have no cells; export a model with model.elastic=false graph.cells=false")
     if path.suffix != ".pt2":
         raise ValueError(f"{path}: an exported program ends in .pt2")
     step = ExportedStep(copy.deepcopy(simulator).cpu().eval())

@@ -20,9 +20,13 @@ def batched(graphs: Sequence[HeteroData]) -> HeteroData:
     for node_type in first.node_types:
         stores = [graph[node_type] for graph in graphs]
         for key, _ in stores[0].items():
-            out[node_type][key] = torch.cat([store[key] for store in stores])
+            if not key.endswith("_index"):
+                out[node_type][key] = torch.cat([store[key] for store in stores])
         sizes = [store.x.shape[0] for store in stores]
         offsets[node_type] = [sum(sizes[:k]) for k in range(len(sizes))]
+        for key in [key for key in first[node_type] if key.endswith("_index")]:
+            shifted = [store[key] + start for store, start in zip(stores, offsets[node_type], strict=True)]
+            out[node_type][key] = torch.cat(shifted)
         number = torch.arange(len(graphs), device=stores[0].x.device)
         out[node_type].batch = torch.repeat_interleave(number, torch.tensor(sizes, device=number.device))
     for edge_type in first.edge_types:

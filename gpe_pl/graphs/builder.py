@@ -21,6 +21,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.graphs import compiled_graph
 from gpe_pl.graphs.compiled_graph import CompiledGraph
+from gpe_pl.graphs.elastic_cells import add_cells
 from gpe_pl.graphs.features import (
     GraphConfig,
     Scales,
@@ -67,6 +68,15 @@ class GraphBuilder:
 
     With ``config.islands`` and ``config.mesh``, nodes of meshes also have ``body``, and the graph has ``num_bodies`` [1]. A body consists of the nodes that
     cells connect, and of nodes without a cell beside them. ``body`` is -1 in a scene without cells.
+
+    With ``config.cells``, the graph has ``gravity`` [1, dim] in m/frame², and nodes of meshes have:
+
+    - ``body_pos`` and ``rest_pos``: present and undeformed positions relative to the mean of the body [m], in one piece in periodic domains
+    - ``velocity``: mean velocity over the last frame, then velocity at the frame [node, 2 dim] in m/frame
+    - ``wall``: normal, distance [m] and friction of the plane of the nearest wall [node, dim + 2]; zero without a wall within the radius
+    - ``corner_index`` and ``corner``: ends of an edge of a body [pair, 2], and for a corner of an obstacle near it the way from the first end [m] and its
+      friction [pair, dim + 1]; empty in 3D
+    - ``cell_index``: corners of each cell [cell, 2^dim]; simplices repeat the last one
 
     Attributes:
         config: settings of the graph.
@@ -153,7 +163,7 @@ class GraphBuilder:
     def graph(self, topology: Topology, state: State) -> HeteroData:
         """Return the graph of a state whose topology is known."""
         if compiled_graph.works_on(state) and (topology.mesh is None or topology.mesh.edges is not None):
-            return self._compiled(self._raw)(topology, state)
+            return self._with_cells(self._compiled(self._raw)(topology, state), topology, state)
         data, history, boundary = HeteroData(), history_of(state), state.boundary
         for material, r in topology.rows.items():
             store = data[material]
@@ -185,6 +195,11 @@ class GraphBuilder:
                 data[material].body = body
             if self.spec.meshes:
                 data.num_bodies = torch.full((1,), islands.num_bodies, device=arm.device)
+        return self._with_cells(data, topology, state)
+
+    def _with_cells(self, data: HeteroData, topology: Topology, state: State) -> HeteroData:
+        if self.spec.cells:
+            add_cells(data, topology, state, self.spec, self.scales, self.precision)
         return data
 
     def standardized(self, state: State, standards: Standards) -> HeteroData:
@@ -193,7 +208,8 @@ class GraphBuilder:
         Raises:
             GraphError, MeshError, SimulationError: as ``topology``.
         """
-        return self._compiled(standards)(self.topology(state), state)
+        topology = self.topology(state)
+        return self._with_cells(self._compiled(standards)(topology, state), topology, state)
 
     def _compiled(self, standards: Standards) -> CompiledGraph:
         return CompiledGraph(self.config, self.metadata, self.spec, self.scales, standards)

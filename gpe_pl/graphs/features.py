@@ -14,6 +14,7 @@ from pydantic import Field
 from torch import Tensor
 
 from gpe_pl.graphs.multiscale import levels_of
+from gpe_pl.graphs.topology import GraphError
 from gpe_pl.schema import (
     BOUNDARY,
     CELL,
@@ -57,6 +58,7 @@ class GraphConfig:
             others.
         num_levels: number of levels of virtual nodes; None takes as many as lead to one root in any body of the domain.
         islands: find the connected groups of nodes, and those without an edge to the boundary; see ``nn.island_momentum``.
+        cells: include the cells of meshes and their rest shape, for ``model.elastic``; needs ``mesh`` and ``islands``.
     """
 
     features: Features = "contact"
@@ -68,6 +70,7 @@ class GraphConfig:
     mesh: bool = False
     num_levels: Annotated[int, Field(ge=0, le=20)] | None = None
     islands: bool = False
+    cells: bool = False
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,13 @@ def scales_of(config: GraphConfig, metadata: Metadata) -> Scales:
 
 
 def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
-    """Return the channel counts of a data set's graphs."""
+    """Return the channel counts of a data set's graphs.
+
+    Raises:
+        GraphError: ``config.cells`` without ``mesh`` or ``islands``.
+    """
+    if config.cells and not (config.mesh and config.islands):
+        raise GraphError("graph.cells=true needs graph.mesh=true graph.islands=true")
     dim, materials = metadata.dim, metadata.materials
     meshes = set(materials) & set(MESH_MATERIALS) if config.mesh else set()
     if not meshes:
@@ -126,6 +135,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
         stress_channels={"solid": 4 if dim == 2 else 6} if "solid" in materials else {},
         num_levels=num_levels,
         islands=config.islands,
+        cells=config.cells,
     )
 
 

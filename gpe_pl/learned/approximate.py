@@ -124,10 +124,15 @@ class Sleeping(Batched):
         is_slow = vel.norm(dim=1) < skips.rest_step_spacings * unit
         calm = is_slow & ((vel - state.vel).norm(dim=1) < skips.rest_step_change_spacings * unit)
         count = torch.where(awake, torch.where(calm, _rest_of(state) + 1, 0), _rest_of(state))
+        at_frame = None
+        if after.frame_velocity is not None:
+            at_frame = torch.zeros_like(state.vel)
+            at_frame[awake] = after.frame_velocity[moved]
         return state.later(
             self.dt,
             pos,
             vel,
+            frame_velocity=at_frame,
             stress=_combined_stress(state, after, awake, moved),
             num_asleep=int((~awake).sum()),
             lost_impulse=float((state.mass * state.vel.norm(dim=1))[~awake].sum()),
@@ -205,5 +210,6 @@ class Repeating(Batched):
 
     def _repeat(self, state: State, repeated: _Repeated) -> State:
         pos, vel = integrators.advance(state.pos, state.vel, repeated.acceleration, self.dt)
-        internal = replace(repeated, frames=repeated.frames - 1)
-        return state.later(self.dt, pos, vel, stress=state.stress, num_asleep=state.num_asleep, internal=internal)
+        at_frame = None if state.frame_velocity is None else state.frame_velocity + (vel - state.vel)
+        known = {"frame_velocity": at_frame, "stress": state.stress, "num_asleep": state.num_asleep}
+        return state.later(self.dt, pos, vel, **known, internal=replace(repeated, frames=repeated.frames - 1))

@@ -51,6 +51,23 @@ def moved(states: list[State], graphs: list[HeteroData], predicted: dict[str, Te
     return new
 
 
+def with_frame_velocity(states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor], dt: float) -> list[State]:
+    """Return the next states with velocities at the frame, if a model predicts any. Other nodes have their mean velocity.
+
+    Args:
+        states: next states of the scenes of a batch.
+        graphs: their graphs.
+        predicted: velocities at the frame for the batch, by material [node, dim] in m/frame.
+        dt: frame interval [s].
+    """
+    if not predicted:
+        return states
+    at_frame = [state.vel.clone() for state in states]
+    for scene, rows, part in per_scene(predicted, graphs):
+        at_frame[scene] = at_frame[scene].index_copy(0, rows, part.double() / dt)
+    return [replace(state, frame_velocity=velocity) for state, velocity in zip(states, at_frame, strict=True)]
+
+
 def with_stress(states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor], unit: Tensor, components: int) -> list[State]:
     """Return the states of scenes with cells with the stresses that a model predicts.
 

@@ -31,9 +31,10 @@ from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.graphs.standardizer import GraphStandardizer, StatisticsSample, named
 from gpe_pl.graphs.standards import Standards
 from gpe_pl.learned import motion
-from gpe_pl.learned.checkpoint_archive import check_archive, check_values
+from gpe_pl.learned.checkpoint_file import CheckpointError as CheckpointError
+from gpe_pl.learned.checkpoint_file import load_checkpoint, reason
 from gpe_pl.learned.motion import per_scene
-from gpe_pl.learned.pretrained import checkpoint_path, names
+from gpe_pl.learned.pretrained import checkpoint_path
 from gpe_pl.learned.training_ranges import outside_masses, outside_parameters, stored_ranges
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.lookup import model_class
@@ -50,10 +51,6 @@ from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 log = logging.getLogger(__name__)
 
 CHECKPOINT_FORMAT = 3
-
-
-class CheckpointError(GpeError, ValueError):
-    """Raised when a checkpoint is missing, damaged, or not one of gpe_pl; the message names the file and says what to do."""
 
 
 class SceneError(GpeError, ValueError):
@@ -181,6 +178,9 @@ class LearnedSimulator(nn.Module):
         if stress:
             rms = torch.cat(stress).double().square().mean().sqrt()
             self.stress_std.copy_(torch.where(rms > 0, rms, 1.0))
+        scales, square = self.builder.scales, self.builder.scales.frame_dt**2
+        stress_unit = float(self.stress_std / self.standardizer.mass) * square
+        self.model.set_units(float(self.acceleration_std) * square, scales.spacing, stress_unit)
         for k, material in enumerate(self.builder.spec.materials):
             mass = torch.cat([g[material].mass for g in sample.of(material)])
             if len(mass):
@@ -403,15 +403,20 @@ class LearnedSimulator(nn.Module):
         self._warn_of_unknown(graphs)
         data = graphs[0] if len(graphs) == 1 else batched(graphs)
         predicted = self.model(data) if is_standardized else self(data)
-        new = self.moved(states, graphs, predicted.acceleration)
+        new = self.moved(states, graphs, predicted)
         return self._with_stress(new, graphs, predicted.stress) if predicted.stress else new
 
-    def moved(self, states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor]) -> list[State]:
-        """Return the next states. Arguments are those of ``accelerations``."""
-        if not self.static_friction and motion.works_on_all(states, predicted):
-            return motion.moved(states, graphs, predicted, float(self.acceleration_std), self.builder.metadata.frame_dt)
-        acc = self.accelerations(states, graphs, predicted)
-        return [self.integrated(*parts) for parts in zip(states, graphs, acc, strict=True)]
+    def moved(self, states: list[State], graphs: list[HeteroData], predicted: Prediction) -> list[State]:
+        """Return the next states from the prediction for a batch of their graphs."""
+        acceleration, dt = predicted.acceleration, self.builder.metadata.frame_dt
+        if not self.static_friction and motion.works_on_all(states, acceleration):
+            new = motion.moved(states, graphs, acceleration, float(self.acceleration_std), dt)
+        else:
+            new = [self.advance(state, acc) for state, acc in zip(states, self.accelerations(states, graphs, acceleration), strict=True)]
+        new = motion.with_frame_velocity(new, graphs, predicted.frame_velocity, dt)
+        if not self.static_friction:
+            return new
+        return [self._with_static_friction(*parts) for parts in zip(states, new, graphs, strict=True)]
 
     def accelerations(self, states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor]) -> list[Tensor]:
         """Return the accelerations [node, dim] of each state in m/s², including gravity.
@@ -437,7 +442,8 @@ class LearnedSimulator(nn.Module):
         for material in self.builder.spec.materials:
             island[graph[material].node_id] = graph[material].island
         stays = keeps_position(state.vel, new.vel, island, self.supported(graph), self.slowest(state.gravity))[:, None]
-        return new.corrected(torch.where(stays, state.pos, new.pos), torch.where(stays, 0.0, new.vel))
+        new = new.corrected(torch.where(stays, state.pos, new.pos), torch.where(stays, 0.0, new.vel))
+        return new if new.frame_velocity is None else replace(new, frame_velocity=torch.where(stays, 0.0, new.frame_velocity))
 
     def slowest(self, gravity: Tensor) -> Tensor:
         """Return the speed [m/s] below which static friction keeps nodes in place."""
@@ -565,34 +571,7 @@ class LearnedSimulator(nn.Module):
         return simulator.to(device).eval()
 
 
-def load_checkpoint(path: Path | str, device: Any = "cpu") -> Any:
-    """Return the content of a checkpoint. Only tensors and plain values are unpickled.
-
-    The checksums of the archive are compared first, because PyTorch does not compare them.
-
-    Raises:
-        CheckpointError: the file does not exist, is damaged, or has any other content.
-    """
-    if not Path(path).is_file():
-        shipped = f", or a shipped model: {', '.join(names())}" if names() else ""
-        raise CheckpointError(f"{path}: no such checkpoint; give the folder of a run, the path of a checkpoint{shipped}")
-    try:
-        check_archive(Path(path))
-        values = torch.load(path, map_location=device, weights_only=True)
-        check_values(values)
-        return values
-    except Exception as error:  # zipfile and torch raise many types for damaged or unsafe files
-        raise CheckpointError(
-            f"{path}: not a safe, complete checkpoint ({reason(error)}); if it was copied, copy it again, or take another of the run, such as last.ckpt"
-        ) from None
-
-
 def _materials(metadata: Metadata) -> str:
     """Return the materials, and the parameters that the data set stores besides the first of each."""
     further = set(metadata.param_names) - set(param_names(metadata.materials))
     return ", ".join(metadata.materials) + (f" with {', '.join(sorted(further))}" if further else "")
-
-
-def reason(error: Exception) -> str:
-    """Return the type and message of an error in one line of bounded length."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"

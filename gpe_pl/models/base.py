@@ -19,10 +19,12 @@ class Prediction:
     Attributes:
         acceleration: acceleration without gravity, per material [node, dim], in units of the data set's acceleration scale.
         stress: Cauchy stress after the step, per material with a stress decoder [node, component], in units of the data set's stress scale.
+        frame_velocity: velocities at the end of the step [node, dim] in m/frame, per material for which the model integrates within the frame.
     """
 
     acceleration: dict[str, Tensor]
     stress: dict[str, Tensor] = field(default_factory=dict)
+    frame_velocity: dict[str, Tensor] = field(default_factory=dict)
 
 
 class Model(nn.Module, ABC):
@@ -65,6 +67,15 @@ class Model(nn.Module, ABC):
     def is_fused(self) -> bool:
         """Whether the model has fused passes for CPUs. If so, ``torch.compile`` makes it no faster on a CPU."""
         return False
+
+    def set_units(self, acceleration: float, spacing: float, stress: float) -> None:
+        """Tell the model the units of a data set, before training.
+
+        Args:
+            acceleration: unit of predicted accelerations [m/frame²].
+            spacing: rest spacing of nodes [m].
+            stress: unit of predicted stresses, in mean masses per m^(dim − 2) and frame².
+        """
 
     @abstractmethod
     def forward(self, data: HeteroData) -> Prediction:

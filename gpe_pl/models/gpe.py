@@ -24,11 +24,12 @@ from gpe_pl.errors import GpeError
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.nn.blocks import MLP, NORM_EPS
 from gpe_pl.nn.connected import Edges, order_of_edges, renumbered, reordered, touched
+from gpe_pl.nn.elastic_bodies import CellError, ElasticBodies
 from gpe_pl.nn.fused import works_on
 from gpe_pl.nn.fused_processor import Conv, Relation, Step, Update, fused_processor
 from gpe_pl.nn.island_momentum import IslandMomentum, conserve, rigid_part
 from gpe_pl.nn.momentum_conv import RAW, EdgeState, Implementation, Interaction, MomentumConv, orient
-from gpe_pl.schema import CELL, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
+from gpe_pl.schema import CELL, MESH_MATERIALS, RADIUS, EdgeType, FeatureSpec, grid, is_symmetric, role
 
 Decoder = Literal["node", "pair", "contact"]
 LevelWeights = Literal["shared", "separate"]
@@ -195,6 +196,7 @@ class GPE(Model):
         stress: also decode the stress of materials that have one.
         node_norm: ``layer`` normalises the encoded state of every node and the update of each step, as GNS does. With the ``node`` decoder, accelerations then
             stay bounded in any rollout. ``none`` follows the paper.
+        elastic: cells of meshes move their nodes through the whole frame by a constitutive law that the model learns (see ``nn.elastic_bodies``).
         island_momentum: conserve the ``linear``, or also the ``angular``, momentum of freely flying islands exactly (see ``nn.island_momentum``); or
             ``ignored``.
 
@@ -202,6 +204,7 @@ class GPE(Model):
         StressError: ``stress`` without a material that has a stress.
         IslandError: graphs do not contain islands and bodies, which ``island_momentum`` and the ``contact`` decoder with meshes need; or the ``contact``
             decoder is used with meshes beside other materials and without ``island_momentum``.
+        CellError: ``elastic`` without cells in the graphs.
     """
 
     def __init__(
@@ -218,6 +221,7 @@ class GPE(Model):
         stress: bool = False,
         node_norm: NodeNorm = "none",
         island_momentum: IslandMomentum = "ignored",
+        elastic: bool = False,
     ) -> None:
         super().__init__(
             spec,
@@ -232,7 +236,13 @@ class GPE(Model):
             stress=stress,
             node_norm=node_norm,
             island_momentum=island_momentum,
+            elastic=elastic,
         )
+        if elastic and not (spec.cells and spec.meshes and spec.islands):
+            raise CellError(
+                "model.elastic=true needs graph.cells=true graph.mesh=true graph.islands=true and a material with cells, "
+                f"such as {MESH_MATERIALS[0]}; the data set has {', '.join(spec.materials)}"
+            )
         if island_momentum != "ignored" and not spec.islands:
             raise IslandError(f"model.island_momentum={island_momentum} needs graph.islands=true")
         self.bodies = tuple(r[0] for r in spec.relations if r[1] == CELL) if decoder == "contact" else ()
@@ -289,8 +299,20 @@ class GPE(Model):
             if self.bodies:
                 forces = [r for r in forces if r[1] == RADIUS and {r[0], r[2]} & {*self.bodies}]
             self.pair_decoder = nn.ModuleDict({self.key(r): PairForce(spec, r, hidden) for r in forces})
+        if elastic:
+            self.elastic_bodies = ElasticBodies({m: spec.param_channels[m] if m in read else 0 for m in spec.meshes}, spec.dim)
+            zeroed = [cast(MLP, self.node_decoder[m])[2] for m in spec.meshes] if decoder != "pair" else []
+            zeroed += [cast(PairForce, force).lin_out for force in self.pair_decoder.values()] if decoder == "pair" or self.bodies else []
+            for layer in zeroed:  # training starts from the motion by cells and walls alone
+                for values in cast(nn.Linear, layer).parameters():
+                    nn.init.zeros_(values)
         if stress:
-            self.stress_decoder = nn.ModuleDict({m: mlp(hidden, hidden, c) for m, c in spec.stress_channels.items()})
+            decoded = {m: c for m, c in spec.stress_channels.items() if not (elastic and m in spec.meshes)}  # the law knows the others'
+            self.stress_decoder = nn.ModuleDict({m: mlp(hidden, hidden, c) for m, c in decoded.items()})
+
+    def set_units(self, acceleration: float, spacing: float, stress: float) -> None:
+        if self.settings["elastic"]:
+            self.elastic_bodies.set_units(acceleration, spacing, stress)
 
     @property
     def num_hops(self) -> int:
@@ -342,16 +364,25 @@ class GPE(Model):
             acceleration = self._moved_by_contacts(data, acceleration, contact)
         if acceleration and self.settings["island_momentum"] != "ignored":
             acceleration = self._conserve(data, acceleration)
-        return Prediction(acceleration, stress)
+        velocity: dict[str, Tensor] = {}
+        if self.settings["elastic"]:
+            acceleration, velocity, of_law = self.elastic_bodies(
+                data, acceleration, params, mass, self._wants_stress and bool(self.spec.stress_channels)
+            )
+            stress = stress | of_law
+        return Prediction(acceleration, stress, velocity)
 
-    @staticmethod
-    def _moved_by_contacts(data: HeteroData, acceleration: dict[str, Tensor], contact: dict[str, Tensor]) -> dict[str, Tensor]:
+    def _moved_by_contacts(self, data: HeteroData, acceleration: dict[str, Tensor], contact: dict[str, Tensor]) -> dict[str, Tensor]:
         """Replace the rigid part of the accelerations of each body by that of its contacts; graphs without cells have no bodies."""
         mass, pos, body = _grouped(data, contact, "body", data.num_bodies)
         in_body = torch.cat([data[m].body for m in contact]) >= 0
         count = body.shape[0] if torch.compiler.is_exporting() else int(data.num_bodies.sum())  # upper bound of the number
-        change = torch.cat([contact[m] - acceleration[m] for m in contact])
-        change = rigid_part(change, mass, pos, torch.where(in_body, body, count), count + 1)
+        forces, own = torch.cat([*contact.values()]), torch.cat([acceleration[m] for m in contact])
+        groups = torch.where(in_body, body, count), count + 1
+        if self.settings["elastic"]:  # forces act where the contact is, and cells pass them on
+            change = forces - rigid_part(own, mass, pos, *groups)
+        else:
+            change = rigid_part(forces - own, mass, pos, *groups)
         parts = torch.where(in_body[:, None], change, 0.0).split([a.shape[0] for a in contact.values()])
         return acceleration | {m: acceleration[m] + part for m, part in zip(contact, parts, strict=True)}
 
@@ -416,8 +447,12 @@ class GPE(Model):
         acceleration = nothing if falls_freely else self.node_decoder[material](h)
         return acceleration, self.stress_decoder[material](h) if with_stress else None, nothing if material in self.bodies else None
 
+    @property
+    def _wants_stress(self) -> bool:
+        return bool(self.settings["stress"]) and (self.training or not self.skips.stress)
+
     def _decodes_stress(self, material: str) -> bool:
-        return bool(self.settings["stress"]) and material in self.spec.stress_channels and (self.training or not self.skips.stress)
+        return self._wants_stress and material in self.stress_decoder
 
     def compute(
         self,

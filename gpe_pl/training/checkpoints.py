@@ -17,7 +17,7 @@ from lightning.pytorch.callbacks import Checkpoint
 
 from gpe_pl.errors import GpeError
 from gpe_pl.files.atomic import replace_bytes
-from gpe_pl.learned.simulator import CheckpointError, load_checkpoint, reason
+from gpe_pl.learned.checkpoint_file import CheckpointError, load_checkpoint, reason
 from gpe_pl.system import ranks
 from gpe_pl.training.interruption import Interruption
 

@@ -160,7 +160,7 @@ class TrainingModule(L.LightningModule):
         batch = self._excursions.graphs(self.simulator, samples) if isinstance(samples, list) else samples
         predicted = self.simulator(batch)
         if isinstance(samples, list):
-            self._excursions.move_on(self.simulator, samples[0].lane, predicted.acceleration)
+            self._excursions.move_on(self.simulator, samples[0].lane, predicted)
         if "trajectory" in batch:
             self._windows = list(zip(batch.trajectory.tolist(), batch.frame.tolist(), strict=True))
         std = self.simulator.stress_std.float()

@@ -18,11 +18,12 @@ from gpe_pl.data.dataset import Start
 from gpe_pl.graphs.batching import batched
 from gpe_pl.learned.approximate import Batched
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
+from gpe_pl.models.base import Prediction
 from gpe_pl.rollout.loop import SimulationError, step_scenes
 from gpe_pl.system import ranks
 from gpe_pl.trajectory.state import State
 
-MOVED = ("pos", "vel", "velocity_history", "time")
+MOVED = ("pos", "vel", "velocity_history", "frame_velocity", "time")
 """Fields of a state that a step changes. A moving boundary changes, too, but follows from the number of steps."""
 
 
@@ -62,7 +63,7 @@ class Excursions:
         self._loaded.clear()
 
     def state_dict(self) -> Stored:
-        """Return unrolls of all ranks: ``steps``, ``time`` and the tensors ``pos``, ``vel``, ``velocity_history`` of each scene. All ranks have to call it."""
+        """Return unrolls of all ranks: ``steps`` and the fields ``MOVED`` of each scene. All ranks have to call it."""
         own: Stored = {lane: dict(scenes) for lane, scenes in self._loaded.items()}  # loaded from a checkpoint and not used since
         for lane, way in self._lanes.items():
             scenes = zip(way.samples, way.states, way.steps, strict=True)
@@ -110,16 +111,16 @@ class Excursions:
         return Excursion([start.sample for start in starts], states, [scene["steps"] for scene in scenes], [])
 
     @torch.no_grad()
-    def move_on(self, simulator: LearnedSimulator, lane: int, acceleration: dict[str, Tensor]) -> None:
+    def move_on(self, simulator: LearnedSimulator, lane: int, predicted: Prediction) -> None:
         """Advance a lane's unrolls by one step.
 
         Args:
             simulator: integrates the accelerations.
             lane: lane of the graphs.
-            acceleration: prediction for the lane's last ``graphs``, by material [node, dim], as the model returns it.
+            predicted: prediction for the lane's last ``graphs``.
         """
         under_way = self._lanes[lane]
-        under_way.states = simulator.moved(under_way.states, under_way.graphs, acceleration)
+        under_way.states = simulator.moved(under_way.states, under_way.graphs, predicted)
         under_way.steps = [step + 1 for step in under_way.steps]
         under_way.graphs = []
 
@@ -136,13 +137,15 @@ def _graph(simulator: LearnedSimulator, start: Start, state: State, step: int) -
 def _moved(start: State, scene: dict[str, Any]) -> State:
     """Return the state of a start with the fields in ``MOVED`` replaced by those of a checkpoint.
 
+    Most models, and older checkpoints, have no ``frame_velocity``.
+
     Raises:
         CheckpointError: a field has another shape or type.
     """
-    values = {}
+    values: dict[str, Any] = {}
     for name in MOVED:
-        there, here = scene[name], getattr(start, name)
-        if isinstance(here, Tensor):
+        there, here = scene.get(name) if name == "frame_velocity" else scene[name], getattr(start, name)
+        if isinstance(here, Tensor) and not (name == "frame_velocity" and there is None):
             if not (isinstance(there, Tensor) and there.shape == here.shape and there.dtype == here.dtype):
                 raise CheckpointError(
                     f"last.ckpt: excursions.{name} does not fit the training data; delete the file to train from the start"

@@ -72,6 +72,7 @@ class Reflection:
             pos=self.point(state.pos),
             vel=self.vector(state.vel),
             velocity_history=None if history is None else self.vector(history),
+            frame_velocity=None if state.frame_velocity is None else self.vector(state.frame_velocity),
             rest_pos=None if rest_pos is None else self.point(rest_pos),
             gravity=self.vector(state.gravity),
             stress=None if stress is None else self._stress(stress),

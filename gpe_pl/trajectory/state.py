@@ -66,6 +66,7 @@ class State:
         boundary: boundary nodes and their conditions.
         gravity: external acceleration [dim] in m/s².
         velocity_history: the last velocities [node, history, dim] in m/s, oldest first; the last one equals ``vel``. None for solvers.
+        frame_velocity: velocities at this instant [node, dim] in m/s, if ``vel`` is the mean over the last frame and they are known.
         time: time since the start [s].
         rest_pos: undeformed positions [node, dim] in m; None without a mesh. Nodes without a cell have their initial position.
         cells: nodes of each mesh cell [cell, corner]; a cell with fewer corners than others repeats its last corner.
@@ -100,6 +101,7 @@ class State:
     num_asleep: int = field(default=0, metadata=STEP)
     lost_impulse: float = field(default=0.0, metadata=STEP)
     internal: Any = field(default=None, metadata=STEP)
+    frame_velocity: Array | None = field(default=None, metadata=NODE)
     periodicity: Periodicity = field(default=NOWHERE, metadata=SCENE)
     param_names: tuple[str, ...] = field(default=(), metadata=SCENE)
 
@@ -170,7 +172,13 @@ class State:
         if self.velocity_history is not None and "velocity_history" not in values:
             xp = array_namespace(vel)
             values["velocity_history"] = xp.concat([self.velocity_history[:, 1:], vel[:, None]], axis=1)
-        known: dict[str, Any] = {"time": self.time + dt, "boundary": self.boundary.at(1), **_nothing_known(self), **values}
+        known: dict[str, Any] = {
+            "time": self.time + dt,
+            "boundary": self.boundary.at(1),
+            "frame_velocity": None,
+            **_nothing_known(self),
+            **values,
+        }
         return replace(self, pos=self.periodicity.wrapped(pos), vel=vel, **known)
 
     def corrected(self, pos: Array, vel: Array) -> State:
@@ -178,7 +186,8 @@ class State:
         history = self.velocity_history
         if history is not None:
             history = array_namespace(vel).concat([history[:, :-1], vel[:, None]], axis=1)
-        return replace(self, pos=pos, vel=vel, velocity_history=history)
+        at_frame = None if self.frame_velocity is None else self.frame_velocity + (vel - self.vel)
+        return replace(self, pos=pos, vel=vel, velocity_history=history, frame_velocity=at_frame)
 
     def to_torch(self, device: Any = "cpu") -> State:
         """Return the state with tensors of float64 and int64 on a device. ``internal`` is dropped, as it belongs to a solver."""

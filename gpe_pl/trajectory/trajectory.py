@@ -302,6 +302,7 @@ class Trajectory:
             raise IndexError(f"frame {frame} with history {history} is outside the {self.num_frames} frames of this trajectory")
         gravity = np.asarray(self.metadata.gravity)
         pos, vel, past = self.pos[frame].astype(np.float64), self.vel[frame].astype(np.float64), None
+        at_frame = vel if history else None
         if history:
             window = self.pos[frame - history : frame + 1].astype(np.float64)
             past = np.ascontiguousarray(integrators.velocities(window, self.metadata.frame_dt, self.metadata.periodicity).swapaxes(0, 1))
@@ -311,7 +312,7 @@ class Trajectory:
         return State(
             pos, vel, self.node_type, self.mass, self.material_params, self.boundary.at(frame), gravity, past,
             self.start_time + frame * self.metadata.frame_dt, rest_pos, self.cells, stress, self.cell_dim, periodicity=self.metadata.periodicity,
-            param_names=self.metadata.param_names,
+            param_names=self.metadata.param_names, frame_velocity=at_frame,
         )  # fmt: skip
 
     def seen_from(self, origin: np.ndarray) -> Trajectory:

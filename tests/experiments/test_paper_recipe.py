@@ -43,7 +43,7 @@ def assert_is_the_papers(cfg: DictConfig) -> None:
     if cfg.model._target_ == "gpe_pl.models.gpe.GPE":
         assert (model["interaction"], model["decoder"], model["edge_state"]) == ("negated", "node", "latent")
         assert (model["level_weights"], model["node_norm"]) == ("separate", "none")
-        assert (model["material_embedding"], model["island_momentum"]) == ("affine", "ignored")
+        assert (model["material_embedding"], model["island_momentum"], model["elastic"]) == ("affine", "ignored", False)
 
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)

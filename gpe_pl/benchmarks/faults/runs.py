@@ -24,7 +24,7 @@ import torch
 from gpe_pl.benchmarks.faults import isolation, stores
 from gpe_pl.benchmarks.faults.verdict import MAX_DETAIL, Fault, Verdict
 from gpe_pl.errors import GpeError
-from gpe_pl.learned.simulator import load_checkpoint
+from gpe_pl.learned.checkpoint_file import load_checkpoint
 from gpe_pl.system.provenance import PROVENANCE
 
 SAVED = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, no_boundary, relative_change, stress_test
+from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, no_boundary, relative_change, stress_test, with_velocities
 from gpe_pl.errors import GpeError
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import SimulationError, Simulator, Start, rollout, rollouts, step_all
@@ -152,7 +153,7 @@ def large_steps(subject: Subject) -> Outcome:
     for factor in (2.0, 5.0, 10.0):
         other = replace(truth, metadata=replace(truth.metadata, frame_dt=factor * truth.metadata.frame_dt))
         refused += _raises(partial(simulator.initial_state, other, subject.history))
-        fast = replace(state, vel=factor * state.vel, velocity_history=factor * state.velocity_history, boundary=no_boundary(state))
+        fast = replace(with_velocities(state, partial(operator.mul, factor)), boundary=no_boundary(state))
         speed, time = float(fast.vel.norm(dim=1).max()), NUM_STEPS * subject.dt
         result = rollouts(simulator, [Start(fast, NUM_STEPS, truth.metadata, Guard())])[0]
         way = np.linalg.norm(result.pos[-1] - result.pos[0], axis=-1).max() / (speed * time + 0.5 * float(state.gravity.norm()) * time**2)

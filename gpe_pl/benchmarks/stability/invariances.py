@@ -101,10 +101,9 @@ def translation(subject: Subject) -> Outcome:
 @stress_test(5, "Galilean boost", "exact where only relative velocities are used; else reported")
 def galilean_boost(subject: Subject) -> Outcome:
     state = subject.free_state()
-    assert state.velocity_history is not None
     boost = torch.zeros(state.dim, dtype=torch.float64)
     boost[0] = float(state.vel.square().mean().sqrt()) or 1e-3 * subject.simulator.builder.scales.velocity
-    moved = with_velocities(state, state.velocity_history + boost)
+    moved = with_velocities(state, lambda velocity: velocity + boost)
     change = (acceleration(subject.simulator, moved) - acceleration(subject.simulator, state)).square().mean().sqrt().item()
     text = f"{change / subject.one_step_rmse:.2g} one-step RMSE for a boost by the rms velocity"
     return inapplicable(f"nodes know their velocities: {text}")
@@ -131,13 +130,12 @@ def rotations(subject: Subject) -> Outcome:
 
 def _transformed(state: State, q: Tensor) -> State:
     b = state.boundary
-    assert state.velocity_history is not None
     return replace(
-        with_velocities(state, state.velocity_history @ q.T),
+        with_velocities(state, lambda velocity: velocity @ q.T),
         pos=state.pos @ q.T,
         rest_pos=None if state.rest_pos is None else state.rest_pos @ q.T,
         gravity=state.gravity @ q.T,
-        boundary=replace(b, pos=b.pos @ q.T, vel=b.vel @ q.T, normal=b.normal @ q.T),
+        boundary=replace(b, pos=b.pos @ q.T, vel=b.vel @ q.T, normal=b.normal @ q.T, shapes=()),  # shapes cannot be turned
         stress=None,
     )
 

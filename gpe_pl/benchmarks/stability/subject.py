@@ -13,6 +13,7 @@ from torch import Tensor
 from torch_geometric.data import HeteroData
 
 from gpe_pl.data.ground_truth import DatasetSpec
+from gpe_pl.geometry.shape_values import moved
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.testing.changes import in_order, to_dtype
@@ -189,13 +190,20 @@ def no_boundary(state: State) -> Boundary:
 def shifted(state: State, offset: Tensor) -> State:
     """Return the scene translated by an offset, for a single step.
 
-    Shapes and the prescribed motion of the boundary are not moved, because the graph of the state does not depend on them.
+    The prescribed motion of the boundary is not moved, because the graph of the state does not depend on it.
     """
-    boundary = replace(state.boundary, pos=state.boundary.pos + offset)
+    shapes = tuple(moved(shape, offset.numpy()) for shape in state.boundary.shapes)
+    boundary = replace(state.boundary, pos=state.boundary.pos + offset, shapes=shapes)
     rest = None if state.rest_pos is None else state.rest_pos + offset
     return replace(state, pos=state.pos + offset, rest_pos=rest, boundary=boundary)
 
 
-def with_velocities(state: State, history: Tensor) -> State:
-    """Return the state with another velocity history [node, history, dim] in m/s."""
-    return replace(state, vel=history[:, -1], velocity_history=history)
+def with_velocities(state: State, change: Callable[[Tensor], Tensor]) -> State:
+    """Return the state with all velocities [..., dim] in m/s changed by a function."""
+    history, at_frame = state.velocity_history, state.frame_velocity
+    return replace(
+        state,
+        vel=change(state.vel),
+        velocity_history=None if history is None else change(history),
+        frame_velocity=None if at_frame is None else change(at_frame),
+    )

@@ -250,6 +250,17 @@ def test_where_nothing_happens_all_windows_are_drawn_alike() -> None:
     assert probabilities(np.zeros(4)) == pytest.approx(np.full(4, 0.25))
 
 
+def test_the_velocity_at_the_frame_is_stored_and_has_the_noise_of_the_mean_velocity(store: Path) -> None:
+    clean, noisy = (dataset(store, noise=noise)[StartKey(0, 1, 0)].state for noise in (None, NOISE))
+    trajectory, frame = dataset(store).locate(1)
+    stored = dataset(store).trajectories[trajectory].window(frame, frame + 1).vel[0]
+    torch.testing.assert_close(clean.frame_velocity, torch.from_numpy(stored).double())
+    assert clean.frame_velocity is not None and noisy.frame_velocity is not None
+    change = noisy.vel - clean.vel
+    assert bool(change.any())
+    torch.testing.assert_close(noisy.frame_velocity - clean.frame_velocity, change)
+
+
 @pytest.mark.parametrize("noise", [None, Noise(0.0, 0.5, 0.3), Noise(0.01, 0.0), Noise(0.01, 0.5, 0.3)])
 def test_a_start_without_unroll_is_the_usual_sample(store: Path, noise: Noise | None) -> None:
     data = dataset(store, noise=noise)

@@ -16,7 +16,7 @@ import torch
 
 from gpe_pl.learned import checkpoint_archive
 from gpe_pl.learned.checkpoint_archive import check_archive, check_pickle, check_values
-from gpe_pl.learned.simulator import CheckpointError, load_checkpoint
+from gpe_pl.learned.checkpoint_file import CheckpointError, load_checkpoint
 
 CONTENT = {
     "state_dict": OrderedDict(a=torch.zeros(3, 2), b=torch.nn.Parameter(torch.ones(2, dtype=torch.float64))),

@@ -35,6 +35,7 @@ def warm() -> Any:
     assert s.cells is not None
     stress = Stress(np.ones((s.num_nodes, 4)), np.ones((len(s.cells), 4)))
     known = {f.name: getattr(s, f.name) for f in fields(s)} | {"stress": stress, "num_substeps": 7, "internal": "opaque", "time": 2.0}
+    known["frame_velocity"] = 0.5 * s.vel
     return Warm(**known, temperature=np.arange(s.num_nodes) + 300.0, facets=s.cells[:, :2], wind=3.0, num_iterations=5)
 
 
@@ -106,9 +107,9 @@ def test_one_frame_later(convert: Any) -> None:
     np.testing.assert_allclose(np.asarray(after.pos), np.asarray(state.pos) + np.array([0.0, 1.0]), atol=1e-12)
     np.testing.assert_array_equal(np.asarray(after.velocity_history[:, :-1]), np.asarray(state.velocity_history[:, 1:]))
     np.testing.assert_array_equal(np.asarray(after.velocity_history[:, -1]), np.asarray(vel))
-    for name in {*names_of(state, NODE), *names_of(state, CELL)} - {"pos", "vel", "velocity_history"}:
+    for name in {*names_of(state, NODE), *names_of(state, CELL)} - {"pos", "vel", "velocity_history", "frame_velocity"}:
         assert getattr(after, name) is getattr(state, name), name
-    assert (after.stress, after.num_iterations, after.internal) == (None, 0, None)
+    assert (after.stress, after.num_iterations, after.internal, after.frame_velocity) == (None, 0, None, None)
     assert replace(state, velocity_history=None).later(0.5, state.pos, vel).velocity_history is None
     assert state.later(0.5, state.pos, vel, velocity_history=None).velocity_history is None
 
@@ -128,6 +129,7 @@ def test_a_corrected_state_is_of_the_same_instant(convert: Any) -> None:
     after = state.corrected(state.pos + 1.0, 3.0 * state.vel)
     assert after.time == state.time and after.internal == state.internal and after.num_substeps == 7
     np.testing.assert_array_equal(np.asarray(after.velocity_history[:, -1]), 3.0 * np.asarray(state.vel))
+    np.testing.assert_allclose(np.asarray(after.frame_velocity), np.asarray(state.frame_velocity) + 2.0 * np.asarray(state.vel))
     np.testing.assert_array_equal(np.asarray(after.velocity_history[:, :-1]), before[:, :-1])
     np.testing.assert_array_equal(np.asarray(state.velocity_history), before)
 

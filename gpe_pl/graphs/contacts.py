@@ -1,0 +1,159 @@
+"""Obstacles beside the nodes and edges of bodies, for ``nn.elastic_bodies``: the plane of the nearest wall of a node, and corners near edges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from gpe_pl.geometry.periodicity import Periodicity
+from gpe_pl.geometry.shapes import Shape, outward_normal
+from gpe_pl.trajectory.boundary import Boundary, as_numpy
+
+BEHIND = 0.1
+"""Depth in rest spacings from which a node is beside the face that a boundary node belongs to, not behind it."""
+BLUNTEST = 0.42
+"""Length of the mean direction from a corner to its neighbours, which is the cosine of half its angle: 130° or less. A disc of three spacings has 0.17."""
+MOST_FRICTION = 1e6
+"""Largest Coulomb coefficient."""
+
+
+def nearest_walls(
+    pos: Float64[Tensor, "node dim"],
+    boundary: Boundary,
+    shapes: Sequence[Shape],
+    edge_index: Int64[Tensor, "2 edge"] | None,
+    spacing: float,
+    periodicity: Periodicity,
+) -> Float64[Tensor, "node _"]:
+    """Return normal, distance [m] and friction [node, dim + 2] of the nearest wall of each node. Nodes without an edge to the boundary have zeros.
+
+    Shapes give exact values. Without shapes, the wall is the plane through the nearest boundary node.
+
+    Args:
+        pos: positions of nodes [m].
+        boundary: boundary nodes.
+        shapes: the shapes that the boundary nodes sample, where they are now; empty if unknown.
+        edge_index: edges from boundary nodes (row 0) to nodes (row 1); None stands for none.
+        spacing: rest spacing of nodes [m].
+        periodicity: axes along which distances take the shortest way.
+    """
+    num_nodes, dim = pos.shape
+    wall = pos.new_zeros(num_nodes, dim + 2)
+    if edge_index is None or not edge_index.shape[1]:
+        return wall
+    if shapes:
+        rows = torch.unique(edge_index[1])
+        wall[rows] = _nearest_shapes(pos[rows], shapes, spacing)
+        return wall
+    source, target = edge_index
+    displacement, normal = periodicity.shortest(pos[target] - boundary.pos[source]), boundary.normal[source].to(pos.dtype)
+    height = (displacement * normal).sum(dim=1)
+    square = displacement.square().sum(dim=1)
+    square = square + torch.where(height < -BEHIND * spacing, 2 * square.max() + 1.0, 0.0)  # last choice: the node is beside that face
+    least = square.new_full((num_nodes,), torch.inf).scatter_reduce_(0, target, square, "amin")
+    count = len(square)
+    edge = torch.where(square == least[target], torch.arange(count, device=pos.device), count)
+    nearest = edge.new_full((num_nodes,), count).scatter_reduce_(0, target, edge, "amin")
+    rows = torch.nonzero(nearest < count).flatten()
+    chosen = nearest[rows]
+    friction = boundary.friction[source[chosen]].clamp(max=MOST_FRICTION).to(pos.dtype)
+    wall[rows] = torch.cat([normal[chosen], height[chosen, None], friction[:, None]], dim=1)
+    return wall
+
+
+def _nearest_shapes(pos: Tensor, shapes: Sequence[Shape], spacing: float) -> Tensor:
+    """Return normal, distance and friction [node, dim + 2] of the nearest shape of each node."""
+    points = as_numpy(pos)
+    distance = np.stack([shape.signed_distance(points) for shape in shapes])
+    nearest = distance.argmin(axis=0)
+    found = np.empty((len(points), points.shape[1] + 2))
+    found[:, -2] = distance[nearest, np.arange(len(points))]
+    for number in np.unique(nearest):
+        own = nearest == number
+        found[own, :-2] = outward_normal(shapes[number], points[own], 1e-4 * spacing)
+        found[own, -1] = min(shapes[number].friction, MOST_FRICTION)
+    return torch.from_numpy(found).to(pos.device)
+
+
+def corners_near_edges(
+    pos: Float64[Tensor, "node 2"],
+    rest_pos: Float64[Tensor, "node 2"],
+    cells: Int64[Tensor, "cell corner"],
+    boundary: Boundary,
+    spacing: float,
+    radius: float,
+    periodicity: Periodicity,
+) -> tuple[Int64[Tensor, "pair 2"], Float64[Tensor, "pair 3"]]:
+    """Return the pairs of a convex corner of an obstacle and an edge on the surface of a body, in 2D, whose distance is below ``radius``.
+
+    Args:
+        pos: positions of the nodes of bodies [m].
+        rest_pos: their positions at rest [m].
+        cells: their cells, all in one sense.
+        boundary: boundary nodes.
+        spacing: rest spacing [m].
+        radius: largest distance of a corner from the middle of an edge [m].
+        periodicity: axes along which distances take the shortest way.
+
+    Returns:
+        Nodes at the ends of each edge, the body on the left; and for each pair the way from the first node to the corner [m], and the friction of the corner.
+    """
+    edges, corner = surface_edges(cells.cpu().numpy()), convex_corners(boundary, spacing)
+    if not len(edges) or not len(corner):
+        return torch.empty(0, 2, dtype=torch.int64, device=pos.device), pos.new_empty(0, 3)
+    a, b, c = rest_pos[cells[0, :3]]
+    if (b - a)[0] * (c - b)[1] < (b - a)[1] * (c - b)[0]:  # clockwise: the cells of a mirror image
+        edges = edges[:, ::-1]
+    where, point = as_numpy(pos), as_numpy(boundary.pos)[corner]
+    middle = where[edges[:, 0]] + 0.5 * periodicity.shortest(where[edges[:, 1]] - where[edges[:, 0]])
+    edge, which = np.nonzero((periodicity.shortest(middle[:, None] - point[None]) ** 2).sum(axis=2) < radius**2)
+    ends = edges[edge]
+    way = periodicity.shortest(point[which] - where[ends[:, 0]])
+    friction = np.minimum(as_numpy(boundary.friction)[corner[which]], MOST_FRICTION)
+    values = np.concatenate([way, friction[:, None]], axis=1)
+    return torch.from_numpy(np.ascontiguousarray(ends)).to(pos.device), torch.from_numpy(values).to(pos)
+
+
+def convex_corners(boundary: Boundary, spacing: float) -> np.ndarray:
+    """Return the rows of boundary nodes in 2D that are convex corners. The result is kept, as the positions of a ``Boundary`` never change."""
+    kept: dict[float, np.ndarray] = boundary.__dict__.setdefault("_corners", {})  # not a field, so neither compared nor stored
+    if spacing not in kept:
+        kept[spacing] = _convex_corners(as_numpy(boundary.pos), as_numpy(boundary.normal).astype(np.float64), spacing)
+    return kept[spacing]
+
+
+def _convex_corners(pos: np.ndarray, normal: np.ndarray, spacing: float) -> np.ndarray:
+    from scipy.spatial import cKDTree
+
+    if not len(pos):
+        return np.empty(0, dtype=np.int64)
+    pairs = cKDTree(pos).query_pairs(1.5 * spacing, output_type="ndarray")
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    way = pos[both[:, 1]] - pos[both[:, 0]]
+    distance = np.linalg.norm(way, axis=1)
+    apart = distance > 1e-6 * spacing  # walls share the nodes of their corners
+    total = np.zeros_like(pos)
+    np.add.at(total, both[apart, 0], way[apart] / distance[apart, None])
+    mean = total / np.maximum(np.bincount(both[apart, 0], minlength=len(pos)), 1)[:, None]
+    is_convex = (mean * normal).sum(axis=1) < 0  # the neighbours are on the side of the solid
+    return np.flatnonzero((np.linalg.norm(mean, axis=1) > BLUNTEST) & is_convex)
+
+
+@lru_cache(maxsize=64)
+def _surface_edges(data: bytes, num_corners: int) -> np.ndarray:
+    cells = np.frombuffer(data, dtype=np.int64).reshape(-1, num_corners)
+    edges = np.concatenate([np.stack([cells[:, k], cells[:, (k + 1) % num_corners]], axis=1) for k in range(num_corners)])
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    _, first, times = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
+    return edges[np.sort(first[times == 1])]
+
+
+def surface_edges(cells: np.ndarray) -> np.ndarray:
+    """Return the edges that belong to one plane cell [edge, 2], in the order of its corners. The result for the same cells is kept."""
+    cells = np.ascontiguousarray(cells, dtype=np.int64)
+    return _surface_edges(cells.tobytes(), cells.shape[1]) if len(cells) else np.empty((0, 2), dtype=np.int64)

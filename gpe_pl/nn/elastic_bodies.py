@@ -1,0 +1,139 @@
+"""Elastic bodies of a graph: their cells and the walls beside them move the nodes through the whole frame (see ``nn.elastic_motion``).
+
+The network learns the constants of the cells as functions of the material parameters, a factor of the friction, and the distance at which walls act. What it
+predicts besides, such as contact between bodies, acts as a constant acceleration.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, cast
+
+import torch
+from torch import Tensor, nn
+from torch_geometric.data import HeteroData
+
+from gpe_pl.errors import GpeError
+from gpe_pl.nn.elastic_motion import Cells, Constants, Corners, Walls, cauchy_stress, elastic_motion
+
+
+class CellError(GpeError, ValueError):
+    """Raised when bodies should be elastic but the graphs do not contain their cells, or cells that the law is not for."""
+
+
+class Moved(NamedTuple):
+    """Motion of all materials over a frame.
+
+    Attributes:
+        acceleration: accelerations without gravity, in the unit of accelerations, per material [node, dim].
+        frame_velocity: velocities at the end of the frame [m/frame], of materials with cells [node, dim].
+        stress: Cauchy stress at the end of the frame, in the unit of stresses, of materials with cells [node, component]; empty if not wanted.
+    """
+
+    acceleration: dict[str, Tensor]
+    frame_velocity: dict[str, Tensor]
+    stress: dict[str, Tensor]
+
+
+class ElasticBodies(nn.Module):
+    """Moves the nodes of bodies by their cells.
+
+    Graphs need ``GraphConfig.cells``. Join them with ``graphs.batching.batched``, which renumbers cells.
+
+    Args:
+        param_channels: number of parameters per material with cells; 0 leaves the parameters out.
+        dim: dimension of space.
+    """
+
+    acceleration_unit: Tensor
+    spacing: Tensor
+    stress_unit: Tensor
+
+    def __init__(self, param_channels: dict[str, int], dim: int) -> None:
+        super().__init__()
+        self.dim = dim
+        self.constants = nn.ModuleDict({m: Constants(count) for m, count in param_channels.items()})
+        self.log_friction = nn.ParameterDict({m: torch.zeros(()) for m in param_channels})
+        self.wall_distance = nn.ParameterDict({m: torch.zeros(()) for m in param_channels})
+        self.register_buffer("acceleration_unit", torch.ones((), dtype=torch.float64))
+        self.register_buffer("spacing", torch.ones((), dtype=torch.float64))
+        self.register_buffer("stress_unit", torch.ones((), dtype=torch.float64))
+
+    def set_units(self, acceleration: float, spacing: float, stress: float) -> None:
+        """Set the units of a data set.
+
+        Args:
+            acceleration: unit of accelerations [m/frame²].
+            spacing: rest spacing of nodes [m].
+            stress: unit of stresses, in mean masses per m^(dim − 2) and frame².
+        """
+        self.acceleration_unit.fill_(acceleration)
+        self.spacing.fill_(spacing)
+        self.stress_unit.fill_(stress)
+
+    def forward(
+        self, data: HeteroData, acceleration: dict[str, Tensor], params: dict[str, Tensor], mass: dict[str, Tensor], with_stress: bool
+    ) -> Moved:
+        """Return how nodes move over the frame.
+
+        Args:
+            data: graph.
+            acceleration: accelerations without gravity by all but cells and walls, per material [node, dim], in the unit of accelerations.
+            params: standardised material parameters [node, param].
+            mass: masses in units of their mean [node].
+            with_stress: also compute the stress at the end of the frame.
+
+        Raises:
+            CellError: PyTorch Geometric joined the graphs, or scenes of one material have different kinds of cells.
+        """
+        moved = Moved({**acceleration}, {}, {})
+        for m in self.constants:
+            if m in acceleration:  # also without cells, so that a scene moves alike alone and in a batch
+                own = self._moved(m, data, acceleration[m], params.get(m), mass[m], with_stress)
+                for values, value in zip(moved, own, strict=True):
+                    if value is not None:
+                        values[m] = value
+        return moved
+
+    def _moved(
+        self, m: str, data: HeteroData, acceleration: Tensor, params: Tensor | None, mass: Tensor, with_stress: bool
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
+        store, unit = data[m], self.acceleration_unit
+        if "ptr" in store:
+            raise CellError("PyTorch Geometric's Batch does not renumber cells; join graphs with gpe_pl.graphs.batching.batched")
+        scene = store.batch if "batch" in store else None
+        mean, velocity = store.velocity.double().split(self.dim, dim=1)
+        gravity = (data.gravity if scene is None else data.gravity[scene]).double()
+        nodes = _without_padding(store.cell_index, self.dim, m)
+        cells = Cells.of(nodes, store.rest_pos, mass, scene)
+        own = store.body_pos.new_empty(len(mass), 0) if params is None else params.to(store.body_pos.dtype)
+        # masses are in units of their mean, and the rest volume of a node is about spacing^dim
+        modulus = self.spacing ** (2 - self.dim)
+        lam, mu, eta = ((value * modulus)[nodes].mean(dim=1) for value in cast(Constants, self.constants[m])(own))
+        normal, gap, friction = store.wall.split([self.dim, 1, 1], dim=1)
+        walls = Walls(normal, gap[:, 0] - self.wall_distance[m] * self.spacing, friction[:, 0] * self.log_friction[m].exp())
+        ends = store.corner_index
+        corners = Corners(
+            ends,
+            store.body_pos.double()[ends[:, 0]] + store.corner[:, : self.dim],
+            store.corner[:, self.dim] * self.log_friction[m].detach().exp(),
+        )
+        way, at_end = elastic_motion(store.body_pos, velocity, acceleration * unit + gravity, mass, (lam, mu, eta), cells, walls, corners)
+        stress = None
+        if with_stress:
+            stress = (cauchy_stress(store.body_pos + way, (lam, mu, eta), cells) / self.stress_unit).to(acceleration.dtype)
+        return ((way - mean - gravity) / unit).to(acceleration.dtype), at_end, stress
+
+
+def _without_padding(cells: Tensor, dim: int, material: str) -> Tensor:
+    """Return simplices [cell, dim + 1] whose last corner was repeated, or other cells as they are.
+
+    Raises:
+        CellError: some of the cells are simplices.
+    """
+    is_simplex = (cells[:, dim : dim + 1] == cells[:, dim + 1 :]).all(dim=1)
+    if bool(is_simplex.all()):
+        return cells[:, : dim + 1]
+    if bool(is_simplex.any()):
+        kinds = "triangles and quadrilaterals" if dim == 2 else "tetrahedra and hexahedra"
+        raise CellError(f"{material}: model.elastic=true needs cells of one kind, these scenes have {kinds}; choose model.elastic=false")
+    return cells

@@ -1,0 +1,373 @@
+"""Motion of elastic bodies over a whole frame, with a constitutive law whose constants a network learns.
+
+Elastic waves cross several cells within a frame, so forces at the start of a frame say little about the motion over it. Here the nodes of bodies move through a
+frame in leapfrog substeps::
+
+    y'' = f + Σ forces of cells / m,   y(0) = x(t),   y'(0) = velocity at the frame
+
+f are the accelerations that the network predicts, constant over the frame, such as those of contacts with other bodies. Cells are neo-Hookean with a viscous
+stress, as in ``solvers.fem.elements`` (Bonet & Wood 2008, section 6.4.3)::
+
+    P = μ F + (λ log J − μ)/J cof F + η F (Fᵀ Ḟ + Ḟᵀ F)
+
+A node that would enter the plane of its nearest wall loses just enough normal velocity to arrive on it. Coulomb friction takes tangential velocity. Forces of
+cells change neither the linear nor the angular momentum of a body.
+
+Units: time in frames, length in m, and λ, μ and η in the unit in which masses divided by rest volumes are given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int64
+from torch import Tensor, nn
+
+from gpe_pl.nn.elastic_kernels import DEEPEST, LOG_SMALLEST, move_forward, pull_back
+from gpe_pl.nn.fused import works_on
+from gpe_pl.trajectory.strain import SMALLEST_RATIO, shape_gradients
+
+MAX_SUBSTEPS = 96
+"""Largest number of substeps in a frame. Cells that need more are softened."""
+STABLE = 0.7
+"""Length of a substep as a fraction of the largest one that is proven to be stable at the start of the frame. Cells may stiffen within the frame."""
+LOGARITHM_SCALE = 5.0
+"""Factor by which logarithms of constants follow their weights, so that training finds them within some hundred steps."""
+FIRST_GUESS = (10.0, 10.0, 0.1)
+"""λ, μ and η before training, in units of density × (spacing/frame)²: waves cross a few cells in a frame."""
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Cells of the bodies of several scenes at rest, in double precision.
+
+    Attributes:
+        nodes: nodes of the corners [cell, corner].
+        gradient: gradients of the shape functions at the quadrature points [cell, point, corner, dim] in 1/m.
+        volume: rest volumes of these points [cell, point].
+        rate: bound of the squared frequency of each cell per modulus [cell].
+        scene: scene of each cell [cell].
+        node_start: first node of each scene, and the number of nodes [scene + 1].
+    """
+
+    nodes: Int64[Tensor, "cell corner"]
+    gradient: Float[Tensor, "cell point corner dim"]
+    volume: Float[Tensor, "cell point"]
+    rate: Float[Tensor, " cell"]
+    scene: Int64[Tensor, " cell"]
+    node_start: Int64[Tensor, " _"]
+
+    @classmethod
+    def of(
+        cls,
+        nodes: Int64[Tensor, "cell corner"],
+        rest_pos: Float[Tensor, "node dim"],
+        mass: Float[Tensor, " node"],
+        scene: Int64[Tensor, " node"] | None,
+    ) -> Cells:
+        """Return cells of one kind at rest.
+
+        Args:
+            nodes: nodes of the corners, scene by scene.
+            rest_pos: positions at rest [m].
+            mass: masses of the nodes.
+            scene: scene of each node, in ascending order; None stands for one scene.
+        """
+        device = rest_pos.device
+        corners = rest_pos.detach().double().cpu().numpy()[nodes.cpu().numpy()]
+        gradient, volume = (torch.from_numpy(a).to(device) for a in shape_gradients(corners))
+        volume = volume.abs()  # cells of a mirror image are numbered the other way round
+        whole = volume.sum(dim=1)
+        around = mass.new_zeros(len(mass), dtype=torch.float64).index_add_(0, nodes.flatten(), whole.repeat_interleave(nodes.shape[1]))
+        own_mass = mass.detach().double()[nodes] * whole[:, None] / around[nodes]
+        rate = (volume[:, :, None] * gradient.square().sum(dim=3)).sum(dim=1).div(own_mass).sum(dim=1)
+        of_node = torch.zeros(len(mass), dtype=torch.int64, device=device) if scene is None else scene
+        sizes = torch.bincount(of_node, minlength=1)
+        start = torch.cat([sizes.new_zeros(1), torch.cumsum(sizes, dim=0)])
+        return cls(nodes, gradient, volume, rate, of_node[nodes[:, 0]], start)
+
+    @property
+    def num_scenes(self) -> int:
+        return self.node_start.shape[0] - 1
+
+    def substeps(self, pos: Tensor, law: Law) -> tuple[Int64[Tensor, " scene"], Float[Tensor, " cell"]]:
+        """Return the number of substeps of each scene, and how many times more than the largest number a cell needs, 1 if that number suffices.
+
+        A substep h is stable while h² ω² + 2 h Γ ≤ 4, with ω the highest frequency and Γ the highest damping rate.
+        """
+        lam, mu, eta = (t.detach()[:, None] for t in law)
+        corner = pos.detach()[self.nodes]
+        f = torch.einsum("cai,cqaj->cqij", corner - corner[:, :1], self.gradient)
+        ratio = torch.linalg.det(f).clamp(min=SMALLEST_RATIO)
+        first = (lam * ratio.log() - mu) / ratio
+        second = (lam / ratio - first) / ratio
+        square = f.square().sum(dim=(2, 3)) / f.shape[-1]
+        stiffness = mu + torch.maximum(first.abs() * square.sqrt(), second * square ** (f.shape[-1] - 1) + first.abs())
+        frequency = stiffness.amax(dim=1).clamp(min=0.0) * self.rate
+        damping = (2.0 * eta * square * f.shape[-1]).amax(dim=1) * self.rate
+        needed = 0.25 * (damping + (damping.square() + 4.0 * frequency).sqrt()) / STABLE
+        largest = needed.new_zeros(self.num_scenes).scatter_reduce_(0, self.scene, needed.clamp(max=MAX_SUBSTEPS), "amax")
+        return (largest - 1e-9).ceil().long().clamp(min=1), (needed / MAX_SUBSTEPS).clamp(1.0, 1e15)
+
+
+Law = tuple[Tensor, Tensor, Tensor]
+"""λ, μ and η of each cell [cell]."""
+
+
+@dataclass(frozen=True)
+class Walls:
+    """The nearest wall of each node, as a plane that the node does not enter.
+
+    Attributes:
+        normal: outward normals [node, dim]; zero where no wall is near.
+        gap: distances of the nodes from their planes [node] in m.
+        friction: Coulomb coefficients [node].
+    """
+
+    normal: Float[Tensor, "node dim"]
+    gap: Float[Tensor, " node"]
+    friction: Float[Tensor, " node"]
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Convex corners of obstacles near edges of bodies in 2D, as pairs of a corner and an edge in the order of the scenes.
+
+    Attributes:
+        nodes: ends of the edge [pair, 2]; the body is on its left.
+        point: position of the corner [pair, 2] in m.
+        friction: Coulomb coefficient [pair].
+    """
+
+    nodes: Int64[Tensor, "pair 2"]
+    point: Float[Tensor, "pair dim"]
+    friction: Float[Tensor, " pair"]
+
+
+def elastic_motion(
+    pos: Float[Tensor, "node dim"],
+    vel: Float[Tensor, "node dim"],
+    forcing: Float[Tensor, "node dim"],
+    mass: Float[Tensor, " node"],
+    law: Law,
+    cells: Cells,
+    walls: Walls,
+    corners: Corners | None = None,
+) -> tuple[Float[Tensor, "node dim"], Float[Tensor, "node dim"]]:
+    """Return the displacement [m] over the frame and the velocity [m/frame] at its end, in double precision.
+
+    Args:
+        pos: positions at the start [m].
+        vel: velocities at the start [m/frame].
+        forcing: accelerations by everything but cells and walls [m/frame²].
+        mass: masses of the nodes.
+        law: constants of each cell.
+        cells: the cells.
+        walls: planes that nodes do not enter.
+        corners: points that do not pass edges of bodies; None stands for none. Derivatives take the place of their contact on the edge as constant.
+    """
+    if corners is None:
+        corners = Corners(cells.nodes.new_empty(0, 2), pos.new_empty(0, pos.shape[1]), pos.new_empty(0))
+    law = (law[0].double(), law[1].double(), law[2].double())
+    number, excess = cells.substeps(pos.double(), law)
+    factor = 1.0 / excess
+    softened = (law[0] * factor**2, law[1] * factor**2, law[2] * factor)
+    gap = walls.gap.clamp(min=0.0)  # a node behind a plane is not pushed out at once
+    values = [t.double() for t in (pos, vel, forcing, mass, *softened, walls.normal, gap, walls.friction, corners.point, corners.friction)]
+    if works_on(*values):
+        return _Motion.apply(*values, corners.nodes, cells, number)
+    return plain_motion(*values, corners.nodes, cells, number)  # type: ignore[call-arg,arg-type]
+
+
+def plain_motion(
+    pos: Tensor,
+    vel: Tensor,
+    forcing: Tensor,
+    mass: Tensor,
+    lam: Tensor,
+    mu: Tensor,
+    eta: Tensor,
+    normal: Tensor,
+    gap: Tensor,
+    friction: Tensor,
+    point: Tensor,
+    point_friction: Tensor,
+    pair: Tensor,
+    cells: Cells,
+    number: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Return the results of ``elastic_motion`` by PyTorch's operations. Scenes with fewer substeps than others stop earlier."""
+    own = number.repeat_interleave(cells.node_start.diff())
+    step = (1.0 / own.double())[:, None]
+    y, velocity = pos, vel
+    for k in range(int(own.max()) + 1 if len(own) else 0):
+        total = forcing + _internal(y, velocity, (lam, mu, eta), cells) / mass[:, None]
+        half = torch.where(torch.logical_or(own == k, torch.full_like(own, k == 0, dtype=torch.bool)), 0.5, 1.0)[:, None]
+        pushed = velocity + half * step * total
+        moves = (own > k)[:, None]
+        stopped = _stopped(pushed, y - pos, normal, gap, friction, step[:, 0])
+        stopped = _stopped_by_corners(stopped, y, mass, point, point_friction, pair, step[:, 0])
+        velocity = torch.where(moves, stopped, torch.where((own == k)[:, None], pushed, velocity))
+        y = torch.where(moves, y + step * velocity, y)
+    return y - pos, velocity
+
+
+def _stopped(velocity: Tensor, moved: Tensor, normal: Tensor, gap: Tensor, friction: Tensor, step: Tensor) -> Tensor:
+    """Return velocities after contact."""
+    along = (velocity * normal).sum(dim=1)
+    distance = gap + (moved * normal).sum(dim=1)
+    hits = (distance + step * along < 0) & (normal != 0).any(dim=1)
+    change = -distance / step - along
+    tangential = velocity - along[:, None] * normal
+    speed = tangential.square().sum(dim=1)
+    slips = speed > (friction * change).square()
+    left = torch.where(slips, 1.0 - friction * change / torch.where(slips, speed, 1.0).sqrt(), 0.0)
+    return torch.where(hits[:, None], (-distance / step)[:, None] * normal + left[:, None] * tangential, velocity)
+
+
+def _stopped_by_corners(velocity: Tensor, y: Tensor, mass: Tensor, point: Tensor, friction: Tensor, pair: Tensor, step: Tensor) -> Tensor:
+    """Return velocities after contact of corners with edges, one pair after the other."""
+    for (a, b), p, mu in zip(pair.tolist(), point, friction.tolist(), strict=True):
+        with torch.no_grad():
+            contact = _corner_contact(y[a], y[b], velocity[a], velocity[b], p, mu, 1.0 / mass[a], 1.0 / mass[b], step[a])
+        if contact is None:
+            continue
+        n, place, height, stop, of_a, of_b = contact
+        here = (1 - place) * velocity[a] + place * velocity[b]
+        change = (here @ n - height / step[a]) * n + stop * (here - (here @ n) * n)
+        velocity = velocity.index_add(0, torch.tensor([a, b]), -torch.stack([of_a * change, of_b * change]))
+    return velocity
+
+
+def _corner_contact(
+    xa: Tensor, xb: Tensor, va: Tensor, vb: Tensor, p: Tensor, mu: float, wa: Tensor, wb: Tensor, step: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor] | None:
+    """Return normal, place on the edge, height, fraction of tangential velocity that stops, and factors of the ends; None without contact."""
+    d = xb - xa
+    square = d @ d
+    place = (p - xa) @ d / square
+    n = torch.stack([d[1], -d[0]]) / square.sqrt()
+    height, here = (p - xa) @ n, (1 - place) * va + place * vb
+    if not (0 <= place <= 1 and height > -DEEPEST * square.sqrt()):
+        return None
+    height = height.clamp(min=0.0)
+    excess = here @ n - height / step
+    if not excess > 0:
+        return None
+    inverse = (1 - place) ** 2 * wa + place**2 * wb
+    tangential = (here - (here @ n) * n).norm()
+    stop = (mu * excess / tangential.clamp(min=1e-300)).clamp(max=1.0)
+    return n, place, height, stop, (1 - place) * wa / inverse, place * wb / inverse
+
+
+def _internal(y: Tensor, velocity: Tensor, law: Law, cells: Cells) -> Tensor:
+    """Return the forces of the cells on their nodes."""
+    lam, mu, eta = (t[:, None] for t in law)
+    corner, speed = y[cells.nodes], velocity[cells.nodes]
+    f = torch.einsum("cai,cqaj->cqij", corner - corner[:, :1], cells.gradient)
+    d = torch.einsum("cai,cqaj->cqij", speed - speed[:, :1], cells.gradient)
+    ratio, cofactor = torch.linalg.det(f), _cofactor(f)
+    safe = ratio.clamp(min=SMALLEST_RATIO)
+    first = torch.where(
+        ratio > SMALLEST_RATIO,
+        (lam * safe.log() - mu) / safe,
+        (lam * (LOG_SMALLEST + (ratio - SMALLEST_RATIO) / SMALLEST_RATIO) - mu) / SMALLEST_RATIO,
+    )
+    viscous = f @ (f.mT @ d + d.mT @ f)
+    stress = mu[:, :, None, None] * f + first[:, :, None, None] * cofactor + eta[:, :, None, None] * viscous
+    force = -torch.einsum("cqij,cqaj,cq->cai", stress, cells.gradient, cells.volume)
+    return torch.zeros_like(y).index_add(0, cells.nodes.flatten(), force.flatten(0, 1))
+
+
+def cauchy_stress(pos: Float[Tensor, "node dim"], law: Law, cells: Cells) -> Float[Tensor, "node component"]:
+    """Return the elastic Cauchy stress at nodes, the mean over the cells around a node by rest volume; zero at nodes without a cell.
+
+    Components are in the order of ``schema.STRESS_COMPONENTS``, in the unit of λ and μ. Where J is below ``SMALLEST_RATIO``, the stress is relative to that
+    fraction of the rest volume, as in ``solvers.fem.elements``.
+
+    Args:
+        pos: positions [m].
+        law: constants of each cell; η is not used.
+        cells: the cells.
+    """
+    lam, mu = (t.double()[:, None] for t in law[:2])
+    corner = pos.double()[cells.nodes]
+    f = torch.einsum("cai,cqaj->cqij", corner - corner[:, :1], cells.gradient)
+    ratio = torch.linalg.det(f)
+    safe = ratio.clamp(min=SMALLEST_RATIO)
+    volumetric = torch.where(
+        ratio > SMALLEST_RATIO,
+        lam * safe.log() - mu,
+        (lam * (LOG_SMALLEST + (ratio - SMALLEST_RATIO) / SMALLEST_RATIO) - mu) * ratio / SMALLEST_RATIO,
+    )
+    left = f @ f.mT
+    if f.shape[-1] == 2:  # plane strain: the third stretch is 1
+        left = torch.nn.functional.pad(left, (0, 1, 0, 1)) + torch.diag(left.new_tensor([0.0, 0.0, 1.0]))
+    whole = (mu[:, :, None, None] * left + volumetric[:, :, None, None] * torch.eye(3, dtype=f.dtype, device=f.device)) / safe[
+        :, :, None, None
+    ]
+    rows, columns = ([0, 0, 1, 2], [0, 1, 1, 2]) if f.shape[-1] == 2 else ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+    weighted = (cells.volume[:, :, None] * whole[:, :, rows, columns]).sum(dim=1)
+    where, count = cells.nodes.flatten(), cells.nodes.shape[1]
+    total = weighted.new_zeros(len(pos), len(rows)).index_add(0, where, weighted.repeat_interleave(count, dim=0))
+    volume = weighted.new_zeros(len(pos)).index_add(0, where, cells.volume.sum(dim=1).repeat_interleave(count))
+    return total / volume.clamp(min=torch.finfo(volume.dtype).tiny)[:, None]
+
+
+def _cofactor(f: Tensor) -> Tensor:
+    if f.shape[-1] == 2:
+        return torch.stack([torch.stack([f[..., 1, 1], -f[..., 1, 0]], -1), torch.stack([-f[..., 0, 1], f[..., 0, 0]], -1)], -2)
+    x, y, z = f.unbind(-2)
+    return torch.stack([torch.linalg.cross(y, z), torch.linalg.cross(z, x), torch.linalg.cross(x, y)], -2)
+
+
+class _Motion(torch.autograd.Function):
+    """``plain_motion`` in one compiled pass, forward and backward."""
+
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:
+        *values, pair, cells, number = inputs
+        values = [t.detach().contiguous() for t in values]
+        pos, arrays, scene = values[0], [t.numpy() for t in values], cells.scene.numpy()
+        nodes = np.ascontiguousarray(cells.nodes.numpy())
+        cell_start = np.searchsorted(scene, np.arange(cells.num_scenes + 1))
+        node_start, most = cells.node_start.numpy(), int(number.max())
+        path, speed_path, pushed = np.empty((most + 1, *pos.shape)), np.empty((most + 1, *pos.shape)), np.empty((most, *pos.shape))
+        pairs = np.ascontiguousarray(pair.numpy())
+        pair_start = np.searchsorted(np.searchsorted(node_start, pairs[:, 0], side="right") - 1, np.arange(cells.num_scenes + 1))
+        geometry = (pairs, nodes, cells.gradient.numpy(), cells.volume.numpy(), cell_start, node_start, pair_start, number.numpy())
+        contacts = np.zeros((most, len(pairs), 6))
+        last_vel = np.empty_like(arrays[0])
+        move_forward(*arrays, *geometry, path, speed_path, pushed, contacts, last_vel)
+        ctx.save_for_backward(*values)
+        ctx.geometry, ctx.paths = geometry, (path, speed_path, pushed, contacts)
+        last = np.repeat(number.numpy(), np.diff(node_start))
+        return torch.from_numpy(path[last, np.arange(len(pos))] - path[0]), torch.from_numpy(last_vel)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor, grad_last: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        pos, vel, forcing, mass, lam, mu, eta, normal, gap, friction, *_ = (t.numpy() for t in ctx.saved_tensors)
+        found = [np.zeros_like(a) for a in (pos, vel, forcing, lam, mu, eta, gap, friction)]
+        constants = (mass, lam, mu, eta, normal, gap, friction)
+        pull_back(grad.contiguous().numpy(), grad_last.contiguous().numpy(), *ctx.paths, *constants, *ctx.geometry, *found)
+        pos, vel, forcing, lam, mu, eta, gap, friction = (torch.from_numpy(g) for g in found)
+        return pos, vel, forcing, None, lam, mu, eta, None, gap, friction, None, None, None, None, None
+
+
+class Constants(nn.Module):
+    """Learned constants λ, μ and η of a material. Their logarithms are affine in the standardised material parameters."""
+
+    def __init__(self, param_channels: int) -> None:
+        super().__init__()
+        self.logarithm = nn.ParameterDict(  # nn.Linear warns if there are no parameters
+            {"weight": torch.zeros(3, param_channels), "bias": torch.tensor(FIRST_GUESS).log() / LOGARITHM_SCALE}
+        )
+
+    def forward(self, params: Float[Tensor, "node param"]) -> tuple[Float[Tensor, " node"], Float[Tensor, " node"], Float[Tensor, " node"]]:
+        """Return λ, μ and η, each from e⁻²⁰ to e²⁰."""
+        logarithm = nn.functional.linear(params, self.logarithm["weight"], self.logarithm["bias"])
+        lam, mu, eta = (LOGARITHM_SCALE * logarithm).clamp(-20.0, 20.0).exp().unbind(dim=1)
+        return lam, mu, eta

@@ -1,0 +1,278 @@
+"""Elastic bodies in a model: batches, symmetries, what a rollout carries along, checkpoints, and clear refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch_geometric.data import Batch
+
+from gpe_pl.export.program import export_model
+from gpe_pl.geometry.shape_values import moved as moved_shape
+from gpe_pl.graphs.builder import GraphBuilder, GraphError
+from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.learned.approximate import Repeating, Sleeping
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.models.gpe import GPE
+from gpe_pl.nn.elastic_bodies import CellError
+from gpe_pl.rollout.containment import contain
+from gpe_pl.rollout.skips import Skips
+from gpe_pl.schema import node_code
+from gpe_pl.training.push_forward import MOVED, _moved
+from gpe_pl.trajectory.reflection import Reflection
+from gpe_pl.trajectory.state import State
+from tests import scenes
+
+BODIES = ("elastomer",)
+MIXED = ("sand", "elastomer")
+DT, ACCELERATION = 0.005, 200.0
+
+
+def simulator(
+    materials: tuple[str, ...] = BODIES, dim: int = 2, periodic: tuple[bool, ...] = (), network: float = 0.1, **settings: Any
+) -> LearnedSimulator:
+    """A simulator with random weights. ``network`` is the size of the weights that training starts at zero."""
+    build = scenes.builder(materials, dim, mesh=True, cells=True)
+    build = GraphBuilder(build.config, replace(build.metadata, periodic=periodic))
+    torch.manual_seed(0)
+    settings = {"num_message_passing_steps": 2, "hidden_channels": 8, "elastic": True, **settings}
+    made = LearnedSimulator(GPE(build.spec, **settings), build).eval()
+    with torch.no_grad():
+        for name, p in made.model.named_parameters():
+            if not p.any() and "elastic" not in name:
+                p.normal_(std=network)
+            if name.endswith("logarithm.weight"):
+                p.fill_(0.01)
+    made.acceleration_std.fill_(ACCELERATION)
+    made.model.set_units(ACCELERATION * DT**2, scenes.SPACING, 1.0)
+    return made
+
+
+def bodies(seed: int = 0, kind: str = "triangles", materials: tuple[str, ...] = BODIES, **settings: Any) -> State:
+    state = scenes.mesh_state(kind, materials, seed=seed, **settings).to_torch()
+    return replace(state, vel=0.3 * state.vel, velocity_history=0.3 * state.vel[:, None], frame_velocity=0.4 * state.vel)
+
+
+def step(simulated: LearnedSimulator, state: State) -> tuple[Tensor, Tensor]:
+    """Positions after a step, and velocities at its end."""
+    after = simulated.step(state)
+    assert after.frame_velocity is not None
+    return after.pos, after.frame_velocity
+
+
+def assert_close(found: tuple[Tensor, Tensor], expected: tuple[Tensor, Tensor], atol: float = 1e-5) -> None:
+    """Features have single precision, so results agree to some 1e-6 of a spacing."""
+    torch.testing.assert_close(found[0], expected[0], rtol=0, atol=atol * scenes.SPACING)
+    torch.testing.assert_close(found[1], expected[1], rtol=0, atol=atol * scenes.SPACING / DT)
+
+
+@pytest.mark.parametrize("kind", ["triangles", "lattice", "tetrahedra"])
+def test_scenes_of_a_batch_move_as_alone(kind: str) -> None:
+    simulated = simulator(dim=3 if kind == "tetrahedra" else 2)
+    states = [bodies(seed, kind, num_bodies=count) for seed, count in ((0, 1), (1, 2), (2, 1))]
+    for state, after in zip(states, simulated.step_all(states), strict=True):
+        assert isinstance(after, State) and after.frame_velocity is not None
+        assert_close((after.pos, after.frame_velocity), step(simulated, state))
+    assert not torch.allclose(simulated.step(states[0]).pos, states[0].pos + DT * states[0].vel, atol=1e-3 * scenes.SPACING)
+
+
+def test_scenes_with_and_without_cells_move_as_alone() -> None:
+    simulated = simulator(MIXED)
+    mixed, cloud = bodies(materials=MIXED), scenes.state(12, ("sand",)).to_torch()
+    cloud = replace(cloud, material_params=cloud.material_params.repeat(1, 2))
+    loose = replace(mixed, cells=None, rest_pos=None)
+    for order in ((0, 1, 2), (2, 1, 0), (1, 0, 2)):
+        states = [(mixed, cloud, loose)[k] for k in order]
+        for state, after in zip(states, simulated.step_all(states), strict=True):
+            assert isinstance(after, State)
+            torch.testing.assert_close(after.pos, simulated.step(state).pos, rtol=0, atol=1e-5 * scenes.SPACING)
+    assert simulated.step(cloud).frame_velocity is None
+
+
+def test_materials_beside_each_other_have_constants_of_their_own() -> None:
+    materials = ("elastomer", "solid")
+    simulated, state = simulator(materials), bodies(materials=materials, gap=20.0, walls=False)
+    is_solid = state.node_type == node_code("solid")
+    before = step(simulated, state)[0]
+    with torch.no_grad():
+        simulated.model.get_parameter("elastic_bodies.constants.solid.logarithm.bias").add_(0.3)
+    moved = (step(simulated, state)[0] - before).norm(dim=1)
+    assert float(moved[is_solid].min()) > 0 and not bool(moved[~is_solid].any())
+
+
+def test_relabelling_and_translation_change_nothing() -> None:
+    simulated, state = simulator(), bodies()
+    found = step(simulated, state)
+    order = torch.randperm(state.num_nodes, generator=torch.Generator().manual_seed(0))
+    assert_close(step(simulated, state.take(order)), (found[0][order], found[1][order]))
+    offset = torch.tensor([3.0, -2.0], dtype=torch.float64)
+    assert state.rest_pos is not None
+    shapes = tuple(moved_shape(shape, offset.numpy()) for shape in state.boundary.shapes)
+    boundary = replace(state.boundary, pos=state.boundary.pos + offset, shapes=shapes)
+    there = replace(state, pos=state.pos + offset, rest_pos=state.rest_pos - 0.7 * offset, boundary=boundary)
+    moved, at_end = step(simulated, there)
+    assert_close((moved - offset, at_end), found)
+
+
+def test_a_mirror_image_moves_as_the_mirror_image_without_a_network() -> None:
+    simulated, state = simulator(network=0.0), bodies()
+    mirror = Reflection.at(0, 0.4, 2)
+    moved, at_end = step(simulated, mirror.state(state, mirror.boundary(state.boundary)))
+    assert_close((mirror.point(moved), mirror.vector(at_end)), step(simulated, state))
+
+
+def test_bodies_cross_the_seam_of_a_periodic_domain() -> None:
+    simulated = simulator(periodic=(True, False))
+    state = replace(bodies(), periodicity=simulated.builder.metadata.periodicity)
+    found = step(simulated, state)
+    offset = torch.tensor([1.0 - float(state.pos[:, 0].mean()), 0.0], dtype=torch.float64)
+    boundary = replace(state.boundary, pos=state.periodicity.wrapped(state.boundary.pos + offset))
+    there = replace(state, pos=state.periodicity.wrapped(state.pos + offset), boundary=boundary)
+    assert float(there.pos[:, 0].min()) < 0.1 and float(there.pos[:, 0].max()) > 0.9
+    moved, at_end = step(simulated, there)
+    assert_close((state.periodicity.shortest(moved - found[0] - offset) + found[0], at_end), found)
+
+
+def test_the_embedding_decides_whether_the_law_reads_the_parameter() -> None:
+    state = bodies()
+    other = replace(state, material_params=1.5 * state.material_params)
+    for embedding, reads in (("affine", True), ("none", False)):
+        simulated = simulator(network=0.0, material_embedding=embedding)
+        assert torch.equal(simulated.step(state).pos, simulated.step(other).pos) != reads
+
+
+def test_the_loss_reaches_the_network_and_the_constants() -> None:
+    simulated, state = simulator().train(), bodies()
+    predicted = simulated(simulated.builder(state))
+    predicted.acceleration["elastomer"].square().sum().backward()
+    names = [name for name, p in simulated.model.named_parameters() if p.grad is not None and bool(p.grad.any())]
+    assert any("node_decoder" in name for name in names) and any("node_encoder" in name for name in names)
+    assert {"elastic_bodies.constants.elastomer.logarithm.weight", "elastic_bodies.constants.elastomer.logarithm.bias"} <= {*names}
+
+
+def test_velocity_at_the_frame_is_carried_along() -> None:
+    simulated, state = simulator(), bodies()
+    after = simulated.step(state)
+    assert after.frame_velocity is not None
+    assert not torch.allclose(after.frame_velocity, after.vel, atol=1e-3 * float(after.vel.abs().max()))
+    dropped = simulated.step(replace(after, frame_velocity=None))
+    assert not torch.allclose(simulated.step(after).pos, dropped.pos, atol=1e-4 * scenes.SPACING)
+    mean = simulated.step(replace(after, frame_velocity=after.vel))
+    assert torch.equal(mean.pos, dropped.pos)
+
+
+def test_containment_changes_the_velocity_at_the_frame() -> None:
+    state = bodies()
+    assert state.frame_velocity is not None
+    out = replace(state, pos=state.pos - torch.tensor([0.0, float(state.pos[:, 1].min()) + 0.01]))
+    contained, corrected = contain(out, DT)
+    assert bool(corrected.any()) and contained.frame_velocity is not None
+    change = contained.frame_velocity - state.frame_velocity
+    torch.testing.assert_close(change, contained.vel - out.vel)
+    assert bool(change[torch.as_tensor(corrected)].any())
+
+
+def test_static_friction_stops_the_velocity_at_the_frame() -> None:
+    simulated = simulator(network=0.0)
+    state = bodies(num_bodies=1)
+    assert state.rest_pos is not None
+    rest = state.rest_pos - state.rest_pos.amin(dim=0) + torch.tensor([0.3, 0.01])
+    still = torch.zeros_like(state.vel)
+    state = replace(state, pos=rest, rest_pos=rest, vel=still, velocity_history=still[:, None], frame_velocity=1e-3 + still)
+    simulated.static_friction = 0.9
+    after = simulated.step(state)
+    stays = (after.pos == state.pos).all(dim=1)
+    assert bool(stays.any()) and after.frame_velocity is not None and not bool(after.frame_velocity[stays].any())
+
+
+def test_sleeping_and_repeated_predictions_keep_the_velocity_at_the_frame() -> None:
+    simulated, state = simulator(), bodies()
+    simulated.skips = Skips(sleep_after=2)
+    full = simulated.step(state)
+    awake = Sleeping(simulated).step(state)
+    assert full.frame_velocity is not None and awake.frame_velocity is not None
+    torch.testing.assert_close(awake.frame_velocity, full.frame_velocity)
+    asleep = Sleeping(simulated)._combined(
+        state, full, torch.zeros(state.num_nodes, dtype=torch.bool), torch.ones(state.num_nodes, dtype=torch.bool)
+    )
+    assert asleep.frame_velocity is not None and not bool(asleep.frame_velocity.any())
+    repeated = Repeating(simulated, DT, 2)
+    first = repeated.step(state)
+    second = repeated.step(first)
+    assert first.frame_velocity is not None and second.frame_velocity is not None
+    torch.testing.assert_close(second.frame_velocity - first.frame_velocity, second.vel - first.vel)
+
+
+def test_a_checkpoint_has_the_constants_and_units(tmp_path: Path) -> None:
+    simulated, state = simulator(), bodies()
+    simulated.save(tmp_path / "elastic.ckpt")
+    again = LearnedSimulator.from_checkpoint(tmp_path / "elastic.ckpt")
+    assert torch.equal(again.step(state).pos, simulated.step(state).pos)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_an_unroll_continues_with_its_velocity_at_the_frame(known: bool) -> None:
+    """A checkpoint of another model, or an older one, has none."""
+    start = bodies()
+    after = simulator().step(start)
+    stored = {name: getattr(after, name) for name in MOVED}
+    if not known:
+        del stored["frame_velocity"]
+    again = _moved(start, stored)
+    assert torch.equal(again.pos, after.pos)
+    assert (again.frame_velocity is not None) == known
+    assert not known or torch.equal(again.frame_velocity, after.frame_velocity)  # type: ignore[arg-type]
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("materials", "config"), [(BODIES, {"mesh": True}), (("sand",), {"mesh": True, "cells": True})])
+def test_elastic_models_need_cells(materials: tuple[str, ...], config: dict[str, Any]) -> None:
+    with pytest.raises(
+        CellError, match=r"model.elastic=true needs graph.cells=true graph.mesh=true graph.islands=true and a material with cells"
+    ):
+        GPE(scenes.builder(materials, **config).spec, elastic=True)
+
+
+@pytest.mark.parametrize("config", [{"mesh": False}, {"mesh": True, "islands": False}])
+def test_cells_need_meshes_and_islands(config: dict[str, Any]) -> None:
+    with pytest.raises(GraphError, match=r"graph.cells=true needs graph.mesh=true graph.islands=true"):
+        _ = GraphBuilder(GraphConfig(cells=True, **{"islands": True, **config}), scenes.metadata(BODIES)).spec
+
+
+def test_surfaces_and_mixed_meshes_are_refused() -> None:
+    build, state = simulator().builder, bodies(kind="lattice")
+    assert state.cells is not None
+    cells = state.cells.clone()
+    cells[0, 3] = cells[0, 2]
+    with pytest.raises(GraphError, match="elastomer: graph.cells=true needs triangles or quadrilaterals, this mesh mixes them"):
+        build(replace(state, cells=cells))
+    solid = scenes.mesh_state("tetrahedra", BODIES).to_torch()
+    assert solid.cells is not None
+    with pytest.raises(GraphError, match="elastomer: graph.cells=true needs tetrahedra or hexahedra, this mesh is a surface"):
+        simulator(dim=3).builder(replace(solid, cells=solid.cells[:, :3], cell_dim=2))
+
+
+def test_scenes_with_different_cells_are_not_joined() -> None:
+    with pytest.raises(
+        CellError, match="elastomer: model.elastic=true needs cells of one kind, these scenes have triangles and quadrilaterals"
+    ):
+        simulator().step_all([bodies(), bodies(kind="lattice")])
+
+
+def test_batches_of_pyg_are_refused() -> None:
+    simulated = simulator()
+    graphs = [simulated.builder(bodies(seed)) for seed in (0, 1)]
+    with pytest.raises(CellError, match=r"join graphs with gpe_pl.graphs.batching.batched"):
+        simulated(Batch.from_data_list(graphs))
+
+
+def test_programs_have_no_cells(tmp_path: Path) -> None:
+    with pytest.raises(CellError, match=r"exported programs have no cells; export a model with model.elastic=false graph.cells=false"):
+        export_model(simulator(), tmp_path / "model.pt2")
+    assert not [*tmp_path.iterdir()]

@@ -1,0 +1,63 @@
+"""The constants of the constitutive law can be learned from frames of the solver, as functions of Young's modulus."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gpe_pl.config.datasets import dataset
+from gpe_pl.data.ground_truth import generate_trajectory
+from gpe_pl.nn.elastic_motion import Cells, Constants, Walls, elastic_motion
+from gpe_pl.solvers.fem import FEM
+from gpe_pl.trajectory.boundary import Boundary
+from gpe_pl.trajectory.strain import lame_parameters
+
+SOFT, STIFF = 1e6, 4e6
+FRAMES, STEPS = 4, 300
+
+
+@pytest.mark.slow
+def test_constants_are_recovered_at_two_moduli() -> None:
+    """Bodies that were strained by 2 % swing freely. Training begins at constants that are wrong by factors of up to 20."""
+    spec = dataset("data=fem", "size=tiny", "data.num_frames=4", "data.scene.num_cells=60")
+    assert isinstance(spec.solver, FEM)
+    truth = generate_trajectory(spec, split="train", index=0)
+    start, dt = truth.state(0), truth.metadata.frame_dt
+    assert start.cells is not None and start.rest_pos is not None
+    strain = np.array([[1.02, 0.01], [0.0, 0.99]])
+    centre = np.asarray(spec.solver.bounds).mean(axis=1)
+    start = replace(
+        start, pos=(start.rest_pos - start.rest_pos.mean(axis=0)) @ strain.T + centre, vel=0.0 * start.vel, gravity=0.0 * start.gravity
+    )
+    start = replace(start, boundary=Boundary.sample((), truth.metadata.spacing, 2), stress=None)
+    rest, nodes, mass = (torch.from_numpy(x) for x in (start.rest_pos, start.cells, start.mass))
+    cells, unit = Cells.of(nodes, rest, mass / mass.mean(), None), float(mass.mean()) / dt**2
+    walls = Walls(torch.zeros_like(rest), torch.zeros_like(mass), torch.zeros_like(mass))
+    samples: list[tuple[Tensor, ...]] = []
+    for modulus, feature in ((SOFT, -1.0), (STIFF, 1.0)):
+        state = replace(start, material_params=torch.full((len(mass), 1), modulus, dtype=torch.float64).numpy())
+        for _ in range(FRAMES):
+            after = spec.solver.step(state)
+            samples.append(tuple(torch.as_tensor(x) for x in (state.pos, dt * state.vel, after.pos - state.pos, [[feature]])))
+            state = after
+    constants = Constants(1).double()
+    optimizer = torch.optim.Adam(constants.parameters(), lr=0.02)
+    schedule = torch.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.05, STEPS)
+    for _ in range(STEPS):
+        optimizer.zero_grad()
+        loss = torch.zeros((), dtype=torch.float64)
+        for pos, vel, way, parameter in samples:
+            law = tuple(constant.expand(len(nodes)) for constant in constants(parameter.double()))
+            moved, _ = elastic_motion(pos, vel, torch.zeros_like(pos), mass / mass.mean(), law, cells, walls)  # type: ignore[arg-type]
+            loss = loss + ((moved - way).square().sum() / (way - vel).square().sum())
+        loss.backward()  # type: ignore[no-untyped-call]
+        optimizer.step()
+        schedule.step()
+    for modulus, value in ((SOFT, -1.0), (STIFF, 1.0)):
+        expected = lame_parameters(modulus, spec.solver.poisson_ratio)
+        lam, mu, _ = (float(c) * unit for c in constants(torch.tensor([[value]], dtype=torch.float64)))
+        assert (lam, mu) == pytest.approx(expected, rel=0.1)
