@@ -17,12 +17,21 @@ PACKAGE = Path(__file__).parents[1]
 
 COMPILED = (
     "schema.py",
-    "graphs/islands.py",
-    "geometry/grid_distance.py",
     "data/importers/tfrecord.py",
-    "trajectory/strain.py",
+    "geometry/compiled_distance.py",
+    "geometry/grid_distance.py",
+    "graphs/cell_lists.py",
+    "graphs/compiled_features.py",
+    "graphs/islands.py",
+    "graphs/mesh_topology.py",
+    "learned/motion.py",
+    "nn/compiled_processor.py",
+    "nn/elastic_kernels.py",
     "nn/fused*.py",
+    "rollout/guard.py",
     "solvers/**/*.py",
+    "training/parameter_passes.py",
+    "trajectory/strain.py",
 )
 """Source files of compiled functions, and of the types and constants in them."""
 NAME = "gpe_pl-compiled-"

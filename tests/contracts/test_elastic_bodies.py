@@ -95,7 +95,7 @@ def test_scenes_with_and_without_cells_move_as_alone() -> None:
 
 def test_materials_beside_each_other_have_constants_of_their_own() -> None:
     materials = ("elastomer", "solid")
-    simulated, state = simulator(materials), bodies(materials=materials, gap=20.0, walls=False)
+    simulated, state = simulator(materials), bodies(kind="lattice", materials=materials, gap=20.0, walls=False)
     is_solid = state.node_type == node_code("solid")
     before = step(simulated, state)[0]
     with torch.no_grad():
@@ -138,7 +138,7 @@ def test_bodies_cross_the_seam_of_a_periodic_domain() -> None:
 
 
 def test_the_embedding_decides_whether_the_law_reads_the_parameter() -> None:
-    state = bodies()
+    state = bodies(kind="lattice")
     other = replace(state, material_params=1.5 * state.material_params)
     for embedding, reads in (("affine", True), ("none", False)):
         simulated = simulator(network=0.0, material_embedding=embedding)
@@ -146,7 +146,7 @@ def test_the_embedding_decides_whether_the_law_reads_the_parameter() -> None:
 
 
 def test_the_loss_reaches_the_network_and_the_constants() -> None:
-    simulated, state = simulator().train(), bodies()
+    simulated, state = simulator().train(), bodies(kind="lattice")
     predicted = simulated(simulated.builder(state))
     predicted.acceleration["elastomer"].square().sum().backward()
     names = [name for name, p in simulated.model.named_parameters() if p.grad is not None and bool(p.grad.any())]
@@ -155,7 +155,7 @@ def test_the_loss_reaches_the_network_and_the_constants() -> None:
 
 
 def test_velocity_at_the_frame_is_carried_along() -> None:
-    simulated, state = simulator(), bodies()
+    simulated, state = simulator(), bodies(kind="lattice")
     after = simulated.step(state)
     assert after.frame_velocity is not None
     assert not torch.allclose(after.frame_velocity, after.vel, atol=1e-3 * float(after.vel.abs().max()))
@@ -267,7 +267,7 @@ def test_scenes_with_different_cells_are_not_joined() -> None:
 
 def test_batches_of_pyg_are_refused() -> None:
     simulated = simulator()
-    graphs = [simulated.builder(bodies(seed)) for seed in (0, 1)]
+    graphs = [simulated.builder(bodies()) for _ in range(2)]
     with pytest.raises(CellError, match=r"join graphs with gpe_pl.graphs.batching.batched"):
         simulated(Batch.from_data_list(graphs))
 

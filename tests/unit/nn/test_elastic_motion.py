@@ -235,17 +235,19 @@ def test_a_mirror_image_moves_as_the_mirror_image(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_energy_is_kept_without_viscosity_and_dissipated_with_it(kind: str) -> None:
-    left = {}
+    """Substeps change from frame to frame, so leapfrog's energy changes by up to 10 % in 200 frames."""
+    energies: dict[float, np.ndarray] = {}
     for viscosity in (0.0, 0.02):
         body = Body(kind, viscosity=viscosity)
         pos, vel = strained(body.rest)
-        before, energies = body.energy(pos, vel), []
+        found = [body.energy(pos, vel)]
         for _ in range(200):
             pos, vel = body.moved(pos, vel)
-            energies.append(body.energy(pos, vel))
-        left[viscosity] = (min(energies) / before, max(energies) / before, energies[-1] / before)
-    assert left[0.0][0] > 0.9 and left[0.0][1] < 1.15
-    assert left[0.02][2] < 0.7
+            found.append(body.energy(pos, vel))
+        energies[viscosity] = np.array(found) / found[0]
+    kept = energies[0.0]
+    assert kept.min() > 0.9 and kept.max() < 1.15
+    assert energies[0.02][-1] < 0.7
 
 
 def test_a_node_reaches_its_plane_and_does_not_pass_it() -> None:
@@ -305,11 +307,18 @@ def test_stiff_scenes_take_more_substeps() -> None:
         body = Body("quadrilaterals", stiffness)
         number, excess = body.cells.substeps(body.rest, body.law)  # type: ignore[arg-type]
         counts.append(int(number))
-        assert float(excess.max()) == 1.0
+        assert bool((excess == 1.0).all())
     assert counts[1] == pytest.approx(4 * counts[0], abs=4) and counts[2] == pytest.approx(4 * counts[1], abs=4)
     body = Body("quadrilaterals", 1e6)
     number, excess = body.cells.substeps(body.rest, body.law)  # type: ignore[arg-type]
     assert int(number) == MAX_SUBSTEPS and float(excess.max()) == pytest.approx(1000 * counts[0] / MAX_SUBSTEPS, rel=0.2)
+
+
+def test_only_cells_that_need_too_many_substeps_are_softened() -> None:
+    body = Body("triangles", 4.0)
+    body.law[1][0] *= 1e6
+    number, excess = body.cells.substeps(body.rest, body.law)  # type: ignore[arg-type]
+    assert int(number) == MAX_SUBSTEPS and float(excess[0]) > 2.0 and bool((excess[1:] == 1.0).all())
 
 
 @pytest.mark.parametrize("kind", KINDS)
