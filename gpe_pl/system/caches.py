@@ -22,6 +22,7 @@ COMPILED = (
     "geometry/grid_distance.py",
     "graphs/cell_lists.py",
     "graphs/compiled_features.py",
+    "graphs/features.py",
     "graphs/islands.py",
     "graphs/mesh_topology.py",
     "learned/motion.py",
