@@ -195,9 +195,10 @@ def move_forward(
 ):  # fmt: skip
     """Integrate all scenes, each with its own number of substeps.
 
-    Writes positions and velocities at the start of each substep to ``path`` and ``speed_path`` [substep + 1, node, dim], velocities before contact to
-    ``pushed``
-    [substep, node, dim], contacts of corners to ``contacts`` [substep, pair, 6], and the velocities at the end of the frame to ``last_vel``.
+    Rows after the last substep of a scene stay undefined. ``path`` gets the positions at the start of each substep and at the end [substep + 1, node, dim].
+    ``speed_path`` gets the first velocities, then those in the middle of each substep after contact [substep + 1, node, dim], and ``pushed`` those before
+    contact [substep, node, dim]. ``contacts`` [substep, pair, 6] gets the normal, place, stop and factors of both ends of ``_stop_at_corner``, and ``last_vel``
+    the velocities at the end of the frame.
     """
     dim = pos.shape[1]
     force = np.empty_like(pos)

@@ -56,7 +56,7 @@ class Conv(NamedTuple):
 
 
 class Update(NamedTuple):
-    """Parameters of the update of a type of nodes: Q, q, p, R and r, then weight and bias of the LayerNorm, or None."""
+    """Parameters that update the nodes of one type: Q, q, p, R and r of the module's equations, then weight and bias of the LayerNorm (None without one)."""
 
     weight: Tensor
     bias: Tensor

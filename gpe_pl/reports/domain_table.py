@@ -111,7 +111,8 @@ def report_domains(folder: Path, runs: list[Run]) -> None:
     """Write tables and figures of finished runs into a folder.
 
     Raises:
-        TableError: runs of one model and domain differ in more than their seeds, or runs of a domain have other data or another start frame than each other.
+        TableError: runs of one model and domain (data set) differ in more than the seed, or runs of one domain differ in their data, in settings of the
+            evaluation or in the start frame.
     """
     runs = distinct_runs(runs)
     if not runs:

@@ -62,7 +62,7 @@ class TrainingModule(L.LightningModule):
     Args:
         simulator: simulator with its statistics set.
         num_steps: optimiser steps of the whole run; the schedule ends there.
-        learning_rate: learning rate of Adam at the start.
+        learning_rate: highest learning rate of Adam: that at the start, or after the warm-up.
         final_learning_rate: learning rate at the end.
         schedule: ``exponential`` decays geometrically (paper: 5e-5 to 1e-6); ``cosine`` warms up and follows a half cosine (short budgets).
         warmup_steps: steps of linear warm-up in the ``cosine`` schedule.

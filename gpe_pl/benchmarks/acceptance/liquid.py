@@ -70,7 +70,7 @@ def volume_change(trajectory: Trajectory) -> float:
 
 
 def dam_break(candidate: Candidate) -> Result:
-    """Let liquid that fills one side of the vessel run to the other."""
+    """Simulate the collapse of a column of liquid at one side of the vessel. Check the way of its front, beside the solver's and over the viscosity."""
     spec = candidate.spec
     trials = [tried(candidate, value, scenes.pool(spec, value, one_side=True), FRONT_SECONDS) for value in candidate.values]
     fronts = [trial.measured(partial(front, float(scenes.middle(spec)[0]))) for trial in trials]
