@@ -87,7 +87,6 @@ def corners_near_edges(
     boundary: Boundary,
     spacing: float,
     radius: float,
-    periodicity: Periodicity,
 ) -> tuple[Int64[Tensor, "pair 2"], Float64[Tensor, "pair 3"]]:
     """Return the pairs of a convex corner of an obstacle and an edge on the surface of a body, in 2D, whose distance is below ``radius``.
 
@@ -98,7 +97,6 @@ def corners_near_edges(
         boundary: boundary nodes.
         spacing: rest spacing [m].
         radius: largest distance of a corner from the middle of an edge [m].
-        periodicity: axes along which distances take the shortest way.
 
     Returns:
         Nodes at the ends of each edge, the body on the left; and for each pair the way from the first node to the corner [m], and the friction of the corner.
@@ -110,10 +108,10 @@ def corners_near_edges(
     if (b - a)[0] * (c - b)[1] < (b - a)[1] * (c - b)[0]:  # clockwise: the cells of a mirror image
         edges = edges[:, ::-1]
     where, point = as_numpy(pos), as_numpy(boundary.pos)[corner]
-    middle = where[edges[:, 0]] + 0.5 * periodicity.shortest(where[edges[:, 1]] - where[edges[:, 0]])
-    edge, which = np.nonzero((periodicity.shortest(middle[:, None] - point[None]) ** 2).sum(axis=2) < radius**2)
+    middle = 0.5 * (where[edges[:, 0]] + where[edges[:, 1]])
+    edge, which = np.nonzero(((middle[:, None] - point[None]) ** 2).sum(axis=2) < radius**2)
     ends = edges[edge]
-    way = periodicity.shortest(point[which] - where[ends[:, 0]])
+    way = point[which] - where[ends[:, 0]]
     friction = np.minimum(as_numpy(boundary.friction)[corner[which]], MOST_FRICTION)
     values = np.concatenate([way, friction[:, None]], axis=1)
     return torch.from_numpy(np.ascontiguousarray(ends)).to(pos.device), torch.from_numpy(values).to(pos)
@@ -140,7 +138,7 @@ def _convex_corners(pos: np.ndarray, normal: np.ndarray, spacing: float) -> np.n
     total = np.zeros_like(pos)
     np.add.at(total, both[apart, 0], way[apart] / distance[apart, None])
     mean = total / np.maximum(np.bincount(both[apart, 0], minlength=len(pos)), 1)[:, None]
-    is_convex = (mean * normal).sum(axis=1) < 0  # the neighbours are on the side of the solid
+    is_convex = (mean * normal).sum(axis=1) < -0.1  # the neighbours are on the side of the solid; 0 at the end of a straight line
     return np.flatnonzero((np.linalg.norm(mean, axis=1) > BLUNTEST) & is_convex)
 
 

@@ -25,10 +25,11 @@ def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureS
         precision: precision of floating-point values.
 
     Raises:
-        GraphError: cells are surfaces or of several kinds.
+        GraphError: cells are surfaces or of several kinds, or walls move.
     """
     device, dim, boundary = state.pos.device, spec.dim, state.boundary
-    shapes = boundary.shapes if boundary.motion is None else ()
+    if boundary.motion is not None or bool((boundary.vel != 0).any()):
+        raise GraphError("graph.cells=true needs walls at rest, the walls of this scene move; choose graph.cells=false model.elastic=false")
     data.gravity = (state.gravity[None] * scales.frame_dt**2).to(precision)
     at_frame = state.vel if state.frame_velocity is None else state.frame_velocity
     mesh, islands = topology.mesh, topology.islands
@@ -36,7 +37,7 @@ def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureS
         store, rows = data[material], topology.rows[material]
         pos = state.pos[rows]
         edges = _in_state(topology.edges.get((BOUNDARY, RADIUS, material)), topology.boundary_rows)
-        store.wall = nearest_walls(pos, boundary, shapes, edges, scales.spacing, topology.periodicity).to(precision)
+        store.wall = nearest_walls(pos, boundary, boundary.shapes, edges, scales.spacing, topology.periodicity).to(precision)
         store.velocity = (torch.cat([state.vel[rows], at_frame[rows]], dim=1) * scales.frame_dt).to(precision)
         store.corner_index, store.corner = torch.empty(0, 2, dtype=torch.int64, device=device), store.velocity.new_empty(0, dim + 1)
         store.body_pos, store.rest_pos = (torch.zeros_like(pos, dtype=precision) for _ in range(2))
@@ -49,8 +50,8 @@ def add_cells(data: HeteroData, topology: Topology, state: State, spec: FeatureS
         cells = _cells(state, rows, material, dim)
         padding = cells[:, -1:].expand(-1, 2**dim - cells.shape[1])
         store.cell_index = torch.cat([cells, padding], dim=1)
-        if dim == 2:
-            pairs = corners_near_edges(pos, rest, cells, boundary, scales.spacing, scales.radius, topology.periodicity)
+        if dim == 2 and not topology.periodicity:
+            pairs = corners_near_edges(pos, rest, cells, boundary, scales.spacing, scales.radius)
             store.corner_index, store.corner = pairs[0], pairs[1].to(precision)
 
 

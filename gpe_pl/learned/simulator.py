@@ -300,7 +300,7 @@ class LearnedSimulator(nn.Module):
         self.check_scene(scene)
         state = state.to_torch(self.acceleration_std.device)
         history = state.vel[:, None].expand(-1, self.builder.config.history, -1)
-        return self._checked(replace(state, velocity_history=history.clone()), "start")
+        return self._checked(replace(state, velocity_history=history.clone(), frame_velocity=None), "start")
 
     def fits(self, scene: Metadata) -> bool:
         """Return whether a scene has the frame interval, spacing (to 1 %), dimension and material parameters of training, and only materials of training."""
@@ -324,7 +324,8 @@ class LearnedSimulator(nn.Module):
             )
 
     def _checked(self, state: State, where: str) -> State:
-        for name, values in (("pos", state.pos), ("velocity", history_of(state))):
+        at_frame = state.vel if state.frame_velocity is None else state.frame_velocity
+        for name, values in (("pos", state.pos), ("velocity", history_of(state)), ("velocity at the frame", at_frame)):
             bad = ~torch.isfinite(values).flatten(1).all(dim=1)
             if bad.any():
                 raise SceneError(

@@ -506,7 +506,12 @@ class GPE(Model):
             return False
         alike = {self.type_key(t) for t in h}, {self.key(r) for r in e}
         distinct = (len(alike[0]), len(alike[1])) == (len(h), len(e))  # else types of nodes or relations have the same weights
-        return distinct and works_on(*h.values(), *e.values()) and all(0 < f.shape[1] <= RAW and not f.requires_grad for f in e.values())
+        return (
+            distinct
+            and bool(h)
+            and works_on(*h.values(), *e.values())
+            and all(0 < f.shape[1] <= RAW and not f.requires_grad for f in e.values())
+        )
 
     def _processed_at_once(self, h: dict[str, Tensor], e: dict[EdgeType, Tensor], edges: Edges) -> dict[str, Tensor]:
         """Return the states of the nodes after all message-passing steps."""

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
 from gpe_pl.errors import GpeError
-from gpe_pl.nn.elastic_motion import Cells, Constants, Corners, Walls, cauchy_stress, elastic_motion
+from gpe_pl.nn.elastic_motion import Cells, Constants, Corners, Walls, cauchy_stress, elastic_motion, softened_law
 
 
 class CellError(GpeError, ValueError):
@@ -105,6 +105,11 @@ class ElasticBodies(nn.Module):
         gravity = (data.gravity if scene is None else data.gravity[scene]).double()
         nodes = _without_padding(store.cell_index, self.dim, m)
         cells = Cells.of(nodes, store.rest_pos, mass, scene)
+        has_volume = cells.volume.sum(dim=1) > 0
+        if not bool(has_volume.all()):
+            raise CellError(
+                f"{m}: cell {int(has_volume.logical_not().nonzero()[0])} has no volume at rest; leave it out or choose model.elastic=false"
+            )
         own = store.body_pos.new_empty(len(mass), 0) if params is None else params.to(store.body_pos.dtype)
         # masses are in units of their mean, and the rest volume of a node is about spacing^dim
         modulus = self.spacing ** (2 - self.dim)
@@ -120,7 +125,8 @@ class ElasticBodies(nn.Module):
         way, at_end = elastic_motion(store.body_pos, velocity, acceleration * unit + gravity, mass, (lam, mu, eta), cells, walls, corners)
         stress = None
         if with_stress:
-            stress = (cauchy_stress(store.body_pos + way, (lam, mu, eta), cells) / self.stress_unit).to(acceleration.dtype)
+            law, _ = softened_law(store.body_pos, (lam, mu, eta), cells)
+            stress = (cauchy_stress(store.body_pos + way, law, cells) / self.stress_unit).to(acceleration.dtype)
         return ((way - mean - gravity) / unit).to(acceleration.dtype), at_end, stress
 
 

@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from gpe_pl.nn.elastic_kernels import DEEPEST, LOG_SMALLEST, move_forward, pull_back
 from gpe_pl.nn.fused import works_on
@@ -171,15 +172,19 @@ def elastic_motion(
     """
     if corners is None:
         corners = Corners(cells.nodes.new_empty(0, 2), pos.new_empty(0, pos.shape[1]), pos.new_empty(0))
-    law = (law[0].double(), law[1].double(), law[2].double())
-    number, excess = cells.substeps(pos.double(), law)
-    factor = 1.0 / excess
-    softened = (law[0] * factor**2, law[1] * factor**2, law[2] * factor)
+    softened, number = softened_law(pos, law, cells)
     gap = walls.gap.clamp(min=0.0)  # a node behind a plane is not pushed out at once
     values = [t.double() for t in (pos, vel, forcing, mass, *softened, walls.normal, gap, walls.friction, corners.point, corners.friction)]
     if works_on(*values):
         return _Motion.apply(*values, corners.nodes, cells, number)
     return plain_motion(*values, corners.nodes, cells, number)  # type: ignore[call-arg,arg-type]
+
+
+def softened_law(pos: Float[Tensor, "node dim"], law: Law, cells: Cells) -> tuple[Law, Int64[Tensor, " scene"]]:
+    """Return the law of each cell, softened where ``MAX_SUBSTEPS`` would not suffice, and the number of substeps of each scene."""
+    lam, mu, eta = (constant.double() for constant in law)
+    number, excess = cells.substeps(pos.double(), (lam, mu, eta))
+    return (lam / excess**2, mu / excess**2, eta / excess), number
 
 
 def plain_motion(
@@ -238,7 +243,7 @@ def _stopped_by_corners(velocity: Tensor, y: Tensor, mass: Tensor, point: Tensor
         n, place, height, stop, of_a, of_b = contact
         here = (1 - place) * velocity[a] + place * velocity[b]
         change = (here @ n - height / step[a]) * n + stop * (here - (here @ n) * n)
-        velocity = velocity.index_add(0, torch.tensor([a, b]), -torch.stack([of_a * change, of_b * change]))
+        velocity = velocity.index_add(0, torch.tensor([a, b], device=velocity.device), -torch.stack([of_a * change, of_b * change]))
     return velocity
 
 
@@ -348,6 +353,7 @@ class _Motion(torch.autograd.Function):
         return torch.from_numpy(path[last, np.arange(len(pos))] - path[0]), torch.from_numpy(last_vel)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, grad: Tensor, grad_last: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         pos, vel, forcing, mass, lam, mu, eta, normal, gap, friction, *_ = (t.numpy() for t in ctx.saved_tensors)
         found = [np.zeros_like(a) for a in (pos, vel, forcing, lam, mu, eta, gap, friction)]

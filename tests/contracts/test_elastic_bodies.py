@@ -276,3 +276,30 @@ def test_programs_have_no_cells(tmp_path: Path) -> None:
     with pytest.raises(CellError, match=r"exported programs have no cells; export a model with model.elastic=false graph.cells=false"):
         export_model(simulator(), tmp_path / "model.pt2")
     assert not [*tmp_path.iterdir()]
+
+
+def test_walls_that_move_are_refused() -> None:
+    simulated, state = simulator(), bodies()
+    sliding = replace(state.boundary, vel=state.boundary.vel + 1.0)
+    with pytest.raises(GraphError, match="needs walls at rest"):
+        simulated.step(replace(state, boundary=sliding))
+
+
+def test_a_body_without_a_network_falls_freely() -> None:
+    simulated, state = simulator(network=0.0), bodies(kind="lattice", walls=False)
+    assert state.rest_pos is not None
+    vel = torch.tensor([0.3, -0.2], dtype=torch.float64).expand_as(state.pos)
+    start = replace(state, pos=state.rest_pos + 1.0, vel=vel, velocity_history=vel[:, None], frame_velocity=vel)
+    pos, at_end = step(simulated, start)
+    torch.testing.assert_close(pos, start.pos + DT * vel + 0.5 * DT**2 * state.gravity, rtol=0, atol=1e-7)
+    torch.testing.assert_close(at_end, vel + DT * state.gravity, rtol=0, atol=1e-4)
+
+
+def test_cells_without_volume_are_refused() -> None:
+    simulated, state = simulator(), bodies(kind="triangles")
+    assert state.rest_pos is not None and state.cells is not None
+    rest = state.rest_pos.clone()
+    a, b, c = state.cells[0].tolist()
+    rest[c] = 0.5 * (rest[a] + rest[b])
+    with pytest.raises(CellError, match="has no volume at rest"):
+        simulated.step(replace(state, rest_pos=rest))

@@ -66,9 +66,9 @@ def test_edges_have_the_body_on_their_left(is_mirrored: bool) -> None:
     if is_mirrored:
         rest = rest * torch.tensor([-1.0, 1.0])
     pos = rest + torch.tensor([0.5, 0.3]) + 0.1 * SPACING
-    ends, _ = corners_near_edges(pos, rest, cells, boundary(BOX), SPACING, 2 * SPACING, NOWHERE)
+    ends, _ = corners_near_edges(pos, rest, cells, boundary(BOX), SPACING, 2 * SPACING)
     assert not len(ends)  # no corner within reach
-    ends, corner = corners_near_edges(pos - torch.tensor([0.1, 0.0]), rest, cells, boundary(BOX), SPACING, 2 * SPACING, NOWHERE)
+    ends, corner = corners_near_edges(pos - torch.tensor([0.1, 0.0]), rest, cells, boundary(BOX), SPACING, 2 * SPACING)
     assert len(ends)
     centre = rest.mean(dim=0)
     first, second = rest[ends[:, 0]], rest[ends[:, 1]]
