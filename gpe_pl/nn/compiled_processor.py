@@ -19,6 +19,7 @@ from numba.core.cgutils import ir  # that of llvmlite, which numba depends on
 from numba.extending import get_cython_function_address, intrinsic
 
 from gpe_pl.nn.fused import FASTMATH
+from gpe_pl.nn.pointers import pointer
 
 EDGES = 512
 """Number of edges whose gradients are kept for a product with their features."""
@@ -47,15 +48,6 @@ def gemm_address(dtype: Any) -> int:
         except (OSError, AttributeError):
             continue
     return int(get_cython_function_address("scipy.linalg.cython_blas", name))
-
-
-@intrinsic
-@no_type_check
-def _pointer(_, address):
-    def convert(context, builder, signature, arguments):
-        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
-
-    return types.voidptr(address), convert
 
 
 @intrinsic
@@ -95,7 +87,7 @@ def _gemm(typing_context, like, address, turns_a, turns_b, m, n, k, a, a_stride,
 @njit(fastmath=FASTMATH, **OPTIONS)
 @no_type_check
 def _parameter(like, address, rows, columns):
-    return carray(_pointer(address), (rows, columns), like.dtype)
+    return carray(pointer(address), (rows, columns), like.dtype)
 
 
 @njit(fastmath=FASTMATH, **OPTIONS)

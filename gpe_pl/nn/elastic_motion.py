@@ -13,7 +13,7 @@ stress, as in ``solvers.fem.elements`` (Bonet & Wood 2008, section 6.4.3)::
 A node that would enter the plane of its nearest wall loses just enough normal velocity to arrive on it. Coulomb friction takes tangential velocity. Forces of
 cells change neither the linear nor the angular momentum of a body.
 
-Units: time in frames, length in m, and λ, μ and η in the unit in which masses divided by rest volumes are given.
+Units: time is in frames, length in m, and masses in any unit. λ and μ are in that unit of mass per m^(dim − 2) and frame², and η is in that times a frame.
 """
 
 from __future__ import annotations

@@ -29,6 +29,7 @@ COMPILED = (
     "nn/compiled_processor.py",
     "nn/elastic_kernels.py",
     "nn/fused*.py",
+    "nn/pointers.py",
     "rollout/guard.py",
     "solvers/**/*.py",
     "training/parameter_passes.py",

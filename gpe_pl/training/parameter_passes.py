@@ -11,11 +11,11 @@ from typing import no_type_check
 
 import numpy as np
 import torch
-from numba import carray, njit, types
-from numba.extending import intrinsic
+from numba import carray, njit
 from torch import Tensor
 
 from gpe_pl.nn.fused import FASTMATH
+from gpe_pl.nn.pointers import pointer
 
 
 def are_covered(*lists: Sequence[Tensor]) -> bool:
@@ -76,21 +76,12 @@ def _like(tensors: Sequence[Tensor]) -> np.ndarray:
     return np.empty(0, np.float64 if tensors and tensors[0].dtype == torch.float64 else np.float32)
 
 
-@intrinsic
-@no_type_check
-def _pointer(_, address):
-    def convert(context, builder, signature, arguments):
-        return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
-
-    return types.voidptr(address), convert
-
-
 @njit(cache=True, error_model="numpy", fastmath=FASTMATH | {"reassoc"})
 @no_type_check
 def _square(sizes, addresses, like):
     total = 0.0
     for k in range(len(sizes)):
-        x, part = carray(_pointer(addresses[k]), sizes[k], like.dtype), 0.0
+        x, part = carray(pointer(addresses[k]), sizes[k], like.dtype), 0.0
         for c in range(sizes[k]):
             part += np.float64(x[c]) * np.float64(x[c])
         total += part
@@ -102,7 +93,7 @@ def _square(sizes, addresses, like):
 def _scale(sizes, addresses, like, factor):
     factor = like.dtype.type(factor)
     for k in range(len(sizes)):
-        x = carray(_pointer(addresses[k]), sizes[k], like.dtype)
+        x = carray(pointer(addresses[k]), sizes[k], like.dtype)
         for c in range(sizes[k]):
             x[c] *= factor
 
@@ -112,8 +103,8 @@ def _scale(sizes, addresses, like, factor):
 def _pull(sizes, addresses, others, like, weight):
     weight = like.dtype.type(weight)
     for k in range(len(sizes)):
-        x = carray(_pointer(addresses[k]), sizes[k], like.dtype)
-        y = carray(_pointer(others[k]), sizes[k], like.dtype)
+        x = carray(pointer(addresses[k]), sizes[k], like.dtype)
+        y = carray(pointer(others[k]), sizes[k], like.dtype)
         for c in range(sizes[k]):
             x[c] += weight * (y[c] - x[c])
 
@@ -125,14 +116,14 @@ def _adam(sizes, addresses, gradients, means, squares, steps, like, learning_rat
     keep, keep_square = number(beta), number(beta_square)
     add, add_square, small = number(1 - beta), number(1 - beta_square), number(eps)
     for k in range(len(sizes)):
-        step = carray(_pointer(steps[k]), 1, np.float32)
+        step = carray(pointer(steps[k]), 1, np.float32)
         step[0] += 1
         rate = number(learning_rate / (1 - beta ** step[0]))
         root = number(1 / np.sqrt(1 - beta_square ** step[0]))
-        x = carray(_pointer(addresses[k]), sizes[k], like.dtype)
-        g = carray(_pointer(gradients[k]), sizes[k], like.dtype)
-        m = carray(_pointer(means[k]), sizes[k], like.dtype)
-        v = carray(_pointer(squares[k]), sizes[k], like.dtype)
+        x = carray(pointer(addresses[k]), sizes[k], like.dtype)
+        g = carray(pointer(gradients[k]), sizes[k], like.dtype)
+        m = carray(pointer(means[k]), sizes[k], like.dtype)
+        v = carray(pointer(squares[k]), sizes[k], like.dtype)
         for c in range(sizes[k]):
             m[c] = keep * m[c] + add * g[c]
             v[c] = keep_square * v[c] + add_square * g[c] * g[c]
