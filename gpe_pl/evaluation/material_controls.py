@@ -23,6 +23,7 @@ from gpe_pl.rollout.loop import Simulator, Start, rollouts
 from gpe_pl.schema import Split
 from gpe_pl.system.progress import Progress
 from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.viz.captions import row_label
 
 UNSEEN: Split = "test_unseen"
 """Split whose scenes get controls."""
@@ -34,6 +35,9 @@ SAME_START = 1e-3
 """Largest difference between a stored frame and the start of the solver's runs [spacings]."""
 MOST_DRAWS = 100
 """Number of permutations from which the one with the fewest scenes that keep their values is taken."""
+
+AtValue = tuple[str, Trajectory, Trajectory]
+"""Caption with the values of a scene's parameters, run of the solver and rollout of the model."""
 
 
 class ControlError(GpeError):
@@ -91,6 +95,25 @@ class MaterialControls:
             for scene, prediction in zip(found, rollouts(simulator, changed), strict=True):
                 scene[control] = prediction
         return found
+
+    def at_three_values(self, simulator: Simulator, start: Start, number: int, truth: Trajectory, prediction: Trajectory) -> list[AtValue]:
+        """Return a scene at the lowest trained values, its own unseen ones and the highest trained ones, in ascending order of the values.
+
+        Args:
+            simulator: the model, with everything that its own rollouts have.
+            start: start of the scene with its own values.
+            number: number of the scene.
+            truth: its ground truth from ``start_frame`` on.
+            prediction: the model's rollout with the scene's own values.
+        """
+        runs, trained = self._runs.read(number), TrainedValues(self.trained)
+        ends = {name: trained.end(name) for name in (LOWEST, HIGHEST)}
+        predicted = rollouts(simulator, [_changed(start, values) for values in ends.values()])
+        own: Values = scene_values(self.spec, UNSEEN, number)
+        scenes = [(own, f"{row_label(own)} (unseen)", truth, prediction)]
+        scenes += [(values, row_label(values), runs[name], rolled) for (name, values), rolled in zip(ends.items(), predicted, strict=True)]
+        scenes.sort(key=lambda scene: [[*parameters.values()] for parameters in scene[0].values()])
+        return [(caption, solved, rolled) for _, caption, solved, rolled in scenes]
 
     def solver_runs(self, number: int, truth: Trajectory) -> dict[str, tuple[Trajectory, Trajectory]]:
         """Return the solver's runs of a scene and what each is compared with, by label.

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from gpe_pl.data.dataset import WindowDataset, long_enough, open_split, usable
 from gpe_pl.errors import GpeError
-from gpe_pl.evaluation.material_controls import UNSEEN, MaterialControls, label_of
+from gpe_pl.evaluation.material_controls import UNSEEN, AtValue, MaterialControls, label_of
 from gpe_pl.export.program import export_model
 from gpe_pl.files import regular_files
 from gpe_pl.files.atomic import replace_text, replacing
@@ -133,7 +133,8 @@ def evaluate(
 
     All rollouts start at ``settings.first_frame`` and run to the end of the ground truth. The files are ``metrics.csv`` with its digest, and
     ``error_curve_*.png``. The first ``settings.num_pictures`` trajectories of each split also get ``rollout_*.png``, ``rollout_*.gif``, ``rollout_*.html``
-    (a viewer), ``stress_*.png`` if the model decodes a stress, and the files of ``settings.export``.
+    (a viewer), ``stress_*.png`` if the model decodes a stress, and the files of ``settings.export``. With ``controls`` they get ``parameters_*.png``, too: the
+    solver and the model at three values of the material parameters.
 
     These metrics are computed here, beside those of ``metrics.rollout_metrics``:
 
@@ -179,8 +180,9 @@ def evaluate(
         while batch := list(islice(trajectories, SCENES_AT_ONCE)):
             left = len(batch) if settings.num_uncontained is None else max(0, settings.num_uncontained - number)
             controlled = controls if split == UNSEEN else None
-            for trajectory, (predictions, extra) in zip(
-                batch, _predict(simulator, batch, start_frame, settings.containment, left, label, controlled, number), strict=True
+            pictured = 0 if controlled is None else max(0, settings.num_pictures - number)
+            for trajectory, (predictions, extra, at_values) in zip(
+                batch, _predict(simulator, batch, start_frame, settings.containment, left, label, controlled, number, pictured), strict=True
             ):
                 truth = trajectory.frames(start_frame)
                 stop = predictions[label].termination
@@ -199,6 +201,8 @@ def evaluate(
                 if number < settings.num_pictures:
                     _pictures(run_dir, split, number, truth, {label: predictions[label]})
                     _exports(run_dir, split, number, truth, predictions[label], settings.export)
+                    if at_values:
+                        _parameter_picture(run_dir / f"parameters_{split}_{number:02d}.png", at_values)
                 number += 1
         if truth is not None:
             _error_curve(run_dir / f"error_curve_{split}.png", curves, truth.metadata.frame_dt)
@@ -217,8 +221,12 @@ def _predict(
     label: str,
     controls: MaterialControls | None,
     first: int,
-) -> Iterator[tuple[dict[str, Trajectory], dict[str, float]]]:
-    """Yield for each trajectory the predictions by model, and further metrics of the learned model by name. ``first`` is the number of the first trajectory."""
+    num_pictured: int,
+) -> Iterator[tuple[dict[str, Trajectory], dict[str, float], list[AtValue]]]:
+    """Yield for each trajectory the predictions by model, further metrics of the learned model by name, and pictures' scenes at three parameter values.
+
+    ``first`` is the number of the first trajectory. The first ``num_pictured`` ones have scenes at three values.
+    """
     truths = [trajectory.frames(start_frame) for trajectory in trajectories]
     starts = [start_of(simulator, start_frame, *pair) for pair in zip(trajectories, truths, strict=True)]
     totals = [{"num_corrected": 0.0, "num_asleep": 0.0, "lost_impulse": 0.0} for _ in starts]
@@ -257,7 +265,10 @@ def _predict(
             shared = prediction.frames(0, min(prediction.num_frames, exact[scene].num_frames))
             extra["skipping_mse"] = float(per_frame_mse(shared, exact[scene])[1:].mean())
             extra["fraction_asleep"], extra["lost_impulse"] = totals[scene]["num_asleep"] / num_steps, totals[scene]["lost_impulse"]
-        yield predictions, extra
+        at_values: list[AtValue] = []
+        if controls is not None and scene < num_pictured:
+            at_values = controls.at_three_values(within_walls(runner), starts[scene], first + scene, truth, prediction)
+        yield predictions, extra, at_values
 
 
 def _parameter(trajectory: Trajectory) -> float:
@@ -392,6 +403,12 @@ def _pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predict
     write_animation(stem.with_suffix(".gif"), truth, predictions, fps=20, stride=stride)
     size = (1 + len(predictions)) * (truth.pos.nbytes + truth.vel.nbytes)
     write_viewer(stem.with_suffix(".html"), truth, predictions, stride=-(-size // VIEWER_BYTES))
+
+
+def _parameter_picture(path: Path, scenes: list[AtValue]) -> None:
+    from gpe_pl.viz.figures import parameter_strip
+
+    save_figure(parameter_strip(scenes), path, dpi=150, bbox_inches="tight")
 
 
 def _exports(run_dir: Path, split: str, number: int, truth: Trajectory, prediction: Trajectory, formats: list[Export]) -> None:

@@ -49,6 +49,27 @@ def rollout_figure(
     return film_strip([(name.replace(" ", "\n"), trajectory) for name, trajectory in rows.items()], frames, coloring)
 
 
+def parameter_strip(scenes: Sequence[tuple[str, Trajectory, Trajectory]], num_columns: int = 5) -> Figure:
+    """Draw a scene at several values of its material parameters: for each the solver's run and the model's rollout below, time to the right.
+
+    Colours are the stress if all rows have one, else the materials if there are several, else the height at the start.
+
+    Args:
+        scenes: caption of the values, run of the solver, rollout of the model.
+        num_columns: number of times; fewer if there are fewer frames.
+    """
+    rows = [
+        (f"{who}\n{caption}", trajectory.with_moving_boundary())
+        for caption, *pair in scenes
+        for who, trajectory in zip(("solver", "model"), pair, strict=True)
+    ]
+    trajectories = [trajectory for _, trajectory in rows]
+    frames = evenly_spaced_frames(scenes[0][1].num_frames, num_columns)
+    has_stress = all(trajectory.stress is not None for trajectory in trajectories)
+    by: ColorBy = "von_mises" if has_stress else "material" if len(trajectories[0].metadata.materials) > 1 else "height"
+    return film_strip(rows, frames, Coloring(by, trajectories, frames))
+
+
 def error_curve_figure(
     curves: Mapping[str, Sequence[Float[np.ndarray, "_"]]],
     frame_dt: float,

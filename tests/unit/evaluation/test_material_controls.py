@@ -12,11 +12,13 @@ import torch
 from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.evaluation import rollouts
 from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, ControlError, MaterialControls, label_of
-from gpe_pl.evaluation.rollouts import EvaluationSettings, Row, evaluate
+from gpe_pl.evaluation.rollouts import EvaluationSettings, Row, evaluate, start_of
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
+from gpe_pl.rollout import loop as rollout_loop
+from gpe_pl.schema import node_code
 from gpe_pl.trajectory.store import iter_trajectories
 from tests.runs import DATA, compose
 
@@ -70,6 +72,25 @@ def test_controls_change_what_reads_the_parameter(embedding: str, controls: Mate
         assert nearest[1] == own[1]  # extrapolated, so clamped to the nearest trained value
     for solver in (SOLVER_NEAREST, SOLVER_ENDS):
         assert len(errors(rows, solver)) == 2 and np.isfinite(errors(rows, solver)).all()
+
+
+def test_pictured_scenes_are_at_three_values_in_ascending_order(controls: MaterialControls) -> None:
+    learned = simulator(controls.root, "affine")
+    trajectory = next(iter_trajectories(controls.root, UNSEEN))
+    start = start_of(learned, 2, trajectory, truth := trajectory.frames(2))
+    (prediction,) = rollout_loop.rollouts(learned, [start])
+    scenes = controls.at_three_values(learned, start, 0, truth, prediction)
+    assert [caption.split("\n")[-1] for caption, *_ in scenes] == ["20°", "21° (unseen)", "42.5°"]
+    assert scenes[1][1:] == (truth, prediction)
+    angles = [[t.material_params[t.node_type == node_code("sand")][:, 0].tolist() for t in pair] for _, *pair in scenes]
+    assert [{*solved, *predicted} for solved, predicted in angles] == [{20.0}, {21.0}, {42.5}]
+    assert not np.array_equal(scenes[0][2].pos[-1], prediction.pos[-1]) and not np.array_equal(scenes[2][2].pos[-1], prediction.pos[-1])
+
+
+def test_controls_give_a_picture_of_three_values(controls: MaterialControls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rollouts, "_pictures", lambda *_: None)
+    evaluate(simulator(controls.root, "affine"), controls.root, replace(SETTINGS, num_pictures=1), tmp_path, controls=controls)
+    assert [path.name for path in tmp_path.glob("*.png")] == ["parameters_test_unseen_00.png"]
 
 
 def test_shuffled_values_are_those_of_another_scene_of_the_group(controls: MaterialControls) -> None:

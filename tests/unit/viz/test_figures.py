@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from matplotlib._pylab_helpers import Gcf
 
-from gpe_pl.viz.figures import error_curve_figure, rollout_figure, validation_loss_figure
+from gpe_pl.viz.figures import error_curve_figure, parameter_strip, rollout_figure, validation_loss_figure
 
 
 def pixels(figure) -> np.ndarray:
@@ -23,6 +23,12 @@ def test_rollout_figure_has_a_panel_per_time_and_row(ground_truth, prediction):
     assert len(rollout_figure(ground_truth, {}, 4).axes) == 4
     texts = [t.get_text() for t in figure.texts]
     assert {"$t$ = 0.00 s", "0.22 s", "ground\ntruth", "GPE", "GNS"} <= set(texts)
+
+
+def test_parameter_strip_has_the_model_below_the_solver(ground_truth, prediction):
+    figure = parameter_strip([("20°", ground_truth, prediction), ("25°\n(unseen)", prediction, ground_truth)], num_columns=3)
+    assert len(figure.axes) == 4 * 3
+    assert [text.get_text() for text in figure.texts][:4] == ["solver\n20°", "model\n20°", "solver\n25°\n(unseen)", "model\n25°\n(unseen)"]
 
 
 def test_few_frames_give_few_columns(ground_truth):
