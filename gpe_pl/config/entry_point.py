@@ -43,7 +43,7 @@ from gpe_pl.printable import clean_messages, one_line, speak_utf8
 from gpe_pl.system import early_interrupts
 from gpe_pl.system.signatures import checked, parameters
 
-WITHOUT_KEY = {"comparison", "experiment", "parameters", "recipe", "scene", "solver", "tuned"}
+WITHOUT_KEY = {"comparison", "experiment", "law", "parameters", "recipe", "scene", "solver", "tuned"}
 """Config groups that set keys under other names than their own. A command may have a key of its own by such a name, as convert has ``parameters``."""
 
 plugins.register()  # files in conf/ use the plugins

@@ -111,7 +111,7 @@ def feature_spec(config: GraphConfig, metadata: Metadata) -> FeatureSpec:
         GraphError: ``config.cells`` without ``mesh`` or ``islands``.
     """
     if config.cells and not (config.mesh and config.islands):
-        raise GraphError("graph.cells=true needs graph.mesh=true graph.islands=true")
+        raise GraphError("graph.cells=true needs graph.mesh=true graph.islands=true; choose these, or law=none")
     dim, materials = metadata.dim, metadata.materials
     meshes = set(materials) & set(MESH_MATERIALS) if config.mesh else set()
     if not meshes:

@@ -241,7 +241,7 @@ class GPE(Model):
         if elastic and not (spec.cells and spec.meshes and spec.islands):
             raise CellError(
                 "model.elastic=true needs graph.cells=true graph.mesh=true graph.islands=true and a material with cells, "
-                f"such as {MESH_MATERIALS[0]}; the data set has {', '.join(spec.materials)}"
+                f"such as {MESH_MATERIALS[0]}; the data set has {', '.join(spec.materials)}; or choose law=none"
             )
         if island_momentum != "ignored" and not spec.islands:
             raise IslandError(f"model.island_momentum={island_momentum} needs graph.islands=true")

@@ -241,7 +241,7 @@ def test_elastic_models_need_cells(materials: tuple[str, ...], config: dict[str,
 
 @pytest.mark.parametrize("config", [{"mesh": False}, {"mesh": True, "islands": False}])
 def test_cells_need_meshes_and_islands(config: dict[str, Any]) -> None:
-    with pytest.raises(GraphError, match=r"graph.cells=true needs graph.mesh=true graph.islands=true"):
+    with pytest.raises(GraphError, match=r"graph.cells=true needs graph.mesh=true graph.islands=true; choose these, or law=none"):
         _ = GraphBuilder(GraphConfig(cells=True, **{"islands": True, **config}), scenes.metadata(BODIES)).spec
 
 

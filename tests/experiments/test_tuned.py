@@ -59,3 +59,31 @@ def test_a_run_uses_the_values(path: Path) -> None:
     cfg = compose("fit", *more, *(f"{group}={name}" for group, name in {**others, **chosen}.items()))
     for key, value in leaves(OmegaConf.to_container(OmegaConf.load(path))):  # type: ignore[arg-type]
         assert OmegaConf.select(cfg, key) == value, key
+
+
+@pytest.mark.parametrize(("data", "model", "law", "is_elastic"), [
+    ("fem", "gpe_tuned", "by_data", True),
+    ("fem", "gpe_tuned", "none", False),
+    ("fem", "gpe", "by_data", False),
+    pytest.param("elastomer", "gpe_tuned", "by_data", False, marks=pytest.mark.slow),
+    pytest.param("elastomer", "gpe", "elastic", True, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_a_law_sets_model_graph_and_training_together(data: str, model: str, law: str, is_elastic: bool) -> None:
+    cfg = compose("fit", f"data={data}", f"model={model}", f"law={law}", "comparison=equal_steps")
+    expected = {"graph.cells": True, "model.elastic": True}
+    if is_elastic:
+        expected = dict(leaves(OmegaConf.to_container(OmegaConf.load(CONF / "law" / "elastic.yaml"))))  # type: ignore[arg-type]
+    found = {key: OmegaConf.select(cfg, key) == value for key, value in expected.items()}
+    assert set(found.values()) == {is_elastic}, found
+    assert is_elastic or cfg.training.push_fraction > 0
+
+
+WITH_LAW = {"elastic_bodies", "fem_stress", "unseen_materials", "mixed_materials", "sand", "smoke"}
+"""Experiments that leave the law of solids on. All others compare models or parts of the network."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", sorted(p.stem for p in (CONF / "experiment").glob("*.yaml") if p.stem != "canyon"))
+def test_comparisons_of_models_and_ablations_of_the_network_have_no_law(experiment: str) -> None:
+    cfg = compose("fit", f"experiment={experiment}", "data=fem", "model=gpe_tuned")
+    assert (cfg.model.elastic, cfg.graph.cells) == (experiment in WITH_LAW,) * 2
