@@ -233,7 +233,12 @@ MOTION = "one or frame"
 
 FIELDS: dict[str, Field] = {
     "pos": Field(("frame", "node", "dim"), "float32", "m", "positions of the dynamic nodes"),
-    "vel": Field(("frame", "node", "dim"), "float32", "m/s", "velocities of the dynamic nodes at the frame, from the solver"),
+    "vel": Field(
+        ("frame", "node", "dim"),
+        "float32",
+        "m/s",
+        "velocities of the dynamic nodes at the frame; in predictions of models that do not know them, their mean over the last frame",
+    ),
     "node_type": Field(("node",), "uint8", "1", "index into the attribute node_types", values="node types"),
     "mass": Field(("node",), "float32", "kg", "mass (per metre of depth in 2D)", values="positive"),
     "material_params": Field(

@@ -72,7 +72,7 @@ class Guard:
         low, high = self._box
         pos, vel = (np.ascontiguousarray(as_numpy(x), np.float64) for x in (state.pos, state.vel))
         within: bool = _within(pos, vel, low, high, self.max_speed**2, self.spacing, self.max_crowding)
-        return within
+        return within and (state.frame_velocity is None or bool(np.isfinite(as_numpy(state.frame_velocity)).all()))
 
     @cached_property
     def _box(self) -> tuple[np.ndarray, np.ndarray]:
@@ -83,6 +83,8 @@ class Guard:
     def _not_finite(self, state: State, frame: int) -> Termination | None:
         xp = array_namespace(state.pos)
         finite = xp.all(xp.isfinite(state.pos) & xp.isfinite(state.vel), axis=-1)
+        if state.frame_velocity is not None:
+            finite = finite & xp.all(xp.isfinite(state.frame_velocity), axis=-1)
         if bool(xp.all(finite)):
             return None
         node = int(xp.argmax(xp.astype(~finite, xp.int8)))
@@ -206,7 +208,7 @@ def crowding(pos: np.ndarray, width: float) -> np.ndarray:
 def unsound(state: State, metadata: Metadata) -> Termination | None:
     """Return a termination for the first array or shape of an initial state that breaks its rule, or None.
 
-    The rules are those of ``schema.FIELDS`` and ``shape_values.shapes_fault``. Gravity and velocity history must be finite.
+    The rules are those of ``schema.FIELDS`` and ``shape_values.shapes_fault``. Gravity, velocity history and velocities at the frame must be finite.
     """
     b, has_mesh = state.boundary, state.cells is not None and state.rest_pos is not None
     nodes = {
@@ -228,7 +230,8 @@ def unsound(state: State, metadata: Metadata) -> Termination | None:
         for fault in faults(arrays, NODE_TYPES, metadata.materials, metadata.param_names):
             reason = {"pos": "nan", "vel": "nan", "material_params": "material"}.get(fault.field, "input")
             return Termination(reason, 0, fault.index("node"), str(fault))
-    for name, values in (("gravity", state.gravity), ("velocity_history", state.velocity_history)):
+    for name in ("gravity", "velocity_history", "frame_velocity"):
+        values = getattr(state, name)
         if values is not None and not np.isfinite(as_numpy(values)).all():
             return Termination("nan", 0, -1, f"{name} is not finite")
     if (wrong := shapes_fault(b.shapes, metadata.periodicity)) is not None:

@@ -234,6 +234,7 @@ class _Recording:
         self.start, self.is_prediction = start, is_prediction
         self.pos: list[np.ndarray] = []
         self.vel: list[np.ndarray] = []
+        self.frame_velocity: list[np.ndarray | None] = []
         self.stress: list[Stress | None] = []
         self.motion: list[Motion] = []
         self.termination: Termination | None = None
@@ -245,10 +246,19 @@ class _Recording:
             return
         self.pos.append(_numpy(item.pos))
         self.vel.append(_numpy(item.vel))
+        self.frame_velocity.append(None if item.frame_velocity is None else _numpy(item.frame_velocity))
         if self.start.state.boundary.motion is not None:
             b = item.boundary
             self.motion.append(Motion(*(np.array(_numpy(x)) for x in (b.pos, b.vel, b.normal))))
         self.stress.append(None if item.stress is None else Stress(_numpy(item.stress.node), _numpy(item.stress.cell)))
+
+    def _velocities(self) -> list[np.ndarray]:
+        """Return the velocities at the frames if the simulator knows them, otherwise the mean velocities over the frames before."""
+        first, *others = self.frame_velocity
+        known = [at_frame for at_frame in others if at_frame is not None]
+        if not known or len(known) < len(others):
+            return self.vel
+        return [self.vel[0] if first is None else first, *known]
 
     def trajectory(self) -> Trajectory:
         state = self.start.state
@@ -258,7 +268,7 @@ class _Recording:
         return Trajectory(
             self.start.metadata,
             np.stack(self.pos),
-            np.stack(self.vel),
+            np.stack(self._velocities()),
             _numpy(state.node_type),
             _numpy(state.mass),
             _numpy(state.material_params),

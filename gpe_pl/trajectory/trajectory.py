@@ -155,7 +155,7 @@ class Trajectory:
     Attributes:
         metadata: provenance and physical constants.
         pos: positions [frame, node, dim] in m.
-        vel: velocities [frame, node, dim] in m/s.
+        vel: velocities at the frames [frame, node, dim] in m/s. Rollouts of models that do not know them have the mean velocity over the last frame.
         node_type, mass: as in ``State`` [node].
         material_params: as in ``State`` [node, param].
         boundary: boundary in the first frame; if it moves, its motion has as many frames as the trajectory.
@@ -293,7 +293,7 @@ class Trajectory:
         """Return the state at a frame.
 
         Without ``history``, the velocities are the stored ones. With ``history`` > 0, they are differences of the last ``history + 1`` stored positions in
-        float64, as a learned simulator needs them.
+        float64, as a learned simulator needs them, and the stored ones are the velocities at the frame.
 
         Raises:
             IndexError: ``frame`` is out of range, or has fewer than ``history`` frames before it.

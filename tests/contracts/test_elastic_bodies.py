@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -20,11 +21,13 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.elastic_bodies import CellError
 from gpe_pl.rollout.containment import contain
+from gpe_pl.rollout.loop import rollout
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import node_code
 from gpe_pl.training.push_forward import MOVED, _moved
 from gpe_pl.trajectory.reflection import Reflection
 from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.store import read_trajectory, write_shard
 from tests import scenes
 
 BODIES = ("elastomer",)
@@ -163,6 +166,29 @@ def test_velocity_at_the_frame_is_carried_along() -> None:
     assert not torch.allclose(simulated.step(after).pos, dropped.pos, atol=1e-4 * scenes.SPACING)
     mean = simulated.step(replace(after, frame_velocity=after.vel))
     assert torch.equal(mean.pos, dropped.pos)
+
+
+def test_a_rollout_continues_from_a_recorded_frame(tmp_path: Path) -> None:
+    """Positions of the store have single precision. Without it, only the last digit of mean velocities, which are differences of positions, is another one."""
+    simulated, start = simulator(), bodies(kind="lattice")
+    seen = dict[int, State]()
+    whole = rollout(simulated, start, 10, simulated.builder.metadata, on_frame=seen.__setitem__)
+    at_frame = seen[6].frame_velocity
+    assert at_frame is not None and np.array_equal(whole.vel[6], at_frame.numpy())
+    assert not np.allclose(whole.vel[6], seen[6].vel.numpy(), atol=1e-3 * np.abs(whole.vel[6]).max())
+    state = simulated.initial_state(whole, 6)
+    assert torch.equal(state.frame_velocity, at_frame)  # type: ignore[arg-type]
+    torch.testing.assert_close(state.vel, seen[6].vel, rtol=1e-9, atol=1e-9)
+    again = rollout(simulated, state, 4, simulated.builder.metadata)
+    np.testing.assert_array_equal(again.vel, whole.vel[6:])
+    np.testing.assert_allclose(again.pos, whole.pos[6:], rtol=0, atol=1e-12)
+
+    write_shard(tmp_path / "rollout.h5", [whole])
+    stored = simulated.initial_state(read_trajectory(tmp_path / "rollout.h5", "00000", verify=True), 6)
+    again = rollout(simulated, stored, 4, simulated.builder.metadata)
+    np.testing.assert_allclose(again.pos, whole.pos[6:], rtol=0, atol=1e-3 * scenes.SPACING)
+    without = rollout(simulated, replace(stored, frame_velocity=None), 4, simulated.builder.metadata)
+    assert np.abs(without.pos - whole.pos[6:]).max() > 3e-3 * scenes.SPACING
 
 
 def test_containment_changes_the_velocity_at_the_frame() -> None:

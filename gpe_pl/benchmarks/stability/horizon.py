@@ -213,11 +213,11 @@ def resuming(subject: Subject) -> Outcome:
     half = advanced(simulator, start, 100)
     with tempfile.TemporaryDirectory() as folder:
         subject.simulator.save(Path(folder) / "model.ckpt")
-        np.savez(Path(folder) / "state.npz", pos=half.pos, vel=half.vel, history=history_of(half))
-        loaded = np.load(Path(folder) / "state.npz")
-        pos, vel, history = (torch.from_numpy(loaded[name]) for name in ("pos", "vel", "history"))
+        kept = {"pos": half.pos, "vel": half.vel, "velocity_history": history_of(half), "frame_velocity": half.frame_velocity}
+        np.savez(Path(folder) / "state.npz", **{name: values for name, values in kept.items() if values is not None})
+        loaded = {name: torch.from_numpy(values) for name, values in np.load(Path(folder) / "state.npz").items()}
         resumed = Contained(LearnedSimulator.from_checkpoint(Path(folder) / "model.ckpt"), subject.dt)
-    rest = advanced(resumed, replace(half, pos=pos, vel=vel, velocity_history=history), 100)
+    rest = advanced(resumed, replace(half, **loaded), 100)
     equal = {"resumed": torch.equal(rest.pos, whole.pos), "repeated": torch.equal(again.pos, whole.pos)}
     finite = bool(torch.isfinite(whole.pos).all())
     text = ", ".join(f"{name} {'equal' if is_equal else 'different'}" for name, is_equal in equal.items())

@@ -133,6 +133,17 @@ def test_guard_of_no_nodes(new_trajectory: New) -> None:
     assert Guard(max_speed=1.0, bounds=empty.metadata.bounds).check(empty.state(0), 1) is None
 
 
+def test_a_velocity_at_the_frame_that_is_not_finite_stops_a_rollout(trajectory: Trajectory) -> None:
+    state = trajectory.state(0)
+    at_frame = state.vel.copy()
+    at_frame[2, 1] = np.inf
+    stop = Guard().check(replace(state, frame_velocity=at_frame), 4)
+    assert stop is not None and (stop.reason, stop.frame, stop.node) == ("nan", 4, 2)
+    result = rollout(FreeFall(0.01), replace(state, frame_velocity=at_frame), 3, trajectory.metadata)
+    assert result.termination is not None and result.termination.message == "frame_velocity is not finite"
+    assert Guard().check(replace(state, frame_velocity=state.vel), 4) is None
+
+
 def slid(node: int, to: tuple[float, float]) -> Callable[[State], State]:
     def spoil(state: State) -> State:
         pos = state.pos.copy()
