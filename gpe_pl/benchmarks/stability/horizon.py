@@ -215,7 +215,7 @@ def resuming(subject: Subject) -> Outcome:
         subject.simulator.save(Path(folder) / "model.ckpt")
         kept = {"pos": half.pos, "vel": half.vel, "velocity_history": history_of(half), "frame_velocity": half.frame_velocity}
         np.savez(Path(folder) / "state.npz", **{name: values for name, values in kept.items() if values is not None})
-        loaded = {name: torch.from_numpy(values) for name, values in np.load(Path(folder) / "state.npz").items()}
+        loaded: dict[str, Any] = {name: torch.from_numpy(values) for name, values in np.load(Path(folder) / "state.npz").items()}
         resumed = Contained(LearnedSimulator.from_checkpoint(Path(folder) / "model.ckpt"), subject.dt)
     rest = advanced(resumed, replace(half, **loaded), 100)
     equal = {"resumed": torch.equal(rest.pos, whole.pos), "repeated": torch.equal(again.pos, whole.pos)}
