@@ -12,6 +12,7 @@ import torch
 from gpe_pl.learned.testing import scenes
 from gpe_pl.learned.testing.changes import to_dtype
 from gpe_pl.learned.testing.contract import CHECKS, MESH_CHECKS, Check, Factory, check_every_parameter_is_used, factory, predict
+from gpe_pl.learned.testing.elastic_contract import ELASTIC_CHECKS
 from gpe_pl.models.base import Model, Prediction
 from gpe_pl.models.cconv import ContinuousConvNet
 from gpe_pl.models.dpinet import DPINet
@@ -62,6 +63,11 @@ def test_contract(check: str, name: str) -> None:
 @pytest.mark.parametrize("check", MESH_CHECKS)
 def test_contract_on_meshes(check: str, name: str) -> None:
     MESH_CHECKS[check](MODELS[name])
+
+
+@pytest.mark.parametrize("check", ELASTIC_CHECKS)
+def test_contract_of_elastic_models(check: str) -> None:
+    ELASTIC_CHECKS[check](gpe(elastic=True, stress=True))
 
 
 @pytest.mark.parametrize("name", ["gpe", *BASELINES])

@@ -8,7 +8,8 @@ In a test of another package::
     def test_contract(check):
         check(factory(Net, hidden_channels=16))
 
-``MESH_CHECKS`` are for models of graphs with meshes. In all checks, features are made in single precision and models compute in double precision.
+``MESH_CHECKS`` are for models of graphs with meshes, ``elastic_contract.ELASTIC_CHECKS`` for those with an elastic law. In all checks, features are made in
+single precision and models compute in double precision.
 """
 
 from __future__ import annotations
