@@ -148,10 +148,25 @@ def _surface_edges(data: bytes, num_corners: int) -> np.ndarray:
     edges = np.concatenate([np.stack([cells[:, k], cells[:, (k + 1) % num_corners]], axis=1) for k in range(num_corners)])
     edges = edges[edges[:, 0] != edges[:, 1]]
     _, first, times = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
-    return edges[np.sort(first[times == 1])]
+    return _neighbours_apart(edges[np.sort(first[times == 1])])
+
+
+def _neighbours_apart(edges: np.ndarray) -> np.ndarray:
+    """Return the edges in another order: first some that share no node, then some of the others, and so on."""
+    sets: list[tuple[set[int], list[int]]] = []
+    for number, ends in enumerate(edges.tolist()):
+        nodes, numbers = next((own for own in sets if own[0].isdisjoint(ends)), (set(), []))
+        if not numbers:
+            sets.append((nodes, numbers))
+        nodes.update(ends)
+        numbers.append(number)
+    return edges[[number for _, numbers in sets for number in numbers]] if sets else edges
 
 
 def surface_edges(cells: np.ndarray) -> np.ndarray:
-    """Return the edges that belong to one plane cell [edge, 2], in the order of its corners. The result for the same cells is kept."""
+    """Return the edges that belong to one plane cell [edge, 2], in the order of its corners. The result for the same cells is kept.
+
+    Edges that share a node are far from each other in the result, so that contacts with many edges are computed together (``nn.elastic_motion``).
+    """
     cells = np.ascontiguousarray(cells, dtype=np.int64)
     return _surface_edges(cells.tobytes(), cells.shape[1]) if len(cells) else np.empty((0, 2), dtype=np.int64)

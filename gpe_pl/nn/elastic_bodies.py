@@ -6,14 +6,19 @@ predicts besides, such as contact between bodies, acts as a constant acceleratio
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple, cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch_geometric.data import HeteroData
 
 from gpe_pl.errors import GpeError
-from gpe_pl.nn.elastic_motion import Cells, Constants, Corners, Walls, cauchy_stress, elastic_motion, softened_law
+from gpe_pl.nn.elastic_motion import Cells, Constants, Corners, Walls, cauchy_stress, elastic_motion
+
+MAX_CACHED = 64
+"""Largest number of batches whose cells at rest are kept in memory; 400 triangles take about 40 kB."""
 
 
 class CellError(GpeError, ValueError):
@@ -103,17 +108,11 @@ class ElasticBodies(nn.Module):
         scene = store.batch if "batch" in store else None
         mean, velocity = store.velocity.double().split(self.dim, dim=1)
         gravity = (data.gravity if scene is None else data.gravity[scene]).double()
-        nodes = _without_padding(store.cell_index, self.dim, m)
-        cells = Cells.of(nodes, store.rest_pos, mass, scene)
-        has_volume = cells.volume.sum(dim=1) > 0
-        if not bool(has_volume.all()):
-            raise CellError(
-                f"{m}: cell {int(has_volume.logical_not().nonzero()[0])} has no volume at rest; leave it out or choose model.elastic=false"
-            )
+        cells = _cells_at_rest(m, store.cell_index, store.rest_pos, mass, scene)
         own = store.body_pos.new_empty(len(mass), 0) if params is None else params.to(store.body_pos.dtype)
         # masses are in units of their mean, and the rest volume of a node is about spacing^dim
         modulus = self.spacing ** (2 - self.dim)
-        lam, mu, eta = ((value * modulus)[nodes].mean(dim=1) for value in cast(Constants, self.constants[m])(own))
+        lam, mu, eta = ((value * modulus)[cells.nodes].mean(dim=1) for value in cast(Constants, self.constants[m])(own))
         normal, gap, friction = store.wall.split([self.dim, 1, 1], dim=1)
         walls = Walls(normal, gap[:, 0] - self.wall_distance[m] * self.spacing, friction[:, 0] * self.log_friction[m].exp())
         ends = store.corner_index
@@ -122,12 +121,41 @@ class ElasticBodies(nn.Module):
             store.body_pos.double()[ends[:, 0]] + store.corner[:, : self.dim],
             store.corner[:, self.dim] * self.log_friction[m].detach().exp(),
         )
-        way, at_end = elastic_motion(store.body_pos, velocity, acceleration * unit + gravity, mass, (lam, mu, eta), cells, walls, corners)
+        way, at_end, law = elastic_motion(
+            store.body_pos, velocity, acceleration * unit + gravity, mass, (lam, mu, eta), cells, walls, corners
+        )
         stress = None
         if with_stress:
-            law, _ = softened_law(store.body_pos, (lam, mu, eta), cells)
             stress = (cauchy_stress(store.body_pos + way, law, cells) / self.stress_unit).to(acceleration.dtype)
         return ((way - mean - gravity) / unit).to(acceleration.dtype), at_end, stress
+
+
+def _cells_at_rest(material: str, cell_index: Tensor, rest_pos: Tensor, mass: Tensor, scene: Tensor | None) -> Cells:
+    """Return the cells of a graph at rest. They are found once for equal arrays, because only the positions change in a rollout.
+
+    Raises:
+        CellError: a cell has no volume, or there are several kinds of cells.
+    """
+    arrays = [None if t is None else np.ascontiguousarray(t.detach().cpu().numpy()) for t in (cell_index, rest_pos, mass, scene)]
+    return _found_once(material, rest_pos.device, *(None if a is None else (a.tobytes(), a.dtype.str, a.shape) for a in arrays))
+
+
+Content = tuple[bytes, str, tuple[int, ...]]
+"""Bytes, type and shape of an array."""
+
+
+@lru_cache(maxsize=MAX_CACHED)
+@torch.inference_mode(False)  # a rollout may be the first to ask, and training the next
+def _found_once(material: str, device: torch.device, *contents: Content | None) -> Cells:
+    cell_index, rest_pos, mass, scene = (
+        None if c is None else torch.from_numpy(np.ndarray(buffer=c[0], dtype=c[1], shape=c[2]).copy()) for c in contents
+    )
+    assert cell_index is not None and rest_pos is not None and mass is not None
+    cells = Cells.of(_without_padding(cell_index, rest_pos.shape[1], material), rest_pos, mass, scene)
+    flat = torch.nonzero(cells.volume.sum(dim=1) <= 0)
+    if len(flat):
+        raise CellError(f"{material}: cell {int(flat[0])} has no volume at rest; leave it out or choose model.elastic=false")
+    return cells.to(device)
 
 
 def _without_padding(cells: Tensor, dim: int, material: str) -> Tensor:

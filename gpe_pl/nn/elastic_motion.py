@@ -18,8 +18,9 @@ Units: time is in frames, length in m, and masses in any unit. λ and μ are in 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -90,6 +91,10 @@ class Cells:
         start = torch.cat([sizes.new_zeros(1), torch.cumsum(sizes, dim=0)])
         return cls(nodes, gradient, volume, rate, of_node[nodes[:, 0]], start)
 
+    def to(self, device: torch.device) -> Cells:
+        """Return the same cells on a device."""
+        return self if self.nodes.device == device else Cells(*(getattr(self, f.name).to(device) for f in fields(self)))
+
     @property
     def num_scenes(self) -> int:
         return self.node_start.shape[0] - 1
@@ -102,7 +107,7 @@ class Cells:
         lam, mu, eta = (t.detach()[:, None] for t in law)
         corner = pos.detach()[self.nodes]
         f = torch.einsum("cai,cqaj->cqij", corner - corner[:, :1], self.gradient)
-        ratio = torch.linalg.det(f).clamp(min=SMALLEST_RATIO)
+        ratio = _determinant(f, _cofactor(f)).clamp(min=SMALLEST_RATIO)
         first = (lam * ratio.log() - mu) / ratio
         second = (lam / ratio - first) / ratio
         square = f.square().sum(dim=(2, 3)) / f.shape[-1]
@@ -148,6 +153,20 @@ class Corners:
     friction: Float[Tensor, " pair"]
 
 
+class Motion(NamedTuple):
+    """Motion over a frame, in double precision.
+
+    Attributes:
+        displacement: in m [node, dim].
+        velocity: velocity at the end in m/frame [node, dim].
+        law: the law of each cell, softened where ``MAX_SUBSTEPS`` would not suffice.
+    """
+
+    displacement: Float[Tensor, "node dim"]
+    velocity: Float[Tensor, "node dim"]
+    law: Law
+
+
 def elastic_motion(
     pos: Float[Tensor, "node dim"],
     vel: Float[Tensor, "node dim"],
@@ -157,8 +176,8 @@ def elastic_motion(
     cells: Cells,
     walls: Walls,
     corners: Corners | None = None,
-) -> tuple[Float[Tensor, "node dim"], Float[Tensor, "node dim"]]:
-    """Return the displacement [m] over the frame and the velocity [m/frame] at its end, in double precision.
+) -> Motion:
+    """Return the motion over a frame.
 
     Args:
         pos: positions at the start [m].
@@ -172,15 +191,15 @@ def elastic_motion(
     """
     if corners is None:
         corners = Corners(cells.nodes.new_empty(0, 2), pos.new_empty(0, pos.shape[1]), pos.new_empty(0))
-    softened, number = softened_law(pos, law, cells)
+    softened, number = _softened_law(pos, law, cells)
     gap = walls.gap.clamp(min=0.0)  # a node behind a plane is not pushed out at once
     values = [t.double() for t in (pos, vel, forcing, mass, *softened, walls.normal, gap, walls.friction, corners.point, corners.friction)]
     if works_on(*values):
-        return _Motion.apply(*values, corners.nodes, cells, number)
-    return plain_motion(*values, corners.nodes, cells, number)  # type: ignore[call-arg,arg-type]
+        return Motion(*_Motion.apply(*values, corners.nodes, cells, number), softened)
+    return Motion(*plain_motion(*values, corners.nodes, cells, number), softened)  # type: ignore[call-arg,arg-type]
 
 
-def softened_law(pos: Float[Tensor, "node dim"], law: Law, cells: Cells) -> tuple[Law, Int64[Tensor, " scene"]]:
+def _softened_law(pos: Float[Tensor, "node dim"], law: Law, cells: Cells) -> tuple[Law, Int64[Tensor, " scene"]]:
     """Return the law of each cell, softened where ``MAX_SUBSTEPS`` would not suffice, and the number of substeps of each scene."""
     lam, mu, eta = (constant.double() for constant in law)
     number, excess = cells.substeps(pos.double(), (lam, mu, eta))
@@ -205,8 +224,10 @@ def plain_motion(
     number: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return the results of ``elastic_motion`` by PyTorch's operations. Scenes with fewer substeps than others stop earlier."""
-    own = number.repeat_interleave(cells.node_start.diff())
+    own = number.repeat_interleave(cells.node_start.diff(), output_size=len(pos))
     step = (1.0 / own.double())[:, None]
+    rounds = [torch.from_numpy(some).to(pos.device) for some in _in_rounds(pair, len(pos))]
+    corners = [Corners(pair[some], point[some], point_friction[some]) for some in rounds]
     y, velocity = pos, vel
     for k in range(int(own.max()) + 1 if len(own) else 0):
         total = forcing + _internal(y, velocity, (lam, mu, eta), cells) / mass[:, None]
@@ -214,7 +235,7 @@ def plain_motion(
         pushed = velocity + half * step * total
         moves = (own > k)[:, None]
         stopped = _stopped(pushed, y - pos, normal, gap, friction, step[:, 0])
-        stopped = _stopped_by_corners(stopped, y, mass, point, point_friction, pair, step[:, 0])
+        stopped = _stopped_by_corners(stopped, y, mass, corners, step[:, 0])
         velocity = torch.where(moves, stopped, torch.where((own == k)[:, None], pushed, velocity))
         y = torch.where(moves, y + step * velocity, y)
     return y - pos, velocity
@@ -233,39 +254,59 @@ def _stopped(velocity: Tensor, moved: Tensor, normal: Tensor, gap: Tensor, frict
     return torch.where(hits[:, None], (-distance / step)[:, None] * normal + left[:, None] * tangential, velocity)
 
 
-def _stopped_by_corners(velocity: Tensor, y: Tensor, mass: Tensor, point: Tensor, friction: Tensor, pair: Tensor, step: Tensor) -> Tensor:
-    """Return velocities after contact of corners with edges, one pair after the other."""
-    for (a, b), p, mu in zip(pair.tolist(), point, friction.tolist(), strict=True):
+def _in_rounds(pair: Int64[Tensor, "pair 2"], num_nodes: int) -> Iterator[Int64[np.ndarray, " _"]]:
+    """Yield the pairs in rounds: pairs of one round share no node, and pairs that share a node keep their order."""
+    ends = pair.cpu().numpy()
+    left = np.arange(len(ends))
+    while len(left):
+        first = np.full(num_nodes, len(ends))
+        np.minimum.at(first, ends[left].ravel(), left.repeat(2))
+        is_next = (first[ends[left]] == left[:, None]).all(axis=1)
+        yield left[is_next]
+        left = left[~is_next]
+
+
+def _stopped_by_corners(velocity: Tensor, y: Tensor, mass: Tensor, corners: Sequence[Corners], step: Tensor) -> Tensor:
+    """Return velocities after contact of corners with edges, one round of ``_in_rounds`` after the other."""
+    for one in corners:
+        ends = one.nodes.T
         with torch.no_grad():
-            contact = _corner_contact(y[a], y[b], velocity[a], velocity[b], p, mu, 1.0 / mass[a], 1.0 / mass[b], step[a])
-        if contact is None:
-            continue
-        n, place, height, stop, of_a, of_b = contact
-        here = (1 - place) * velocity[a] + place * velocity[b]
-        change = (here @ n - height / step[a]) * n + stop * (here - (here @ n) * n)
-        velocity = velocity.index_add(0, torch.tensor([a, b], device=velocity.device), -torch.stack([of_a * change, of_b * change]))
+            n, place, least, stop, factors = _corner_contact(y[ends], velocity[ends], one, mass[ends], step[ends[0]])
+        here = (1 - place) * velocity[ends[0]] + place * velocity[ends[1]]
+        along = (here * n).sum(dim=1, keepdim=True)
+        change = (along - least) * n + stop * (here - along * n)
+        velocity = velocity.index_add(0, ends.flatten(), -(factors * change).flatten(0, 1))
     return velocity
 
 
 def _corner_contact(
-    xa: Tensor, xb: Tensor, va: Tensor, vb: Tensor, p: Tensor, mu: float, wa: Tensor, wb: Tensor, step: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor] | None:
-    """Return normal, place on the edge, height, fraction of tangential velocity that stops, and factors of the ends; None without contact."""
-    d = xb - xa
-    square = d @ d
-    place = (p - xa) @ d / square
-    n = torch.stack([d[1], -d[0]]) / square.sqrt()
-    height, here = (p - xa) @ n, (1 - place) * va + place * vb
-    if not (0 <= place <= 1 and height > -DEEPEST * square.sqrt()):
-        return None
-    height = height.clamp(min=0.0)
-    excess = here @ n - height / step
-    if not excess > 0:
-        return None
-    inverse = (1 - place) ** 2 * wa + place**2 * wb
-    tangential = (here - (here @ n) * n).norm()
-    stop = (mu * excess / tangential.clamp(min=1e-300)).clamp(max=1.0)
-    return n, place, height, stop, (1 - place) * wa / inverse, place * wb / inverse
+    y: Float[Tensor, "2 pair dim"],
+    velocity: Float[Tensor, "2 pair dim"],
+    corners: Corners,
+    mass: Float[Tensor, "2 pair"],
+    step: Float[Tensor, " pair"],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return normal [pair, dim], place on the edge, allowed velocity along the normal, fraction of tangential velocity that stops [pair, 1], and factors of
+    both ends [2, pair, 1]. Without contact all of them are zero.
+    """
+    d, from_first = y[1] - y[0], corners.point - y[0]
+    square = d.square().sum(dim=1)
+    length = square.sqrt()
+    place = (from_first * d).sum(dim=1) / square
+    n = torch.stack([d[:, 1], -d[:, 0]], dim=1) / length[:, None]
+    height = (from_first * n).sum(dim=1)
+    here = (1 - place)[:, None] * velocity[0] + place[:, None] * velocity[1]
+    along = (here * n).sum(dim=1)
+    least = height.clamp(min=0.0) / step
+    excess = along - least
+    hits = (place >= 0) & (place <= 1) & (height > -DEEPEST * length) & (excess > 0)
+    tangential = (here - along[:, None] * n).norm(dim=1)
+    stop = (corners.friction * excess / tangential.clamp(min=1e-300)).clamp(max=1.0)
+    weight = torch.stack([1 - place, place])
+    factors = weight / mass / (weight.square() / mass).sum(dim=0)
+    found = (n, place[:, None], least[:, None], stop[:, None], factors[:, :, None])
+    where = hits[:, None]
+    return tuple(torch.where(where, value, 0.0) for value in found)  # type: ignore[return-value]
 
 
 def _internal(y: Tensor, velocity: Tensor, law: Law, cells: Cells) -> Tensor:
@@ -274,7 +315,8 @@ def _internal(y: Tensor, velocity: Tensor, law: Law, cells: Cells) -> Tensor:
     corner, speed = y[cells.nodes], velocity[cells.nodes]
     f = torch.einsum("cai,cqaj->cqij", corner - corner[:, :1], cells.gradient)
     d = torch.einsum("cai,cqaj->cqij", speed - speed[:, :1], cells.gradient)
-    ratio, cofactor = torch.linalg.det(f), _cofactor(f)
+    cofactor = _cofactor(f)
+    ratio = _determinant(f, cofactor)
     safe = ratio.clamp(min=SMALLEST_RATIO)
     first = torch.where(
         ratio > SMALLEST_RATIO,
@@ -301,7 +343,7 @@ def cauchy_stress(pos: Float[Tensor, "node dim"], law: Law, cells: Cells) -> Flo
     lam, mu = (t.double()[:, None] for t in law[:2])
     corner = pos.double()[cells.nodes]
     f = torch.einsum("cai,cqaj->cqij", corner - corner[:, :1], cells.gradient)
-    ratio = torch.linalg.det(f)
+    ratio = _determinant(f, _cofactor(f))
     safe = ratio.clamp(min=SMALLEST_RATIO)
     volumetric = torch.where(
         ratio > SMALLEST_RATIO,
@@ -327,6 +369,10 @@ def _cofactor(f: Tensor) -> Tensor:
         return torch.stack([torch.stack([f[..., 1, 1], -f[..., 1, 0]], -1), torch.stack([-f[..., 0, 1], f[..., 0, 0]], -1)], -2)
     x, y, z = f.unbind(-2)
     return torch.stack([torch.linalg.cross(y, z), torch.linalg.cross(z, x), torch.linalg.cross(x, y)], -2)
+
+
+def _determinant(f: Tensor, cofactor: Tensor) -> Tensor:
+    return (f[..., 0, :] * cofactor[..., 0, :]).sum(dim=-1)
 
 
 class _Motion(torch.autograd.Function):

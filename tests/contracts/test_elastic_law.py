@@ -52,7 +52,7 @@ def test_constants_are_recovered_at_two_moduli() -> None:
         loss = torch.zeros((), dtype=torch.float64)
         for pos, vel, way, parameter in samples:
             law = tuple(constant.expand(len(nodes)) for constant in constants(parameter.double()))
-            moved, _ = elastic_motion(pos, vel, torch.zeros_like(pos), mass / mass.mean(), law, cells, walls)  # type: ignore[arg-type]
+            moved, *_ = elastic_motion(pos, vel, torch.zeros_like(pos), mass / mass.mean(), law, cells, walls)  # type: ignore[arg-type]
             loss = loss + ((moved - way).square().sum() / (way - vel).square().sum())
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()

@@ -9,6 +9,8 @@ import torch
 from gpe_pl.geometry.periodicity import NOWHERE
 from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, domain_walls
 from gpe_pl.graphs.contacts import convex_corners, corners_near_edges, nearest_walls, surface_edges
+from gpe_pl.learned.testing.scenes import mesh
+from gpe_pl.nn.elastic_motion import _in_rounds
 from gpe_pl.trajectory.boundary import Boundary
 
 SPACING = 0.02
@@ -79,3 +81,10 @@ def test_edges_have_the_body_on_their_left(is_mirrored: bool) -> None:
 
 def test_surface_edges_belong_to_one_cell() -> None:
     assert {tuple(sorted(e)) for e in surface_edges(np.array([[0, 1, 2], [1, 3, 2]])).tolist()} == {(0, 1), (0, 2), (1, 3), (2, 3)}
+
+
+def test_surface_edges_that_share_a_node_are_apart() -> None:
+    """Contacts with all edges then take as few rounds as a loop of edges allows."""
+    for kind in ("lattice", "triangles"):
+        edges = surface_edges(mesh(kind)[1])
+        assert len([*_in_rounds(torch.tensor(edges.copy()), int(edges.max()) + 1)]) <= 3

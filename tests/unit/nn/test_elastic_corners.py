@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gpe_pl.nn.elastic_motion import Cells, Corners, Walls, elastic_motion
+from gpe_pl.nn.elastic_motion import Cells, Corners, Walls, _in_rounds, elastic_motion
 from gpe_pl.nn.fused import unfused
 
 REST = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], dtype=torch.float64)
@@ -20,7 +20,7 @@ def moved(pos: Tensor, vel: Tensor, forcing: Tensor, point: Tensor, friction: fl
     walls = Walls(torch.zeros_like(pos), torch.zeros_like(mass), torch.zeros_like(mass))
     corners = Corners(nodes[:, :2], point.repeat(copies, 1), torch.full((copies,), friction).double())
     law = tuple(c.repeat(copies) for c in LAW)
-    return elastic_motion(pos, vel, forcing, mass, (law[0], law[1], law[2]), cells, walls, corners)
+    return elastic_motion(pos, vel, forcing, mass, (law[0], law[1], law[2]), cells, walls, corners)[:2]
 
 
 def test_a_corner_stops_an_edge_and_not_what_passes_beside_it() -> None:
@@ -71,3 +71,37 @@ def test_the_compiled_pass_equals_the_plain_one() -> None:
         assert torch.allclose(a, b, rtol=1e-10, atol=1e-12)
     free, _ = moved(inputs[0], inputs[1], inputs[2], torch.tensor([[0.4, -50.0]]).double(), 0.3, copies=3)
     assert not torch.allclose(free, compiled[0])
+
+
+def test_contacts_that_share_nodes_follow_each_other_in_both_passes() -> None:
+    """Two corners touch one edge of the first square, and one of them the edge beside it."""
+    nodes = torch.arange(8).reshape(2, 4)
+    mass, scene = torch.linspace(0.2, 0.4, 8).double(), torch.arange(2).repeat_interleave(4)
+    cells = Cells.of(nodes, REST.repeat(2, 1), mass, scene)
+    walls = Walls(torch.zeros(8, 2).double(), torch.zeros(8).double(), torch.zeros(8).double())
+    pairs = torch.tensor([[0, 1], [2, 3], [0, 1], [3, 0], [1, 2], [4, 5]])
+    point = torch.tensor([[0.3, -0.02], [0.5, 1.05], [0.8, -0.01], [-0.01, 0.1], [1.02, 0.4], [0.5, -0.03]]).double()
+    corners = Corners(pairs, point, torch.linspace(0.1, 0.9, 6).double())
+    law = tuple(c.repeat(2) for c in LAW)
+    pos = REST.repeat(2, 1).requires_grad_()
+    vel = torch.tensor([[0.1, -0.4]]).double().repeat(8, 1) + 0.2 * torch.randn(8, 2, generator=torch.Generator().manual_seed(1)).double()
+
+    def results() -> list[Tensor]:
+        way, after, _ = elastic_motion(pos, vel, torch.zeros_like(vel), mass, (law[0], law[1], law[2]), cells, walls, corners)
+        return [way, after, *torch.autograd.grad(way.square().sum() + after[:, 0].sum(), pos)]
+
+    compiled = results()
+    with unfused():
+        plain = results()
+    for a, b in zip(compiled, plain, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)
+    only_one = Corners(pairs[:1], point[:1], corners.friction[:1])
+    way = elastic_motion(pos, vel, torch.zeros_like(vel), mass, (law[0], law[1], law[2]), cells, walls, only_one).displacement
+    assert not torch.allclose(way[:4], compiled[0][:4], atol=1e-3)
+
+
+def test_rounds_keep_the_order_of_pairs_that_share_a_node() -> None:
+    pair = torch.tensor([[0, 1], [1, 2], [4, 5], [2, 0], [0, 1], [5, 6]])
+    rounds = [r.tolist() for r in _in_rounds(pair, 7)]
+    assert rounds == [[0, 2], [1, 5], [3], [4]]
+    assert [*_in_rounds(pair[:0], 7)] == []
