@@ -60,9 +60,10 @@ class Sleeping(Batched):
     An island wakes up when a node that is awake, or a wall that moves with a prescribed motion, comes within the radius of the graph.
 
     An island (see ``graphs.islands``) falls asleep if all its nodes have been at rest in the last ``Skips.sleep_after`` predictions.
-    ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` define rest. Islands sleep as a whole, so no edge connects a sleeping node to one
-    that is awake. For awake nodes, the model gets all nodes that can influence them, also sleeping ones. An island that falls asleep loses its momentum. New
-    states contain this loss (``State.lost_impulse``) and the number of sleeping nodes (``State.num_asleep``).
+    ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` define rest. They are compared with the velocities at the frame where the model knows
+    them. Islands sleep as a whole, so no edge connects a sleeping node to one that is awake. For awake nodes, the model gets all nodes that can influence
+    them, also sleeping ones. An island that falls asleep loses its momentum. New states contain this loss (``State.lost_impulse``) and the number of sleeping
+    nodes (``State.num_asleep``).
 
     Args:
         simulator: simulator, whose ``skips`` set when islands sleep.
@@ -120,14 +121,15 @@ class Sleeping(Batched):
         pos, vel = state.pos.clone(), torch.zeros_like(state.vel)
         moved = awake[seen]
         pos[awake], vel[awake] = after.pos[moved], after.vel[moved]
-        skips, unit = self.simulator.skips, self.simulator.builder.scales.velocity
-        is_slow = vel.norm(dim=1) < skips.rest_step_spacings * unit
-        calm = is_slow & ((vel - state.vel).norm(dim=1) < skips.rest_step_change_spacings * unit)
-        count = torch.where(awake, torch.where(calm, _rest_of(state) + 1, 0), _rest_of(state))
-        at_frame = None
+        at_frame, before, now = None, state.vel, vel
         if after.frame_velocity is not None:
             at_frame = torch.zeros_like(state.vel)
             at_frame[awake] = after.frame_velocity[moved]
+            before, now = before if state.frame_velocity is None else state.frame_velocity, at_frame
+        skips, unit = self.simulator.skips, self.simulator.builder.scales.velocity
+        is_slow = now.norm(dim=1) < skips.rest_step_spacings * unit
+        calm = is_slow & ((now - before).norm(dim=1) < skips.rest_step_change_spacings * unit)
+        count = torch.where(awake, torch.where(calm, _rest_of(state) + 1, 0), _rest_of(state))
         return state.later(
             self.dt,
             pos,
@@ -135,7 +137,7 @@ class Sleeping(Batched):
             frame_velocity=at_frame,
             stress=_combined_stress(state, after, awake, moved),
             num_asleep=int((~awake).sum()),
-            lost_impulse=float((state.mass * state.vel.norm(dim=1))[~awake].sum()),
+            lost_impulse=float((state.mass * before.norm(dim=1))[~awake].sum()),
             internal=_Rest(count),
         )
 

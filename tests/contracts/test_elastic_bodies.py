@@ -19,7 +19,8 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.approximate import Repeating, Sleeping
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
-from gpe_pl.nn.elastic_bodies import CellError
+from gpe_pl.nn.elastic_bodies import CellError, _found_once
+from gpe_pl.nn.elastic_motion import Cells
 from gpe_pl.rollout.containment import contain
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.rollout.skips import Skips
@@ -150,6 +151,8 @@ def test_the_embedding_decides_whether_the_law_reads_the_parameter() -> None:
 
 def test_the_loss_reaches_the_network_and_the_constants() -> None:
     simulated, state = simulator().train(), bodies(kind="lattice")
+    _found_once.cache_clear()
+    simulated.step(state)  # in inference mode
     predicted = simulated(simulated.builder(state))
     predicted.acceleration["elastomer"].square().sum().backward()
     names = [name for name, p in simulated.model.named_parameters() if p.grad is not None and bool(p.grad.any())]
@@ -231,6 +234,37 @@ def test_sleeping_and_repeated_predictions_keep_the_velocity_at_the_frame() -> N
     second = repeated.step(first)
     assert first.frame_velocity is not None and second.frame_velocity is not None
     torch.testing.assert_close(second.frame_velocity - first.frame_velocity, second.vel - first.vel)
+
+
+@pytest.mark.parametrize("swings", [True, False])
+def test_sleeping_judges_by_the_velocity_at_the_frame(swings: bool) -> None:
+    simulated, state = simulator(), bodies(num_bodies=1)
+    simulated.skips = Skips(sleep_after=2)
+    fast, still = torch.ones_like(state.vel), torch.zeros_like(state.vel)
+    mean, at_frame = (still, fast) if swings else (fast, still)
+    state = replace(state, vel=mean, frame_velocity=at_frame)
+    everything = torch.ones(state.num_nodes, dtype=torch.bool)
+    after = Sleeping(simulated)._combined(state, replace(state, velocity_history=None), everything, everything)
+    assert (after.internal.count == (0 if swings else 1)).all()
+
+
+def test_cells_at_rest_are_found_once_in_a_rollout(monkeypatch: pytest.MonkeyPatch) -> None:
+    simulated, state, calls, found = simulator(), bodies(kind="lattice"), list[int](), Cells.of
+    monkeypatch.setattr(Cells, "of", lambda *arguments: calls.append(1) or found(*arguments))
+    _found_once.cache_clear()
+    for _ in range(3):
+        state = simulated.step(state)
+    assert len(calls) == 1
+    assert state.rest_pos is not None and state.cells is not None
+    others = [replace(state, rest_pos=1.1 * state.rest_pos), replace(state, mass=2 * state.mass), replace(state, cells=state.cells[1:])]
+    for number, other in enumerate(others, start=2):
+        after = step(simulated, other)
+        assert len(calls) == number
+        _found_once.cache_clear()
+        again = step(simulated, other)
+        calls.pop()
+        assert all(torch.equal(a, b) for a, b in zip(after, again, strict=True))
+    assert simulated.step_all([state, state])[0] is not None and len(calls) == len(others) + 2
 
 
 def test_a_checkpoint_has_the_constants_and_units(tmp_path: Path) -> None:
