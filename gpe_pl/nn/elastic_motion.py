@@ -194,9 +194,9 @@ def elastic_motion(
     softened, number = _softened_law(pos, law, cells)
     gap = walls.gap.clamp(min=0.0)  # a node behind a plane is not pushed out at once
     values = [t.double() for t in (pos, vel, forcing, mass, *softened, walls.normal, gap, walls.friction, corners.point, corners.friction)]
-    if works_on(*values):
-        return Motion(*_Motion.apply(*values, corners.nodes, cells, number), softened)
-    return Motion(*plain_motion(*values, corners.nodes, cells, number), softened)  # type: ignore[call-arg,arg-type]
+    move: Any = _Motion.apply if works_on(*values) else plain_motion
+    displacement, velocity = move(*values, corners.nodes, cells, number)
+    return Motion(displacement, velocity, softened)
 
 
 def _softened_law(pos: Float[Tensor, "node dim"], law: Law, cells: Cells) -> tuple[Law, Int64[Tensor, " scene"]]:

@@ -250,7 +250,12 @@ def test_sleeping_judges_by_the_velocity_at_the_frame(swings: bool) -> None:
 
 def test_cells_at_rest_are_found_once_in_a_rollout(monkeypatch: pytest.MonkeyPatch) -> None:
     simulated, state, calls, found = simulator(), bodies(kind="lattice"), list[int](), Cells.of
-    monkeypatch.setattr(Cells, "of", lambda *arguments: calls.append(1) or found(*arguments))
+
+    def counted(*arguments: Any) -> Cells:
+        calls.append(1)
+        return found(*arguments)
+
+    monkeypatch.setattr(Cells, "of", counted)
     _found_once.cache_clear()
     for _ in range(3):
         state = simulated.step(state)
