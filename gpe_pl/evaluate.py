@@ -25,7 +25,7 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
 
     A split that is missing is generated first. The first printed line says which acceptance checks the model fails, or that it was not checked.
     """
-    from gpe_pl.config.datasets import check_material_controls, ensure_split, evaluated_config, material_controls, scene_metadata
+    from gpe_pl.config.datasets import check_material_controls, ensure_split, evaluated_config, material_controls, scene_metadata, stride_of
     from gpe_pl.evaluation.rollouts import EvaluationSettings, evaluate
     from gpe_pl.files.names import run_name
     from gpe_pl.files.run_folder import claim, release, without_orphans
@@ -52,7 +52,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     evaluated = evaluated_config(cfg)
     scene = scene_metadata(evaluated, cfg.split)
     if not simulator.fits(scene):
-        simulator.check_scene(scene, _own_data(simulator) or "data=… size=…")
+        stride = simulator.stride_on(scene_metadata(evaluated, cfg.split, strided=False))
+        simulator.check_scene(scene, f"data.stride={stride}" if stride else _own_data(simulator))
     shown = None if cfg.data.get("showcase") is None else _showcase(cfg, simulator)
     folder = Path(cfg.paths.runs) / run_name(cfg.name)
     with locked(folder), recorded(folder, "evaluate", sys.argv[1:], cfg.paths.runs):
@@ -60,8 +61,9 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
         claim(folder, _identity(evaluated, root), results=["*"])
         with without_orphans(folder):
             try:
-                controls = material_controls(cfg, settings, root, settings.first_frame(simulator.builder.config.history))
-                evaluate(simulator, root, settings, folder, controls=controls)
+                start_frame = settings.first_frame(simulator.builder.config.history, scene.frame_dt)
+                controls = material_controls(cfg, settings, root, start_frame)
+                evaluate(simulator, root, settings, folder, controls=controls, stride=stride_of(evaluated))
             finally:
                 release(folder)
         report_evaluation(folder)
@@ -97,13 +99,14 @@ def _own_data(simulator: LearnedSimulator) -> str:
     from gpe_pl.data.ground_truth import trajectory_metadata
 
     own = simulator.builder.metadata
+    strided = [f"data.stride={simulator.stride}"] if simulator.stride > 1 else []
     if own.solver.startswith("import/"):
-        return f"data={IMPORTED} data.name={own.dataset}"
+        return " ".join([f"data={IMPORTED} data.name={own.dataset}", *strided])
     groups = sorted(path.stem for path in (CONF / "data").glob("*.yaml") if path.stem != IMPORTED and own.dataset.startswith(path.stem))
     for group, size, dimension in product(groups, ("tiny", "small", "paper"), ([], [f"dimension={own.dim}"])):
         overrides = [f"data={group}", f"size={size}", *dimension]
-        if simulator.fits(trajectory_metadata(dataset(*overrides), "train", 0)):
-            return " ".join(overrides)
+        if simulator.fits(trajectory_metadata(dataset(*overrides), "train", 0).every(simulator.stride)):
+            return " ".join([*overrides, *strided])
     return ""
 
 

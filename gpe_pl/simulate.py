@@ -10,7 +10,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gpe_pl.config.datasets import AUTOMATIC_BYTES, dataset_spec
+from gpe_pl.config.datasets import AUTOMATIC_BYTES, check_without_stride, dataset_spec
 from gpe_pl.config.entry_point import ConfigError, entry_point
 
 if TYPE_CHECKING:
@@ -27,6 +27,7 @@ def simulate(cfg: DictConfig) -> None:
         raise ConfigError(f"num_workers={cfg.num_workers!r}: must be null (one per core) or an integer of at least 1")
     if not (isinstance(cfg.num_parts, int) and isinstance(cfg.part, int) and 0 <= cfg.part < cfg.num_parts):
         raise ConfigError(f"part={cfg.part!r}, num_parts={cfg.num_parts!r}: must be integers with 0 <= part < num_parts")
+    check_without_stride(cfg)
     spec, num_workers = dataset_spec(cfg), cfg.num_workers or os.cpu_count() or 1
     part = (cfg.part, cfg.num_parts)
     with nullcontext() if is_complete(cfg.paths.data, spec, part) else written(cfg.paths.data, spec, part):

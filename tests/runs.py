@@ -24,7 +24,7 @@ DATA = [
 RUN = [
     *("size.num_message_passing_steps=1", "size.hidden_channels=8", "graph.history=2"),
     *("training.num_steps=2", "training.val_interval=1", "training.num_val_rollouts=1", "training.val_rollout_steps=3"),
-    *("trainer.progress=false", "trainer.num_threads=1", "evaluation.num_pictures=0", "evaluation.horizons=[5]"),
+    *("trainer.progress=false", "trainer.num_threads=1", "evaluation.num_pictures=0", "evaluation.horizons=[0.025]"),
 ]
 
 

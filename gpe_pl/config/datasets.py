@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gpe_pl.config.entry_point import ConfigError, compose, construct, construct_target
+from gpe_pl.config.entry_point import LARGEST_INTEGER, ConfigError, compose, construct, construct_target
 from gpe_pl.files.names import data_name
 from gpe_pl.schema import SPLITS
 
@@ -26,6 +26,24 @@ AUTOMATIC_BYTES = 2**30
 
 TABLES = ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds", "larger", "comparison", "showcase", "split_name")
 """Keys of ``data`` from which other keys take their values."""
+STRIDE = "stride"
+"""Key of ``data`` with the number of stored frames in a frame of a model. Data sets do not depend on it."""
+
+
+def stride_of(cfg: DictConfig) -> int:
+    """Return ``data.stride``; raise ``ConfigError`` if it is not an integer of at least 1."""
+    stride = cfg.data.get(STRIDE, 1)
+    if type(stride) is not int or not 1 <= stride <= LARGEST_INTEGER:
+        raise ConfigError(f"data.stride={stride!r}: must be an integer of at least 1, the number of stored frames in a frame of the model")
+    return stride
+
+
+def check_without_stride(cfg: DictConfig) -> None:
+    """Raise ``ConfigError`` if ``data.stride`` is set for a command that works with stored frames."""
+    if stride_of(cfg) != 1:
+        raise ConfigError(
+            f"data.stride={stride_of(cfg)}: solvers store every frame; leave it out here, and train or evaluate with it on the same data"
+        )
 
 
 def dataset_spec(cfg: DictConfig) -> DatasetSpec:
@@ -41,8 +59,8 @@ def dataset_spec(cfg: DictConfig) -> DatasetSpec:
     if cfg.size.name not in cfg.data.sizes:
         raise ConfigError(f"size={cfg.size.name}: data={cfg.data.name} has the sizes {', '.join(cfg.data.sizes)}")
     values: dict[str, Any] = OmegaConf.to_container(cfg.data, resolve=True)  # type: ignore[assignment]
-    for table in TABLES:
-        values.pop(table, None)
+    for key in (*TABLES, STRIDE):
+        values.pop(key, None)
     scene = construct_target(values.pop("scene"), "data.scene", "gpe_pl.solvers.")
     solver = construct_target(values.pop("solver"), "data.solver", "gpe_pl.solvers.")
     return construct(DatasetSpec, values, "data", scene=scene, solver=solver)
@@ -54,7 +72,9 @@ def dataset(*overrides: str) -> DatasetSpec:
     Raises:
         ConfigError: an override is not valid, or as in ``dataset_spec``.
     """
-    return dataset_spec(compose("simulate", overrides))
+    cfg = compose("simulate", overrides)
+    check_without_stride(cfg)
+    return dataset_spec(cfg)
 
 
 def imported_data(cfg: DictConfig) -> Path:
@@ -91,14 +111,22 @@ def ensure_data(cfg: DictConfig) -> Path:
         return generate(cfg.paths.data, spec, os.cpu_count() or 1, on_progress)
 
 
-def scene_metadata(cfg: DictConfig, split: str) -> Metadata:
-    """Return the metadata of the first scene of a split. Generated data need not exist for this, imported data do."""
+def scene_metadata(cfg: DictConfig, split: str, strided: bool = True) -> Metadata:
+    """Return the metadata of the first scene of a split. Generated data need not exist for this, imported data do.
+
+    Args:
+        cfg: configuration of a command.
+        split: split of the data set.
+        strided: with frames as long as ``data.stride`` says; else as stored.
+    """
     from gpe_pl.data.ground_truth import trajectory_metadata
     from gpe_pl.trajectory.store import iter_trajectories
 
     if cfg.data.size == IMPORTED:
-        return next(iter_trajectories(imported_data(cfg), split)).metadata
-    return trajectory_metadata(dataset_spec(cfg), split, 0)
+        stored = next(iter_trajectories(imported_data(cfg), split)).metadata
+    else:
+        stored = trajectory_metadata(dataset_spec(cfg), split, 0)
+    return stored.every(stride_of(cfg)) if strided else stored
 
 
 def ensure_split(cfg: DictConfig, split: str) -> Path:
@@ -129,6 +157,15 @@ def evaluated_config(cfg: DictConfig) -> DictConfig:
     return merged
 
 
+def check_same_frames(trained: Metadata, evaluated: Metadata) -> None:
+    """Raise ``ConfigError`` if evaluated data have frames of another length than those of the training."""
+    if abs(evaluated.frame_dt / trained.frame_dt - 1) > 1e-6:
+        raise ConfigError(
+            f"evaluation.data: frames of {evaluated.frame_dt:g} s, those of the training have {trained.frame_dt:g} s; "
+            "choose another evaluation.data.stride or evaluation.data.solver.frame_dt"
+        )
+
+
 def check_material_controls(cfg: DictConfig, settings: EvaluationSettings) -> None:
     """Raise ``ConfigError`` if an evaluation asks for controls that its data cannot have."""
     from gpe_pl.evaluation.material_controls import UNSEEN
@@ -142,15 +179,16 @@ def check_material_controls(cfg: DictConfig, settings: EvaluationSettings) -> No
 def material_controls(cfg: DictConfig, settings: EvaluationSettings, root: Path, start_frame: int) -> MaterialControls | None:
     """Return the controls of an evaluation on the data in ``root``, or None if the settings want none. Missing solver runs are computed.
 
-    Errors are those of ``MaterialControls.prepare``.
+    ``start_frame`` counts frames of the model, which ``data.stride`` makes longer. Errors are those of ``MaterialControls.prepare``.
     """
     from gpe_pl.evaluation.material_controls import MaterialControls
     from gpe_pl.system.progress import progress_bar
 
     if not settings.material_controls:
         return None
-    spec = dataset_spec(evaluated_config(cfg))
-    controls = MaterialControls(root, spec, dataset_spec(cfg), start_frame, settings.num_trajectories)
+    evaluated = evaluated_config(cfg)
+    spec = dataset_spec(evaluated)
+    controls = MaterialControls(root, spec, dataset_spec(cfg), start_frame, settings.num_trajectories, stride_of(evaluated))
     with progress_bar(f"{spec.name} {spec.size} controls") as on_progress:
         controls.prepare(os.cpu_count() or 1, on_progress)
     return controls

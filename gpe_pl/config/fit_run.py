@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,16 +12,18 @@ from omegaconf import DictConfig, OmegaConf
 from gpe_pl.config.datasets import (
     IMPORTED,
     check_material_controls,
+    check_same_frames,
     dataset_spec,
     ensure_data,
     evaluated_config,
     material_controls,
     scene_metadata,
+    stride_of,
 )
 from gpe_pl.config.entry_point import ConfigError, bind, construct
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
-from gpe_pl.data.dataset import open_split, window_counts
+from gpe_pl.data.dataset import every, open_split, window_counts
 from gpe_pl.data.sampling import BatchSize
 from gpe_pl.evaluation.rollouts import LEARNED, EvaluationSettings, evaluate, means, read_rows
 from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError, claim, without_tables
@@ -50,7 +52,6 @@ class FitRun:
 
     Raises:
         ConfigError: a setting has the wrong type or value, or does not fit the others.
-        StartError: ``evaluation.start_frame`` leaves too little history.
     """
 
     def __init__(self, cfg: DictConfig, folder: Path) -> None:
@@ -64,7 +65,7 @@ class FitRun:
         self.evaluation = construct(EvaluationSettings, {k: v for k, v in cfg.evaluation.items() if k != "data"}, "evaluation")
         check_material_controls(cfg, self.evaluation)
         self.graph = construct(GraphConfig, cfg.graph, "graph")
-        self.first_frame = self.evaluation.first_frame(self.graph.history)
+        self.stride, self.evaluated_stride = stride_of(cfg), stride_of(evaluated_config(cfg))
         self.logger = construct(LoggerSettings, cfg.logger, "logger")
         settings = {key: value for key, value in cfg.model.items() if key != "_target_"}
         self.new_model = bind(model_class(cfg.model._target_), settings, "model", "spec")
@@ -77,14 +78,22 @@ class FitRun:
         self.callbacks: list[PauseForMeasurements] = []
 
     def prepare_data(self) -> None:
-        """Generate missing data and controls, after checking that the noise and the model of ``start_from`` fit the scenes. Choose the device."""
-        if self.start is not None or self.training.position_noise_of_domain:
-            scenes = scene_metadata(self.cfg, "train")
-            self.training.noise.check(scenes)
-            if self.start is not None:
-                self.start.check_scene(scenes)
+        """Generate missing data and controls, after checking that noise, evaluation and the model of ``start_from`` fit the scenes. Choose the device.
+
+        Raises:
+            StartError: ``evaluation.start_time`` leaves too little history, or is between frames.
+            ConfigError: evaluated data have frames of another length.
+        """
+        scenes, evaluated = scene_metadata(self.cfg, "train"), evaluated_config(self.cfg)
+        self.training.noise.check(scenes)
+        if self.start is not None:
+            stride = self.start.stride_on(scene_metadata(self.cfg, "train", strided=False))
+            self.start.check_scene(scenes, f"data.stride={stride}" if stride else "")
+        self.first_frame = self.evaluation.first_frame(self.graph.history, scenes.frame_dt)
+        if self.cfg.evaluation.data:
+            check_same_frames(scenes, scene_metadata(evaluated, self.evaluation.splits[0]))
         self.root = ensure_data(self.cfg)
-        self.evaluated_root = ensure_data(evaluated_config(self.cfg)) if self.cfg.evaluation.data else self.root
+        self.evaluated_root = ensure_data(evaluated) if self.cfg.evaluation.data else self.root
         self.controls = material_controls(self.cfg, self.evaluation, self.evaluated_root, self.first_frame)
         self.device = set_up(self.trainer)
 
@@ -110,7 +119,7 @@ class FitRun:
     def check_evaluation(self) -> None:
         """Check before training that the evaluated splits have trajectories that are long enough."""
         for split in self.evaluation.splits:
-            window_counts(open_split(self.evaluated_root, split, cache_bytes=0), self.first_frame)
+            window_counts(every(open_split(self.evaluated_root, split, cache_bytes=0), self.evaluated_stride), self.first_frame)
 
     def finished_model(self) -> Path | None:
         """Copy the best checkpoint of a finished run with the same training from the sweep that ``reuse`` names. Return the copy, or None."""
@@ -128,7 +137,7 @@ class FitRun:
     def evaluate(self, checkpoint: Path) -> None:
         """Roll the model out on the evaluated splits, and log the mean errors."""
         simulator = LearnedSimulator.from_checkpoint(checkpoint, self.device)
-        rows = evaluate(simulator, self.evaluated_root, self.evaluation, self.folder, controls=self.controls)
+        rows = evaluate(simulator, self.evaluated_root, self.evaluation, self.folder, controls=self.controls, stride=self.evaluated_stride)
         publish(self._loggers, self.folder, means(rows))
 
     def error(self) -> float:
@@ -187,11 +196,12 @@ class FitRun:
             sampling=self.training.sampling,
             solver=self._solver,
             mirror=self.training.mirror,
+            stride=self.stride,
         )
 
     @property
     def _solver(self) -> Restartable | None:
-        """Solver that gives training targets; None if ``training.targets`` is ``trajectory``."""
+        """Solver that gives training targets, with frames as long as the model's; None if ``training.targets`` is ``trajectory``."""
         if self.training.targets == "trajectory":
             return None
         if self.cfg.data.size == IMPORTED:
@@ -202,12 +212,13 @@ class FitRun:
                 f"training.targets=solver: the solver {solver.name} cannot continue {', '.join(solver.materials)} from positions; "
                 "choose training.targets=trajectory"
             )
-        return solver
+        longer: Any = solver
+        return replace(longer, frame_dt=self.stride * solver.frame_dt)  # type: ignore[no-any-return]
 
     def _new_module(self, training: TrainingSettings) -> TrainingModule:
         seed(self.cfg.seed)
         data = self._data
-        simulator = LearnedSimulator(self.new_model(spec=data.builder.spec), data.builder)
+        simulator = LearnedSimulator(self.new_model(spec=data.builder.spec), data.builder, data.stride)
         simulator.fit_statistics(data.statistics_sample(), data.parameter_ranges(), data.trained_scene())
         if self.start is not None:
             simulator.start_from(self.start)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from dataclasses import replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -14,10 +15,21 @@ from torch.utils.data import DataLoader
 from torch_geometric.data import HeteroData
 
 from gpe_pl.data.checksum import split_checksum
-from gpe_pl.data.dataset import CachedGraphs, StoredTrajectory, WindowDataset, collated, long_enough, open_split, usable
+from gpe_pl.data.dataset import (
+    CachedGraphs,
+    StoredTrajectory,
+    WindowDataset,
+    collated,
+    every,
+    long_enough,
+    open_split,
+    usable,
+    window_counts,
+)
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSampler, BatchSize, PushForward, Sampling, probabilities
 from gpe_pl.data.statistics import acceleration_std
+from gpe_pl.data.strides import connectivity_radius, stride_statistics
 from gpe_pl.files import sealed
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
@@ -80,6 +92,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         solver: gives the targets of noisy and unrolled states; see ``WindowDataset``.
         mirror: mirror training windows at random; see ``WindowDataset``.
         num_statistics_windows: number of windows from which features are standardised, evenly spread over the ``train`` split.
+        stride: number of stored frames in a frame. Training windows begin at any stored frame, validation windows at every ``stride``-th.
 
     Attributes:
         push_forward: settings of the push-forward trick; None if it is not used. In steps with push-forward, batches contain starts of unrolls instead of
@@ -104,20 +117,27 @@ class TrajectoryDataModule(L.LightningDataModule):
         num_statistics_windows: int = 256,
         solver: Restartable | None = None,
         mirror: bool = False,
+        stride: int = 1,
     ) -> None:
         super().__init__()
         self.root, self.noise, self.batch_size, self.seed = Path(root), noise, batch_size, seed
         self.num_workers, self.num_val_windows = num_workers, num_val_windows
-        self.num_statistics_windows = num_statistics_windows
+        self.num_statistics_windows, self.stride = num_statistics_windows, stride
         self.push_forward: PushForward | None = None
-        statistics = data_statistics(root)
+        std = data_statistics(root)["acceleration_std"]
         stored = open_split(root, "train")
         train = usable(stored)
-        val = usable(open_split(root, "val"))
+        val = every(usable(open_split(root, "val")), stride)
         self.metadata = train[0].window(0, 1).metadata
+        if stride > 1:
+            window_counts(every(train, stride), graph.history)
+            statistics = stride_statistics(root, stride, train)
+            std, radius = statistics.acceleration_std, connectivity_radius(self.metadata, stride, statistics.max_speed)
+            self.metadata = replace(self.metadata.every(stride), connectivity_radius=radius)
+            train = every(train, stride, phases=stride)
+        elif len(train) < len(stored):
+            std = acceleration_std(t.window(0, t.num_frames) for t in train)
         self.builder = GraphBuilder(graph, self.metadata)
-        whole = len(train) == len(stored)
-        std = statistics["acceleration_std"] if whole else acceleration_std(t.window(0, t.num_frames) for t in train)
         unit = std * self.metadata.frame_dt
         noise.check(self.metadata, unit)
         self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress, solver, mirror)
@@ -201,7 +221,7 @@ class TrajectoryDataModule(L.LightningDataModule):
 
     def val_trajectories(self, count: int) -> list[Trajectory]:
         """Read the first ``count`` trajectories of the ``val`` split that are valid and long enough; see ``long_enough``."""
-        return list(islice(long_enough(self.root, "val", self.builder.config.history), count))
+        return list(islice(long_enough(self.root, "val", self.builder.config.history, self.stride), count))
 
     def train_dataloader(self) -> DataLoader:
         trainer = self.trainer

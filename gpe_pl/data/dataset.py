@@ -71,21 +71,30 @@ data."""
 
 @dataclass(frozen=True)
 class StoredTrajectory:
-    """The place of a stored trajectory, and the trajectory itself if it is cached.
+    """The place of a stored trajectory, and the trajectory itself if it is cached. With a stride, it is the view of every ``stride``-th stored frame.
 
     Attributes:
         path: shard.
         name: name of the trajectory in the shard.
-        num_frames: number of frames.
+        num_stored: number of stored frames.
         num_nodes: number of dynamic nodes.
         cached: the trajectory if the split is cached in memory and its values are valid, else None.
+        stride: number of stored frames in a frame.
+        phase: stored frame that is frame 0.
     """
 
     path: Path
     name: str
-    num_frames: int
+    num_stored: int
     num_nodes: int
     cached: Trajectory | None
+    stride: int = 1
+    phase: int = 0
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames."""
+        return max(0, -(-(self.num_stored - self.phase) // self.stride))
 
     def window(self, start: int, stop: int) -> Trajectory:
         """Return the frames ``start:stop``.
@@ -93,17 +102,29 @@ class StoredTrajectory:
         Raises:
             StoreError: the trajectory cannot be read, or has invalid values.
         """
+        first, last = self.phase + start * self.stride, min(self.phase + stop * self.stride, self.num_stored)
         if self.cached is not None:
-            return self.cached.frames(start, stop)
-        return read_trajectory(self.path, self.name, frames=slice(start, stop))
+            return self.cached.frames(first, last).every(self.stride)
+        return read_trajectory(self.path, self.name, frames=slice(first, last)).every(self.stride)
 
     def whole(self) -> Trajectory:
-        """Return all frames after comparing them with their stored digest. Errors are those of ``window``."""
+        """Return all stored frames after comparing them with their stored digest. Errors are those of ``window``."""
         return read_trajectory(self.path, self.name, verify=True) if self.cached is None else self.cached
 
 
+def every(trajectories: Sequence[StoredTrajectory], stride: int, phases: int = 1) -> list[StoredTrajectory]:
+    """Return views of every ``stride``-th stored frame.
+
+    Args:
+        trajectories: trajectories with all stored frames.
+        stride: number of stored frames in a frame.
+        phases: number of views of each trajectory. They begin at its stored frames 0 to ``phases - 1``.
+    """
+    return [replace(stored, stride=stride, phase=phase) for stored in trajectories for phase in range(phases)]
+
+
 def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> list[StoredTrajectory]:
-    """Index all trajectories of a split, and cache them in memory if the split is small enough.
+    """Index all trajectories of a split with all stored frames, and cache them in memory if the split is small enough.
 
     Raises:
         StoreError: the split has no trajectories, or a shard is damaged. Invalid values are not an error here; ``usable`` reports them.
@@ -125,8 +146,8 @@ def open_split(root: Path | str, split: str, cache_bytes: int = CACHE_BYTES) -> 
     return stored
 
 
-def long_enough(root: Path | str, split: str, history: int) -> Iterator[Trajectory]:
-    """Yield the valid trajectories of a split that have at least ``history + 2`` frames, and warn of the others.
+def long_enough(root: Path | str, split: str, history: int, stride: int = 1) -> Iterator[Trajectory]:
+    """Yield every ``stride``-th frame of the valid trajectories of a split that have at least ``history + 2`` such frames, and warn of the others.
 
     A model needs ``history`` velocities before a frame and one frame to predict.
     """
@@ -138,6 +159,7 @@ def long_enough(root: Path | str, split: str, history: int) -> Iterator[Trajecto
                 _warn(path, name, error.fault)
                 continue
             fault = damage(trajectory)
+            trajectory = trajectory.every(stride)
             if fault is None and trajectory.num_frames < history + 2:
                 fault = f"its {trajectory.num_frames} frames are fewer than the {history + 2} that a start at frame {history} needs"
             if fault is None:
@@ -310,19 +332,23 @@ def window_counts(trajectories: Sequence[StoredTrajectory], history: int) -> lis
     if not any(counts):
         longest = max((t.num_frames for t in trajectories), default=0)
         where = f"{trajectories[0].path.parent}: " if trajectories else ""
-        needed = f"{history + 2} frames that a start at frame {history} needs (graph.history, evaluation.start_frame)"
-        raise StoreError(f"{where}no trajectory has the {needed}; the longest has {longest}; choose a smaller frame or longer trajectories")
+        needed = f"{history + 2} frames that a start at frame {history} needs (graph.history, evaluation.start_time)"
+        strided = f" with data.stride={trajectories[0].stride}" if trajectories and trajectories[0].stride > 1 else ""
+        smaller = "stride, an earlier start" if strided else "history, an earlier start"
+        raise StoreError(
+            f"{where}no trajectory has the {needed}; the longest has {longest}{strided}; choose a smaller {smaller} or longer trajectories"
+        )
     return counts
 
 
 class WindowDataset(Dataset[HeteroData | Start]):
     """Windows x[t−H … t+1] of a split as graphs at frame t.
 
-    Every material's store has ``target`` [node, dim] in m/s²: the acceleration from t to t+1 without gravity, from float64 differences. The graph has the
-    numbers ``trajectory`` and ``frame`` for error messages.
+    Every material's store has ``target`` [node, dim] in m/s²: the acceleration from t to t+1 without gravity, from float64 differences. For error
+    messages, the graph has the number of its ``trajectory`` in the split and of its stored ``frame``.
 
     Args:
-        trajectories: trajectories of the split.
+        trajectories: trajectories of the split, or views of them as ``every`` returns them.
         builder: builder of the graphs.
         noise: noise on inputs; None for evaluation.
         velocity_unit: root mean square acceleration × frame interval [m/s], the unit of velocity noise.
@@ -355,6 +381,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         self.velocity_unit, self.seed = velocity_unit, seed
         self.probability: np.ndarray | None = None
         self.ends = np.cumsum(window_counts(trajectories, builder.config.history))
+        self._num_phases = 1 + max(t.phase for t in trajectories)
 
     def __len__(self) -> int:
         return int(self.ends[-1])
@@ -434,7 +461,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         stress = None
         if self.stress and trajectory.stress is not None:
             stress = torch.from_numpy(np.array(trajectory.stress.node[history + 1 :], dtype=np.float32))
-        about: dict[str, Any] = {"trajectory": number, "frame": frame}
+        about: dict[str, Any] = {"trajectory": number // self._num_phases, "frame": stored.phase + frame * stored.stride}
         if self.probability is not None:
             about["weight"] = 1 / (len(self) * float(self.probability[window]))
         deviates = start is not None or (self.noise is not None and self.noise.is_any)

@@ -57,8 +57,9 @@ class MaterialControls:
         root: folder of the evaluated data set.
         spec: the evaluated data set.
         trained: the data set of the training, whose values are the trained ones.
-        start_frame: frame at which rollouts start.
+        start_frame: frame of the model at which rollouts start.
         num_trajectories: number of trajectories, from the start of the split; None takes all.
+        stride: number of stored frames in a frame of the model.
     """
 
     root: Path
@@ -66,6 +67,7 @@ class MaterialControls:
     trained: DatasetSpec
     start_frame: int
     num_trajectories: int | None = None
+    stride: int = 1
 
     def prepare(self, num_workers: int = 1, on_progress: Progress | None = None) -> None:
         """Compute the missing solver runs.
@@ -74,10 +76,10 @@ class MaterialControls:
             ControlError: the data set has no scenes with unseen parameters, or they are too short.
             GenerationError: the solver stopped.
         """
-        if not self._indices or self.spec.num_frames <= self.start_frame + 1:
+        if not self._indices or self.spec.num_frames <= (self.start_frame + 1) * self.stride:
             raise ControlError(
                 f"evaluation.material_controls=true: {self.spec.name} has {self.spec.num_test_unseen} trajectories of {self.spec.num_frames} frames in "
-                f"{UNSEEN}, rollouts start at frame {self.start_frame}; choose data with more, or false"
+                f"{UNSEEN}, rollouts start at frame {self.start_frame * self.stride}; choose data with more, or false"
             )
         self._runs.generate(self._indices, num_workers, on_progress)
 
@@ -125,7 +127,7 @@ class MaterialControls:
         Raises:
             ControlError: the runs do not start like the ground truth.
         """
-        runs = self._runs.read(number)
+        runs = {name: run.every(self.stride) for name, run in self._runs.read(number).items()}
         start, spacing = runs[NEAREST], truth.metadata.spacing
         is_same = start.metadata.seed == truth.metadata.seed and start.pos.shape == truth.pos.shape
         if not is_same or np.abs(displacement(start.pos[0], truth.pos[0], truth.metadata)).max() > SAME_START * spacing:
@@ -162,7 +164,7 @@ class MaterialControls:
 
     @cached_property
     def _runs(self) -> ControlRuns:
-        return ControlRuns(self.root, self.spec, TrainedValues(self.trained), UNSEEN, self.start_frame)
+        return ControlRuns(self.root, self.spec, TrainedValues(self.trained), UNSEEN, self.start_frame * self.stride)
 
 
 def _changed(start: Start, values: Values) -> Start:

@@ -17,8 +17,9 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from gpe_pl.data.dataset import WindowDataset, long_enough, open_split, usable
+from gpe_pl.data.dataset import WindowDataset, every, long_enough, open_split, usable
 from gpe_pl.errors import GpeError
+from gpe_pl.evaluation.horizons import labels, time_of
 from gpe_pl.evaluation.material_controls import UNSEEN, AtValue, MaterialControls, label_of
 from gpe_pl.export.program import export_model
 from gpe_pl.files import regular_files
@@ -63,10 +64,10 @@ class EvaluationSettings:
 
     Attributes:
         splits: splits of the data set.
-        horizons: horizons [frames]; the full length is always added.
+        horizons: horizons [s], each at the nearest frame (see ``horizons``); the full length is always added.
         num_trajectories: number of trajectories per split, from its start; None takes all.
-        start_frame: frame at which rollouts start. Set it to evaluate models with different histories on the same frames. None takes the first frame with
-            enough history.
+        start_time: time at which rollouts start [s]. Set it to compare models with different histories or frames from the same instant. None takes the first
+            frame with enough history.
         containment: put particles that cross a wall back on its surface.
         num_uncontained: number of trajectories per split that are also rolled out without containment, which shows what it corrects; None takes all.
         clamp_parameters: clamp material parameters outside the trained range to the nearest trained value.
@@ -79,9 +80,9 @@ class EvaluationSettings:
     """
 
     splits: Annotated[list[Split], Field(min_length=1)] = field(default_factory=lambda: ["test", "test_unseen"])
-    horizons: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [5, 20, 50, 100])
+    horizons: list[Annotated[float, Field(gt=0)]] = field(default_factory=lambda: [0.025, 0.1, 0.25, 0.5])
     num_trajectories: Annotated[int, Field(ge=1)] | None = None
-    start_frame: Annotated[int, Field(ge=1)] | None = None
+    start_time: Annotated[float, Field(gt=0)] | None = None
     containment: bool = True
     num_uncontained: Annotated[int, Field(ge=0)] | None = None
     clamp_parameters: bool = True
@@ -90,17 +91,22 @@ class EvaluationSettings:
     num_pictures: Annotated[int, Field(ge=0)] = 2
     export: list[Export] = field(default_factory=list)
 
-    def first_frame(self, history: int) -> int:
+    def first_frame(self, history: int, frame_dt: float) -> int:
         """Return the frame at which rollouts of a model with this history [frames] start.
 
         Raises:
-            StartError: ``start_frame`` leaves too little history.
+            StartError: ``start_time`` leaves too little history, or is between frames.
         """
-        if self.start_frame is not None and self.start_frame < history:
+        if self.start_time is None:
+            return history
+        frame, key = round(self.start_time / frame_dt), f"evaluation.start_time={self.start_time:g}"
+        if frame < history:
             raise StartError(
-                f"evaluation.start_frame={self.start_frame}: graph.history={history} needs as many frames before it; choose at least {history}"
+                f"{key}: graph.history={history} needs as many frames of {frame_dt:g} s before it; choose at least {history * frame_dt:g}"
             )
-        return history if self.start_frame is None else self.start_frame
+        if abs(frame * frame_dt - self.start_time) > 1e-6 * frame_dt:
+            raise StartError(f"{key}: is between two frames of {frame_dt:g} s; choose {frame * frame_dt:g}")
+        return frame
 
 
 class ExportError(GpeError):
@@ -128,6 +134,7 @@ def evaluate(
     run_dir: Path,
     label: str = LEARNED,
     controls: MaterialControls | None = None,
+    stride: int = 1,
 ) -> list[Row]:
     """Roll out every trajectory of the splits, and write metrics and pictures to ``run_dir``.
 
@@ -156,15 +163,19 @@ def evaluate(
         run_dir: folder for the files.
         label: name of the model in the rows.
         controls: prepared controls of scenes with unseen parameters.
+        stride: number of stored frames in a frame of the simulator.
 
     Returns:
         The rows of ``metrics.csv``.
 
     Raises:
-        StartError: ``settings.start_frame`` leaves too little history.
+        StartError: ``settings.start_time`` leaves too little history, or is between frames.
+        SceneError: the data do not fit the simulator.
         ExportError: a format in ``settings.export`` needs a package that is not installed.
     """
-    start_frame = settings.first_frame(simulator.builder.config.history)
+    frame_dt = simulator.builder.metadata.frame_dt
+    start_frame = settings.first_frame(simulator.builder.config.history, frame_dt)
+    steps = labels(settings.horizons, frame_dt)
     if "mp4" in settings.export and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ExportError(
             "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
@@ -174,8 +185,8 @@ def evaluate(
     rows: list[Row] = []
     for split in settings.splits:
         curves: dict[str, list[np.ndarray]] = {}
-        rows += [Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split))]
-        trajectories = islice(long_enough(root, split, start_frame), settings.num_trajectories)
+        rows += [Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split, stride=stride))]
+        trajectories = islice(long_enough(root, split, start_frame, stride), settings.num_trajectories)
         number, truth = 0, None
         while batch := list(islice(trajectories, SCENES_AT_ONCE)):
             left = len(batch) if settings.num_uncontained is None else max(0, settings.num_uncontained - number)
@@ -195,8 +206,9 @@ def evaluate(
                 for model, (prediction, reference) in compared.items():
                     if model in BASELINES or model in (label, EXACT):
                         curves.setdefault(model, []).append(per_frame_mse(prediction, reference))
-                    for record in rollout_metrics(prediction, reference, [*settings.horizons, "full"]):
-                        rows.append(Row(model, *about, record.metric, str(record.horizon), record.value))
+                    for record in rollout_metrics(prediction, reference, [*steps, "full"]):
+                        horizon = "full" if record.horizon == "full" else steps[record.horizon]
+                        rows.append(Row(model, *about, record.metric, horizon, record.value))
                 rows += [Row(label, *about, metric, "full", value) for metric, value in extra.items()]
                 if number < settings.num_pictures:
                     _pictures(run_dir, split, number, truth, {label: predictions[label]})
@@ -304,9 +316,15 @@ def _fraction_outside(prediction: Trajectory, first: int, last: int, tolerance: 
     return (fraction_outside(good, tolerance) * good.num_frames + wanted - good.num_frames) / wanted
 
 
-def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windows: int = ONE_STEP_WINDOWS) -> float:
-    """Return the normalised one-step error without noise (``metrics.OneStepNMSE``), over windows spread evenly over a split. Predicting free fall gives 1."""
-    dataset = WindowDataset(usable(open_split(root, split)), simulator.builder)
+def one_step_nmse(simulator: LearnedSimulator, root: Path, split: str, num_windows: int = ONE_STEP_WINDOWS, stride: int = 1) -> float:
+    """Return the normalised one-step error without noise (``metrics.OneStepNMSE``), over windows spread evenly over a split. Predicting free fall gives 1.
+
+    Raises:
+        SceneError: every ``stride``-th frame of the data does not fit the simulator.
+    """
+    views = every(usable(open_split(root, split)), stride)
+    simulator.check_scene(views[0].window(0, 1).metadata)
+    dataset = WindowDataset(views, simulator.builder)
     windows = np.unique(np.linspace(0, len(dataset) - 1, min(len(dataset), num_windows)).round().astype(int))
     metric = OneStepNMSE()
     with torch.inference_mode():
@@ -367,8 +385,9 @@ def read_rows(path: Path) -> Iterator[Row]:
                 "parameter": float(r["parameter"]),
                 "value": float(r["value"]),
             }
-            if r["split"] not in SPLITS or r["parameter_group"] not in GROUPS or not (r["horizon"] == "full" or r["horizon"].isdecimal()):
-                raise ValueError(f"split, parameter group or horizon is {r['split']}, {r['parameter_group']}, {r['horizon']}")
+            if r["split"] not in SPLITS or r["parameter_group"] not in GROUPS:
+                raise ValueError(f"split or parameter group is {r['split']}, {r['parameter_group']}")
+            time_of(r["horizon"])
             if not (r["model"].isprintable() and r["metric"].isprintable()):
                 raise ValueError("model or metric contains characters that are not printable")
             yield Row(**known)

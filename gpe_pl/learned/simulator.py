@@ -63,6 +63,7 @@ class LearnedSimulator(nn.Module):
     Args:
         model: the network; its ``settings`` rebuild it from a checkpoint.
         builder: makes the graphs.
+        stride: number of stored frames of the training data in a frame of the model; for messages.
 
     Attributes:
         skips: levels of skipping.
@@ -80,9 +81,9 @@ class LearnedSimulator(nn.Module):
     trained_mass: Tensor
     clamps_parameters: bool = True
 
-    def __init__(self, model: Model, builder: GraphBuilder) -> None:
+    def __init__(self, model: Model, builder: GraphBuilder, stride: int = 1) -> None:
         super().__init__()
-        self.model, self.builder = model, builder
+        self.model, self.builder, self.stride = model, builder, stride
         self._static_friction = 0.0
         self._warned: set[str] = set()
         self._unknown: list[str | EdgeType] | None = None  # None: not determined yet
@@ -309,19 +310,27 @@ class LearnedSimulator(nn.Module):
         same_channels = scene.dim == own.dim and scene.param_names == own.param_names
         return same_scales and same_channels and {*scene.materials} <= {*own.materials}  # materials can share their parameters
 
-    def check_scene(self, scene: Metadata, choice: str = "data=… size=…") -> None:
-        """Raise an error for a scene that does not fit. The message recommends a ``choice`` of the data set.
+    def check_scene(self, scene: Metadata, choice: str = "") -> None:
+        """Raise an error for a scene that does not fit. The message recommends a ``choice`` of the data set; by default a stride if that is enough.
 
         Raises:
             SceneError: the scene does not fit (``fits``).
         """
         own = self.builder.metadata
         if not self.fits(scene):
+            if (stride := self.stride_on(scene)) > 1:
+                choice = choice or f"every frame number {stride}: Trajectory.every({stride}), or data.stride={stride}"
+            strided = f" (data.stride={self.stride})" if self.stride > 1 else ""
             raise SceneError(
-                f"the model was trained with frame_dt={own.frame_dt:g} s and spacing={own.spacing:g} m in {own.dim}D on {_materials(own)}; "
+                f"the model was trained with frame_dt={own.frame_dt:g} s{strided} and spacing={own.spacing:g} m in {own.dim}D on {_materials(own)}; "
                 f"the scene has frame_dt={scene.frame_dt:g} s and spacing={scene.spacing:g} m in {scene.dim}D and "
-                f"{_materials(scene)}; choose the data set with {choice}"
+                f"{_materials(scene)}; choose the data set with {choice or 'data=… size=…'}"
             )
+
+    def stride_on(self, stored: Metadata) -> int:
+        """Return the stride with which data fit the model; 0 if there is none. ``stored`` describes the data with all stored frames."""
+        stride = round(self.builder.metadata.frame_dt / stored.frame_dt)
+        return stride if stride >= 1 and self.fits(stored.every(stride)) else 0
 
     def _checked(self, state: State, where: str) -> State:
         at_frame = state.vel if state.frame_velocity is None else state.frame_velocity
@@ -515,6 +524,7 @@ class LearnedSimulator(nn.Module):
             "graph": asdict(self.builder.config),
             "metadata": asdict(self.builder.metadata),
             "static_friction": self.static_friction,
+            "stride": self.stride,
         }
 
     @classmethod
@@ -530,8 +540,10 @@ class LearnedSimulator(nn.Module):
         graph, metadata = GraphConfig(**checked(GraphConfig, values["graph"])), Metadata(**checked(Metadata, values["metadata"]))
         for key, fault in metadata.violations():
             raise ValueError(f"{key} {fault}")
-        builder, model = GraphBuilder(graph, metadata), model_class(values["model"])
-        simulator = cls(model(builder.spec, **checked(model, values["settings"], "spec")), builder)
+        builder, model, stride = GraphBuilder(graph, metadata), model_class(values["model"]), values.get("stride", 1)
+        if type(stride) is not int or stride < 1:
+            raise ValueError(f"stride {stride!r} is no integer of at least 1")
+        simulator = cls(model(builder.spec, **checked(model, values["settings"], "spec")), builder, stride)
         simulator.static_friction = values.get("static_friction", 0.0)
         return simulator
 

@@ -36,6 +36,7 @@ HORIZONS: tuple[Horizon, ...] = (5, 20, 50, 100, "full")
 
 UNITS: dict[str, str] = {
     "rollout_mse": "m^2",
+    "final_mse": "m^2",
     "displacement_error": "1",
     "velocity_error": "1",
     "von_mises_error": "1",
@@ -269,6 +270,7 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
 
     ====================== ====== ====================================================================================================
     rollout_mse            m²     squared position error, mean over frames 1 … h, nodes and dimensions (the paper's average MSE)
+    final_mse              m²     squared position error in frame h, mean over nodes and dimensions
     displacement_error     1      ‖x − x̂‖ / ‖x̂ − x̂(0)‖ with x̂ the ground truth, norms over frames, nodes and dimensions
     velocity_error         1      ‖v − v̂‖ / ‖v̂‖, norms as above
     von_mises_error        1      root mean square error of the von Mises stress at mesh nodes over frames 1 … h, over the root mean square in all
@@ -321,7 +323,7 @@ def rollout_metrics(prediction: Trajectory, ground_truth: Trajectory, horizons: 
             values |= {name: motion[name] for name in motion.keys() & values.keys()}
             if planes:
                 values["mirror_error"] = max(mirror_error(prediction, ground_truth, plane, steps) for plane in planes)
-            values["rollout_mse"] = float(error[1 : steps + 1].mean())
+            values["rollout_mse"], values["final_mse"] = float(error[1 : steps + 1].mean()), float(error[steps])
             values |= _relative_errors(prediction, ground_truth, steps)
             if "fraction_outside" in values:
                 values["fraction_outside"] = fraction_outside(

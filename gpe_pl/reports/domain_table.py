@@ -18,6 +18,7 @@ import numpy as np
 import pandas as pd
 
 from gpe_pl.errors import GpeError
+from gpe_pl.evaluation.horizons import time_of
 from gpe_pl.evaluation.rollouts import LEARNED
 from gpe_pl.files.atomic import replace_text, replacing
 from gpe_pl.files.markdown import table_row
@@ -166,18 +167,25 @@ def _check(folder: Path, domains: list[str], by_cell: dict[tuple[str, str], list
                 f"{folder}: models on {domain} were trained or evaluated on different data ({', '.join(keys[:3])}) and do not compare; "
                 "give these runs another name=…"
             )
-        frames = {frame for frame in map(_first_frame, runs) if frame is not None}
-        if len(frames) > 1:
+        starts = {start for start in map(_start, runs) if start is not None}
+        if len(starts) > 1:
             raise TableError(
-                f"{folder}: rollouts of models on {domain} start at different frames ({', '.join(map(str, sorted(frames)))}: evaluation.start_frame, "
-                "or else graph.history) and do not compare; evaluate all with one evaluation.start_frame=…"
+                f"{folder}: rollouts of models on {domain} start at different times ({', '.join(sorted(starts))}: evaluation.start_time, "
+                "or else graph.history) and do not compare; evaluate all with one evaluation.start_time=…"
             )
 
 
-def _first_frame(run: Run) -> int | None:
-    """Start frame of a run's rollouts; None if its configuration does not have it."""
-    frame = run.config.get("evaluation.start_frame")
-    return run.config.get("graph.history") if frame is None else frame
+def _start(run: Run) -> str | None:
+    """Start of a run's rollouts: a time, or a frame if frames of unknown length; None if its configuration does not have it."""
+    time, frame_dt = run.config.get("evaluation.start_time"), run.config.get("data.solver.frame_dt")
+    if time is not None:
+        return f"{time:g} s"
+    frame = run.config.get("evaluation.start_frame")  # of earlier versions
+    frame = run.config.get("graph.history") if frame is None else frame
+    if frame is None:
+        return None
+    frame *= run.config.get("data.stride", 1)
+    return f"frame {frame}" if frame_dt is None else f"{frame * frame_dt:g} s"
 
 
 def _row(by_model: dict[str, list[Run]], domain: str) -> dict[str, tuple[Cell, Cell]]:
@@ -218,7 +226,7 @@ def _write_csv(path: Path, runs: Sequence[Run]) -> None:
         tables.append(rows.assign(model=models).groupby([*keys, "horizon"])["value"].mean())
     means = pd.concat(tables)
     means = means[~means.index.duplicated(keep="last")].unstack("horizon")
-    means = means[sorted(means.columns, key=lambda horizon: (horizon == "full", horizon.zfill(6)))]
+    means = means[sorted(means.columns, key=time_of)]
     with replacing(path) as part:
         means.sort_index().to_csv(part, float_format="%.6g", lineterminator="\n", na_rep="")
 

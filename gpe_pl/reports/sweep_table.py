@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from gpe_pl.evaluation.horizons import time_of
 from gpe_pl.evaluation.rollouts import EXACT, LEARNED, read_rows
 from gpe_pl.files import sealed
 from gpe_pl.files.atomic import replace_text, replacing
@@ -135,7 +136,7 @@ def summary(rows: pd.DataFrame) -> str:
     groups: dict[tuple[str, str, str], dict[str, float]] = defaultdict(dict)
     for (split, metric, model, horizon), value in shown.groupby(["split", "metric", "model", "horizon"])["value"].mean().items():
         groups[split, metric, model][horizon] = value
-    horizons = sorted({*rows["horizon"]} - {"1", "full"}, key=int)
+    horizons = sorted({*rows["horizon"]} - {"1", "full"}, key=time_of)
     lines = [(("split", "metric", "model"), "".join(f"{h:>11}" for h in (*horizons, "full")))]
     for key, values in sorted(groups.items()):
         if "1" in values:  # a metric of one step, shown in the last column
@@ -272,7 +273,7 @@ def _rollout_table(names: list[str], variants: dict[Variant, list[Run]], first: 
 
 def _horizons(run: Run) -> list[str]:
     found = {*run.rows[run.rows["metric"] == "rollout_mse"]["horizon"]}
-    return sorted(found, key=lambda h: (h == "full", h.zfill(6)))[-TABLE_HORIZONS:]
+    return sorted(found, key=time_of)[-TABLE_HORIZONS:]
 
 
 def _stress_table(names: list[str], variants: dict[Variant, list[Run]]) -> list[str]:

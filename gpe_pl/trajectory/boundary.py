@@ -43,6 +43,13 @@ class Motion:
         """Return the motion in the frames ``start:stop``."""
         return Motion(self.pos[start:stop], self.vel[start:stop], self.normal[start:stop])
 
+    def every(self, stride: int) -> Motion:
+        """Return every ``stride``-th frame from the first on. Velocities are means over the frames until the next one that is returned."""
+        first = np.arange(0, self.num_frames, stride)
+        count = np.minimum(first + stride, self.num_frames) - first
+        vel = np.add.reduceat(self.vel, first, axis=0) / count[:, None, None]
+        return Motion(self.pos[::stride], vel.astype(self.vel.dtype), self.normal[::stride])
+
     def take(self, nodes: np.ndarray) -> Motion:
         """Return the motion of some boundary nodes, given by row numbers or a mask."""
         return Motion(self.pos[:, nodes], self.vel[:, nodes], self.normal[:, nodes])
@@ -213,6 +220,10 @@ class Boundary:
 
         now = replace(self, pos=like(motion.pos[0]), vel=like(motion.vel[0]), normal=like(motion.normal[0]), motion=motion)
         return now if frame < self.motion.num_frames else replace(now, vel=0.0 * now.vel, motion=None)
+
+    def every(self, stride: int) -> Boundary:
+        """Return the boundary with every ``stride``-th frame of its motion; the same object if it has none."""
+        return self if self.motion is None else replace(self, motion=self.motion.every(stride)).at(0)
 
     def tree(self, periodicity: Periodicity) -> Any:
         """Return ``search_tree`` of the positions. It is built once, as the positions of a ``Boundary`` never change."""

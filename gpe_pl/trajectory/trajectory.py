@@ -98,6 +98,10 @@ class Metadata:
         """Return the columns of ``material_params`` that hold the parameters of a material, in the order of ``parameters_of``."""
         return [self.param_names.index(p.name) for p in self.parameters_of(material)]
 
+    def every(self, stride: int) -> Metadata:
+        """Return the metadata of a trajectory that has every ``stride``-th frame of this one."""
+        return self if stride == 1 else replace(self, frame_dt=stride * self.frame_dt)
+
     def violations(self) -> Iterator[tuple[str, str]]:
         """Yield the invalid fields, each with its fault. Call it for metadata from files, which may hold any values."""
         unknown = [name for name in self.materials if name not in MATERIALS]
@@ -341,6 +345,24 @@ class Trajectory:
             boundary=self.boundary.at(start, stop),
             stress=stress,
             start_time=self.start_time + first * self.metadata.frame_dt,
+        )
+
+    def every(self, stride: int) -> Trajectory:
+        """Return every ``stride``-th frame, from the first on, as a trajectory whose frames are ``stride`` times as long.
+
+        Velocities of nodes stay those at the frames. Boundary nodes get their mean velocities over the longer frames.
+        """
+        if stride == 1:
+            return self
+        stop = self.termination
+        return replace(
+            self,
+            metadata=self.metadata.every(stride),
+            pos=self.pos[::stride],
+            vel=self.vel[::stride],
+            boundary=self.boundary.every(stride),
+            stress=None if self.stress is None else Stress(self.stress.node[::stride], self.stress.cell[::stride]),
+            termination=None if stop is None else replace(stop, frame=-(-stop.frame // stride)),
         )
 
     def with_moving_boundary(self) -> Trajectory:

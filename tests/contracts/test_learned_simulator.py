@@ -503,6 +503,31 @@ def test_a_scene_of_other_scales_or_materials_is_refused(change: dict[str, Any])
         simulator.initial_state(replace(fitting, metadata=replace(build.metadata, **change)), 1)
 
 
+def test_data_of_shorter_frames_are_refused_with_the_stride_that_fits() -> None:
+    build = scenes.builder()
+    long = replace(build, metadata=build.metadata.every(4))
+    simulator = learned(long)
+    simulator.stride = 4
+    assert [simulator.stride_on(m) for m in (build.metadata, build.metadata.every(2), build.metadata.every(3))] == [4, 2, 0]
+    assert simulator.stride_on(replace(build.metadata, spacing=0.06)) == 0
+    with pytest.raises(
+        SceneError,
+        match=r"0.02 s \(data.stride=4\) .*; the scene has .*: Trajectory.every\(4\), or data.stride=4$",
+    ):
+        simulator.check_scene(build.metadata)
+    simulator.check_scene(build.metadata.every(4))
+
+
+def test_a_checkpoint_keeps_the_stride_of_its_training() -> None:
+    described = learned(scenes.builder()).description()
+    assert described["stride"] == 1
+    assert LearnedSimulator.from_description({**described, "stride": 3}).stride == 3
+    assert LearnedSimulator.from_description({k: v for k, v in described.items() if k != "stride"}).stride == 1  # of earlier versions
+    for wrong in (0, -1, 2.0, True, None, "2"):
+        with pytest.raises(ValueError, match="is no integer of at least 1"):
+            LearnedSimulator.from_description({**described, "stride": wrong})
+
+
 def test_material_parameters_outside_the_training_data_are_named(caplog: pytest.LogCaptureFixture) -> None:
     build = scenes.builder(("sand", "snow"), history=1)
     simulator = learned(build)

@@ -96,7 +96,7 @@ def test_a_periodic_data_set_is_imported_trained_on_and_evaluated(
     evaluate_checkpoint(
         compose(
             "evaluate", "data=imported", "data.name=tgv", "split=val", f"checkpoint={tmp_path / 'runs' / 'fit' / 'checkpoints' / 'best.ckpt'}",
-            f"paths.data={tmp_path / 'data'}", f"paths.runs={tmp_path / 'runs'}", "evaluation.num_pictures=0", "evaluation.horizons=[5]",
+            f"paths.data={tmp_path / 'data'}", f"paths.runs={tmp_path / 'runs'}", "evaluation.num_pictures=0", "evaluation.horizons=[0.025]",
         )
     )  # fmt: skip
     assert (tmp_path / "runs" / "evaluation_fit_tgv_val" / "metrics.csv").exists()

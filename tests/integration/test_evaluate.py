@@ -30,7 +30,7 @@ from tests.runs import DATA, compose, tiny
 
 
 def evaluate(data: Path, runs: Path, checkpoint: Path | str, *overrides: str) -> list[Row]:
-    shared = [f"paths.data={data}", f"paths.runs={runs}", "evaluation.horizons=[5]", "split=test_unseen", "name=evaluation_test_unseen"]
+    shared = [f"paths.data={data}", f"paths.runs={runs}", "evaluation.horizons=[0.025]", "split=test_unseen", "name=evaluation_test_unseen"]
     evaluate_checkpoint(compose("evaluate", *DATA, *shared, f"checkpoint={checkpoint}", *overrides))
     return list(read_rows(runs / "evaluation_test_unseen" / "metrics.csv"))
 
@@ -99,6 +99,21 @@ def test_data_that_do_not_fit_are_refused_before_any_is_generated(checkpoint: Pa
     with pytest.raises(SceneError, match="choose the data set with data=sand size=small$"):
         evaluate(tmp_path / "data", tmp_path / "runs", "sand", "size=tiny")
     assert not (tmp_path / "data").exists() and not (tmp_path / "runs").exists()
+
+
+def test_a_model_of_longer_frames_asks_for_its_stride(tmp_path: Path) -> None:
+    metadata = trajectory_metadata(dataset_spec(compose("simulate", *DATA)), "train", 0).every(2)
+    builder = GraphBuilder(GraphConfig(history=2), metadata)
+    path = tmp_path / "every_second.ckpt"
+    LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder, 2).save(path)
+    for stride in (1, 4):
+        with pytest.raises(SceneError, match=r"frame_dt=0.01 s \(data.stride=2\) .* choose the data set with data.stride=2$"):
+            evaluate(tmp_path / "data", tmp_path, path, f"data.stride={stride}")
+    with pytest.raises(SceneError, match=r"choose the data set with data=sand size=tiny data.stride=2$"):
+        evaluate(tmp_path / "data", tmp_path, path, "dimension=3", "data.stride=2")
+    rows = evaluate(tmp_path / "data", tmp_path, path, "data.stride=2")
+    assert {r.horizon for r in rows if r.metric == "rollout_mse"} == {"0.02s", "full"}
+    assert {r.value for r in rows if r.metric == "num_good_frames"} <= {0.0, 1.0, 2.0, 3.0}  # frames 2 to 5 of 6
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
+from gpe_pl.config.entry_point import ConfigError
 from gpe_pl.data import sampling
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import NoiseError
@@ -358,7 +359,7 @@ def test_metrics_hold_the_model_and_the_baselines(tiny_data: Path, tmp_path: Pat
     for split, groups in (("test", {"seen"}), ("test_unseen", {"interpolated", "extrapolated"})):
         mse = [r for r in rows if r.split == split and r.metric == "rollout_mse"]
         assert {r.model for r in mse} == {"learned", "ballistic", "stops_at_walls", "constant_velocity"}
-        assert {r.horizon for r in mse} == {"5", "full"}
+        assert {r.horizon for r in mse} == {"0.025s", "full"}
         assert {r.parameter_group for r in mse} == groups
         assert all(np.isfinite(r.value) and r.value >= 0 and np.isfinite(r.parameter) for r in mse)
         assert (tmp_path / "fit" / f"error_curve_{split}.png").stat().st_size > 1000
@@ -372,18 +373,62 @@ def test_metrics_hold_the_model_and_the_baselines(tiny_data: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("targets", ["trajectory", "solver"])
+def test_a_model_of_every_second_frame_is_compared_at_the_same_times(tiny_data: Path, tmp_path: Path, targets: str) -> None:
+    elastomer = [] if targets == "trajectory" else ["data=elastomer"]
+    shared = [
+        *elastomer,
+        "graph.history=1",
+        "evaluation.start_time=0.02",
+        "evaluation.horizons=[0.02,0.03]",
+        "evaluation.material_controls=true",
+    ]
+    at: dict[int, dict[str, dict[Any, float]]] = {}
+    for stride in (1, 2):
+        settings = [*shared, f"data.stride={stride}", f"training.targets={targets}", "training.push_fraction=0.5", f"name=every_{stride}"]
+        fit(tiny(tiny_data, tmp_path, *settings))
+        rows = list(read_rows(tmp_path / f"every_{stride}" / "metrics.csv"))
+        assert {r.horizon for r in rows if r.metric == "final_mse"} == {"0.02s", "0.03s", "full"}
+        for model in ("constant_velocity", "solver at nearest value", "learned"):
+            own = {
+                (r.split, r.trajectory, r.horizon): r.value
+                for r in rows
+                if (r.model, r.metric) == (model, "final_mse") and r.horizon != "full"
+            }
+            at.setdefault(stride, {})[model] = own
+    assert at[1]["solver at nearest value"] == pytest.approx(at[2]["solver at nearest value"], rel=1e-6)
+    for model, errors in at[2].items():
+        assert errors.keys() == at[1][model].keys() and errors, model
+    simulator = LearnedSimulator.from_checkpoint(tmp_path / "every_2")
+    assert simulator.stride == 2 and simulator.builder.metadata.frame_dt == pytest.approx(0.01)
+
+
+def test_evaluated_data_with_other_frames_are_refused_before_training(tiny_data: Path, tmp_path: Path) -> None:
+    with pytest.raises(
+        ConfigError, match=r"evaluation.data: frames of 0.005 s, those of the training have 0.01 s; choose another evaluation.data.stride"
+    ):
+        fit(tiny(tiny_data, tmp_path, "data.stride=2", "+evaluation.data.stride=1"))
+    assert not (tmp_path / "fit").exists()
+
+
+@pytest.mark.slow
 def test_models_with_other_histories_are_judged_on_the_same_frames(tiny_data: Path, tmp_path: Path) -> None:
     judged = []
     for history in (1, 3):
         fit(
             tiny(
-                tiny_data, tmp_path, f"graph.history={history}", "evaluation.start_frame=3", "evaluation.splits=[test]", f"name=h{history}"
+                tiny_data,
+                tmp_path,
+                f"graph.history={history}",
+                "evaluation.start_time=0.015",
+                "evaluation.splits=[test]",
+                f"name=h{history}",
             )
         )
         judged.append([r for r in read_rows(tmp_path / f"h{history}" / "metrics.csv") if r.model == "ballistic"])
     assert judged[0] == judged[1] and judged[0]
-    with pytest.raises(StartError, match="start_frame=1: graph.history=3 needs"):
-        fit(tiny(tiny_data, tmp_path, "graph.history=3", "evaluation.start_frame=1", "name=early"))
+    with pytest.raises(StartError, match="start_time=0.005: graph.history=3 needs"):
+        fit(tiny(tiny_data, tmp_path, "graph.history=3", "evaluation.start_time=0.005", "name=early"))
     assert not (tmp_path / "early").exists()
 
 

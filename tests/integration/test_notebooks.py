@@ -37,7 +37,7 @@ RUN = (
     *("model.hidden_channels=8", "model.num_message_passing_steps=1"),
     *("training.num_steps=4", "training.val_interval=2", "training.warmup_steps=0", "training.compile=off"),
     *("training.num_val_rollouts=1", "training.val_rollout_steps=5"),
-    *("evaluation.horizons=[5,20]", "evaluation.num_pictures=0", "trainer.progress=false"),
+    *("evaluation.horizons=[0.025,0.1]", "evaluation.num_pictures=0", "trainer.progress=false"),
 )
 CANYON = (
     "data.sizes.tiny.num_frames=12",

@@ -62,7 +62,9 @@ def imported(folder: Path, gravity: float) -> Path:
 
 def config(command: str, tmp_path: Path, *overrides: str) -> DictConfig:
     fixed = ["data=imported", "data.name=mine", "size=tiny", f"paths.data={tmp_path / 'data'}", f"paths.runs={tmp_path / 'runs'}"]
-    return compose(command, *fixed, *(RUN if command == "fit" else ["evaluation.num_pictures=0", "evaluation.horizons=[5]"]), *overrides)
+    return compose(
+        command, *fixed, *(RUN if command == "fit" else ["evaluation.num_pictures=0", "evaluation.horizons=[0.025]"]), *overrides
+    )
 
 
 def test_a_run_knows_its_data_by_what_they_hold(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,12 +9,12 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64, Int
 from scipy.spatial import cKDTree
 
 
 def gradients(
-    values: Float64[np.ndarray, "node dim"], at: Float64[np.ndarray, "node dim"], cells: Int64[np.ndarray, "cell corner"]
+    values: Float64[np.ndarray, "node dim"], at: Float64[np.ndarray, "node dim"], cells: Int[np.ndarray, "cell corner"]
 ) -> Float64[np.ndarray, "node dim dim"]:
     """Return the gradient at each node of the linear function that fits the differences to the nodes with which it shares cells, in least squares.
 

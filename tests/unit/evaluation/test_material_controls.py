@@ -22,7 +22,7 @@ from gpe_pl.schema import node_code
 from gpe_pl.trajectory.store import iter_trajectories
 from tests.runs import DATA, compose
 
-SETTINGS = EvaluationSettings(splits=["test", "test_unseen"], horizons=[5], num_pictures=0, num_uncontained=0, material_controls=True)
+SETTINGS = EvaluationSettings(splits=["test", "test_unseen"], horizons=[0.025], num_pictures=0, num_uncontained=0, material_controls=True)
 
 
 @pytest.fixture(autouse=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gpe_pl.evaluation.horizons import labels, time_of
 from gpe_pl.evaluation.rollouts import (
     EvaluationSettings,
     MetricsError,
@@ -70,6 +71,8 @@ def test_changed_rows_are_refused(tmp_path: Path, change: Callable[[bytes], byte
         {"horizon": "many"},
         {"horizon": "-5"},
         {"horizon": ""},
+        {"horizon": "0s"},
+        {"horizon": "infs"},
         {"split": "exam"},
         {"parameter_group": "new"},
         {"model": "\x1b[2Kerror: forged"},
@@ -98,10 +101,22 @@ def test_rows_without_a_digest_have_to_mean_something(tmp_path: Path, change: di
 
 
 def test_rollouts_start_where_asked_or_as_early_as_they_can() -> None:
-    assert EvaluationSettings().first_frame(3) == 3
-    assert EvaluationSettings(start_frame=5).first_frame(3) == 5
-    with pytest.raises(StartError, match="start_frame=2: graph.history=3 needs"):
-        EvaluationSettings(start_frame=2).first_frame(3)
+    assert EvaluationSettings().first_frame(3, 0.005) == 3
+    assert [EvaluationSettings(start_time=0.06).first_frame(3, dt) for dt in (0.005, 0.02)] == [12, 3]
+    with pytest.raises(
+        StartError, match=r"start_time=0\.02: graph.history=3 needs as many frames of 0.01 s before it; choose at least 0.03$"
+    ):
+        EvaluationSettings(start_time=0.02).first_frame(3, 0.01)
+    with pytest.raises(StartError, match=r"start_time=0\.05: is between two frames of 0.02 s; choose 0.04$"):
+        EvaluationSettings(start_time=0.05).first_frame(2, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("frame_dt", "expected"), [(0.005, {20: "0.1s", 50: "0.25s"}), (0.02, {5: "0.1s", 12: "0.24s"}), (0.3, {1: "0.3s"})]
+)
+def test_horizons_are_frames_near_a_time_and_named_by_their_own_time(frame_dt: float, expected: dict[int, str]) -> None:
+    assert labels([0.1, 0.25], frame_dt) == expected
+    assert sorted(["full", *labels([2.0, 0.25], frame_dt).values()], key=time_of)[-2:] == [f"{round(2 / frame_dt) * frame_dt:.6g}s", "full"]
 
 
 def test_a_scene_of_several_materials_has_no_one_parameter(inside: Trajectory) -> None:

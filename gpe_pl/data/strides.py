@@ -1,0 +1,92 @@
+"""Data at every ``stride``-th stored frame: their statistics, and the connectivity radius that the longer frames need.
+
+The radius R of the data lets a node meet another node or a wall in time if it moves less than R in a frame. With longer frames it is
+
+    R_k = max(R, min(v k Δt, MOST_RADII R))
+
+where v is the largest speed in the train split and Δt the time between stored frames. In periodic domains it also stays below half a period.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.data.checksum import split_checksum
+from gpe_pl.data.dataset import StoredTrajectory, every
+from gpe_pl.data.statistics import acceleration_std, motion
+from gpe_pl.files import sealed
+from gpe_pl.trajectory.store import StoreError
+from gpe_pl.trajectory.trajectory import Metadata
+
+MOST_RADII = 2.0
+"""Largest radius with a stride, as a multiple of the radius of the data. In 3D, eight times as many edges is the most that a step should cost."""
+OF_PERIOD = 0.49
+"""Largest radius with a stride in a periodic domain, as a fraction of the period."""
+
+
+@dataclass(frozen=True)
+class StrideStatistics:
+    """Statistics of a train split at every ``stride``-th frame.
+
+    Attributes:
+        acceleration_std: rms per component of the accelerations without gravity over the longer frames [m/s²], from stored frame 0 of each trajectory on.
+        max_speed: largest speed of a node between stored frames [m/s].
+    """
+
+    acceleration_std: float
+    max_speed: float
+
+
+def stride_statistics(root: Path | str, stride: int, train: Sequence[StoredTrajectory]) -> StrideStatistics:
+    """Return the statistics of the train split, from ``statistics_stride_{stride}.json`` in the data set's folder if it belongs to these data.
+
+    Otherwise they are computed, and written if the folder can be written.
+
+    Args:
+        root: folder of the data set.
+        stride: number of stored frames in a frame.
+        train: usable trajectories of the train split with all stored frames.
+    """
+    path, checksum = Path(root) / f"statistics_stride_{stride}.json", split_checksum(root, "train")
+    with suppress(sealed.SealError, OSError, KeyError, TypeError, ValueError):
+        known = sealed.read(path, "")
+        if known["data_sha256"] == checksum:
+            return StrideStatistics(float(known["acceleration_std"]), float(known["max_speed"]))
+    std = acceleration_std(view.window(0, view.num_frames) for view in every(train, stride))
+    found = StrideStatistics(std, max(map(_max_speed, train)))
+    with suppress(OSError):  # data may be read-only
+        sealed.write(path, {"data_sha256": checksum, "acceleration_std": found.acceleration_std, "max_speed": found.max_speed})
+    return found
+
+
+def _max_speed(stored: StoredTrajectory) -> float:
+    parts = (values for key, values in motion(stored.window(0, stored.num_frames)) if key == "velocity")
+    return max(float(np.linalg.norm(values, axis=-1).max(initial=0.0)) for values in parts)
+
+
+def connectivity_radius(metadata: Metadata, stride: int, max_speed: float) -> float:
+    """Return the connectivity radius [m] of graphs with a stride.
+
+    Args:
+        metadata: metadata of the stored data.
+        stride: number of stored frames in a frame.
+        max_speed: largest speed of a node [m/s].
+
+    Raises:
+        StoreError: a node may move by half a period or more in a frame, so that its way is not known.
+    """
+    radius, step, most = metadata.connectivity_radius, max_speed * stride * metadata.frame_dt, MOST_RADII * metadata.connectivity_radius
+    if stride > 1 and metadata.periodicity:
+        period = float(min(metadata.periodicity.period[axis] for axis in metadata.periodicity.axes))
+        if step >= 0.5 * period:
+            raise StoreError(
+                f"data.stride={stride}: nodes move up to {step:.3g} m in a frame, and only less than half the period of {period:.3g} m is known; "
+                f"choose at most {max(1, int(0.5 * period / (max_speed * metadata.frame_dt)))}"
+            )
+        most = min(most, OF_PERIOD * period)
+    return max(radius, min(step, most)) if stride > 1 else radius

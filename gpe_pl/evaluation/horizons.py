@@ -1,0 +1,36 @@
+"""Horizons of an evaluation: times after the start of a rollout, so that models with frames of different lengths are compared at the same instants."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+FULL = "full"
+"""Horizon at the last frame of the ground truth."""
+
+
+def labels(seconds: Sequence[float], frame_dt: float) -> dict[int, str]:
+    """Return the label of each horizon by its number of frames.
+
+    A horizon is at the frame nearest to the time, but not at frame 0. Its label is the time of that frame: with frames of 0.02 s, the horizon 0.25 s becomes
+    ``0.24s``.
+
+    Args:
+        seconds: times after the start [s].
+        frame_dt: time between frames [s].
+    """
+    return {n: f"{n * frame_dt:.6g}s" for n in (max(1, round(time / frame_dt)) for time in seconds)}
+
+
+def time_of(label: str) -> float:
+    """Return the time of a label [s], by which horizons are sorted; infinite for ``full``. Labels of earlier versions are numbers of frames.
+
+    Raises:
+        ValueError: the text is no label.
+    """
+    if label == FULL:
+        return math.inf
+    time = float(label) if label.isdecimal() else float(label.removesuffix("s")) if label.endswith("s") else math.nan
+    if not 0 < time < math.inf:
+        raise ValueError(f"horizon is {label!r}, must be a time such as 0.1s, a number of frames, or {FULL}")
+    return time
