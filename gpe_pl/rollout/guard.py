@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import no_type_check
@@ -12,7 +13,7 @@ from array_api_compat import array_namespace
 from numba import njit
 
 from gpe_pl.geometry.shape_values import shapes_fault
-from gpe_pl.geometry.shapes import signed_distance
+from gpe_pl.geometry.shapes import Shape, signed_distance
 from gpe_pl.schema import NODE_TYPES
 from gpe_pl.trajectory.boundary import as_numpy
 from gpe_pl.trajectory.state import State
@@ -24,9 +25,11 @@ CROWDING_LIMIT = 32
 FINEST = 0.01
 """Width of a cell whose nodes count as coincident [rest spacings]. If too many nodes of a start coincide, its limit on crowding is not raised."""
 TUNNEL_DEPTH = 0.25
-"""A path between two frames that is deeper than this in a wall or obstacle went through it [rest spacings]."""
+"""A path between two frames may be this deep in a wall or obstacle without having gone through it [rest spacings]."""
 MAX_PATH_SAMPLES = 4096
 """Maximum number of samples of a path. Paths longer than this many eighths of a spacing are sampled more coarsely."""
+NUM_BISECTIONS = 20
+"""Number of halvings of the part of a way in which it crosses a surface."""
 SUSPECTS_AT_ONCE = 1000
 """Number of nodes whose paths are sampled together, as finely as the fastest of them needs."""
 
@@ -142,8 +145,7 @@ class Guard:
         deepest = np.zeros(len(end))
         for some in np.array_split(suspects, max(1, len(suspects) // SUSPECTS_AT_ONCE)):
             count = min(MAX_PATH_SAMPLES, math.ceil(float(length[some].max(initial=0.0)) / (0.5 * tolerance)))
-            for fraction in np.arange(1, count) / max(1, count):
-                deepest[some] = np.maximum(deepest[some], -signed_distance(shapes, start[some] + fraction * way[some]))
+            deepest[some] = _depth_through(shapes, start[some], way[some], count, tolerance)
         node = int(np.argmax(deepest))
         if not deepest[node] > tolerance:
             return None
@@ -162,6 +164,47 @@ class Guard:
         if crowding(pos, FINEST * self.spacing).max() > self.max_crowding:
             return self
         return replace(self, max_crowding=max(self.max_crowding, 2 * int(crowding(pos, self.spacing).max())))
+
+
+def _depth_through(shapes: Sequence[Shape], start: np.ndarray, way: np.ndarray, count: int, tolerance: float) -> np.ndarray:
+    """Return the largest depth [m] in shapes of the straight ways that go through one; 0 for other ways.
+
+    A way goes through if it is deeper than ``tolerance`` and leaves by a face that is turned by more than 90° from the one where it enters. Other ways cut a
+    corner, around which a node may have moved between the frames.
+
+    Args:
+        shapes: walls and obstacles.
+        start: starts [node, dim] in m.
+        way: displacements [node, dim] in m.
+        count: number of parts into which ways are divided.
+        tolerance: depth [m].
+    """
+    if count < 2:
+        return np.zeros(len(start))
+    depth = np.stack([-signed_distance(shapes, start + k / count * way) for k in range(1, count)])
+    deepest = depth.max(axis=0)
+    deep = np.flatnonzero(deepest > tolerance)
+    found, inside = np.zeros(len(start)), depth[:, deep] > 0
+    first, last = 1 + inside.argmax(axis=0), count - 1 - inside[::-1].argmax(axis=0)
+    enters, leaves = (
+        _normals_at_surface(shapes, start[deep], way[deep], out / count, within / count)
+        for out, within in ((first - 1, first), (last + 1, last))
+    )
+    through = np.einsum("nd,nd->n", enters, leaves) < 0
+    found[deep[through]] = deepest[deep[through]]
+    return found
+
+
+def _normals_at_surface(shapes: Sequence[Shape], start: np.ndarray, way: np.ndarray, out: np.ndarray, within: np.ndarray) -> np.ndarray:
+    """Return the normals [node, dim] where ways cross the surface of shapes, between fractions [node] of the way that are out of and within a shape."""
+    for _ in range(NUM_BISECTIONS):
+        middle = 0.5 * (out + within)
+        is_within = signed_distance(shapes, start + middle[:, None] * way) < 0
+        out, within = np.where(is_within, out, middle), np.where(is_within, middle, within)
+    at = start + within[:, None] * way
+    ways = 1e-4 * np.linalg.norm(way, axis=1).min(initial=1.0) * np.eye(start.shape[1])
+    difference = np.stack([signed_distance(shapes, at + step) - signed_distance(shapes, at - step) for step in ways], axis=1)
+    return np.asarray(difference / ways[0, 0])
 
 
 @njit(cache=True, error_model="numpy")

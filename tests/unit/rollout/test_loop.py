@@ -211,6 +211,14 @@ def test_a_thin_obstacle_is_seen_on_a_way_of_any_length(new_trajectory: New, way
     assert (stop.reason, stop.frame, stop.node) == ("tunnelling", 7, 0)
 
 
+@pytest.mark.parametrize(("to", "goes_through"), [((0.5, 0.13), False), ((0.6, 0.23), False), ((0.66, 0.08), True), ((0.9, 0.16), True)])
+def test_who_may_have_moved_around_a_corner_did_not_go_through(new_trajectory: New, to: tuple[float, float], goes_through: bool) -> None:
+    one = new_trajectory(num_nodes=1, gravity=(0.0, 0.0))
+    before = replace(one.state(0), pos=np.array([[0.38, 0.01]]))  # the straight line over the corner at (0.4, 0.1) is 0.035 m deep
+    stop = Guard(spacing=one.metadata.spacing).check(replace(before, pos=np.array([to])), 1, before)
+    assert (stop is not None) == goes_through
+
+
 def test_who_goes_through_an_obstacle_slowly_is_seen_inside(new_trajectory: New) -> None:
     one = new_trajectory(num_nodes=1, gravity=(0.0, 0.0))
     before = replace(one.state(0), pos=np.array([[0.41, 0.04]]))
