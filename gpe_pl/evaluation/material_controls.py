@@ -108,7 +108,7 @@ class MaterialControls:
             truth: its ground truth from ``start_frame`` on.
             prediction: the model's rollout with the scene's own values.
         """
-        runs, trained = self._runs.read(number), TrainedValues(self.trained)
+        runs, trained = self._solved(number), TrainedValues(self.trained)
         ends = {name: trained.end(name) for name in (LOWEST, HIGHEST)}
         predicted = rollouts(simulator, [_changed(start, values) for values in ends.values()])
         own: Values = scene_values(self.spec, UNSEEN, number)
@@ -127,7 +127,7 @@ class MaterialControls:
         Raises:
             ControlError: the runs do not start like the ground truth.
         """
-        runs = {name: run.every(self.stride) for name, run in self._runs.read(number).items()}
+        runs = self._solved(number)
         start, spacing = runs[NEAREST], truth.metadata.spacing
         is_same = start.metadata.seed == truth.metadata.seed and start.pos.shape == truth.pos.shape
         if not is_same or np.abs(displacement(start.pos[0], truth.pos[0], truth.metadata)).max() > SAME_START * spacing:
@@ -156,6 +156,10 @@ class MaterialControls:
             drawn = [rng.permutation(own) for _ in range(MOST_DRAWS)]
             other[own] = min(drawn, key=lambda order: sum(dealt[a][0] == dealt[b][0] for a, b in zip(own, order, strict=True)))
         return [int(k) for k in other]
+
+    def _solved(self, number: int) -> dict[str, Trajectory]:
+        """Return the solver's runs of a scene by name, with frames as long as the model's."""
+        return {name: run.every(self.stride) for name, run in self._runs.read(number).items()}
 
     @property
     def _indices(self) -> range:

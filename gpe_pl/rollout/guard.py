@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import no_type_check
@@ -166,7 +165,7 @@ class Guard:
         return replace(self, max_crowding=max(self.max_crowding, 2 * int(crowding(pos, self.spacing).max())))
 
 
-def _depth_through(shapes: Sequence[Shape], start: np.ndarray, way: np.ndarray, count: int, tolerance: float) -> np.ndarray:
+def _depth_through(shapes: tuple[Shape, ...], start: np.ndarray, way: np.ndarray, count: int, tolerance: float) -> np.ndarray:
     """Return the largest depth [m] in shapes of the straight ways that go through one; 0 for other ways.
 
     A way goes through if it is deeper than ``tolerance`` and leaves by a face that is turned by more than 90° from the one where it enters. Other ways cut a
@@ -195,7 +194,7 @@ def _depth_through(shapes: Sequence[Shape], start: np.ndarray, way: np.ndarray, 
     return found
 
 
-def _normals_at_surface(shapes: Sequence[Shape], start: np.ndarray, way: np.ndarray, out: np.ndarray, within: np.ndarray) -> np.ndarray:
+def _normals_at_surface(shapes: tuple[Shape, ...], start: np.ndarray, way: np.ndarray, out: np.ndarray, within: np.ndarray) -> np.ndarray:
     """Return the normals [node, dim] where ways cross the surface of shapes, between fractions [node] of the way that are out of and within a shape."""
     for _ in range(NUM_BISECTIONS):
         middle = 0.5 * (out + within)
