@@ -39,7 +39,7 @@ from gpe_pl.training.parallel import end_later_processes
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, seed, set_up, train
 from gpe_pl.training.tracking import LoggerSettings, publish
 
-OPTIMISATION = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "stress_weight", "compile")
+OPTIMISATION = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "loss", "stress_weight", "compile")
 """Fields of ``TrainingSettings`` that are arguments of ``TrainingModule``."""
 
 

@@ -197,6 +197,7 @@ class GPE(Model):
         node_norm: ``layer`` normalises the encoded state of every node and the update of each step, as GNS does. With the ``node`` decoder, accelerations then
             stay bounded in any rollout. ``none`` follows the paper.
         elastic: cells of meshes move their nodes through the whole frame by a constitutive law that the model learns (see ``nn.elastic_bodies``).
+        wall_distance: with ``elastic``, distance from walls at which nodes stop before training, in rest spacings. Training changes it.
         island_momentum: conserve the ``linear``, or also the ``angular``, momentum of freely flying islands exactly (see ``nn.island_momentum``); or
             ``ignored``.
 
@@ -222,6 +223,7 @@ class GPE(Model):
         node_norm: NodeNorm = "none",
         island_momentum: IslandMomentum = "ignored",
         elastic: bool = False,
+        wall_distance: Annotated[float, Field(ge=0)] = 0.0,
     ) -> None:
         super().__init__(
             spec,
@@ -237,6 +239,7 @@ class GPE(Model):
             node_norm=node_norm,
             island_momentum=island_momentum,
             elastic=elastic,
+            wall_distance=wall_distance,
         )
         if elastic and not (spec.cells and spec.meshes and spec.islands):
             raise CellError(
@@ -300,7 +303,9 @@ class GPE(Model):
                 forces = [r for r in forces if r[1] == RADIUS and {r[0], r[2]} & {*self.bodies}]
             self.pair_decoder = nn.ModuleDict({self.key(r): PairForce(spec, r, hidden) for r in forces})
         if elastic:
-            self.elastic_bodies = ElasticBodies({m: spec.param_channels[m] if m in read else 0 for m in spec.meshes}, spec.dim)
+            self.elastic_bodies = ElasticBodies(
+                {m: spec.param_channels[m] if m in read else 0 for m in spec.meshes}, spec.dim, wall_distance
+            )
             zeroed = [cast(MLP, self.node_decoder[m])[2] for m in spec.meshes] if decoder != "pair" else []
             zeroed += [cast(PairForce, force).lin_out for force in self.pair_decoder.values()] if decoder == "pair" or self.bodies else []
             for layer in zeroed:  # training starts from the motion by cells and walls alone

@@ -27,6 +27,7 @@ from gpe_pl.training.push_forward import Excursions
 
 Schedule = Literal["cosine", "exponential"]
 Compile = Literal["auto", "on", "off"]
+Loss = Literal["square", "log"]
 
 MAX_SKIPPED, SKIP_WINDOW, MAX_IN_ROW = 10, 100, 3
 """Limits on skipped batches, whose loss or gradient is not finite. More than ``MAX_SKIPPED`` within ``SKIP_WINDOW`` steps, or ``MAX_IN_ROW`` in a row, stop the
@@ -66,6 +67,7 @@ class TrainingModule(L.LightningModule):
         final_learning_rate: learning rate at the end.
         schedule: ``exponential`` decays geometrically (paper: 5e-5 to 1e-6); ``cosine`` warms up and follows a half cosine (short budgets).
         warmup_steps: steps of linear warm-up in the ``cosine`` schedule.
+        loss: ``square``, or ``log``: ``log(1 + e²)`` of each normalised error e of an acceleration, so that large errors have little weight.
         stress_weight: weight of the mean squared error of the normalised stress, relative to that of the acceleration; used if the model decodes a stress.
         compile: whether to apply ``torch.compile`` to the model. ``auto`` compiles if the run is long enough, the model has no fused passes for the device
             (``is_fused``, on a CPU) and a C++ compiler is found.
@@ -79,6 +81,7 @@ class TrainingModule(L.LightningModule):
         final_learning_rate: Annotated[float, Field(gt=0)] = 1e-5,
         schedule: Schedule = "cosine",
         warmup_steps: Annotated[int, Field(ge=0)] = 100,
+        loss: Loss = "square",
         stress_weight: Annotated[float, Field(gt=0)] = 1.0,
         compile: Compile = "auto",
     ) -> None:
@@ -86,7 +89,7 @@ class TrainingModule(L.LightningModule):
         self.simulator = simulator
         self.num_steps, self.schedule, self.warmup_steps = num_steps, schedule, warmup_steps
         self.learning_rate, self.final_learning_rate = learning_rate, final_learning_rate
-        self.stress_weight = stress_weight
+        self.is_robust, self.stress_weight = loss == "log", stress_weight
         self.compile_mode: Compile = compile
         self.val_nmse = OneStepNMSE()
         self._excursions = Excursions()
@@ -165,6 +168,8 @@ class TrainingModule(L.LightningModule):
             self._windows = list(zip(batch.trajectory.tolist(), batch.frame.tolist(), strict=True))
         std = self.simulator.stress_std.float()
         acceleration = [(a - self._normalized(batch[m].target)).square() for m, a in predicted.acceleration.items()]
+        if self.is_robust:
+            acceleration = [error.log1p() for error in acceleration]
         stress = [(s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]
         if "weight" in batch:
             acceleration = self._weighted(batch, predicted.acceleration, acceleration)

@@ -29,7 +29,7 @@ from gpe_pl.system.machine import keep_freed_memory
 from gpe_pl.training.callbacks import RolloutValidation, StepProgress, WarmAverage
 from gpe_pl.training.checkpoints import AtomicCheckpoints, Checkpoints
 from gpe_pl.training.interruption import Interruption
-from gpe_pl.training.module import Compile, Schedule, TrainingError, TrainingModule
+from gpe_pl.training.module import Compile, Loss, Schedule, TrainingError, TrainingModule
 from gpe_pl.training.parallel import SummedGradients
 
 log = logging.getLogger(__name__)
@@ -72,6 +72,7 @@ class TrainingSettings:
     push_fraction: Annotated[float, Field(ge=0, le=1)] = 0.0
     push_steps: Annotated[int, Field(ge=1)] = 20
     push_correction: Annotated[float, Field(ge=0, le=1)] = 1.0
+    loss: Loss = "square"
     stress_weight: Annotated[float, Field(gt=0)] = 1.0
     compile: Compile = "auto"
     val_interval: Annotated[int, Field(ge=1)] = 1000

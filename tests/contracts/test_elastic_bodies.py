@@ -360,6 +360,18 @@ def test_a_body_without_a_network_falls_freely() -> None:
     torch.testing.assert_close(at_end, vel + DT * state.gravity, rtol=0, atol=1e-4)
 
 
+@pytest.mark.parametrize(("wall_distance", "way"), [(0.0, -0.5), (1.0, -0.2), (2.0, 0.0)])
+def test_nodes_stop_at_the_distance_of_walls(wall_distance: float, way: float) -> None:
+    simulated, state = simulator(network=0.0, wall_distance=wall_distance), bodies(kind="lattice", walls=False)
+    assert state.rest_pos is not None
+    vel = torch.tensor([0.0, -0.5 * scenes.SPACING / DT], dtype=torch.float64).expand_as(state.pos)
+    start = replace(state, pos=state.rest_pos, vel=vel, velocity_history=vel[:, None], frame_velocity=vel, gravity=0 * state.gravity)
+    graph = simulated.builder(start)
+    graph["elastomer"].wall = torch.tensor([0.0, 1.0, 1.2 * scenes.SPACING, 0.0]).expand(len(state.pos), 4)
+    change = simulated(graph).acceleration["elastomer"][:, 1] * ACCELERATION * DT**2  # of the way over a frame
+    torch.testing.assert_close(change / scenes.SPACING, torch.full_like(change, way + 0.5), rtol=0, atol=1e-4)
+
+
 def test_cells_without_volume_are_refused() -> None:
     simulated, state = simulator(), bodies(kind="triangles")
     assert state.rest_pos is not None and state.cells is not None

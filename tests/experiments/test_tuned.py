@@ -66,6 +66,7 @@ def test_a_run_uses_the_values(path: Path) -> None:
     ("fem", "gpe_tuned", "none", False),
     ("fem", "gpe", "by_data", False),
     pytest.param("elastomer", "gpe_tuned", "by_data", False, marks=pytest.mark.slow),
+    ("elastomer", "gpe_tuned", "elastic", True),
     pytest.param("elastomer", "gpe", "elastic", True, marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_a_law_sets_model_graph_and_training_together(data: str, model: str, law: str, is_elastic: bool) -> None:
@@ -76,6 +77,8 @@ def test_a_law_sets_model_graph_and_training_together(data: str, model: str, law
     found = {key: OmegaConf.select(cfg, key) == value for key, value in expected.items()}
     assert set(found.values()) == {is_elastic}, found
     assert is_elastic or cfg.training.push_fraction > 0
+    of_grid = (data, model, law) == ("elastomer", "gpe_tuned", "elastic")
+    assert (cfg.training.loss, cfg.model.wall_distance) == (("log", 1.0) if of_grid else ("square", 0.0))
 
 
 WITH_LAW = {"elastic_bodies", "fem_stress", "unseen_materials", "mixed_materials", "sand", "smoke"}

@@ -96,6 +96,15 @@ def test_the_loss_is_the_mean_over_all_nodes_and_axes_of_both_materials() -> Non
     assert m.loss(data).item() == pytest.approx(sum(errors) / len(errors), rel=1e-5)
 
 
+def test_the_logarithmic_loss_is_the_mean_logarithm_of_one_plus_each_squared_error() -> None:
+    data = batch()
+    square, logarithm = (module(loss=name) for name in ("square", "log"))
+    error = (square.simulator(data).acceleration["sand"] - data["sand"].target / 5.0).detach()
+    data["snow"].target = 5.0 * square.simulator(data).acceleration["snow"].detach()
+    assert square.loss(data).item() == pytest.approx(error.square().sum().item() / (2 * 46), rel=1e-5)
+    assert logarithm.loss(data).item() == pytest.approx((1 + error.square()).log().sum().item() / (2 * 46), rel=1e-5)
+
+
 def test_the_validation_error_is_relative_to_predicting_free_fall() -> None:
     m, data = module(), batch()
     with torch.no_grad():
