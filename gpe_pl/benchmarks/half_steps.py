@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+from gpe_pl.solvers.finer import FinerSolver
 from gpe_pl.trajectory.state import State
 
 
@@ -16,16 +17,22 @@ class HalfSteps:
     It takes twice as many substeps as the solver, also where one substep takes a whole frame. It takes fewer where gravity or viscosity limits them.
 
     Attributes:
-        solver: the solver, a dataclass with ``frame_dt`` and ``cfl``.
+        solver: the solver, a dataclass with ``frame_dt`` and ``cfl``, or a ``FinerSolver`` with such a solver.
     """
 
     solver: Any
 
     @cached_property
     def _half(self) -> Any:
-        return replace(self.solver, frame_dt=self.solver.frame_dt / 2, cfl=self.solver.cfl / 2)
+        if isinstance(self.solver, FinerSolver):
+            return replace(self.solver, solver=_halved(self.solver.solver))
+        return _halved(self.solver)
 
     def step(self, state: State) -> State:
         middle = self._half.step(state)
         after = self._half.step(middle)
         return replace(after, num_substeps=middle.num_substeps + after.num_substeps)
+
+
+def _halved(solver: Any) -> Any:
+    return replace(solver, frame_dt=solver.frame_dt / 2, cfl=solver.cfl / 2)

@@ -108,14 +108,14 @@ def scene_changes(spec: DatasetSpec, index: int) -> dict[str, list[float]]:
     start, num_frames = initial_state(spec, SPLIT, index), spec.num_frames - 1
     names = spec.param_names
     try:
-        own = positions(spec.solver, start, num_frames)
+        own = positions(spec.label_solver, start, num_frames)
         others = {}
         for name, values in trained_values(spec, index).items():
             params = with_values(start.material_params, start.node_type, names, values)
-            others[name] = positions(spec.solver, replace(start, material_params=params), num_frames)
-        others["half_step"] = positions(HalfSteps(spec.solver), start, num_frames)
+            others[name] = positions(spec.label_solver, replace(start, material_params=params), num_frames)
+        others["half_step"] = positions(HalfSteps(spec.label_solver), start, num_frames)
         rounded = replace(start, pos=np.asarray(start.pos).astype(np.float32).astype(np.float64))
-        others["rounded"] = positions(spec.solver, rounded, num_frames)
+        others["rounded"] = positions(spec.label_solver, rounded, num_frames)
     except SimulationError as error:
         raise EffectError(
             f"{spec.name} {spec.size}, scene {index} of {SPLIT}: {error}; leave the data set out, or change its scenes"
@@ -152,7 +152,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
     for label, spec in specs.items():
         if spec.num_test_unseen < 1:
             raise EffectError(f"suite.cases.{label}: the data set has no scenes with unseen values; set data.num_test_unseen")
-        spec.solver.compile_kernels()
+        spec.label_solver.compile_kernels()
     jobs = [(label, index) for label, spec in specs.items() for index in range(min(settings.num_scenes, spec.num_test_unseen))]
     found: dict[tuple[str, int], dict[str, list[float]]] = {}
     with progress_bar("scenes") as on_progress, pool(settings.num_workers) as executor:

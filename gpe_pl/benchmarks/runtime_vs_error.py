@@ -1,9 +1,10 @@
 """Run time against error of solvers and learned models: accuracy at equal cost, and cost at equal accuracy.
 
-The reference is the solver at half the spacing between nodes. Its substeps are half as long where waves or speeds limit them. A substep that takes a whole
-frame stays as long. The observed order of convergence is reported. Everything is compared with the reference, also the solver that made the training data. No
-model can be expected to have a smaller error than that solver. The protocol follows McGreivy and Hakim 2024 (arXiv 2407.07218): a solver can always run at a
-lower resolution, so a fair comparison is at equal cost or at equal accuracy.
+The reference is the solver at half the spacing of the one that made the data, which may be finer than that of the nodes (``data.fine``). It is seen at the
+nodes of the scene (``solvers.finer``). Its substeps are half as long where waves or speeds limit them. A substep that takes a whole frame stays as long. The
+observed order of convergence is reported. Everything is compared with the reference, also the solver that made the training data. No model can be expected to
+have a smaller error than that solver. The protocol follows McGreivy and Hakim 2024 (arXiv 2407.07218): a solver can always run at a lower resolution, so a
+fair comparison is at equal cost or at equal accuracy.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import SimulationError, Simulator, steps
 from gpe_pl.schema import Split
-from gpe_pl.solvers.resolution import Resolved, coarser, finer
+from gpe_pl.solvers.finer import FinerSolver, Refinable
+from gpe_pl.solvers.resolution import Resolved, coarser
 from gpe_pl.training.budget import read_times
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -47,6 +49,7 @@ Frame = tuple[np.ndarray, np.ndarray]
 
 DATA = "solver, as for the data"
 SPACING, STEPS = "spacing × ", "steps × "
+NODES = "solver, spacing of the nodes"
 BALLISTIC = "ballistic"
 REPEATED = ", repeated predictions"
 
@@ -218,7 +221,9 @@ def _simulators(
 ) -> Iterator[tuple[str, Family, Simulator, _Restricted]]:
     """Yield the simulators. Solvers start at frame 0, all others at the first frame with enough history for learned models."""
     same = Resolved(start, lambda pos: pos)
-    yield DATA, "solver", spec.solver, _Restricted(same, True)
+    yield DATA, "solver", spec.label_solver, _Restricted(same, True)
+    if spec.fine > 1:
+        yield NODES, "solver", spec.solver, _Restricted(same, True)
     for factor in settings.factors:
         solver = _solver(spec, factor)
         try:
@@ -270,19 +275,25 @@ def _with_longer_steps(spec: DatasetSpec, factor: int) -> Any | None:
 
 
 def _reference(spec: DatasetSpec, start: State, data: Trajectory) -> Trajectory:
-    """Run the solver at half the spacing, and restrict it to the nodes of the scene."""
-    resolved = finer(start, spec.scene.spacing)
-    prediction, _ = _timed(_solver(spec, 0.5), _Restricted(resolved, True), data, 0)
+    """Run the solver at half the spacing of the data's, seen at the nodes of the scene."""
+    if not isinstance(spec.solver, Refinable):
+        raise ComparisonError(f"{spec.name}: the solver {spec.solver.name} has no solution at a finer spacing to compare with")
+    solver = FinerSolver(spec.solver.finer(2 * spec.fine), 2 * spec.fine, spec.scene.spacing)
+    prediction, _ = _timed(solver, _Restricted(Resolved(start, lambda pos: pos), True), data, 0)
     if prediction.num_frames < data.num_frames:
         raise ComparisonError(f"{spec.name}: the reference solution failed after {prediction.num_frames - 1} frames")
     return prediction
 
 
 def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Trajectory, num_frames: int = 20) -> float:
-    """Return the observed order P = log₂ (|u_2h − u_h| / |u_h − u_{h/2}|) over the first frames; NaN if there is no rollout with spacing 2h."""
-    solver = _solver(spec, 2.0)
+    """Return the observed order P = log₂ (|u_2h − u_h| / |u_h − u_{h/2}|) over the first frames; NaN if there is no rollout with spacing 2h.
+
+    The data have the spacing h.
+    """
+    is_fine = spec.fine > 1
+    solver = spec.refined(spec.fine // 2) if is_fine else _solver(spec, 2.0)
     try:
-        resolved = coarser(start, spec.scene.spacing, 2.0)
+        resolved = Resolved(start, lambda pos: pos) if is_fine else coarser(start, spec.scene.spacing, 2.0)
     except ValueError:
         return float("nan")
     if solver is None:
@@ -457,7 +468,7 @@ def _section(case: str, points: Sequence[Point], order: float, num_trajectories:
         cells = [_interval(point.mse[h], 1e3) for h in horizons]
         lines.append(table_row([point.name, f"{point.cost:.3g}", *cells, f"{1e3 * np.mean(point.distance):.3g}"]))
     note = (
-        f"{num_trajectories} scenes. MSE ×1e-3 [m²] to the solver at half the spacing between nodes, whose observed order of convergence is "
+        f"{num_trajectories} scenes. MSE ×1e-3 [m²] to the solver at half the spacing of the data's, whose observed order of convergence is "
         f"{order:.1f} (positions, first 20 frames): mean and 95 % interval over scenes. `{DATA}` is the error in the "
         "training data. Times: one core, warm, neighbour search and features included."
     )

@@ -78,10 +78,10 @@ def simulate(spec: DatasetSpec, index: int, num_frames: int) -> Timing:
         BenchmarkError: the solver stopped early.
     """
     state, metadata = initial_state(spec, "train", index), trajectory_metadata(spec, "train", index)
-    rollout(spec.solver, state, 1, metadata)  # loads the kernels before timing
+    rollout(spec.label_solver, state, 1, metadata)  # loads the kernels before timing
     substeps: list[int] = []
     started = time.perf_counter()
-    trajectory = rollout(spec.solver, state, num_frames, metadata, on_frame=lambda _, frame: substeps.append(frame.num_substeps))
+    trajectory = rollout(spec.label_solver, state, num_frames, metadata, on_frame=lambda _, frame: substeps.append(frame.num_substeps))
     seconds = time.perf_counter() - started
     if trajectory.termination is not None:
         raise BenchmarkError(f"{spec.name}, training scene {index}: {trajectory.termination.message}")
@@ -97,7 +97,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
     lines = []
     with ProcessPoolExecutor(settings.num_workers, multiprocessing.get_context("spawn")) as pool:
         for label, spec in specs.items():
-            spec.solver.compile_kernels()
+            spec.label_solver.compile_kernels()
             frames = min(settings.num_frames, spec.num_frames - 1)
             indices = np.linspace(0, spec.num_train - 1, settings.num_trajectories).round().astype(int).tolist()
             timings = list(pool.map(simulate, [spec] * len(indices), indices, [frames] * len(indices)))

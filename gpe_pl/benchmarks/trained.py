@@ -10,6 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from gpe_pl.data.ground_truth import DatasetSpec
+from gpe_pl.errors import GpeError
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.reports.finished_runs import Run, axes_of, finished_runs
 
@@ -32,16 +33,39 @@ def runs_in(folders: Sequence[str]) -> list[Run]:
     return [run for folder in folders for run in finished_runs(Path(folder))]
 
 
+class StrideError(GpeError, ValueError):
+    """Raised for a model with a stride, because suites run models on stored frames; the message names the model and its stride."""
+
+
+def of_stored_frames(checkpoint: Path | str) -> LearnedSimulator:
+    """Return the simulator of a checkpoint that was trained on all stored frames.
+
+    Raises:
+        StrideError: it was trained with another ``data.stride`` than 1.
+        CheckpointError: as ``LearnedSimulator.from_checkpoint``.
+    """
+    simulator = LearnedSimulator.from_checkpoint(checkpoint)
+    if simulator.stride != 1:
+        raise StrideError(
+            f"{checkpoint}: was trained with data.stride={simulator.stride}, and suites run models on stored frames; choose a model without it, "
+            "or compare strides with `fit experiment=stride`"
+        )
+    return simulator
+
+
 def trained_on(spec: DatasetSpec, runs: Iterable[Run]) -> dict[str, tuple[LearnedSimulator, Run]]:
     """Return simulators that were trained on a data set of this name and size, and their runs, by label.
 
     A label names the model, and the settings of training and graph in which its runs differ. The length of training is no part of it. Of runs with the same
     label, such as runs with other seeds, the first is returned.
+
+    Raises:
+        StrideError: a run has another ``data.stride`` than 1.
     """
     same: dict[str, list[tuple[LearnedSimulator, Run]]] = defaultdict(list)
     for run in runs:
         if (run.config["data.name"], run.config["size.name"]) == (spec.name, spec.size):
-            simulator = LearnedSimulator.from_checkpoint(run.folder / "checkpoints" / "best.ckpt")
+            simulator = of_stored_frames(run.folder / "checkpoints" / "best.ckpt")
             same[model_label(simulator)].append((simulator, run))
     found: dict[str, tuple[LearnedSimulator, Run]] = {}
     for label, members in same.items():

@@ -52,6 +52,7 @@ OmegaConf.register_new_resolver("model_name", model_name, replace=True)  # ${mod
 
 OmegaConf.register_new_resolver("run_name", run_name, replace=True)  # ${run_name:name} in conf/ checks the name of a results folder
 OmegaConf.register_new_resolver("sweep_name", sweep_name, replace=True)
+OmegaConf.register_new_resolver("fine_suffix", lambda fine: "" if fine == 1 else f"_fine{fine}", replace=True)  # of names of data sets
 
 T = TypeVar("T")
 

@@ -163,7 +163,7 @@ class ControlRuns:
             if on_progress is not None:
                 on_progress(done, total)
             with contextlib.suppress(SimulationError):  # the first scene reports impossible settings with its seed
-                self.spec.solver.compile_kernels()
+                self.spec.label_solver.compile_kernels()
             with pool(min(num_workers, max(1, len(missing)))) as workers:
                 for _ in results(workers, self._write, [(index,) for index in missing]):
                     done += 1
@@ -212,14 +212,14 @@ class ControlRuns:
         state = initial_state(spec, self.split, index)
         guard = Guard(bounds=spec.scene.bounds, margin=ON_SURFACE * max(high - low for low, high in spec.scene.bounds))
         try:
-            *_, state = (state, *steps(spec.solver, state, self.start_frame))
+            *_, state = (state, *steps(spec.label_solver, state, self.start_frame))
         except SimulationError as error:
             raise GenerationError(f"{where}: {error}", self.split, index, metadata.seed) from None
         runs = {}
         for name, values in self.values(index).items():
             params = with_values(state.material_params, state.node_type, metadata.param_names, values)
             num_steps = spec.num_frames - 1 - self.start_frame
-            runs[name] = rollout(spec.solver, replace(state, material_params=params), num_steps, metadata, guard)
+            runs[name] = rollout(spec.label_solver, replace(state, material_params=params), num_steps, metadata, guard)
             if (stop := runs[name].termination) is not None:
                 raise GenerationError(
                     f"{where}, {name} trained values: {stop.reason}: {stop.message}; evaluate without evaluation.material_controls",

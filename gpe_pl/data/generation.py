@@ -211,7 +211,7 @@ def _compile(spec: DatasetSpec) -> None:
     notice.start()
     try:
         with contextlib.suppress(SimulationError):  # the first trajectory reports impossible settings with its seed
-            spec.solver.compile_kernels()
+            spec.label_solver.compile_kernels()
     finally:
         notice.cancel()
 
@@ -289,7 +289,7 @@ def generate(
         check_rounding(spec)
         every = {name: sorted({*v.seen, *v.interpolated, *v.extrapolated}) for name, v in spec.parameters.items()}
         for caution in unresolved(
-            spec.solver, every, (initial_state(spec, "train", k) for k in range(min(SCENES_LOOKED_AT, spec.num_train)))
+            spec.label_solver, every, (initial_state(spec, "train", k) for k in range(min(SCENES_LOOKED_AT, spec.num_train)))
         ):
             log.warning("%s %s: %s", spec.name, spec.size, caution)
     with written(root, spec, part, waits=True):

@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Protocol, cast, runtime_checkable
+from typing import Annotated, Any, ClassVar, Literal, Protocol, cast, runtime_checkable
 
 import numpy as np
 from pydantic import Field, InstanceOf
@@ -22,6 +22,7 @@ from gpe_pl.geometry.shapes import ON_SURFACE
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Simulator, rollout
 from gpe_pl.schema import MATERIALS, SPLITS, MaterialParameter, MaterialValues, ParameterGroup, param_names, parameters_by_name
+from gpe_pl.solvers.finer import TRACERS, FinerSolver, Refinable
 from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.trajectory.state import State
@@ -142,6 +143,7 @@ class DatasetSpec:
         num_frames: number of stored frames per trajectory, including the initial one.
         trajectories_per_shard: number of trajectories in a shard, the unit of work and of resuming.
         seed: seed of the data set.
+        fine: number of parts into which the solver divides the spacing of the scene. Above 1, the nodes are tracers of the finer solution (``solvers.finer``).
         scene: distribution of scenes.
         solver: solver that simulates them.
     """
@@ -158,8 +160,11 @@ class DatasetSpec:
     num_test_unseen: Count = 0
     trajectories_per_shard: Annotated[int, Field(ge=1)] = 8
     seed: Annotated[int, Field(ge=0)] = 0
+    fine: Literal[1, 2, 4] = 1
 
     def __post_init__(self) -> None:
+        if self.fine > 1 and not isinstance(self.solver, Refinable):
+            raise ValueError(f"fine = {self.fine}: the solver {self.solver.name} has no solution at a finer spacing; use fine = 1")
         scene, solver = asdict(cast(Any, self.scene)), asdict(cast(Any, self.solver))
         for key in sorted(scene.keys() & solver.keys()):
             if scene[key] != solver[key]:
@@ -210,14 +215,26 @@ class DatasetSpec:
         """Number of trajectories per split."""
         return dict(zip(SPLITS, (self.num_train, self.num_val, self.num_test, self.num_test_unseen), strict=True))
 
+    def refined(self, factor: int) -> Solver:
+        """Return the solver for ``1 / factor`` of the spacing, which takes and returns states of the scene at its own spacing."""
+        if factor == 1:
+            return self.solver
+        return cast(Solver, FinerSolver(cast(Refinable, self.solver).finer(factor), factor, self.scene.spacing))
+
+    @property
+    def label_solver(self) -> Solver:
+        """The solver of the trajectories: ``solver``, or that for a finer spacing."""
+        return self.refined(self.fine)
+
     @property
     def provenance(self) -> dict[str, Any]:
-        """Settings of scene and solver, with the solver's name, version and largest substep."""
-        scene, solver = asdict(cast(Any, self.scene)), asdict(cast(Any, self.solver))
-        return {
-            "scene": {"kind": type(self.scene).__name__, **scene},
-            "solver": {**solver, "name": self.solver.name, "version": self.solver.version, "solver_dt": self.solver.solver_dt},
-        }
+        """Settings of scene and solver, with the solver's name, version and largest substep; for finer labels also those of the finer solver."""
+        scene = asdict(cast(Any, self.scene))
+        settings = {"scene": {"kind": type(self.scene).__name__, **scene}, "solver": _settings(self.solver, self.solver)}
+        if self.fine == 1:
+            return settings
+        finer = _settings(cast(FinerSolver, self.label_solver).solver, self.solver)
+        return {**settings, "fine": self.fine, "fine_solver": {**finer, "spacing": self.scene.spacing / self.fine, "tracers": TRACERS}}
 
     def as_dict(self) -> dict[str, Any]:
         """Convert to plain JSON values.
@@ -230,7 +247,13 @@ class DatasetSpec:
         for design in values["parameters"].values():
             if not design["further"]:  # as in the specification of a data set with one parameter per material
                 del design["further"]
+        if self.fine == 1:  # as in the specification of a data set that has no finer labels
+            del values["fine"]
         return json.loads(json.dumps({**values, **self.provenance, "input_files": files}))
+
+
+def _settings(solver: Any, named: Solver) -> dict[str, Any]:
+    return {**asdict(solver), "name": named.name, "version": named.version, "solver_dt": solver.solver_dt}
 
 
 def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:
@@ -286,7 +309,7 @@ def trajectory_metadata(spec: DatasetSpec, split: str, index: int) -> Metadata:
         spec.scene,
         spec.solver.frame_dt,
         dataset=spec.name,
-        solver_dt=spec.solver.solver_dt,
+        solver_dt=spec.label_solver.solver_dt,
         seed=scene_seed(spec, split, index),
         split=split,
         parameter_group=parameter_values(spec, split, index)[1],
@@ -324,7 +347,7 @@ def generate_trajectory(
     label = f"split {split}, index {index}, seed {metadata.seed}"
     state = initial_state(spec, split, index, values)
     guard = Guard(bounds=spec.scene.bounds, margin=ON_SURFACE * max(high - low for low, high in spec.scene.bounds))
-    trajectory = rollout(spec.solver, state, (num_frames or spec.num_frames) - 1, metadata, guard)
+    trajectory = rollout(spec.label_solver, state, (num_frames or spec.num_frames) - 1, metadata, guard)
     if trajectory.termination is not None:
         stop = trajectory.termination
         advice = "raise the solver's max_substeps or lower" if stop.reason == "explosion" else "lower the solver's cfl or"

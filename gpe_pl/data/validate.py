@@ -22,6 +22,7 @@ from typing import get_args
 import h5py
 import numpy as np
 
+from gpe_pl.data import fine_provenance
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.motion import motion_of, rounding_fault
 from gpe_pl.files.hdf5_arrays import attribute, is_named
@@ -212,6 +213,9 @@ def _check_file(path: Path, result: Result, seen: dict[str, str], reference: dic
                 for key in SAME_IN_A_DATASET:
                     if getattr(metadata, key) != getattr(common, key):
                         violation(name, key, f"is {getattr(metadata, key)}, but {getattr(common, key)} in {first} of the same data set")
+                own, others = map(fine_provenance.factor_of, (metadata, common))
+                if own != others:
+                    violation(name, "config", f"fine is {own}, but {others} in {first} of the same data set")
                 if len(result.violations) == before:
                     group = result.groups.setdefault((metadata.dataset, metadata.split), Group(metadata))
                     group.add(metadata, arrays)
@@ -280,6 +284,7 @@ def _check_metadata(m: Metadata, path: Path) -> Iterator[Finding]:
         parsed(m.config)
     except ValueError:
         yield "config", "is not JSON"
+    yield from (("config", fault) for fault in fine_provenance.faults(m))
     if m.split not in SPLITS:
         yield "split", f"is {m.split!r}, must be one of {', '.join(SPLITS)}"
     folder = path.absolute().parent.name

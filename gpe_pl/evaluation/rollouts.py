@@ -21,6 +21,7 @@ from gpe_pl.data.dataset import WindowDataset, every, long_enough, open_split, u
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.horizons import labels, time_of
 from gpe_pl.evaluation.material_controls import UNSEEN, AtValue, MaterialControls, label_of
+from gpe_pl.evaluation.rollout_cost import Timed, write_cost
 from gpe_pl.export.program import export_model
 from gpe_pl.files import regular_files
 from gpe_pl.files.atomic import replace_text, replacing
@@ -33,7 +34,7 @@ from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Simulator, Start, fraction_outside, rollout, rollouts
-from gpe_pl.schema import SPLITS, ParameterGroup, Split, param_names
+from gpe_pl.schema import RADIUS, SPLITS, ParameterGroup, Split, param_names
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 from gpe_pl.viz.saving import save_figure
@@ -138,15 +139,16 @@ def evaluate(
 ) -> list[Row]:
     """Roll out every trajectory of the splits, and write metrics and pictures to ``run_dir``.
 
-    All rollouts start at ``settings.first_frame`` and run to the end of the ground truth. The files are ``metrics.csv`` with its digest, and
-    ``error_curve_*.png``. The first ``settings.num_pictures`` trajectories of each split also get ``rollout_*.png``, ``rollout_*.gif``, ``rollout_*.html``
-    (a viewer), ``stress_*.png`` if the model decodes a stress, and the files of ``settings.export``. With ``controls`` they get ``parameters_*.png``, too: the
-    solver and the model at three values of the material parameters.
+    All rollouts start at ``settings.first_frame`` and run to the end of the ground truth. The files are ``metrics.csv`` with its digest, ``rollout_cost.json``
+    (see ``rollout_cost``) and ``error_curve_*.png``. The first ``settings.num_pictures`` trajectories of each split also get ``rollout_*.png``,
+    ``rollout_*.gif``, ``rollout_*.html`` (a viewer), ``stress_*.png`` if the model decodes a stress, and the files of ``settings.export``. With ``controls``
+    they get ``parameters_*.png``, too: the solver and the model at three values of the material parameters.
 
     These metrics are computed here, beside those of ``metrics.rollout_metrics``:
 
     - ``one_step_nmse``: one value for each split (see ``one_step_nmse``).
     - ``num_good_frames``: number of frames that the rollout reached.
+    - ``edges_per_node``: number of edges within the radius over that of nodes, in the graph of the ground truth at half of its length.
     - ``fraction_outside_at_end``: fraction of particles inside a wall or obstacle in the last frame.
     - ``fraction_corrected``: fraction of particle-steps that containment corrects.
     - ``fraction_outside_uncontained``: fraction of particle-frames inside a wall or obstacle with containment off, for the first ``settings.num_uncontained``
@@ -183,6 +185,7 @@ def evaluate(
     simulator = simulator.configured(clamps_parameters=settings.clamp_parameters, static_friction=settings.static_friction)
     run_dir.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
+    seconds: list[float] = []
     for split in settings.splits:
         curves: dict[str, list[np.ndarray]] = {}
         rows += [Row(label, split, -1, "", float("nan"), "one_step_nmse", "1", one_step_nmse(simulator, root, split, stride=stride))]
@@ -193,7 +196,9 @@ def evaluate(
             controlled = controls if split == UNSEEN else None
             pictured = 0 if controlled is None else max(0, settings.num_pictures - number)
             for trajectory, (predictions, extra, at_values) in zip(
-                batch, _predict(simulator, batch, start_frame, settings.containment, left, label, controlled, number, pictured), strict=True
+                batch,
+                _predict(simulator, batch, start_frame, settings.containment, left, label, controlled, number, pictured, seconds),
+                strict=True,
             ):
                 truth = trajectory.frames(start_frame)
                 stop = predictions[label].termination
@@ -220,6 +225,7 @@ def evaluate(
             _error_curve(run_dir / f"error_curve_{split}.png", curves, truth.metadata.frame_dt)
     if "model" in settings.export:
         export_model(simulator, run_dir / "model.pt2")
+    write_cost(run_dir, seconds, frame_dt)
     write_rows(run_dir / "metrics.csv", rows)
     return rows
 
@@ -234,10 +240,11 @@ def _predict(
     controls: MaterialControls | None,
     first: int,
     num_pictured: int,
+    seconds: list[float],
 ) -> Iterator[tuple[dict[str, Trajectory], dict[str, float], list[AtValue]]]:
     """Yield for each trajectory the predictions by model, further metrics of the learned model by name, and pictures' scenes at three parameter values.
 
-    ``first`` is the number of the first trajectory. The first ``num_pictured`` ones have scenes at three values.
+    ``first`` is the number of the first trajectory. The first ``num_pictured`` ones have scenes at three values. Times of steps are added to ``seconds``.
     """
     truths = [trajectory.frames(start_frame) for trajectory in trajectories]
     starts = [start_of(simulator, start_frame, *pair) for pair in zip(trajectories, truths, strict=True)]
@@ -252,7 +259,7 @@ def _predict(
     def within_walls(inner: Simulator) -> Simulator:
         return Contained(inner, truths[0].metadata.frame_dt) if containment else inner
 
-    predicted = rollouts(within_walls(runner), starts, count)
+    predicted = rollouts(Timed(within_walls(runner), seconds), starts, count)
     free = rollouts(runner, starts[:num_uncontained]) if containment else predicted
     exact = None if runner is simulator else rollouts(within_walls(simulator), starts)
     others = None if controls is None else controls.predictions(within_walls(runner), starts, first)
@@ -265,7 +272,7 @@ def _predict(
         if others is not None:
             predictions |= {label_of(label, control): other for control, other in others[scene].items()}
         num_steps = truth.num_nodes * max(1, prediction.num_frames - 1)
-        extra = {"num_good_frames": float(prediction.num_frames - 1)}
+        extra = {"num_good_frames": float(prediction.num_frames - 1), "edges_per_node": _edges_per_node(simulator, trajectory)}
         if truth.boundary.shapes:  # a boundary of nodes alone has no inside
             extra["fraction_outside_at_end"] = _fraction_outside(
                 prediction, steps, steps, tolerance=surface_tolerance(truth.boundary.shapes)
@@ -281,6 +288,14 @@ def _predict(
         if controls is not None and scene < num_pictured:
             at_values = controls.at_three_values(within_walls(runner), starts[scene], first + scene, truth, prediction)
         yield predictions, extra, at_values
+
+
+def _edges_per_node(simulator: LearnedSimulator, trajectory: Trajectory) -> float:
+    """Return the number of edges within the radius over that of nodes, in the graph of the frame at half of a trajectory."""
+    history = simulator.builder.config.history
+    graph = simulator.builder(trajectory.state(max(history, trajectory.num_frames // 2), history).to_torch())
+    edges = (graph[relation].edge_index.shape[1] for relation in simulator.builder.spec.relations if relation[1] == RADIUS)
+    return sum(edges) / trajectory.num_nodes
 
 
 def _parameter(trajectory: Trajectory) -> float:

@@ -37,6 +37,7 @@ from gpe_pl.reports.finished_runs import (
 )
 from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, verdict, write_material_figure
 from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
+from gpe_pl.reports.stride_table import stride_lines
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.viz.saving import save_figure
 
@@ -199,6 +200,7 @@ def _markdown(axes: list[str], variants: dict[Variant, list[Run]], ratios: dict[
             *_rollout_table(names, variants, first),
             *_stress_table(names, variants),
             *_body_table(names, variants),
+            *(["", *strides] if (strides := stride_lines(axes, variants)) else []),
             *(["", *lines] if (lines := material_lines(_material_groups(variants))) else []),
             "",
         ]

@@ -1,23 +1,51 @@
-"""Scenes at another resolution, for studies of a solver's convergence, with a map back to the original nodes.
+"""Scenes at another resolution, with a map back to the original nodes: divided for finer solutions, merged or meshed again for coarser ones.
 
-Particles are divided into 2^dim children, or merged with their neighbours; mass is conserved. Meshes get divided cells, or their outline is meshed again with
-longer edges. ``Resolved.restrict`` returns the positions of the original nodes.
+``divided`` splits particles and cells of meshes, and ``coarser`` merges them. Both conserve mass.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.sparse import csr_array, eye_array, vstack
 from scipy.spatial import cKDTree
 
 from gpe_pl.geometry.meshing import triangulate
 from gpe_pl.trajectory.state import State, Stress
 
 Positions = Float[np.ndarray, "node dim"]
+
+MARKER = 1e-9
+"""Mass of the particle at the position of a divided one, as a fraction of its mass. Such a light particle moves with the others and does not act on them."""
+
+PARTS: dict[int, tuple[list[tuple[int, ...]], list[tuple[int, ...]]]] = {
+    3: ([(0, 1), (1, 2), (2, 0)], [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]),
+    4: (
+        [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)],
+        [(0, 4, 5, 6), (4, 1, 7, 8), (5, 7, 2, 9), (6, 8, 9, 3), (4, 5, 6, 8), (5, 4, 7, 8), (5, 6, 8, 9), (7, 5, 8, 9)],
+    ),
+}
+"""Edges of a triangle and of a tetrahedron, and its parts of equal volume (Bey 1995), by the number of corners. The middle of an edge has the number of corners
+plus the number of the edge."""
+
+
+@dataclass(frozen=True)
+class Divided:
+    """A scene at a finer spacing.
+
+    Attributes:
+        state: its state. The nodes of the original scene come first and have their numbers.
+        origin: weights [node, original node] that interpolate values of the original nodes; the rows sum to 1.
+    """
+
+    state: State
+    origin: csr_array
 
 
 @dataclass(frozen=True)
@@ -31,15 +59,6 @@ class Resolved:
 
     state: State
     restrict: Callable[[np.ndarray], np.ndarray]
-
-
-def finer(state: State, spacing: float) -> Resolved:
-    """Return the scene with half the spacing between nodes; ``spacing`` is the present one [m].
-
-    Raises:
-        ValueError: the mesh has cells that are not triangles in 2D, or its scene has already started.
-    """
-    return _divided_particles(state, spacing) if state.cells is None or not len(state.cells) else _divided_triangles(state)
 
 
 def coarser(state: State, spacing: float, factor: float = 2.0) -> Resolved:
@@ -56,13 +75,43 @@ def coarser(state: State, spacing: float, factor: float = 2.0) -> Resolved:
 # --- particles --------------------------------------------------------------------------------------------------------------------------------
 
 
-def _divided_particles(state: State, spacing: float) -> Resolved:
+def divided_particles(state: State, spacing: float, factor: int) -> Divided:
+    """Divide every particle into ``factor`` parts along each axis, around a particle of nearly no mass at its position.
+
+    The parts form a lattice. Its axes are those of the lattice that the cells describe, for materials with cells, otherwise those of space.
+
+    Args:
+        state: start of a scene.
+        spacing: distance of neighbouring particles [m].
+        factor: number of parts along each axis.
+    """
     dim, count = state.dim, state.num_nodes
-    shifts = spacing / 4 * np.array(list(itertools.product((-1, 1), repeat=dim)))
-    children = len(shifts)
-    pos = (state.pos[:, None] + shifts).reshape(-1, dim)
-    rows = np.repeat(np.arange(count), children)
-    return Resolved(_rows(state, rows, pos, state.mass[rows] / children), lambda pos: pos.reshape(count, children, dim).mean(axis=1))
+    line = (2 * np.arange(factor) + 1 - factor) / (2 * factor)
+    shifts = spacing * np.array(list(itertools.product(line, repeat=dim))) @ _lattice_axes(state)
+    parts = shifts.shape[1]
+    pos = np.concatenate([state.pos, (state.pos[:, None] + shifts).reshape(-1, dim)])
+    rows = np.concatenate([np.arange(count), np.repeat(np.arange(count), parts)])
+    fraction = np.concatenate([np.full(count, MARKER), np.full(count * parts, (1 - MARKER) / parts)])
+    origin = csr_array((np.ones(len(rows)), (np.arange(len(rows)), rows)), shape=(len(rows), count))
+    return Divided(_rows(state, rows, pos, fraction * state.mass[rows]), origin)
+
+
+def _lattice_axes(state: State) -> np.ndarray:
+    """Return the axes of the undeformed lattice around each particle [node, axis, dim]; those of space for materials without cells.
+
+    The lattice cells are cut into simplices whose ``dim`` shortest edges have the directions of the lattice.
+    """
+    axes = np.tile(np.eye(state.dim), (state.num_nodes, 1, 1))
+    if state.cells is None or not len(state.cells):
+        return axes
+    corners = np.asarray(state.pos)[state.cells]
+    edges = np.stack([corners[:, b] - corners[:, a] for a, b in itertools.combinations(range(corners.shape[1]), 2)], axis=1)
+    length = np.linalg.norm(edges, axis=-1)
+    shortest = np.argsort(length, axis=1, kind="stable")[:, : state.dim]
+    directions = np.take_along_axis(edges / length[..., None], shortest[..., None], axis=1)
+    meshed = np.flatnonzero(np.isin(state.node_type, np.unique(state.node_type[state.cells])))
+    axes[meshed] = directions[cKDTree(corners.mean(axis=1)).query(np.asarray(state.pos)[meshed])[1]]
+    return axes
 
 
 def _merged_particles(state: State, size: float) -> Resolved:
@@ -87,39 +136,53 @@ def _rows(state: State, rows: np.ndarray, pos: np.ndarray, mass: np.ndarray) -> 
     return replace(state.take(rows), pos=pos, mass=mass, velocity_history=None, rest_pos=None, cells=None)
 
 
-# --- triangles --------------------------------------------------------------------------------------------------------------------------------
+# --- meshes -----------------------------------------------------------------------------------------------------------------------------------
 
 
-def _check_triangles(state: State) -> None:
-    if state.dim != 2 or state.cells is None or state.cells.shape[1] != 3:
-        raise ValueError("only meshes of triangles can be divided or meshed again")
+def _check_start(state: State) -> None:
     if state.time > 0:
         raise ValueError(f"the mesh at {state.time:g} s is deformed; only the start of a scene can have another resolution")
 
 
-def _divided_triangles(state: State) -> Resolved:
-    """Divide every triangle into four; the original nodes come first and keep their numbers."""
-    _check_triangles(state)
-    count, cells = state.num_nodes, state.cells
-    assert cells is not None
-    sides = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    edges, number = np.unique(sides, axis=0, return_inverse=True)
-    ab, bc, ca = (count + number.reshape(-1, 3)).T
-    a, b, c = cells.T
-    divided = np.concatenate([np.stack(corners, axis=1) for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+def divided_mesh(state: State, factor: int) -> Divided:
+    """Divide every cell into parts of equal volume, ``factor`` along each edge. Original nodes keep their numbers and positions.
 
-    def with_middles(values: np.ndarray) -> np.ndarray:
-        return np.concatenate([values, values[edges].mean(axis=1)])
+    Part k of cell c has the number ``k num_cells + c``.
 
-    ends = np.concatenate([np.arange(count), edges[:, 0]])
-    new = _mesh_state(state, ends, with_middles(state.pos), divided, with_middles(state.vel))
-    return Resolved(replace(new, material_params=with_middles(state.material_params)), lambda pos: pos[:count])
+    Args:
+        state: start of a scene.
+        factor: power of 2.
+
+    Raises:
+        ValueError: the cells are neither triangles in 2D nor tetrahedra in 3D, or the scene has already started.
+    """
+    _check_start(state)
+    cells = state.cells
+    if cells is None or cells.shape[1] != state.dim + 1:
+        raise ValueError(
+            "only meshes of triangles in 2D and of tetrahedra in 3D can be divided; choose data.scene.cell=triangle or tetrahedron"
+        )
+    origin: Any = eye_array(state.num_nodes, format="csr")
+    for _ in range(round(math.log2(factor))):
+        ends, parts = PARTS[cells.shape[1]]
+        sides = np.sort(cells[:, ends].reshape(-1, 2), axis=1)
+        edges, number = np.unique(sides, axis=0, return_inverse=True)
+        count = origin.shape[0]
+        local = np.concatenate([cells, count + number.reshape(-1, len(ends))], axis=1)
+        cells = np.concatenate([local[:, part] for part in parts])
+        rows = np.repeat(np.arange(len(edges)), 2)
+        middles = csr_array((np.full(len(rows), 0.5), (rows, edges.ravel())), shape=(len(edges), count))
+        origin = csr_array(vstack([origin, middles @ origin]))
+    near = np.asarray(origin.argmax(axis=1)).ravel()
+    new = _mesh_state(state, near, origin @ state.pos, cells, origin @ state.vel)
+    return Divided(replace(new, material_params=origin @ state.material_params), origin)
 
 
 def _remeshed(state: State, spacing: float) -> Resolved:
     """Fill the outline of the mesh with new triangles; original nodes move with the nearest new triangle."""
-    _check_triangles(state)
-    assert state.cells is not None
+    _check_start(state)
+    if state.dim != 2 or state.cells is None or state.cells.shape[1] != 3:
+        raise ValueError("only meshes of triangles can be meshed again")
     loops = [state.pos[loop] for loop in outline(state.cells)]
     points, cells = triangulate(loops, spacing, np.random.default_rng(0))
     nodes, weights = _locate(points, cells, state.pos)
@@ -135,10 +198,11 @@ def _remeshed(state: State, spacing: float) -> Resolved:
 def _mesh_state(state: State, near: np.ndarray, pos: np.ndarray, cells: np.ndarray, vel: np.ndarray) -> State:
     """Return a state with another mesh of the same body and the same total mass; a new node takes other values from an old one, ``near`` [node]."""
     corners = pos[cells]
-    area = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 2
-    share = np.bincount(cells.ravel(), np.repeat(area / 3, 3), minlength=len(pos))
-    stress = None if state.stress is None else Stress(np.zeros((len(pos), 4)), np.zeros((len(cells), 4)))
-    mass = share / share.sum() * state.mass.sum()
+    volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
+    mass = np.bincount(cells.ravel(), np.repeat(volume, cells.shape[1]), minlength=len(pos))
+    components = 4 if state.dim == 2 else 6
+    stress = None if state.stress is None else Stress(np.zeros((len(pos), components)), np.zeros((len(cells), components)))
+    mass *= state.mass.sum() / mass.sum()
     return replace(state.take(near), pos=pos, vel=vel, mass=mass, velocity_history=None, rest_pos=pos.copy(), cells=cells, stress=stress)
 
 

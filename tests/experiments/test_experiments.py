@@ -30,6 +30,8 @@ SLOW = {
     "unseen_materials",
 }
 """Experiments that run with the slow tests; all others run with the long tests. The canyon is also trained and evaluated for its notebook."""
+SHORT = {"stride": ["evaluation.start_time=0.025"]}
+"""Overrides with which experiments fit miniature data."""
 TAKING_OVER = [e for e in EXPERIMENTS if "\nreuse: table1\n" in (CONF / "experiment" / f"{e}.yaml").read_text()]
 
 
@@ -49,7 +51,7 @@ def test_an_experiment_states_its_own_name(experiment: str) -> None:
 
 @pytest.mark.parametrize("experiment", [e if e in QUICK else pytest.param(e, marks=_mark(e)) for e in EXPERIMENTS])
 def test_an_experiment_trains_and_evaluates(experiment: str, tiny_data: Path, tmp_path: Path) -> None:
-    cfg = tiny(tiny_data, tmp_path, f"experiment={experiment}", *first_choices(experiment))
+    cfg = tiny(tiny_data, tmp_path, f"experiment={experiment}", *first_choices(experiment), *SHORT.get(experiment, []))
     value = fit(cfg)
     rows = list(read_rows(tmp_path / experiment / "metrics.csv"))
     assert {r.split for r in rows} == set(cfg.evaluation.splits)

@@ -19,14 +19,13 @@ from pydantic import Field
 from gpe_pl.benchmarks.acceptance import bodies, flight, liquid, particles
 from gpe_pl.benchmarks.acceptance.trial import Candidate, Result
 from gpe_pl.benchmarks.finished_parts import PARTS, FinishedParts
-from gpe_pl.benchmarks.trained import Case, checkpoint_label
+from gpe_pl.benchmarks.trained import Case, checkpoint_label, of_stored_frames
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.errors import GpeError
 from gpe_pl.files.markdown import table_row
 from gpe_pl.learned import acceptance
 from gpe_pl.learned.acceptance import Acceptance, Check
 from gpe_pl.learned.pretrained import FOLDER, checkpoint_path
-from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.viz.saving import save_figure
 
 log = logging.getLogger(__name__)
@@ -93,7 +92,7 @@ def _candidates(checkpoints: Sequence[str], specs: dict[str, DatasetSpec]) -> li
     """Return the models with the paths of their checkpoints, all loaded first, so that a wrong name is reported at once."""
     found: dict[str, tuple[Candidate, Path]] = {}
     for checkpoint in checkpoints:
-        simulator, name = LearnedSimulator.from_checkpoint(checkpoint), checkpoint_label(checkpoint)
+        simulator, name = of_stored_frames(checkpoint), checkpoint_label(checkpoint)
         own = simulator.builder.metadata
         fitting = [s for s in specs.values() if s.name == own.dataset and abs(s.scene.spacing / own.spacing - 1) < 0.01]
         if not fitting or len(own.materials) > 1:

@@ -154,7 +154,7 @@ def settle(subject: Subject) -> State | str:
     fastest = math.inf
     for index in range(len(subject.scenes)):
         start, num_steps = initial_state(subject.spec, "test", index), round(min(length, 5 * subject.spec.num_frames))
-        for frame, state in enumerate(steps(subject.spec.solver, start, num_steps)):
+        for frame, state in enumerate(steps(subject.spec.label_solver, start, num_steps)):
             speed = float(np.linalg.norm(state.vel, axis=-1).max()) * subject.dt / subject.spacing
             fastest = min(fastest, speed)
             if speed < AT_REST and frame > subject.spec.num_frames // 2:
@@ -171,7 +171,7 @@ def perturbation(subject: Subject) -> Outcome:
     num_steps = subject.scenes[0].num_frames - 1 - subject.history
     size = subject.simulator.builder.metadata.longest_side
     own = separation(Contained(subject.simulator, subject.dt), subject.state(0, 0.0), num_steps, subject.spacing, size)
-    solver = separation(subject.spec.solver, initial_state(subject.spec, "test", 0), num_steps, subject.spacing, size)
+    solver = separation(subject.spec.label_solver, initial_state(subject.spec, "test", 0), num_steps, subject.spacing, size)
     rate, reference = growth_rate(own, subject.spacing), growth_rate(solver, subject.spacing)
     limit = 1.5 * reference if reference > 0 else reference / 1.5
     text = f"{rate:.3g} per frame, solver {reference:.3g}"

@@ -25,7 +25,7 @@ from pydantic import Field
 from gpe_pl.benchmarks.finished_parts import PARTS, FinishedParts
 from gpe_pl.benchmarks.stability import conservation, geometry, horizon, inputs, invariances, precision
 from gpe_pl.benchmarks.stability.subject import Outcome, StressTest, Subject
-from gpe_pl.benchmarks.trained import Case, checkpoint_label, fingerprint_of, runs_in, trained_on
+from gpe_pl.benchmarks.trained import Case, checkpoint_label, fingerprint_of, of_stored_frames, runs_in, trained_on
 from gpe_pl.data.ground_truth import DatasetSpec, generate_trajectory
 from gpe_pl.errors import GpeError
 from gpe_pl.files.markdown import table_row
@@ -226,7 +226,7 @@ def _models(spec: DatasetSpec, settings: Settings) -> Iterator[tuple[str, Learne
     """Yield the names and simulators of all models of a data set."""
     yield from ((name, simulator) for name, (simulator, _) in trained_on(spec, runs_in(settings.runs)).items())
     for checkpoint in settings.checkpoints:
-        simulator = LearnedSimulator.from_checkpoint(checkpoint)
+        simulator = of_stored_frames(checkpoint)
         metadata = simulator.builder.metadata
         if (metadata.dataset, metadata.spacing) == (spec.name, spec.scene.spacing):
             yield checkpoint_label(checkpoint), simulator

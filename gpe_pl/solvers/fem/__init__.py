@@ -70,6 +70,7 @@ class FEM:
     name: ClassVar[str] = "fem"
     version: ClassVar[str] = "1"
     stores_stress: ClassVar[bool] = True
+    has_mesh: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_bounds(self.bounds)
@@ -99,6 +100,10 @@ class FEM:
             np.zeros_like(pos),
         )
         return min(self.frame_dt, self.cfl / _critical_rate(mesh.scale * stiffest, mesh.scale * most_viscous))
+
+    def finer(self, factor: int) -> FEM:
+        """Return the solver with ``factor`` times as many substeps allowed. The mesh sets the spacing; see ``solvers.finer``."""
+        return replace(self, max_substeps=factor * self.max_substeps)
 
     can_restart: ClassVar[bool] = True
 

@@ -148,6 +148,7 @@ class FLIP:
     name: ClassVar[str] = "flip"
     version: ClassVar[str] = "2"
     stores_stress: ClassVar[bool] = False
+    has_mesh: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_whole_cells(self.bounds, self.grid_spacing)
@@ -186,6 +187,10 @@ class FLIP:
     def restarted(self, state: State) -> State:
         """Return the state without velocity history and stress. A step starts from positions and velocities alone."""
         return replace(state, velocity_history=None, stress=None)
+
+    def finer(self, factor: int) -> FLIP:
+        """Return the solver with ``1 / factor`` of the grid spacing, and ``factor`` times as many substeps allowed; see ``solvers.finer``."""
+        return replace(self, grid_spacing=self.grid_spacing / factor, max_substeps=factor * self.max_substeps)
 
     def step(self, state: State) -> State:
         """Advance one frame.

@@ -94,6 +94,7 @@ class MPM:
     name: ClassVar[str] = "mpm"
     version: ClassVar[str] = "6"
     stores_stress: ClassVar[bool] = False
+    has_mesh: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         check_whole_cells(self.bounds, self.grid_spacing)
@@ -165,6 +166,10 @@ class MPM:
             raise self._error(status, node, particles.pos, particles.vel, state.gravity)
         internal = MPMInternal(particles.deformation, particles.affine, particles.gradient, particles.plastic, np.array(last_substep))
         return state.later(self.frame_dt, particles.pos, particles.vel, velocity_history=None, num_substeps=num_substeps, internal=internal)
+
+    def finer(self, factor: int) -> MPM:
+        """Return the solver with ``1 / factor`` of the grid spacing, and ``factor`` times as many substeps allowed; see ``solvers.finer``."""
+        return replace(self, grid_spacing=self.grid_spacing / factor, max_substeps=factor * self.max_substeps)
 
     @property
     def can_restart(self) -> bool:

@@ -20,7 +20,7 @@ from gpe_pl.data.dataset import StoredTrajectory, WindowDataset, every, long_eno
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
 from gpe_pl.data.statistics import acceleration_std
-from gpe_pl.data.strides import MOST_RADII, connectivity_radius
+from gpe_pl.data.strides import MOST_RADII, REACH, connectivity_radius
 from gpe_pl.files import sealed
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
@@ -148,11 +148,10 @@ def test_walls_move_as_far_in_longer_frames(trajectory: Trajectory) -> None:
 
 def test_the_radius_follows_the_fastest_node_up_to_a_limit(trajectory: Trajectory) -> None:
     m = trajectory.metadata  # radius 0.15 m, frames of 0.01 s
-    assert [connectivity_radius(m, 4, speed) for speed in (1.0, 5.0, 100.0)] == pytest.approx([0.15, 0.2, MOST_RADII * 0.15])
+    assert [connectivity_radius(m, 4, speed) for speed in (1.0, 10.0, 100.0)] == pytest.approx([0.15, 0.2, MOST_RADII * 0.15])
     assert connectivity_radius(m, 1, 100.0) == 0.15
     around = replace(m, periodic=(True, False), bounds=((0.0, 0.5), (0.0, 1.0)))
-    assert connectivity_radius(around, 4, 6.1) == pytest.approx(0.244)
-    assert connectivity_radius(replace(around, connectivity_radius=0.14), 4, 6.24) == pytest.approx(0.49 * 0.5)
+    assert connectivity_radius(replace(around, connectivity_radius=0.1), 4, 6.2) == pytest.approx(REACH * 4 * 0.01 * 6.2)
     with pytest.raises(StoreError, match=r"data.stride=4: nodes move up to 0.28 m in a frame, .* half the period of 0.5 m .* at most 3$"):
         connectivity_radius(around, 4, 7.0)
 

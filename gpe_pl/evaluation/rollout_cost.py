@@ -1,0 +1,65 @@
+"""Processor time of rollouts per simulated second, which compares models whose frames differ in length."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.files import sealed
+from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
+from gpe_pl.trajectory.state import State
+
+COST = "rollout_cost.json"
+"""File with the cost of rollouts in the folder of a run or evaluation."""
+
+
+@dataclass(frozen=True)
+class Timed:
+    """A simulator whose steps are timed.
+
+    Attributes:
+        simulator: simulator that makes the steps.
+        seconds: processor time per scene of each step so far [s].
+    """
+
+    simulator: Simulator
+    seconds: list[float] = field(default_factory=list)
+
+    def step(self, state: State) -> State:
+        begun = time.process_time()
+        new = self.simulator.step(state)
+        self.seconds.append(time.process_time() - begun)
+        return new
+
+    def step_all(self, states: list[State]) -> list[State | SimulationError]:
+        begun = time.process_time()
+        new = step_all(self.simulator, states)
+        self.seconds.append((time.process_time() - begun) / max(1, len(states)))
+        return new
+
+
+def write_cost(folder: Path, seconds: list[float], frame_dt: float) -> None:
+    """Write the median time of a step and the cost of rollouts, so that compilation in the first steps does not count; nothing without a step.
+
+    Args:
+        folder: folder of the run or evaluation.
+        seconds: processor time per scene of each step [s].
+        frame_dt: time between frames [s].
+    """
+    if seconds:
+        step = float(np.median(seconds))
+        sealed.write(folder / COST, {"seconds_per_step": step, "seconds_per_simulated_second": step / frame_dt})
+
+
+def read_cost(folder: Path) -> float | None:
+    """Return the processor time per simulated second [s/s], or None if it was not measured.
+
+    Raises:
+        SealError: the file was changed or damaged.
+    """
+    if not (folder / COST).is_file():
+        return None
+    return float(sealed.read(folder / COST, "delete it to do without")["seconds_per_simulated_second"])

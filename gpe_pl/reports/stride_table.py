@@ -1,0 +1,75 @@
+"""Lines of a sweep's table that compare strides: errors at the same instants, cost per simulated second, and edges per node."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gpe_pl.evaluation.horizons import FULL, time_of
+from gpe_pl.evaluation.rollout_cost import read_cost
+from gpe_pl.evaluation.rollouts import LEARNED
+from gpe_pl.files.markdown import table_row
+from gpe_pl.metrics import bootstrap_ratio
+from gpe_pl.reports.finished_runs import Run, shared_table, shared_trajectories, splits_of, values_by_seed
+
+AXIS = "data.stride"
+ERROR = "final_mse"
+NOTE = (
+    "Position MSE ×1e-3 [m²] at the instant, nodes and axes: median over trajectories and seeds, and the ratio of the means to the first row with its 95 % "
+    "bootstrap interval over paired trajectories that no row failed. Failed: rollouts that stopped early. Cost: processor time of rollout steps per simulated "
+    "second, measured in each run's evaluation, and its ratio to the first row. Edges: within the radius, per node, in the middle of the scenes."
+)
+
+
+def stride_lines(axes: list[str], variants: dict[tuple[str, ...], list[Run]]) -> list[str]:
+    """Return a Markdown table of variants that differ in their stride; empty if they do not.
+
+    Args:
+        axes: configuration keys in which the variants differ.
+        variants: runs by their values of these keys. The first is the reference.
+    """
+    if AXIS not in axes:
+        return []
+    first, *_ = variants.values()
+    instants = _shared_instants(variants)
+    names = [axis.rpartition(".")[2] for axis in axes]
+    header = [*names, "split", *(f"at {instant}" for instant in instants), "failed", "cost [s/s]", "edges per node"]
+    lines = [table_row(header), "|" + "---|" * len(header)]
+    for split in splits_of(first[0]):
+        for key, runs in variants.items():
+            errors = [_error(runs, first, split, instant, variants) for instant in instants]
+            ends = [value for seed in values_by_seed(runs, LEARNED, split, ERROR, FULL) for value in seed.values()]
+            failed = f"{int(np.sum(~np.isfinite(ends)))} of {len(ends)}"
+            edges = [value for seed in values_by_seed(runs, LEARNED, split, "edges_per_node", FULL) for value in seed.values()]
+            lines.append(
+                table_row([*key, split, *errors, failed, _cost(runs, first), f"{np.mean(edges):.1f}" if edges else "not measured"])
+            )
+    return [*lines, "", NOTE]
+
+
+def _shared_instants(variants: dict[tuple[str, ...], list[Run]]) -> list[str]:
+    """Return the horizons that all runs have, apart from the full length, which differs between strides."""
+    found = [{*run.rows[run.rows["metric"] == ERROR]["horizon"]} for runs in variants.values() for run in runs]
+    return sorted(set.intersection(*found) - {FULL}, key=time_of)
+
+
+def _error(runs: list[Run], first: list[Run], split: str, instant: str, variants: dict[tuple[str, ...], list[Run]]) -> str:
+    own, reference = (values_by_seed(some, LEARNED, split, ERROR, instant) for some in (runs, first))
+    if not own:
+        return "not measured"
+    median = f"{1e3 * np.median(shared_table(own)):.3g}"
+    if runs is first or not reference:
+        return median
+    every = [values_by_seed(some, LEARNED, split, ERROR, instant) for some in variants.values()]
+    sound = [k for k in shared_trajectories(*every) if all(np.isfinite(seed[k]) for table in every for seed in table)]
+    if not sound:
+        return median
+    ratio = bootstrap_ratio(shared_table(own, sound), shared_table(reference, sound), np.mean)
+    return f"{median} (×{ratio.estimate:.2f} [{ratio.low:.2f}, {ratio.high:.2f}])"
+
+
+def _cost(runs: list[Run], first: list[Run]) -> str:
+    own, reference = ([cost for run in some if (cost := read_cost(run.folder)) is not None] for some in (runs, first))
+    if not own:
+        return "not measured"
+    ratio = f" (×{np.mean(own) / np.mean(reference):.2f})" if reference and runs is not first else ""
+    return f"{np.mean(own):.3g}{ratio}"
