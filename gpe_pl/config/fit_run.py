@@ -34,12 +34,16 @@ from gpe_pl.models.lookup import model_class
 from gpe_pl.reports.finished_runs import Run, rollout_errors, table_of
 from gpe_pl.rollout.loop import Restartable
 from gpe_pl.training.budget import PauseForMeasurements, mean_step_time, step_time_key, within_budget
+from gpe_pl.training.errors import mean_num_neighbors
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.parallel import end_later_processes
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, seed, set_up, train
 from gpe_pl.training.tracking import LoggerSettings, publish
 
-OPTIMISATION = ("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps", "loss", "stress_weight", "compile")
+OPTIMISATION = (
+    *("num_steps", "learning_rate", "final_learning_rate", "schedule", "warmup_steps"),
+    *("loss", "stress_weight", "neighbor_weight", "compile"),
+)
 """Fields of ``TrainingSettings`` that are arguments of ``TrainingModule``."""
 
 
@@ -66,6 +70,11 @@ class FitRun:
         check_material_controls(cfg, self.evaluation)
         self.graph = construct(GraphConfig, cfg.graph, "graph")
         self.stride, self.evaluated_stride = stride_of(cfg), stride_of(evaluated_config(cfg))
+        if (self.training.unroll_steps or 1) > 1 and self.graph.cells:
+            raise ConfigError(
+                f"training.unroll_steps={self.training.unroll_steps}: not together with graph.cells=true, whose contacts have no "
+                "gradients; choose training.unroll_steps=null"
+            )
         self.logger = construct(LoggerSettings, cfg.logger, "logger")
         settings = {key: value for key, value in cfg.model.items() if key != "_target_"}
         self.new_model = bind(model_class(cfg.model._target_), settings, "model", "spec")
@@ -197,6 +206,7 @@ class FitRun:
             solver=self._solver,
             mirror=self.training.mirror,
             stride=self.stride,
+            unroll_steps=self.training.unroll_steps or 1,
         )
 
     @property
@@ -219,10 +229,12 @@ class FitRun:
         seed(self.cfg.seed)
         data = self._data
         simulator = LearnedSimulator(self.new_model(spec=data.builder.spec), data.builder, data.stride)
-        simulator.fit_statistics(data.statistics_sample(), data.parameter_ranges(), data.trained_scene())
+        sample = data.statistics_sample()
+        simulator.fit_statistics(sample, data.parameter_ranges(), data.trained_scene())
+        neighbors = mean_num_neighbors(sample, data.builder.spec.materials) if training.neighbor_weight is not None else 1.0
         if self.start is not None:
             simulator.start_from(self.start)
-        return TrainingModule(simulator, **{name: getattr(training, name) for name in OPTIMISATION})
+        return TrainingModule(simulator, mean_neighbors=neighbors, **{name: getattr(training, name) for name in OPTIMISATION})
 
     def _step_time(self, training: TrainingSettings) -> float:
         return mean_step_time(self._new_module(training).to(self.device), self._data.train_set, self.batch_size, training)

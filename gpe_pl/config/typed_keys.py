@@ -17,7 +17,7 @@ OF_SWEEPS = "size.comparison.seeds"
 UNREAD: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "training.num_steps": ("training.budget_minutes", lambda minutes: minutes is not None),
     "training.batch_size": ("batching.max_nodes", lambda nodes: nodes is not None),
-    "training.warmup_steps": ("training.schedule", lambda schedule: schedule == "exponential"),
+    "training.warmup_steps": ("training.schedule", lambda schedule: schedule != "cosine"),
     "training.push_steps": ("training.push_fraction", lambda fraction: fraction == 0),
     "training.push_correction": ("training.push_fraction", lambda fraction: fraction == 0),
     "training.stress_weight": ("model.stress", lambda stress: stress is False),

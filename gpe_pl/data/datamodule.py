@@ -91,6 +91,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         sampling: how often each training window is drawn.
         solver: gives the targets of noisy and unrolled states; see ``WindowDataset``.
         mirror: mirror training windows at random; see ``WindowDataset``.
+        unroll_steps: steps of an unroll with gradients; see ``WindowDataset``.
         num_statistics_windows: number of windows from which features are standardised, evenly spread over the ``train`` split.
         stride: number of stored frames in a frame. Training windows begin at any stored frame, validation windows at every ``stride``-th.
 
@@ -118,6 +119,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         solver: Restartable | None = None,
         mirror: bool = False,
         stride: int = 1,
+        unroll_steps: int = 1,
     ) -> None:
         super().__init__()
         self.root, self.noise, self.batch_size, self.seed = Path(root), noise, batch_size, seed
@@ -140,7 +142,7 @@ class TrajectoryDataModule(L.LightningDataModule):
         self.builder = GraphBuilder(graph, self.metadata)
         unit = std * self.metadata.frame_dt
         noise.check(self.metadata, unit)
-        self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress, solver, mirror)
+        self.train_set = WindowDataset(train, self.builder, noise, unit, seed, stress, solver, mirror, unroll_steps)
         self.val_set = WindowDataset(val, self.builder, stress=stress)
         if sampling == "activity":
             self.train_set.probability = probabilities(self.train_set.activity())

@@ -51,8 +51,21 @@ class StartKey(NamedTuple):
     correction: float = 1.0
 
 
-Key = int | tuple[int, int] | StartKey
-"""The number of a window, or sample number and window, or the key of a push-forward sample."""
+@dataclass(frozen=True)
+class UnrollKey:
+    """Key of a sample that is unrolled with gradients, for ``WindowDataset.unroll_steps`` steps.
+
+    Attributes:
+        sample: sample number.
+        window: number of the window at which the unroll starts.
+    """
+
+    sample: int
+    window: int
+
+
+Key = int | tuple[int, int] | StartKey | UnrollKey
+"""The number of a window, or sample number and window, or the key of a push-forward sample or of an unroll with gradients."""
 
 CACHE_BYTES = 2 * 1024**3
 """A split is cached in memory if its compressed files have at most half this size [bytes]. Larger splits are read from disk window by window. Cached graphs may
@@ -299,40 +312,83 @@ class Start:
         return training_graph(builder, state, target, None if self.stress is None else self.stress[step], self.about)
 
 
+@dataclass(frozen=True)
+class Unroll:
+    """The start of an unroll with gradients, and the positions that it should reach.
+
+    Attributes:
+        graph: training graph of the initial state.
+        state: initial state with noise, as float64 tensors.
+        reference: positions [num_steps, node, dim] in m that the state should have after each step: the true ones, plus the part of the noise on the last
+            position that the targets have not removed (see ``Noise.correction``).
+        stress: true Cauchy stress [num_steps, node, component] in Pa after each step; None as in ``Start``.
+        about: attributes of the graphs, as in ``Start``.
+    """
+
+    graph: HeteroData
+    state: State
+    reference: Tensor
+    stress: Tensor | None
+    about: dict[str, Any]
+
+    @property
+    def num_steps(self) -> int:
+        """Number of steps of the unroll."""
+        return self.reference.shape[0]
+
+    def to(self, device: Any) -> Unroll:
+        """Return the same unroll on another device."""
+        stress = None if self.stress is None else self.stress.to(device)
+        return Unroll(self.graph.to(device), self.state.to_torch(device), self.reference.to(device), stress, self.about)
+
+    def graph_after(self, builder: GraphBuilder, state: State, step: int) -> HeteroData:
+        """Create the training graph of the state after ``step`` steps. The target leads to the reference; its gradients lead to the state.
+
+        Raises:
+            SimulationError: as ``GraphBuilder.topology``.
+        """
+        dt = builder.metadata.frame_dt
+        vel = integrators.velocities(torch.stack([state.pos, self.reference[step]]), dt, state.periodicity)[0]
+        target = integrators.acceleration(vel, state.vel, dt) - state.gravity
+        return training_graph(builder, state, target, None if self.stress is None else self.stress[step], self.about)
+
+
 def training_graph(builder: GraphBuilder, state: State, target: Tensor, stress: Tensor | None, about: dict[str, Any]) -> HeteroData:
     """Create the graph of a state with the targets of each node: ``target`` [node, dim] in m/s² and, if given, ``stress_target`` [node, component] in Pa."""
     data = builder(state)
     for material in builder.spec.materials:
-        data[material].target = target.float()[data[material].node_id]
+        data[material].target = target.to(builder.precision)[data[material].node_id]
     if stress is not None:
         for material in builder.spec.stress_channels:
-            data[material].stress_target = stress.float()[data[material].node_id]
+            data[material].stress_target = stress.to(builder.precision)[data[material].node_id]
     for name, value in about.items():
         data[name] = value
     return data
 
 
-Samples: TypeAlias = HeteroData | list[Start]
-"""Samples of an optimiser step: one batch of graphs, or the starts of unrolls."""
+Samples: TypeAlias = HeteroData | list[Start] | list[Unroll]
+"""Samples of an optimiser step: one batch of graphs, the starts of unrolls of push-forward, or unrolls with gradients."""
 
 
-def collated(samples: list[HeteroData | Start]) -> Samples:
-    """Join samples of one kind: graphs become one batch, starts a list."""
+def collated(samples: list[HeteroData | Start | Unroll]) -> Samples:
+    """Join samples of one kind: graphs become one batch, starts and unrolls a list."""
     starts = [sample for sample in samples if isinstance(sample, Start)]
-    return starts or batched(samples)
+    unrolls = [sample for sample in samples if isinstance(sample, Unroll)]
+    return starts or unrolls or batched(samples)
 
 
-def window_counts(trajectories: Sequence[StoredTrajectory], history: int) -> list[int]:
-    """Count the windows of frames t − H … t + 1 in each trajectory of a split.
+def window_counts(trajectories: Sequence[StoredTrajectory], history: int, steps: int = 1) -> list[int]:
+    """Count the windows of frames t − H … t + ``steps`` in each trajectory of a split.
 
     Raises:
         StoreError: no trajectory is long enough for a window.
     """
-    counts = [max(0, t.num_frames - history - 1) for t in trajectories]
+    counts = [max(0, t.num_frames - history - steps) for t in trajectories]
     if not any(counts):
         longest = max((t.num_frames for t in trajectories), default=0)
         where = f"{trajectories[0].path.parent}: " if trajectories else ""
-        needed = f"{history + 2} frames that a start at frame {history} needs (graph.history, evaluation.start_time)"
+        keys = "graph.history, evaluation.start_time" if steps == 1 else "graph.history, training.unroll_steps"
+        needed = f"{history + steps + 1} frames that a start at frame {history} needs ({keys})"
         strided = f" with data.stride={trajectories[0].stride}" if trajectories and trajectories[0].stride > 1 else ""
         smaller = "stride, an earlier start" if strided else "history, an earlier start"
         raise StoreError(
@@ -341,7 +397,7 @@ def window_counts(trajectories: Sequence[StoredTrajectory], history: int) -> lis
     return counts
 
 
-class WindowDataset(Dataset[HeteroData | Start]):
+class WindowDataset(Dataset[HeteroData | Start | Unroll]):
     """Windows x[t−H … t+1] of a split as graphs at frame t.
 
     Every material's store has ``target`` [node, dim] in m/s²: the acceleration from t to t+1 without gravity, from float64 differences. For error
@@ -356,6 +412,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         solver: gives the targets of noisy and unrolled states; None takes those that lead back to the trajectory.
         mirror: mirror each window at random. Every axis without gravity is mirrored with probability 1/2, independently of the others.
         stress: also give the Cauchy stress at t+1 of materials that have one, as ``stress_target`` [node, component] in Pa.
+        unroll_steps: steps of an unroll with gradients. Windows then end early enough for that many true frames after t.
 
     Attributes:
         probability: probability of drawing each window [window], or None if all are equal. With it, graphs have a ``weight``: the uniform probability
@@ -375,12 +432,13 @@ class WindowDataset(Dataset[HeteroData | Start]):
         stress: bool = False,
         solver: Restartable | None = None,
         mirror: bool = False,
+        unroll_steps: int = 1,
     ) -> None:
         self.trajectories, self.builder, self.noise, self.stress, self.solver = trajectories, builder, noise, stress, solver
-        self.mirror = mirror
+        self.mirror, self.unroll_steps = mirror, unroll_steps
         self.velocity_unit, self.seed = velocity_unit, seed
         self.probability: np.ndarray | None = None
-        self.ends = np.cumsum(window_counts(trajectories, builder.config.history))
+        self.ends = np.cumsum(window_counts(trajectories, builder.config.history, unroll_steps))
         self._num_phases = 1 + max(t.phase for t in trajectories)
 
     def __len__(self) -> int:
@@ -400,7 +458,7 @@ class WindowDataset(Dataset[HeteroData | Start]):
         """Return the root mean square acceleration without gravity of each window [window] in m/s². This reads the whole split."""
         values = []
         for stored in self.trajectories:
-            trajectory = stored.window(0, stored.num_frames)
+            trajectory = stored.window(0, max(0, stored.num_frames - self.unroll_steps + 1))
             metadata = trajectory.metadata
             velocities = integrators.velocities(trajectory.pos.astype(np.float64), metadata.frame_dt, metadata.periodicity)
             acc = integrators.acceleration(velocities[1:], velocities[:-1], metadata.frame_dt) - np.asarray(metadata.gravity)
@@ -419,14 +477,21 @@ class WindowDataset(Dataset[HeteroData | Start]):
     @overload
     def __getitem__(self, key: StartKey) -> Start: ...
 
-    def __getitem__(self, key: Key) -> HeteroData | Start:
-        """Return the graph of a window, or the start of an unroll for a ``StartKey``. The trajectory's length limits the unroll."""
+    @overload
+    def __getitem__(self, key: UnrollKey) -> Unroll: ...
+
+    def __getitem__(self, key: Key) -> HeteroData | Start | Unroll:
+        """Return the graph of a window, the start of an unroll for a ``StartKey``, or an unroll for an ``UnrollKey``.
+
+        The trajectory's length limits the unroll of a ``StartKey``.
+        """
         start = key if isinstance(key, StartKey) else None
-        sample, window = (key, key) if isinstance(key, int) else key[:2]
+        is_unroll = isinstance(key, UnrollKey)
+        sample, window = (key.sample, key.window) if isinstance(key, UnrollKey) else (key, key) if isinstance(key, int) else key[:2]
         number, frame = self.locate(window)
         history = self.builder.config.history
         stored = self.trajectories[number]
-        ahead = 0 if start is None else min(start.num_steps, stored.num_frames - 2 - frame)
+        ahead = self.unroll_steps - 1 if is_unroll else 0 if start is None else min(start.num_steps, stored.num_frames - 2 - frame)
         original = stored.window(frame - history, frame + 2 + ahead)
         reflection = self._reflection(original.metadata, sample)
         trajectory = reflection.trajectory(original)
@@ -472,7 +537,13 @@ class WindowDataset(Dataset[HeteroData | Start]):
             unroll = Start(state, torch.from_numpy(truth[history:]), stress, correction, key.correction, about, sample, key.lane, targets)
             return unroll if start else unroll.graph(self.builder, state, 0)
         target = integrators.acceleration(velocities[-1], velocities[-2], dt) - gravity
-        return training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[-1], about)
+        graph = training_graph(self.builder, state, torch.from_numpy(target), None if stress is None else stress[0], about)
+        if not is_unroll:
+            return graph
+        kept = 0.0 if self.noise is None else 1 - self.noise.correction  # fraction of the noise on the position that a step keeps
+        left = kept ** np.arange(1, self.unroll_steps + 1)[:, None, None]
+        reference = truth[history + 1 :] + left * (pos[history] - truth[history])
+        return Unroll(graph, state, torch.from_numpy(reference), stress, about)
 
 
 class CachedGraphs(Dataset[HeteroData]):

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 from torch.utils.data import Sampler
 
-from gpe_pl.data.dataset import Key, StartKey, WindowDataset
+from gpe_pl.data.dataset import Key, StartKey, UnrollKey, WindowDataset
 from gpe_pl.system import ranks
 from gpe_pl.trajectory.store import StoreError
 
@@ -148,7 +148,7 @@ class BatchSampler(Sampler[list[Key]]):
     """Samples of this rank in each optimiser step. All ranks together follow the order that a single process would follow.
 
     Args:
-        data: training windows.
+        data: training windows. If they have more than one of ``unroll_steps``, samples are unrolls with gradients.
         size: size of the batches.
         seed: seed of the order.
         step: returns the number of optimiser steps already taken; called when iteration begins.
@@ -176,7 +176,7 @@ class BatchSampler(Sampler[list[Key]]):
         num_plain = None if push is None else max(0, push.first_step - first)
         batches = map(self._part, self.size.batches(self.data, self.seed, first if push is None else min(first, push.first_step)))
         for batch in islice(batches, num_plain):
-            yield [*batch]
+            yield [UnrollKey(*key) for key in batch] if self.data.unroll_steps > 1 else [*batch]
         if push is not None:
             for starts in islice(push.starts(batches), max(0, first - push.first_step), None):
                 yield [*starts]

@@ -39,7 +39,7 @@ from gpe_pl.graphs.neighbors import Points, check_crowding
 from gpe_pl.graphs.search import as_array, find_topology, rows_of
 from gpe_pl.graphs.standards import Standards, raw
 from gpe_pl.graphs.topology import GraphError as GraphError
-from gpe_pl.graphs.topology import MeshTopology, Topology
+from gpe_pl.graphs.topology import IslandTopology, MeshTopology, Topology
 from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import BOUNDARY, CELL, DOWN, NODE_TYPES, RADIUS, SAME, EdgeType, FeatureSpec, grid, level_of
@@ -186,7 +186,11 @@ class GraphBuilder:
             self._add_edges(data, relation, topology.edges.get(relation), features.get(relation), state.pos.device)
         if topology.islands is not None:
             islands, num_islands = topology.islands, topology.islands.is_free.shape[0]
-            arm = from_centre(state.pos, islands.label, num_islands) if islands.arm is None else islands.arm
+            arm = (
+                from_centre(state.pos, islands.label, num_islands)
+                if islands.arm is None
+                else _with_gradient(islands.arm, state.pos, islands)
+            )
             arm = self._rounded(arm)  # single precision has no room for where the island is
             for material, r in topology.rows.items():
                 data[material].pos, data[material].island = arm[r], islands.label[r]
@@ -285,6 +289,18 @@ class GraphBuilder:
             parts = zip(self._rounded(odd).split(counts), self._rounded(even).split(counts), strict=True)
             features |= dict(zip(relations, parts, strict=True))
         return [*x.split(sizes)], features
+
+
+def _with_gradient(arm: Tensor, pos: Tensor, islands: IslandTopology) -> Tensor:
+    """Return lever arms that a search has found, with their gradients with respect to positions. Those of islands around the domain stay constant."""
+    if not pos.requires_grad:
+        return arm
+    num_islands = islands.is_free.shape[0]
+    is_whole = torch.zeros(num_islands, dtype=torch.bool, device=pos.device).index_put(
+        (islands.label[(arm != 0).any(dim=1)],), torch.tensor(True)
+    )
+    change = from_centre(pos, islands.label, num_islands)
+    return arm + torch.where(is_whole[islands.label, None], change - change.detach(), 0.0)
 
 
 def _means_below(mesh: MeshTopology, values: Tensor, mass: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""``LightningModule`` of a learned simulator: one-step loss, optimiser, learning-rate schedule, and a stop when losses are not finite."""
+"""``LightningModule`` of a learned simulator: loss of one step or a few, optimiser, learning-rate schedule, and a stop when losses are not finite."""
 
 from __future__ import annotations
 
@@ -11,23 +11,26 @@ from typing import Annotated, Any, Literal
 
 import lightning as L
 import torch
+from lightning.pytorch.callbacks import WeightAveraging
 from pydantic import Field
 from torch import Tensor
 from torch.utils._pytree import tree_leaves
 from torch_geometric.data import HeteroData
 
-from gpe_pl.data.dataset import Samples
+from gpe_pl.data.dataset import Samples, Start, Unroll
 from gpe_pl.errors import GpeError
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.metrics import OneStepNMSE
+from gpe_pl.models.base import Prediction
 from gpe_pl.system import ranks
 from gpe_pl.system.machine import has_cpp_compiler
+from gpe_pl.training.errors import LEAST_ERROR, Loss, num_neighbors, penalty
 from gpe_pl.training.optimizer import OnePassAdam, clip
 from gpe_pl.training.push_forward import Excursions
+from gpe_pl.training.unroll import predictions
 
-Schedule = Literal["cosine", "exponential"]
+Schedule = Literal["cosine", "exponential", "staircase"]
 Compile = Literal["auto", "on", "off"]
-Loss = Literal["square", "log"]
 
 MAX_SKIPPED, SKIP_WINDOW, MAX_IN_ROW = 10, 100, 3
 """Limits on skipped batches, whose loss or gradient is not finite. More than ``MAX_SKIPPED`` within ``SKIP_WINDOW`` steps, or ``MAX_IN_ROW`` in a row, stop the
@@ -37,10 +40,12 @@ COMPILE_PAYS_AFTER = 10_000
 """Steps from which ``compile: auto`` repays the time that compilation takes."""
 
 RESUMED = {
-    *("state_dict", "current_model_state", "averaging_state", "optimizer_states", "lr_schedulers", "loops", "callbacks", "global_step"),
+    *("state_dict", "optimizer_states", "lr_schedulers", "loops", "callbacks", "global_step"),
     *("skipped", "excursions"),
 }
 """Keys that a checkpoint needs for a run to resume from it."""
+OF_AVERAGE = {"current_model_state", "averaging_state"}
+"""Further keys that it needs if the run averages its weights."""
 
 log = logging.getLogger(__name__)
 
@@ -65,10 +70,13 @@ class TrainingModule(L.LightningModule):
         num_steps: optimiser steps of the whole run; the schedule ends there.
         learning_rate: highest learning rate of Adam: that at the start, or after the warm-up.
         final_learning_rate: learning rate at the end.
-        schedule: ``exponential`` decays geometrically (paper: 5e-5 to 1e-6); ``cosine`` warms up and follows a half cosine (short budgets).
+        schedule: ``exponential`` decays geometrically (paper: 5e-5 to 1e-6); ``cosine`` warms up and follows a half cosine (short budgets); ``staircase`` keeps
+            the rate for half of the steps, then falls after every tenth of the steps by the same factor, to the final rate in the last tenth.
         warmup_steps: steps of linear warm-up in the ``cosine`` schedule.
-        loss: ``square``, or ``log``: ``log(1 + e²)`` of each normalised error e of an acceleration, so that large errors have little weight.
+        loss: ``square``, ``log`` or ``root``: how errors of normalised accelerations count; see ``errors.penalty``. Stress always has the squared error.
         stress_weight: weight of the mean squared error of the normalised stress, relative to that of the acceleration; used if the model decodes a stress.
+        neighbor_weight: c in the weight exp(−c n/n̄) of the acceleration of a node with n neighbours; see ``errors.num_neighbors``. None weights all alike.
+        mean_neighbors: n̄, the mean number of neighbours of a node in the training data.
         compile: whether to apply ``torch.compile`` to the model. ``auto`` compiles if the run is long enough, the model has no fused passes for the device
             (``is_fused``, on a CPU) and a C++ compiler is found.
     """
@@ -83,13 +91,16 @@ class TrainingModule(L.LightningModule):
         warmup_steps: Annotated[int, Field(ge=0)] = 100,
         loss: Loss = "square",
         stress_weight: Annotated[float, Field(gt=0)] = 1.0,
+        neighbor_weight: Annotated[float, Field(gt=0, le=10)] | None = None,
+        mean_neighbors: Annotated[float, Field(gt=0)] = 1.0,
         compile: Compile = "auto",
     ) -> None:
         super().__init__()
         self.simulator = simulator
         self.num_steps, self.schedule, self.warmup_steps = num_steps, schedule, warmup_steps
         self.learning_rate, self.final_learning_rate = learning_rate, final_learning_rate
-        self.is_robust, self.stress_weight = loss == "log", stress_weight
+        self.loss_kind: Loss = loss
+        self.stress_weight, self.neighbor_weight, self.mean_neighbors = stress_weight, neighbor_weight, mean_neighbors
         self.compile_mode: Compile = compile
         self.val_nmse = OneStepNMSE()
         self._excursions = Excursions()
@@ -108,6 +119,8 @@ class TrainingModule(L.LightningModule):
         ratio = self.final_learning_rate / self.learning_rate
         if self.schedule == "exponential":
             return ratio ** (min(step, self.num_steps) / self.num_steps)
+        if self.schedule == "staircase":
+            return ratio ** (min(5, max(0, 10 * step // self.num_steps - 4)) / 5)
         if step < self.warmup_steps:
             return (step + 1) / self.warmup_steps
         progress = min(1.0, (step - self.warmup_steps) / max(1, self.num_steps - self.warmup_steps))
@@ -155,22 +168,45 @@ class TrainingModule(L.LightningModule):
             del model.compute  # leaves the method of the class
 
     def loss(self, samples: Samples) -> Tensor:
-        """Return the mean squared error of the normalised accelerations, plus that of the normalised stress if the model decodes one.
+        """Return the mean error of the normalised accelerations, plus that of the normalised stress if the model decodes one.
 
-        With several ranks, it is this rank's part of the sum. For push-forward samples, the graphs show the states that the unrolls have reached, and the
-        predictions advance these unrolls by one step.
+        ``errors.penalty`` says how an error counts. With several ranks, the loss is this rank's part of the sum. For push-forward samples, the
+        graphs show the states that the unrolls have reached, and the predictions advance these unrolls by one step. For unrolls with gradients, the loss is the
+        mean over their steps. Its errors are those of positions after each step, in units of the acceleration scale times the squared frame interval.
         """
-        batch = self._excursions.graphs(self.simulator, samples) if isinstance(samples, list) else samples
+        if isinstance(samples, list) and isinstance(samples[0], Unroll):
+            unrolls = [sample for sample in samples if isinstance(sample, Unroll)]
+            return self._mean_loss(predictions(self.simulator, unrolls), unrolls[0].num_steps)
+        starts = [sample for sample in samples if isinstance(sample, Start)] if isinstance(samples, list) else []
+        batch = self._excursions.graphs(self.simulator, starts) if isinstance(samples, list) else samples
         predicted = self.simulator(batch)
-        if isinstance(samples, list):
-            self._excursions.move_on(self.simulator, samples[0].lane, predicted)
+        if starts:
+            self._excursions.move_on(self.simulator, starts[0].lane, predicted)
+        self._remember_windows(batch)
+        return self._loss_of(batch, predicted)
+
+    def _mean_loss(self, steps: Iterable[tuple[HeteroData, Prediction]], count: int) -> Tensor:
+        """Return the mean loss over ``count`` steps. Steps that are missing, because no scene is left, count as zero."""
+        losses: list[Tensor] = []
+        for batch, predicted in steps:
+            if not losses:
+                self._remember_windows(batch)
+            losses.append(self._loss_of(batch, predicted))
+        for _ in range(count - len(losses)):
+            self._fractions([], [])  # other ranks may have these steps
+        return torch.stack(losses).sum() / count
+
+    def _remember_windows(self, batch: HeteroData) -> None:
         if "trajectory" in batch:
             self._windows = list(zip(batch.trajectory.tolist(), batch.frame.tolist(), strict=True))
-        std = self.simulator.stress_std.float()
-        acceleration = [(a - self._normalized(batch[m].target)).square() for m, a in predicted.acceleration.items()]
-        if self.is_robust:
-            acceleration = [error.log1p() for error in acceleration]
+
+    def _loss_of(self, batch: HeteroData, predicted: Prediction) -> Tensor:
+        """Return the loss of the predictions for a batch of training graphs."""
+        std = self.simulator.stress_std.to(self.simulator.builder.precision)
+        acceleration = [self._penalty(a - self._normalized(batch[m].target)) for m, a in predicted.acceleration.items()]
         stress = [(s - batch[m].stress_target / std).square() for m, s in predicted.stress.items()]
+        if self.neighbor_weight is not None:
+            acceleration = self._weighted_by_neighbors(batch, predicted.acceleration, acceleration)
         if "weight" in batch:
             acceleration = self._weighted(batch, predicted.acceleration, acceleration)
             stress = self._weighted(batch, predicted.stress, stress)
@@ -179,6 +215,18 @@ class TrainingModule(L.LightningModule):
         if stress:
             loss = loss + self.stress_weight * torch.cat(stress).mean() * fractions[1]
         return loss
+
+    def _penalty(self, error: Tensor) -> Tensor:
+        """Return ``errors.penalty`` of errors [node, dim] of normalised accelerations."""
+        unit = self.simulator.builder.scales.acceleration / self.simulator.acceleration_std  # one rest spacing, as positions
+        return penalty(error, self.loss_kind, (LEAST_ERROR * unit).to(error.dtype))
+
+    def _weighted_by_neighbors(self, batch: HeteroData, materials: Iterable[str], errors: list[Tensor]) -> list[Tensor]:
+        """Return errors [node, …] of each material, multiplied by the weights of their nodes."""
+        assert self.neighbor_weight is not None
+        scale = self.neighbor_weight / self.mean_neighbors
+        count = num_neighbors(batch, self.simulator.builder.spec.materials)
+        return [torch.exp(-scale * count[m])[:, None] * error for m, error in zip(materials, errors, strict=True)]
 
     @staticmethod
     def _weighted(batch: HeteroData, materials: Iterable[str], errors: list[Tensor]) -> list[Tensor]:
@@ -255,7 +303,9 @@ class TrainingModule(L.LightningModule):
         checkpoint["excursions"] = self._excursions.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        missing = RESUMED - checkpoint.keys()
+        callbacks = () if self._trainer is None else self._trainer.callbacks  # type: ignore[attr-defined]
+        is_averaged = any(isinstance(callback, WeightAveraging) for callback in callbacks)
+        missing = (RESUMED | OF_AVERAGE if is_averaged else RESUMED) - checkpoint.keys()
         if missing:
             raise CheckpointError(f"last.ckpt: has no {min(missing)}, which resuming needs; delete the file to train from the start")
         self._skipped.extend(checkpoint["skipped"])

@@ -28,8 +28,9 @@ from gpe_pl.files.run_folder import CONFIG, RunError, config_in, differences
 from gpe_pl.system.machine import keep_freed_memory
 from gpe_pl.training.callbacks import RolloutValidation, StepProgress, WarmAverage
 from gpe_pl.training.checkpoints import AtomicCheckpoints, Checkpoints
+from gpe_pl.training.errors import Loss
 from gpe_pl.training.interruption import Interruption
-from gpe_pl.training.module import Compile, Loss, Schedule, TrainingError, TrainingModule
+from gpe_pl.training.module import Compile, Schedule, TrainingError, TrainingModule
 from gpe_pl.training.parallel import SummedGradients
 
 log = logging.getLogger(__name__)
@@ -46,6 +47,7 @@ class TrainingSettings:
         budget_minutes: training time on one core or GPU [min]; replaces ``num_steps`` (see ``training.budget``).
         gradient_clip: largest norm of the gradient; None switches clipping off.
         ema_decay: decay of the moving average of the weights; None switches averaging off.
+        unroll_steps: number of steps in a row whose errors are in the loss, with gradients through the states between them; None for one.
         push_fraction: fraction of the steps, at the end of training, that use push-forward.
         push_steps: maximum number of steps of an unroll.
         push_correction: fraction of the velocity's deviation after an unroll that the target removes within one step, with ``targets=trajectory``.
@@ -74,6 +76,8 @@ class TrainingSettings:
     push_correction: Annotated[float, Field(ge=0, le=1)] = 1.0
     loss: Loss = "square"
     stress_weight: Annotated[float, Field(gt=0)] = 1.0
+    unroll_steps: Annotated[int, Field(ge=1, le=100)] | None = None
+    neighbor_weight: Annotated[float, Field(gt=0, le=10)] | None = None
     compile: Compile = "auto"
     val_interval: Annotated[int, Field(ge=1)] = 1000
     num_val_rollouts: Annotated[int, Field(ge=1)] = 4
@@ -85,6 +89,13 @@ class TrainingSettings:
             raise ValueError(
                 f"val_interval={self.val_interval} must divide num_steps={self.num_steps}: the last steps would be neither validated nor saved"
             )
+        if (self.unroll_steps or 1) > 1:
+            if self.push_fraction:
+                raise ValueError(
+                    f"unroll_steps={self.unroll_steps}: not together with push_fraction={self.push_fraction:g}; set push_fraction=0"
+                )
+            if self.targets != "trajectory":
+                raise ValueError(f"unroll_steps={self.unroll_steps}: not together with targets={self.targets}; set targets=trajectory")
 
     @property
     def noise(self) -> Noise:

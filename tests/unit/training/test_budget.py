@@ -169,6 +169,7 @@ def test_a_measurement_that_fails_writes_nothing(tmp_path: Path) -> None:
         (["training.compile=auto"], True),
         (["trainer.matmul_precision=high"], True),
         (["training.push_fraction=0.9"], True),
+        (["training.push_fraction=0", "training.unroll_steps=2"], True),
     ],
 )
 def test_a_step_is_measured_again_where_its_time_is_another(overrides: list[str], is_other: bool) -> None:

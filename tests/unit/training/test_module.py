@@ -17,6 +17,7 @@ from torch_geometric.data import Batch, HeteroData
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.training.callbacks import WarmAverage
+from gpe_pl.training.errors import mean_num_neighbors
 from gpe_pl.training.module import TrainingError, TrainingModule
 from tests import scenes
 
@@ -62,7 +63,14 @@ def test_the_cosine_schedule_warms_up_and_ends_at_the_final_rate() -> None:
     assert all(a > b for a, b in itertools.pairwise(falling))
 
 
-@pytest.mark.parametrize("schedule", ["cosine", "exponential"])
+def test_the_staircase_falls_by_equal_factors_in_the_second_half() -> None:
+    m = module(50_000, schedule="staircase", learning_rate=1e-3, final_learning_rate=1e-3 / 32)
+    assert rates(m, [0, 24_999, 25_000, 29_999, 30_000, 35_000, 40_000, 44_999, 45_000, 60_000]) == pytest.approx(
+        [1e-3, 1e-3, 5e-4, 5e-4, 2.5e-4, 1.25e-4, 6.25e-5, 6.25e-5, 3.125e-5, 3.125e-5]
+    )
+
+
+@pytest.mark.parametrize("schedule", ["cosine", "exponential", "staircase"])
 @pytest.mark.parametrize(("num_steps", "warmup_steps"), [(1, 0), (1, 100), (100, 100), (50, 100), (10, 0)])
 def test_every_rate_is_positive_and_at_most_the_initial_one(schedule: Any, num_steps: int, warmup_steps: int) -> None:
     m = module(num_steps, schedule=schedule, warmup_steps=warmup_steps)
@@ -103,6 +111,28 @@ def test_the_logarithmic_loss_is_the_mean_logarithm_of_one_plus_each_squared_err
     data["snow"].target = 5.0 * square.simulator(data).acceleration["snow"].detach()
     assert square.loss(data).item() == pytest.approx(error.square().sum().item() / (2 * 46), rel=1e-5)
     assert logarithm.loss(data).item() == pytest.approx((1 + error.square()).log().sum().item() / (2 * 46), rel=1e-5)
+
+
+def test_the_root_loss_and_weights_by_neighbours_follow_their_formulas() -> None:
+    m, data = module(loss="root", neighbor_weight=0.7, mean_neighbors=3.0), batch()
+    predicted = m.simulator(data).acceleration
+    neighbors = {t: [0] * data[t].x.shape[0] for t in MATERIALS}
+    for source, name, target in data.edge_types:
+        if name == "radius" and source in MATERIALS:
+            for j, i in data[source, name, target].edge_index.T.tolist():
+                neighbors[source][j] += 1
+                neighbors[target][i] += 1
+    least = 6.3e-4 * scenes.SPACING / 0.005**2 / 5.0  # of a position, in units of the acceleration scale times the squared frame interval
+    errors = [
+        math.exp(-0.7 * neighbors[t][i] / 3.0)
+        * (float((predicted[t][i].detach() - data[t].target[i] / 5.0).square().sum()) + least**2) ** 0.25
+        for t in MATERIALS
+        for i in range(data[t].x.shape[0])
+    ]
+    assert len({n for t in MATERIALS for n in neighbors[t]}) > 3
+    assert m.loss(data).item() == pytest.approx(sum(errors) / len(errors), rel=1e-5)
+    counts = [n for t in MATERIALS for n in neighbors[t]]
+    assert mean_num_neighbors([data], MATERIALS) == pytest.approx(sum(counts) / len(counts))
 
 
 def test_the_validation_error_is_relative_to_predicting_free_fall() -> None:
