@@ -61,6 +61,16 @@ class ConfigError(GpeError, ValueError):
     """Raised for a config value that is not allowed; the message names key, value and the allowed values."""
 
 
+def _refused(message: str) -> None:
+    """Resolver ``${refused:"…"}`` for a value that other files in ``conf/`` have to replace."""
+    raise ConfigError(message)
+
+
+OmegaConf.register_new_resolver("refused", _refused, replace=True)
+REFUSALS = (NameRefused.__name__, ConfigError.__name__)
+"""Errors of resolvers, whose message is complete without the interpolation that OmegaConf adds."""
+
+
 _results: list[Path] = []
 """Results folders of this process, which ``Report`` adds."""
 
@@ -206,6 +216,8 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             ) as error:  # OSError: full disks, folders that cannot be written, missing files
                 if verbose:
                     raise
+                if (refusal := _refusal(error)) is not None:
+                    _fail(ConfigError(refusal))
                 _fail(unnamed(error, _written(cfg.paths)) if isinstance(error, OSError) else error)
 
         def main() -> Any:
@@ -283,11 +295,19 @@ def _fail(error: Exception) -> None:
     sys.exit(USAGE_ERROR if RESULT in os.environ and isinstance(error, (ConfigError, NameRefused)) else 2)
 
 
+def _refusal(error: Exception) -> str | None:
+    """Return the message of a resolver in ``REFUSALS`` without what OmegaConf adds to it; None for other errors."""
+    text = " ".join(str(error).split())
+    if any(f"{name} raised" in text for name in REFUSALS):
+        return re.sub(r"^.*? raised while resolving interpolation: | full_key: .*", "", text)
+    return None
+
+
 def explain(error: Exception, config_name: str, overrides: list[str]) -> str:
     """Explain a composition error in one line, with the valid keys or choices."""
+    if (refusal := _refusal(error)) is not None:
+        return refusal
     text = " ".join(str(error).split())
-    if f"{NameRefused.__name__} raised" in text:
-        return re.sub(r"^.*? raised while resolving interpolation: | full_key: .*", "", text)
     if "'data/imported'" in text:
         return f"data=imported: {config_name} takes data that it simulates; fit and evaluate take imported ones"
     match = re.search(r"Could not override '([^']+)'", text)

@@ -41,6 +41,8 @@ STEPS = ("training.num_steps=6", "training.val_interval=2", "training.warmup_ste
 PLAIN = ("training.push_fraction=0",)
 LATE = ("training.sampling=activity", "training.push_fraction=0.5", "training.push_steps=3")
 
+UNROLLED = ("recipe=authors", "model=cconv", "graph.history=1", "training.batch_size=3")
+
 
 class Killed(BaseException):
     """Exception that stands for the end of the process."""
@@ -84,6 +86,7 @@ def checkpoint(cfg: DictConfig, name: str = "last") -> dict[str, Any]:
         pytest.param(1, 0, PLAIN, marks=pytest.mark.slow),
         pytest.param(5, 4, LATE, marks=pytest.mark.slow),
         pytest.param(5, 4, PLAIN, marks=pytest.mark.slow),
+        pytest.param(3, 2, UNROLLED, marks=pytest.mark.slow),
         (5, 5, (*LATE, "trainer.checkpoint_minutes=1e-9")),  # between validations
     ],
 )
@@ -146,6 +149,23 @@ def test_the_papers_recipe_trains_without_average_and_clipping(
     assert saved["lr_schedulers"][0]["_last_lr"] == pytest.approx([1e-6])
     written = json.loads((tmp_path / "paper" / "config.json").read_text())
     assert written["training"]["position_noise_of_domain"] == 5e-4 and written["training"]["gradient_clip"] is None
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("training.unroll_steps=2",), r"^training: unroll_steps=2: not together with push_fraction=0.6; set push_fraction=0$"),
+        (("training.unroll_steps=2", "training.targets=solver", *PLAIN), r"not together with targets=solver; set targets=trajectory$"),
+        (("training.unroll_steps=2", "graph.cells=true", *PLAIN), r"^training.unroll_steps=2: not together with graph.cells=true, "),
+        (("training.unroll_steps=0",), r"^training.unroll_steps=0: "),
+        (("training.neighbor_weight=-1",), r"^training.neighbor_weight=-1: "),
+        (("training.loss=cube",), r"^training.loss='cube': "),
+    ],
+)
+def test_settings_of_the_loss_that_do_not_fit_are_refused(tmp_path: Path, overrides: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        fit(tiny(tmp_path / "data", tmp_path, *overrides))
+    assert not (tmp_path / "data").exists()
 
 
 def test_a_noise_of_metres_is_refused_before_data_are_generated(tmp_path: Path) -> None:
