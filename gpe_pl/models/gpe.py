@@ -12,7 +12,7 @@ Virtual nodes above meshes are nodes of separate types. They pass messages, and 
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Annotated, Any, Literal, NamedTuple, cast
+from typing import Annotated, Any, Literal, cast
 
 import torch
 from jaxtyping import Float
@@ -22,6 +22,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.errors import GpeError
 from gpe_pl.models.base import Model, Prediction
+from gpe_pl.models.gpe_compiled import CompiledGPE, Decoded, notice
 from gpe_pl.nn.blocks import MLP, NORM_EPS
 from gpe_pl.nn.connected import Edges, order_of_edges, renumbered, reordered, touched
 from gpe_pl.nn.elastic_bodies import CellError, ElasticBodies
@@ -43,20 +44,6 @@ class StressError(GpeError, ValueError):
 
 class IslandError(GpeError, ValueError):
     """Raised when islands or bodies should move as a whole but the graphs do not contain them, or when momentum would not be conserved."""
-
-
-class Decoded(NamedTuple):
-    """Output of the network, per material.
-
-    Attributes:
-        acceleration: acceleration without gravity [node, dim].
-        stress: stress, if decoded [node, component].
-        contact: acceleration of nodes of bodies by contacts alone [node, dim], with the ``contact`` decoder.
-    """
-
-    acceleration: dict[str, Tensor]
-    stress: dict[str, Tensor]
-    contact: dict[str, Tensor]
 
 
 class MaterialEmbedding(nn.Module):
@@ -262,6 +249,7 @@ class GPE(Model):
                 f"model.stress=true, but the data set stores no stress of {', '.join(spec.materials)}; choose model.stress=false or data=fem"
             )
         self.interaction, self.decoder, self.edge_state = interaction, decoder, edge_state
+        self._program: CompiledGPE | None = None
         self.level_weights = level_weights
         self.num_message_passing_steps = num_message_passing_steps
         hidden, norm = hidden_channels, node_norm == "layer"
@@ -348,12 +336,45 @@ class GPE(Model):
             readable.append(readers.union(*({r[0], r[2]} for r in self.spec.relations if {r[0], r[2]} & readers)))
         return readable[::-1]
 
+    def train(self, mode: bool = True) -> "GPE":
+        if mode:  # weights are about to change, perhaps in ways that PyTorch does not count
+            self._program = None
+        return super().train(mode)
+
     def forward(self, data: HeteroData) -> Prediction:
         """Return accelerations without gravity per material, in units of the data set's acceleration scale, and stresses.
 
         Node types and relations are skipped if they are empty or cannot influence a material within the number of steps.
         """
         keep_absent = not (self.training or self.skips.absent_types)
+        acceleration, stress, contact = self._compiled(data, keep_absent) or self._uncompiled(data, keep_absent)
+        if contact:
+            acceleration = self._moved_by_contacts(data, acceleration, contact)
+        if acceleration and self.settings["island_momentum"] != "ignored":
+            acceleration = self._conserve(data, acceleration)
+        velocity: dict[str, Tensor] = {}
+        if self.settings["elastic"]:
+            params = {m: data[m].material_params for m in self.material_embedding if m in acceleration}
+            mass = {m: data[m].mass for m in acceleration}
+            with_stress = self._wants_stress and bool(self.spec.stress_channels)
+            acceleration, velocity, of_law = self.elastic_bodies(data, acceleration, params, mass, with_stress)
+            stress = stress | of_law
+        return Prediction(acceleration, stress, velocity)
+
+    def _compiled(self, data: HeteroData, keep_absent: bool) -> Decoded | None:
+        """Return what the network decodes from one compiled call, or None where that is impossible (see ``models.gpe_compiled``)."""
+        weight = self.updates[0][self.type_key(self.spec.materials[0])][0].weight  # type: ignore[index]
+        if self.training or torch.is_grad_enabled() or not works_on(weight) or self.settings["implementation"] != "factored":
+            return None
+        if "compute" in self.__dict__:  # replaced by torch.compile
+            return None
+        if type(self) is not GPE:
+            return notice(f"{type(self).__name__} is a subclass of GPE")
+        if self._program is None or not self._program.is_current():
+            self._program = CompiledGPE(self)
+        return self._program(data, self.skips, keep_absent)
+
+    def _uncompiled(self, data: HeteroData, keep_absent: bool) -> Decoded:
         x = {t: data[t].x for t in self.spec.node_types if self.type_key(t) in self.node_encoder and (keep_absent or data[t].x.shape[0])}
         params = {m: data[m].material_params for m in self.material_embedding if m in x}
         mass = {m: data[m].mass for m in self.spec.materials if m in x}
@@ -364,18 +385,7 @@ class GPE(Model):
             x, edges = _merge_levels(x, edges)
         apart = self.skips.isolated_nodes and not self.training
         body = {m: data[m].body for m in self.bodies if m in x}
-        acceleration, stress, contact = (self._compute_apart if apart else self._compute_in_order)(x, params, mass, body, edges)
-        if contact:
-            acceleration = self._moved_by_contacts(data, acceleration, contact)
-        if acceleration and self.settings["island_momentum"] != "ignored":
-            acceleration = self._conserve(data, acceleration)
-        velocity: dict[str, Tensor] = {}
-        if self.settings["elastic"]:
-            acceleration, velocity, of_law = self.elastic_bodies(
-                data, acceleration, params, mass, self._wants_stress and bool(self.spec.stress_channels)
-            )
-            stress = stress | of_law
-        return Prediction(acceleration, stress, velocity)
+        return (self._compute_apart if apart else self._compute_in_order)(x, params, mass, body, edges)
 
     def _moved_by_contacts(self, data: HeteroData, acceleration: dict[str, Tensor], contact: dict[str, Tensor]) -> dict[str, Tensor]:
         """Replace the rigid part of the accelerations of each body by that of its contacts; graphs without cells have no bodies."""

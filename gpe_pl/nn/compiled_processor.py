@@ -6,20 +6,14 @@ addresses. Gradients of parameters go to one array, ``grads``.
 
 from __future__ import annotations
 
-import ctypes
-from functools import cache
-from pathlib import Path
-from typing import Any, no_type_check
+from typing import no_type_check
 
 import numpy as np
-import torch
-from numba import carray, njit, types
-from numba.core import cgutils
-from numba.core.cgutils import ir  # that of llvmlite, which numba depends on
-from numba.extending import get_cython_function_address, intrinsic
+from numba import njit
 
 from gpe_pl.nn.fused import FASTMATH
-from gpe_pl.nn.pointers import pointer
+from gpe_pl.nn.matrix_product import gemm
+from gpe_pl.nn.pointers import matrix_at
 
 EDGES = 512
 """Number of edges whose gradients are kept for a product with their features."""
@@ -36,58 +30,6 @@ REASSOCIATED = {*FASTMATH, "reassoc"}
 (U_G_WEIGHT, U_G_BIAS, U_G_SLOPE, U_G_OUT, U_G_OUT_BIAS, U_G_GAIN, U_G_SHIFT) = range(9, 16)
 (U_BEFORE, U_AFTER, U_Z, U_ROWS, U_SCALE, U_FIRST, U_COUNT) = range(16, 23)
 (I_CONV, I_SUMS, I_G_SUMS, I_PRODUCT, I_DEGREE) = range(5)
-
-
-@cache
-def gemm_address(dtype: Any) -> int:
-    """Return the address of the matrix product of a precision: PyTorch's, which keeps to its number of threads, or SciPy's if PyTorch shows none."""
-    name = "dgemm" if dtype == np.float64 else "sgemm"
-    for library in sorted((Path(torch.__file__).parent / "lib").glob("libtorch_cpu.*")):
-        try:
-            return int(ctypes.cast(getattr(ctypes.CDLL(str(library)), f"{name}_"), ctypes.c_void_p).value or 0)
-        except (OSError, AttributeError):
-            continue
-    return int(get_cython_function_address("scipy.linalg.cython_blas", name))
-
-
-@intrinsic
-@no_type_check
-def _gemm(typing_context, like, address, turns_a, turns_b, m, n, k, a, a_stride, b, b_stride, adds, c, c_stride):
-    """Compute C = A B, or C += A B, for matrices with rows of given strides at addresses in memory; A or B may be stored transposed."""
-    is_double = like.dtype == types.float64
-    signature = types.void(like, *[types.int64] * 13)
-
-    def generate(context, builder, _, arguments):
-        _, address, turns_a, turns_b, m, n, k, a, a_stride, b, b_stride, adds, c, c_stride = arguments
-        number, real, letter = ir.IntType(32), ir.DoubleType() if is_double else ir.FloatType(), ir.IntType(8)
-
-        def at(x):
-            return cgutils.alloca_once_value(builder, x)
-
-        def size(x):
-            return at(builder.trunc(x, number))
-
-        def matrix(x):
-            return builder.inttoptr(x, real.as_pointer())
-
-        def kind(turns):
-            is_turned = builder.icmp_signed("!=", turns, ir.Constant(turns.type, 0))
-            return at(builder.select(is_turned, ir.Constant(letter, ord("T")), ir.Constant(letter, ord("N"))))
-
-        # Fortran sees every matrix transposed, and computes Cᵀ = Bᵀ Aᵀ
-        values = [kind(turns_b), kind(turns_a), size(n), size(m), size(k), at(ir.Constant(real, 1.0)), matrix(b), size(b_stride), matrix(a)]
-        values += [size(a_stride), at(builder.sitofp(adds, real)), matrix(c), size(c_stride)]
-        function = builder.inttoptr(address, ir.FunctionType(ir.VoidType(), [v.type for v in values]).as_pointer())
-        builder.call(function, values)
-        return context.get_dummy_value()
-
-    return signature, generate
-
-
-@njit(fastmath=FASTMATH, **OPTIONS)
-@no_type_check
-def _parameter(like, address, rows, columns):
-    return carray(pointer(address), (rows, columns), like.dtype)
 
 
 @njit(fastmath=FASTMATH, **OPTIONS)
@@ -238,11 +180,11 @@ def _normalize_back(grad, y, scale, gain, out, grad_gain, grad_shift):
 
 @njit(fastmath=FASTMATH, **OPTIONS)
 @no_type_check
-def forward(gemm, convs, updates, incoming, starts, sizes, states, source, target, features, work, scratch, width, eps, channels):
+def forward(address, convs, updates, incoming, starts, sizes, states, source, target, features, work, scratch, width, eps, channels):
     """Execute all steps.
 
     Args:
-        gemm: ``gemm_address``.
+        address: ``gemm_address``.
         convs, updates, incoming: tables.
         starts: first row of each step in ``convs`` and ``updates`` [step + 1, 2].
         sizes: number of nodes of each type.
@@ -262,12 +204,12 @@ def forward(gemm, convs, updates, incoming, starts, sizes, states, source, targe
             p = convs[o]
             stride, num_target, num_source = 2 * width + p[C_FEATURES], sizes[p[C_TARGET]], sizes[p[C_SOURCE]]
             a, b = _matrix(work, p[C_A], num_target, width), _matrix(work, p[C_B], num_source, width)
-            a[:] = _parameter(work, p[C_BIAS], 1, width)
+            a[:] = matrix_at(p[C_BIAS], 1, width, work)
             h_target, h_source = place + size * states[s, p[C_TARGET]], place + size * states[s, p[C_SOURCE]]
-            _gemm(work, gemm, 0, 1, num_target, width, width, h_target, width, p[C_WEIGHT], stride, 1, place + size * p[C_A], width)
-            _gemm(
+            gemm(work, address, 0, 1, num_target, width, width, h_target, width, p[C_WEIGHT], stride, 1, place + size * p[C_A], width)
+            gemm(
                 work,
-                gemm,
+                address,
                 0,
                 1,
                 num_source,
@@ -281,24 +223,24 @@ def forward(gemm, convs, updates, incoming, starts, sizes, states, source, targe
                 place + size * p[C_B],
                 width,
             )
-            _feature_weight(_parameter(work, p[C_WEIGHT], width, stride), width, w)
+            _feature_weight(matrix_at(p[C_WEIGHT], width, stride, work), width, w)
             at_target, at_source = _matrix(work, p[C_AT_TARGET], num_target, width), _matrix(work, p[C_AT_SOURCE], num_source, width)
             at_target[:] = 0
             at_source[:] = 0
             first, end = p[C_FIRST], p[C_FIRST] + p[C_COUNT]
             _send(
-                a, b, features[first:end], w, _parameter(work, p[C_SLOPE], 1, 1)[0, 0], source[first:end], target[first:end], at_target, at_source,
+                a, b, features[first:end], w, matrix_at(p[C_SLOPE], 1, 1, work)[0, 0], source[first:end], target[first:end], at_target, at_source,
                 p[C_TO_TARGET], p[C_TO_SOURCE], channels,
             )  # fmt: skip
         for o in range(starts[s, 1], starts[s + 1, 1]):
             p = updates[o]
             n = sizes[p[U_TYPE]]
-            z, weight = _matrix(work, p[U_Z], n, width), _parameter(work, p[U_WEIGHT], width, width)
-            z[:] = _parameter(work, p[U_BIAS], 1, width)
+            z, weight = _matrix(work, p[U_Z], n, width), matrix_at(p[U_WEIGHT], width, width, work)
+            z[:] = matrix_at(p[U_BIAS], 1, width, work)
             for r in range(p[U_FIRST], p[U_FIRST] + p[U_COUNT]):
                 q = incoming[r]
                 conv, degree = convs[q[I_CONV]], work[q[I_DEGREE] : q[I_DEGREE] + n]
-                bias = _parameter(work, conv[C_OUT_BIAS], 1, width)
+                bias = matrix_at(conv[C_OUT_BIAS], 1, width, work)
                 for i in range(width):
                     total = bias[0, 0] * 0
                     for c in range(width):
@@ -308,15 +250,15 @@ def forward(gemm, convs, updates, incoming, starts, sizes, states, source, targe
                     for c in range(width):
                         z[k, c] += degree[k] * row[c]
                 product = place + size * q[I_PRODUCT]
-                _gemm(work, gemm, 0, 0, width, width, width, p[U_WEIGHT], width, conv[C_OUT], width, 0, product, width)
-                _gemm(work, gemm, 0, 1, n, width, width, place + size * q[I_SUMS], width, product, width, 1, place + size * p[U_Z], width)
+                gemm(work, address, 0, 0, width, width, width, p[U_WEIGHT], width, conv[C_OUT], width, 0, product, width)
+                gemm(work, address, 0, 1, n, width, width, place + size * q[I_SUMS], width, product, width, 1, place + size * p[U_Z], width)
             active, y = _matrix(scratch, 0, n, width), _matrix(work, p[U_ROWS], n, width)
-            _activate(z, _parameter(work, p[U_SLOPE], 1, 1)[0, 0], active)
-            _gemm(work, gemm, 0, 1, n, width, width, scratch.ctypes.data, width, p[U_OUT], width, 0, place + size * p[U_ROWS], width)
+            _activate(z, matrix_at(p[U_SLOPE], 1, 1, work)[0, 0], active)
+            gemm(work, address, 0, 1, n, width, width, scratch.ctypes.data, width, p[U_OUT], width, 0, place + size * p[U_ROWS], width)
             before, after = _matrix(work, p[U_BEFORE], n, width), _matrix(work, p[U_AFTER], n, width)
-            bias = _parameter(work, p[U_OUT_BIAS], 1, width)[0]
+            bias = matrix_at(p[U_OUT_BIAS], 1, width, work)[0]
             if p[U_GAIN]:
-                gain, shift = _parameter(work, p[U_GAIN], 1, width)[0], _parameter(work, p[U_SHIFT], 1, width)[0]
+                gain, shift = matrix_at(p[U_GAIN], 1, width, work)[0], matrix_at(p[U_SHIFT], 1, width, work)[0]
                 _normalize(y, bias, gain, shift, eps, before, after, work[p[U_SCALE] : p[U_SCALE] + n])
             else:
                 _add(y, bias, before, after)
@@ -325,7 +267,7 @@ def forward(gemm, convs, updates, incoming, starts, sizes, states, source, targe
 @njit(fastmath=FASTMATH, **OPTIONS)
 @no_type_check
 def backward(
-    gemm, convs, updates, incoming, starts, sizes, states, source, target, features, work, scratch, width, channels, of_states, grads
+    address, convs, updates, incoming, starts, sizes, states, source, target, features, work, scratch, width, channels, of_states, grads
 ):
     """Execute all steps backward; arguments as in ``forward``.
 
@@ -349,40 +291,81 @@ def backward(
             if p[U_GAIN]:
                 total[:] = 0
                 other[:] = 0
-                gain = _parameter(work, p[U_GAIN], 1, width)[0]
+                gain = matrix_at(p[U_GAIN], 1, width, work)[0]
                 _normalize_back(grad, _matrix(work, p[U_ROWS], n, width), work[p[U_SCALE] : p[U_SCALE] + n], gain, y, total, other)
                 for c in range(width):
                     grads[p[U_G_GAIN] + c] = total[c]
                     grads[p[U_G_SHIFT] + c] = other[c]
             else:
                 y[:] = grad
-            _gemm(work, gemm, 0, 0, n, width, width, free, width, p[U_OUT], width, 0, free + size * largest, width)
+            gemm(work, address, 0, 0, n, width, width, free, width, p[U_OUT], width, 0, free + size * largest, width)
             below[:] = 0
-            _activate_back(_matrix(work, p[U_Z], n, width), _parameter(work, p[U_SLOPE], 1, 1)[0, 0], g, active, below)
+            _activate_back(_matrix(work, p[U_Z], n, width), matrix_at(p[U_SLOPE], 1, 1, work)[0, 0], g, active, below)
             grads[p[U_G_SLOPE]] = below.sum()
-            _gemm(work, gemm, 1, 0, width, width, n, free, width, free + size * 2 * largest, width, 0, of_grads + size * p[U_G_OUT], width)
+            gemm(
+                work, address, 1, 0, width, width, n, free, width, free + size * 2 * largest, width, 0, of_grads + size * p[U_G_OUT], width
+            )
             _sum_rows(y, total, grads[p[U_G_OUT_BIAS] : p[U_G_OUT_BIAS] + width])
             _sum_rows(g, total, grads[p[U_G_BIAS] : p[U_G_BIAS] + width])
-            weight, of_weight = _parameter(work, p[U_WEIGHT], width, width), _matrix(grads, p[U_G_WEIGHT], width, width)
+            weight, of_weight = matrix_at(p[U_WEIGHT], width, width, work), _matrix(grads, p[U_G_WEIGHT], width, width)
             for r in range(p[U_FIRST], p[U_FIRST] + p[U_COUNT]):
                 q = incoming[r]
                 conv, degree = convs[q[I_CONV]], work[q[I_DEGREE] : q[I_DEGREE] + n]
                 of_g, of_square = free + size * largest, square.ctypes.data
-                _gemm(
-                    work, gemm, 0, 0, n, width, width, of_g, width, place + size * q[I_PRODUCT], width, 0, place + size * q[I_G_SUMS], width
+                gemm(
+                    work,
+                    address,
+                    0,
+                    0,
+                    n,
+                    width,
+                    width,
+                    of_g,
+                    width,
+                    place + size * q[I_PRODUCT],
+                    width,
+                    0,
+                    place + size * q[I_G_SUMS],
+                    width,
                 )
-                _gemm(work, gemm, 1, 0, width, width, n, of_g, width, place + size * q[I_SUMS], width, 0, of_square, width)
-                _gemm(
-                    work, gemm, 0, 1, width, width, width, of_square, width, conv[C_OUT], width, 1, of_grads + size * p[U_G_WEIGHT], width
+                gemm(work, address, 1, 0, width, width, n, of_g, width, place + size * q[I_SUMS], width, 0, of_square, width)
+                gemm(
+                    work,
+                    address,
+                    0,
+                    1,
+                    width,
+                    width,
+                    width,
+                    of_square,
+                    width,
+                    conv[C_OUT],
+                    width,
+                    1,
+                    of_grads + size * p[U_G_WEIGHT],
+                    width,
                 )
-                _gemm(
-                    work, gemm, 1, 0, width, width, width, p[U_WEIGHT], width, of_square, width, 1, of_grads + size * conv[C_G_OUT], width
+                gemm(
+                    work,
+                    address,
+                    1,
+                    0,
+                    width,
+                    width,
+                    width,
+                    p[U_WEIGHT],
+                    width,
+                    of_square,
+                    width,
+                    1,
+                    of_grads + size * conv[C_G_OUT],
+                    width,
                 )
                 total[:] = 0
                 for k in range(n):
                     for c in range(width):
                         total[c] += degree[k] * g[k, c]
-                bias, of_bias = _parameter(work, conv[C_OUT_BIAS], 1, width)[0], grads[conv[C_G_OUT_BIAS] : conv[C_G_OUT_BIAS] + width]
+                bias, of_bias = matrix_at(conv[C_OUT_BIAS], 1, width, work)[0], grads[conv[C_G_OUT_BIAS] : conv[C_G_OUT_BIAS] + width]
                 for i in range(width):
                     for c in range(width):
                         of_weight[i, c] += total[i] * bias[c]
@@ -392,29 +375,29 @@ def backward(
             stride, num_target, num_source = 2 * width + p[C_FEATURES], sizes[p[C_TARGET]], sizes[p[C_SOURCE]]
             a, b = _matrix(work, p[C_A], num_target, width), _matrix(work, p[C_B], num_source, width)
             of_a, of_b = _matrix(scratch, 0, num_target, width), _matrix(scratch, largest, num_source, width)
-            _feature_weight(_parameter(work, p[C_WEIGHT], width, stride), width, w)
+            _feature_weight(matrix_at(p[C_WEIGHT], width, stride, work), width, w)
             grad_target, grad_source = _matrix(work, p[C_G_TARGET], num_target, width), _matrix(work, p[C_G_SOURCE], num_source, width)
             of_a[:] = 0
             of_b[:] = 0
             of_w[:] = 0
             below[:] = 0
-            slope, first, end = _parameter(work, p[C_SLOPE], 1, 1)[0, 0], p[C_FIRST], p[C_FIRST] + p[C_COUNT]
+            slope, first, end = matrix_at(p[C_SLOPE], 1, 1, work)[0, 0], p[C_FIRST], p[C_FIRST] + p[C_COUNT]
             for start in range(first, end, EDGES):
                 count = min(EDGES, end - start)
                 _return(
                     a, b, features, w, slope, source, target, grad_target, grad_source, p[C_TO_TARGET], p[C_TO_SOURCE], start, count, block, of_a, of_b,
                     below, channels,
                 )  # fmt: skip
-                _gemm(
-                    work, gemm, 1, 0, len(channels), width, count, features.ctypes.data + size * start * len(channels), len(channels), block.ctypes.data,
+                gemm(
+                    work, address, 1, 0, len(channels), width, count, features.ctypes.data + size * start * len(channels), len(channels), block.ctypes.data,
                     width, 1, of_w.ctypes.data, width,
                 )  # fmt: skip
             of_weight = of_grads + size * p[C_G_WEIGHT]
             h_target, h_source = place + size * states[s, p[C_TARGET]], place + size * states[s, p[C_SOURCE]]
-            _gemm(work, gemm, 1, 0, width, width, num_target, free, width, h_target, width, 0, of_weight, stride)
-            _gemm(
+            gemm(work, address, 1, 0, width, width, num_target, free, width, h_target, width, 0, of_weight, stride)
+            gemm(
                 work,
-                gemm,
+                address,
                 1,
                 0,
                 width,
@@ -435,6 +418,6 @@ def backward(
             _sum_rows(of_a, total, grads[p[C_G_BIAS] : p[C_G_BIAS] + width])
             grads[p[C_G_SLOPE]] = below.sum()
             for t, at, n, column in ((p[C_TARGET], 0, num_target, 0), (p[C_SOURCE], largest, num_source, width)):
-                _gemm(
-                    work, gemm, 0, 0, n, width, width, free + size * at, width, p[C_WEIGHT] + size * column, stride, 1, place + size * of_states[t], width
+                gemm(
+                    work, address, 0, 0, n, width, width, free + size * at, width, p[C_WEIGHT] + size * column, stride, 1, place + size * of_states[t], width
                 )  # fmt: skip

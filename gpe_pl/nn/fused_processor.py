@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gpe_pl.nn import compiled_processor
+from gpe_pl.nn import compiled_processor, matrix_product
 from gpe_pl.nn.compiled_processor import C_AT_SOURCE, C_AT_TARGET, C_G_SOURCE, C_G_TARGET
 from gpe_pl.nn.fused import plain_gradients
 
@@ -118,7 +118,7 @@ class _Tables:
         self.tables = [
             np.array(rows, np.int64).reshape(len(rows), n) for rows, n in ((self.convs, 24), (self.updates, 23), (self.incoming, 5))
         ]
-        self.given = compiled_processor.gemm_address(self.work.dtype), *self.tables, *map(np.array, (self.starts, self.sizes, self.states))
+        self.given = matrix_product.gemm_address(self.work.dtype), *self.tables, *map(np.array, (self.starts, self.sizes, self.states))
 
     def forward(self, eps: float) -> list[Tensor]:
         """Return the final states."""

@@ -17,6 +17,9 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
+from gpe_pl.nn.compiled_islands import remove_rigid_part
+from gpe_pl.nn.fused import works_on
+
 IslandMomentum = Literal["ignored", "linear", "angular"]
 SMALLEST_PRINCIPAL_FRACTION = 1e-4
 """Fraction of the largest principal moment of inertia below which an island has no defined rotation about an axis (a single node, nodes in a row)."""
@@ -43,6 +46,11 @@ def conserve(
     if torch.compiler.is_exporting():  # shapes must not depend on values: compute all rows, then select those of free islands
         rows = torch.arange(island.shape[0], device=island.device)
         return torch.where(is_free[island][:, None], _kept(acceleration, mass, pos, island, rows, is_free.shape[0], angular), acceleration)
+    if _compiles(acceleration, mass, pos):
+        kept = acceleration.clone()
+        if bool(is_free.any()):
+            _remove(kept, mass, pos, island, is_free, angular)
+        return kept
     rows = torch.nonzero(is_free[island]).flatten()
     if not len(rows):
         return acceleration
@@ -58,8 +66,23 @@ def rigid_part(
     count: int,
 ) -> Float[Tensor, "node dim"]:
     """Return the rigid part of accelerations for each of ``count`` bodies: it carries all of their linear and angular momentum and no deformation."""
+    if _compiles(acceleration, mass, pos):
+        rest = acceleration.clone()
+        _remove(rest, mass, pos, body, torch.ones(count, dtype=torch.bool), angular=True)
+        return acceleration - rest
     rows = torch.arange(body.shape[0], device=body.device)
     return acceleration - _kept(acceleration, mass, pos, body, rows, count, angular=True)
+
+
+def _compiles(*tensors: Tensor) -> bool:
+    """Tell whether ``compiled_islands`` can be used in the present context."""
+    return not torch.is_grad_enabled() and works_on(*tensors)
+
+
+def _remove(acceleration: Tensor, mass: Tensor, pos: Tensor, group: Tensor, is_wanted: Tensor, angular: bool) -> None:
+    """Remove the rigid part of the accelerations of some groups, in place."""
+    arrays = [t.detach().contiguous().numpy() for t in (mass, pos, group, is_wanted)]
+    remove_rigid_part(acceleration.detach().numpy(), *arrays, angular, SMALLEST_PRINCIPAL_FRACTION)
 
 
 def _kept(acceleration: Tensor, mass: Tensor, pos: Tensor, island: Tensor, rows: Tensor, count: int, angular: bool) -> Tensor:

@@ -1,19 +1,34 @@
-"""Addresses of arrays in compiled functions."""
+"""Arrays at addresses in compiled functions. Their memory has to live as long as they are used."""
 
 from __future__ import annotations
 
 from typing import no_type_check
 
-from numba import types
+from numba import carray, njit, types
 from numba.extending import intrinsic
 
 
 @intrinsic
 @no_type_check
 def pointer(_, address):
-    """Return an integer address as a pointer, for ``numba.carray``. The memory has to live as long as the array is used."""
+    """Return an integer address as a pointer, for ``numba.carray``."""
 
     def convert(context, builder, signature, arguments):
         return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
 
     return types.voidptr(address), convert
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def matrix_at(address, rows, columns, like):
+    """Return the matrix at an address, of the precision of another array."""
+    return carray(pointer(address), (rows, columns), like.dtype)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def row_of(matrix, row, column, count):
+    """Return some columns of a row. Loops over them vectorise, unlike loops over ``matrix[row, column + c]``, whose index might be negative."""
+    address = matrix.ctypes.data + matrix.itemsize * (row * matrix.shape[1] + column)
+    return carray(pointer(address), (count,), matrix.dtype)

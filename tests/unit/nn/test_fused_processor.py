@@ -12,8 +12,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from gpe_pl.nn import compiled_processor
 from gpe_pl.nn import fused_processor as module
+from gpe_pl.nn import matrix_product
 from gpe_pl.nn.compiled_processor import EDGES
 from gpe_pl.nn.fused_processor import Conv, Relation, Step, Update, fused_processor, plain_processor
 
@@ -65,11 +65,11 @@ def test_states_and_gradients_equal_the_plain_ones(dtype: torch.dtype, tolerance
 
 
 def test_products_of_scipy_serve_where_pytorch_shows_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    own = compiled_processor.gemm_address(np.dtype(np.float64))
+    own = matrix_product.gemm_address(np.dtype(np.float64))
     with monkeypatch.context() as without_library:
         without_library.setattr(torch, "__file__", str(tmp_path / "__init__.py"))
-        address = compiled_processor.gemm_address.__wrapped__(np.dtype(np.float64))
-    monkeypatch.setattr(compiled_processor, "gemm_address", lambda _: address)
+        address = matrix_product.gemm_address.__wrapped__(np.dtype(np.float64))
+    monkeypatch.setattr(matrix_product, "gemm_address", lambda _: address)
     found, expected = (differentiated(f, torch.float64, True) for f in (fused_processor, plain_processor))
     assert address != own
     for x, y in zip(found, expected, strict=True):

@@ -1,0 +1,255 @@
+"""A network as data: sets of rows, matrices, weights and instructions, which ``compiled_instructions.run`` executes in one call.
+
+A model writes its layers with the methods of ``Program``. Weights are copied when the program is written, so write it again when they change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, no_type_check
+
+import numpy as np
+import torch
+from numba import njit
+from torch import Tensor
+
+from gpe_pl.nn import compiled_instructions, matrix_product
+from gpe_pl.nn.compiled_instructions import BLOCK, NONE, SET, run
+from gpe_pl.nn.compiled_network_inputs import find_wrong_edges, load_bodies, load_edges, load_nodes, number_nodes, store
+
+NUM_ARGUMENTS = 14
+ALIGNED = 16
+"""Matrices begin at multiples of this number of elements."""
+
+
+@dataclass(frozen=True)
+class NodeType:
+    """Sets of rows of a type of nodes: all of them, those with an edge, and those without."""
+
+    number: int
+    every: int
+    connected: int
+    isolated: int
+
+
+@dataclass
+class Program:
+    """A network as instructions.
+
+    Args:
+        dtype: precision of all matrices.
+
+    Attributes:
+        node_types: sets of rows of each type of nodes.
+        relations: set of rows of each relation.
+    """
+
+    dtype: torch.dtype
+    node_types: dict[str, NodeType] = field(default_factory=dict)
+    relations: dict[Any, int] = field(default_factory=dict)
+    num_sets: int = 0
+    matrices: list[tuple[int, int]] = field(default_factory=list)
+    instructions: list[list[int]] = field(default_factory=list)
+    segments: list[tuple[int, int, int]] = field(default_factory=list)
+    weights: list[np.ndarray] = field(default_factory=list)
+    num_weights: int = 0
+
+    # --- rows, matrices and weights ---------------------------------------------------------------------------------------------------------
+
+    def node_type(self, name: str) -> NodeType:
+        """Add a type of nodes."""
+        first = self.new_set(), self.new_set(), self.new_set()
+        self.node_types[name] = NodeType(len(self.node_types), *first)
+        return self.node_types[name]
+
+    def new_set(self) -> int:
+        """Add a set of rows."""
+        self.num_sets += 1
+        return self.num_sets - 1
+
+    def matrix(self, rows: int, columns: int) -> int:
+        """Add a matrix with these rows, or with the rows of one block for ``NONE``."""
+        self.matrices.append((rows, max(columns, 1)))
+        return len(self.matrices) - 1
+
+    def weight(self, values: Tensor) -> int:
+        """Add weights, and return their place."""
+        flat = values.detach().to(self.dtype).contiguous().numpy().ravel()
+        self.weights.append(flat)
+        self.num_weights += len(flat)
+        return self.num_weights - len(flat)
+
+    @contextmanager
+    def segment(self, rows: int) -> Iterator[None]:
+        """Add a segment: the instructions that are written in this context, for these rows."""
+        first = len(self.instructions)
+        yield
+        if len(self.instructions) > first:
+            self.segments.append((rows, first, len(self.instructions)))
+
+    def _add(self, code: int, *arguments: int, needs: int = NONE) -> None:
+        self.instructions.append([code, needs, *arguments, *[0] * (NUM_ARGUMENTS - len(arguments))])
+
+    # --- instructions of rows, see ``compiled_instructions`` ----------------------------------------------------------------------------------------
+
+    def product(self, y: int, x: int, weight: Tensor, mode: int = SET, column: int = 0, to: int = 0, needs: int = NONE) -> None:
+        """Write y[:, to:] = x[:, column:] Wᵀ, for a weight W [out, in] as PyTorch stores it."""
+        out, channels = weight.shape
+        if channels:
+            self._add(compiled_instructions.PRODUCT, y, x, column, channels, self.weight(weight.t()), out, to, mode, needs=needs)
+        elif mode == SET:
+            self._add(compiled_instructions.ZERO, y, needs=needs)
+
+    def bias(self, y: int, bias: Tensor, column: int = 0, needs: int = NONE) -> None:
+        self._add(compiled_instructions.BIAS, y, column, self.weight(bias), len(bias), needs=needs)
+
+    def degree(self, y: int, degree: int, column: int, bias: Tensor, needs: int = NONE) -> None:
+        self._add(compiled_instructions.DEGREE, y, degree, self.weight(bias), len(bias), column, needs=needs)
+
+    def activate(self, y: int, bias: Tensor, slope: Tensor, needs: int = NONE, fills: bool = False) -> None:
+        self._add(compiled_instructions.ACTIVATE, y, self.weight(bias), self.weight(slope), len(bias), int(fills), needs=needs)
+
+    def normalize(self, h: int, y: int, bias: Tensor, norm: torch.nn.LayerNorm, adds: bool) -> None:
+        eps = self.weight(torch.tensor([norm.eps], dtype=torch.float64))
+        self._add(
+            compiled_instructions.NORMALIZE,
+            y,
+            h,
+            self.weight(bias),
+            self.weight(norm.weight),
+            self.weight(norm.bias),
+            eps,
+            len(bias),
+            int(adds),
+        )
+
+    def residual(self, h: int, y: int, bias: Tensor) -> None:
+        self._add(compiled_instructions.RESIDUAL, y, h, self.weight(bias), len(bias))
+
+    def zero(self, y: int) -> None:
+        self._add(compiled_instructions.ZERO, y)
+
+    def divide(self, y: int, divisor: int) -> None:
+        self._add(compiled_instructions.DIVIDE, y, divisor)
+
+    # --- instructions of edges; ends are 1 for the target and 0 for the source ---------------------------------------------------------------
+
+    def messages(self, w: int, width: int, slope: Tensor, target: tuple[int, int], source: tuple[int, int], at_target: tuple[int, int], at_source: tuple[int, int]) -> None:  # fmt: skip  # noqa: E501
+        """Gather a (target) and b (source), add w, activate, and add to the sums at the target, and subtract from those at the source."""
+        self._add(compiled_instructions.MESSAGES, w, *target, *source, width, self.weight(slope), *at_target, *at_source)
+
+    def gather(self, w: int, width: int, slope: Tensor, own: tuple[int, int], other: tuple[int, int], end: int = 1) -> None:
+        """Replace w by the activation of a (at ``end``), b (at the other end) and w."""
+        self._add(compiled_instructions.GATHER, w, *own, *other, width, self.weight(slope), end)
+
+    def gather_odd(self, w: int, u: int, width: int, slope: Tensor, nodes: int, a: int, b: int) -> None:
+        self._add(compiled_instructions.GATHER_ODD, w, nodes, a, b, u, width, self.weight(slope))
+
+    def activate_odd(self, w: int, u: int, bias: Tensor, slope: Tensor) -> None:
+        self._add(compiled_instructions.ACTIVATE_ODD, w, u, self.weight(bias), self.weight(slope), len(bias))
+
+    def update(self, m: int, e: int, bias: Tensor) -> None:
+        self._add(compiled_instructions.UPDATE, m, e, self.weight(bias), len(bias))
+
+    def scatter(self, x: int, width: int, sums: tuple[int, int], sign: int, end: int, bodies: tuple[int, int] = (NONE, NONE)) -> None:
+        """Add rows to the sums at one end, or subtract them; edges within one body are left out if the types of their bodies are given."""
+        self._add(compiled_instructions.SCATTER, x, width, *sums, sign, end, *bodies)
+
+    def count(self, degree: tuple[int, int], sign: int, end: int, bodies: tuple[int, int] = (NONE, NONE)) -> None:
+        self._add(compiled_instructions.COUNT, *degree, sign, end, *bodies)
+
+
+class Tables(NamedTuple):
+    """What a program reads and writes; see ``compiled_network_inputs`` for the columns.
+
+    Attributes:
+        nodes, edges, bodies: inputs of nodes, relations, and bodies of nodes.
+        results: results of nodes.
+    """
+
+    nodes: np.ndarray
+    edges: np.ndarray
+    bodies: np.ndarray
+    results: np.ndarray
+
+
+class Executable:
+    """A program that is ready to run. Its matrices stay in memory between calls.
+
+    Args:
+        program: the program.
+        kinds: what each input and result is.
+    """
+
+    def __init__(self, program: Program, kinds: Tables) -> None:
+        self.kinds = kinds
+        self.instructions = np.array(program.instructions, np.int64).reshape(-1, NUM_ARGUMENTS + 2)
+        self.segments = np.array(program.segments, np.int64).reshape(-1, 3)
+        self.weights = np.concatenate(program.weights)
+        self.rows = np.array([rows for rows, _ in program.matrices], np.int64)
+        self.stride = np.array([columns for _, columns in program.matrices], np.int64)
+        self.is_block = self.rows == NONE
+        self.sets = np.array([[t.every, t.connected, t.isolated] for t in program.node_types.values()], np.int64).reshape(-1, 3)
+        self.address = matrix_product.gemm_address(self.weights.dtype)
+        self._free: list[np.ndarray] = []
+
+    def __call__(self, tensors: Tables, num_nodes: np.ndarray, size: np.ndarray, apart: bool, sorts: bool) -> int | None:
+        """Run the program, unless an edge names a node that does not exist. Return the number of its relation, or None.
+
+        Args:
+            tensors: addresses and sizes of the inputs and results, whose memory must stay in use. Sizes are not checked.
+            num_nodes: number of nodes of each type.
+            size: number of rows of each set: of nodes all, of edges all.
+            apart: leave nodes without an edge out of message passing.
+            sorts: order nodes in memory by their edges.
+        """
+        height = np.where(self.is_block, BLOCK, size[self.rows])
+        length = (height * self.stride + ALIGNED - 1) // ALIGNED * ALIGNED
+        offset, needed = np.cumsum(length) - length, int(length.sum())
+        try:
+            work = self._free.pop()  # each thread that runs the program takes its own
+        except IndexError:
+            work = self.weights[:0]
+        if len(work) < needed:
+            work = np.empty(needed + needed // 4, self.weights.dtype)
+        wrong = _run(
+            self.address, self.segments, self.instructions, offset, self.stride, self.is_block, height, self.weights, work, size, num_nodes,
+            self.sets, *self.kinds, *tensors, apart, sorts,
+        )  # fmt: skip
+        self._free.append(work)
+        return None if wrong == NONE else wrong
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+@no_type_check
+def _run(
+    address, segments, instructions, offset, stride, is_block, height, weights, work, size, num_nodes, sets, node_kinds, edge_kinds, body_kinds,
+    result_kinds, nodes, edges, bodies, results, apart, sorts,
+):  # fmt: skip
+    wrong = find_wrong_edges(edge_kinds, edges, num_nodes)
+    if wrong != NONE:
+        return wrong
+    num_sets, first_node = len(size), np.cumsum(num_nodes) - num_nodes
+    number, connected = np.empty(num_nodes.sum(), np.int64), np.empty(len(num_nodes), np.int64)
+    number_nodes(edge_kinds, edges, first_node, num_nodes, number, connected, apart, sorts)
+    span = np.zeros((num_sets, 2), np.int64)
+    span[:, 1] = size
+    for t in range(len(num_nodes)):
+        span[sets[t, 1], 1] = connected[t]
+        span[sets[t, 2], 0], span[sets[t, 2], 1] = connected[t], num_nodes[t]
+    first_edge, num_edges = np.full(num_sets, NONE), 0
+    for r in range(len(edge_kinds)):
+        rows = edge_kinds[r, 2]
+        if first_edge[rows] == NONE:
+            first_edge[rows] = num_edges
+            num_edges += size[rows]
+    ends = np.empty((num_edges, 2), np.int64)
+    body = np.empty(len(number) if len(bodies) else 0, np.int64)
+    load_nodes(node_kinds, nodes, number, first_node, work, offset, stride, height)
+    load_edges(edge_kinds, edges, number, first_node, ends, first_edge, work, offset, stride)
+    load_bodies(body_kinds, bodies, number, first_node, body)
+    run(address, segments, instructions, offset, stride, is_block, span, height, weights, work, ends, first_edge, body, first_node)
+    store(result_kinds, results, number, first_node, work, offset, stride)
+    return NONE
