@@ -1,7 +1,8 @@
 """Passes over all parameters of a model in one call: norm and scaling of gradients, Adam, and moving averages (on a CPU).
 
 PyTorch's functions for lists of tensors spend microseconds on each tensor. A model of this package has a hundred or more small ones, for which that is longer
-than the arithmetic takes. The kernels here read the addresses of all tensors. They work on contiguous tensors of one precision, single or double.
+than the arithmetic takes. The kernels here read the addresses of all tensors. They work on contiguous tensors of one precision, single or double. PyTorch does
+not see what they write, so they tell it that parameters have changed.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 import torch
 from numba import carray, njit
 from torch import Tensor
+from torch.autograd.graph import increment_version
 
 from gpe_pl.nn.fused import FASTMATH
 from gpe_pl.nn.pointers import pointer
@@ -37,6 +39,7 @@ def scale(tensors: Sequence[Tensor], factor: float) -> None:
 def pull(tensors: Sequence[Tensor], towards: Sequence[Tensor], weight: float) -> None:
     """Move tensors towards others of the same shapes, in place: x ← x + weight (y − x)."""
     _pull(*_places(tensors), _addresses(towards), _like(tensors), weight)
+    _mark_as_changed(tensors)
 
 
 def adam(
@@ -61,6 +64,12 @@ def adam(
     """
     lists = (_addresses(values) for values in (gradients, means, squares, steps))
     _adam(*_places(parameters), *lists, _like(parameters), learning_rate, *betas, eps)
+    _mark_as_changed(parameters)
+
+
+def _mark_as_changed(tensors: Sequence[Tensor]) -> None:
+    for tensor in tensors:
+        increment_version(tensor)
 
 
 def _addresses(tensors: Sequence[Tensor]) -> np.ndarray:
