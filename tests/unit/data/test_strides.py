@@ -99,6 +99,11 @@ def test_training_windows_begin_at_every_stored_frame(stored: dict[str, list[Tra
     data = module_of(store(tmp_path, stored), stride=STRIDE).train_set
     places = sorted((int(data[k].trajectory), int(data[k].frame)) for k in range(len(data)))
     assert places == [(t, frame) for t in (0, 1) for frame in range(STRIDE * HISTORY, NUM_FRAMES - STRIDE)]
+    for view in data.trajectories:
+        whole = view.window(0, view.num_frames)
+        np.testing.assert_array_equal(whole.pos, stored["train"][int(view.name)].pos[view.phase :: STRIDE])
+        np.testing.assert_array_equal(view.window(1, 3).vel, whole.vel[1:3])
+        assert whole.start_time == pytest.approx(0.01 * view.phase)
 
 
 def test_statistics_of_a_stride_are_kept_until_the_data_change(stored: dict[str, list[Trajectory]], tmp_path: Path) -> None:
