@@ -42,7 +42,7 @@ def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows
         "|---|---|",
         *ranges,
         "",
-        f"Values outside are warned of; the errors below say what to expect. {_against_ballistic(rows)}{_bodies(rows)}",
+        f"Values outside are warned of; the errors below say what to expect.{_clamping(settings)} {_against_ballistic(rows)}{_bodies(rows)}",
         "",
         "```",
         summary(table_of(rows)),
@@ -51,6 +51,13 @@ def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows
         "It knows boxes with the obstacles of that data set. Fracture, other contact laws and other materials are beyond it.",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _clamping(settings: dict[str, object]) -> str:
+    """Sentence on an evaluation that did not clamp material parameters, as rollouts do by default."""
+    evaluation = settings.get("evaluation")
+    is_default = not isinstance(evaluation, dict) or evaluation.get("clamp_parameters", True)
+    return "" if is_default else " They were measured with `evaluation.clamp_parameters=false`."
 
 
 def _against_ballistic(rows: list[Row]) -> str:
