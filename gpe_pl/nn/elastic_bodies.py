@@ -16,9 +16,15 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.errors import GpeError
 from gpe_pl.nn.elastic_motion import Cells, Constants, Corners, Walls, cauchy_stress, elastic_motion
+from gpe_pl.system.compiled import is_wanted
 
 MAX_CACHED = 64
 """Largest number of batches whose cells at rest are kept in memory; 400 triangles take about 40 kB."""
+
+
+MOST_ON_HOST = 16
+"""Largest number of scenes whose bodies move on the host if the model is on a GPU."""
+ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "cell_index", "corner_index", "corner")
 
 
 class CellError(GpeError, ValueError):
@@ -103,32 +109,33 @@ class ElasticBodies(nn.Module):
     def _moved(
         self, m: str, data: HeteroData, acceleration: Tensor, params: Tensor | None, mass: Tensor, with_stress: bool
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        store, unit = data[m], self.acceleration_unit
-        if "ptr" in store:
+        if "ptr" in data[m]:
             raise CellError("PyTorch Geometric's Batch does not renumber cells; join graphs with gpe_pl.graphs.batching.batched")
-        scene = store.batch if "batch" in store else None
-        mean, velocity = store.velocity.double().split(self.dim, dim=1)
-        gravity = (data.gravity if scene is None else data.gravity[scene]).double()
-        cells = _cells_at_rest(m, store.cell_index, store.rest_pos, mass, scene)
-        own = store.body_pos.new_empty(len(mass), 0) if params is None else params.to(store.body_pos.dtype)
+        own = data[m].body_pos.new_empty(len(mass), 0) if params is None else params.to(data[m].body_pos.dtype)
+        constants = cast(Constants, self.constants[m])(own)
+        # the compiled pass on the host takes less time than a GPU needs to start the operations of some scenes
+        device = mass.device if len(data.gravity) > MOST_ON_HOST or not is_wanted() else torch.device("cpu")
+        store = {key: data[m][key].to(device) for key in ENTRIES}
+        scene = data[m].batch.to(device) if "batch" in data[m] else None
+        unit, spacing, friction_factor, forcing = (
+            x.to(device) for x in (self.acceleration_unit, self.spacing, self.log_friction[m].exp(), acceleration * self.acceleration_unit)
+        )
+        body_pos, (mean, velocity) = store["body_pos"], store["velocity"].double().split(self.dim, dim=1)
+        gravity = data.gravity.to(device).double()
+        gravity = gravity if scene is None else gravity[scene]
+        cells = _cells_at_rest(m, store["cell_index"], store["rest_pos"], mass.to(device), scene)
         # masses are in units of their mean, and the rest volume of a node is about spacing^dim
-        modulus = self.spacing ** (2 - self.dim)
-        lam, mu, eta = ((value * modulus)[cells.nodes].mean(dim=1) for value in cast(Constants, self.constants[m])(own))
-        normal, gap, friction = store.wall.split([self.dim, 1, 1], dim=1)
-        walls = Walls(normal, gap[:, 0] - self.wall_distance[m] * self.spacing, friction[:, 0] * self.log_friction[m].exp())
-        ends = store.corner_index
-        corners = Corners(
-            ends,
-            store.body_pos.double()[ends[:, 0]] + store.corner[:, : self.dim],
-            store.corner[:, self.dim] * self.log_friction[m].detach().exp(),
-        )
-        way, at_end, law = elastic_motion(
-            store.body_pos, velocity, acceleration * unit + gravity, mass, (lam, mu, eta), cells, walls, corners
-        )
+        modulus = spacing ** (2 - self.dim)
+        lam, mu, eta = ((value.to(device) * modulus)[cells.nodes].mean(dim=1) for value in constants)
+        normal, gap, friction = store["wall"].split([self.dim, 1, 1], dim=1)
+        walls = Walls(normal, gap[:, 0] - self.wall_distance[m].to(device) * spacing, friction[:, 0] * friction_factor)
+        ends, corner = store["corner_index"], store["corner"]
+        corners = Corners(ends, body_pos.double()[ends[:, 0]] + corner[:, : self.dim], corner[:, self.dim] * friction_factor.detach())
+        way, at_end, law = elastic_motion(body_pos, velocity, forcing + gravity, mass.to(device), (lam, mu, eta), cells, walls, corners)
         stress = None
         if with_stress:
-            stress = (cauchy_stress(store.body_pos + way, law, cells) / self.stress_unit).to(acceleration.dtype)
-        return ((way - mean - gravity) / unit).to(acceleration.dtype), at_end, stress
+            stress = (cauchy_stress(body_pos + way, law, cells) / self.stress_unit.to(device)).to(acceleration)
+        return ((way - mean - gravity) / unit).to(acceleration), at_end.to(mass.device), stress
 
 
 def _cells_at_rest(material: str, cell_index: Tensor, rest_pos: Tensor, mass: Tensor, scene: Tensor | None) -> Cells:
