@@ -16,15 +16,20 @@ from torch_geometric.data import HeteroData
 
 Loss = Literal["square", "log", "root"]
 
+SMALL_ERROR = 0.1
+"""Normalised error s of an acceleration up to which ``log`` is nearly the square."""
 LEAST_ERROR = 6.3e-4
 """Error of a position in rest spacings below which ``root`` is smooth. The code of Ummenhofer et al. adds 1e-9 m² to the square, with a spacing of 0.05 m."""
 
 
 def penalty(error: Float[Tensor, "node dim"], loss: Loss, least: Float[Tensor, ""]) -> Float[Tensor, "node _"]:
-    """Return how errors e count in the loss: ``square``, e² of each component; ``log``, log(1 + e²) of each; ``root``, (|e|² + least²)^(1/4) of each node."""
+    """Return how errors e count in the loss.
+
+    ``square`` is e² of each component, ``log`` is s² log(1 + e²/s²) of each with s = ``SMALL_ERROR``, and ``root`` is (|e|² + least²)^(1/4) of each node.
+    """
     if loss == "root":
         return (error.square().sum(dim=1, keepdim=True) + least.square()) ** 0.25
-    return error.square().log1p() if loss == "log" else error.square()
+    return SMALL_ERROR**2 * (error / SMALL_ERROR).square().log1p() if loss == "log" else error.square()
 
 
 def num_neighbors(data: HeteroData, materials: Sequence[str]) -> dict[str, Float[Tensor, " node"]]:
