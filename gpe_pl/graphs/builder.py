@@ -296,9 +296,8 @@ def _with_gradient(arm: Tensor, pos: Tensor, islands: IslandTopology) -> Tensor:
     if not pos.requires_grad:
         return arm
     num_islands = islands.is_free.shape[0]
-    is_whole = torch.zeros(num_islands, dtype=torch.bool, device=pos.device).index_put(
-        (islands.label[(arm != 0).any(dim=1)],), torch.tensor(True)
-    )
+    is_whole = torch.zeros(num_islands, dtype=torch.bool, device=pos.device)
+    is_whole[islands.label[(arm != 0).any(dim=1)]] = True
     change = from_centre(pos, islands.label, num_islands)
     return arm + torch.where(is_whole[islands.label, None], change - change.detach(), 0.0)
 

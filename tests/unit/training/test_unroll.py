@@ -31,6 +31,7 @@ from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import StoreError, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
 from tests import scenes
+from tests.ranks import on_ranks
 from tests.scenes import assert_equal_graphs
 
 MOTION = 0.02
@@ -238,3 +239,19 @@ def test_batches_hold_unrolls_of_the_same_windows(store: Path) -> None:
     drawn = next(BatchSize(2).batches(data, 0, 0))
     assert next(batches) == [UnrollKey(*pair) for pair in drawn]
     assert_equal_graphs(data[UnrollKey(*drawn[0])].graph, data[drawn[0]])
+
+
+def test_several_processes_share_the_loss_of_each_step(store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The only scene of one process falls apart after its first step."""
+    data = windows(store, 3)
+    parts = [[data[UnrollKey(0, 0)], data[UnrollKey(1, 1)]], [replace(data[UnrollKey(2, 0)], about={"trajectory": 9, "frame": 0})]]
+    usual = Unroll.graph_after
+
+    def fails(self: Unroll, builder: GraphBuilder, state: State, step: int) -> HeteroData:
+        if self.about["trajectory"] == 9:
+            raise SimulationError("no")
+        return usual(self, builder, state, step)
+
+    monkeypatch.setattr(Unroll, "graph_after", fails)
+    losses = on_ranks(tmp_path, lambda rank: float(module_of(data).loss(parts[rank])))
+    assert sum(losses) == pytest.approx(module_of(data).loss([*parts[0], *parts[1]]).item(), rel=1e-6)
