@@ -97,7 +97,7 @@ class FinerSolver:
             SimulationError: with reason ``input``, if the finer solution of a state is not known, or the cells of a mesh cannot be divided; otherwise as the
                 solver. Its node is the node of the scene that the particle comes from.
         """
-        fine = self._solution(state)
+        fine = self.solution(state)
         start = replace(fine.state, material_params=fine.origin @ state.material_params, boundary=state.boundary, gravity=state.gravity)
         try:
             after = self.solver.step(start)
@@ -111,7 +111,8 @@ class FinerSolver:
             internal=Divided(after, fine.origin),
         )  # fmt: skip
 
-    def _solution(self, state: State) -> Divided:
+    def solution(self, state: State) -> Divided:
+        """Return the finer solution of a state; errors are those of ``step``."""
         fine, count = state.internal, state.num_nodes
         if fine is None and state.time == 0:
             try:

@@ -34,7 +34,7 @@ def started(name: str, fine: int) -> tuple[State, Divided]:
     spec = spec_of(name, fine)
     state = initial_state(spec, "train", 0)
     solver: Any = spec.label_solver
-    return state, solver._solution(state)
+    return state, solver.solution(state)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -88,7 +88,7 @@ def test_tracers_do_not_act_on_the_finer_solution() -> None:
     state = initial_state(spec, "train", 0)
     traced: Any = spec.label_solver
     with_tracers = list(steps(traced, state, 20))[-1]
-    begun = traced._solution(state).state
+    begun = traced.solution(state).state
     parts = np.arange(state.num_nodes, begun.num_nodes)
     alone = replace(begun.take(parts), mass=begun.mass[parts] / (1 - MARKER))
     without = list(steps(traced.solver, alone, 20))[-1]
