@@ -228,10 +228,9 @@ class TrainingModule(L.LightningModule):
         count = num_neighbors(batch, self.simulator.builder.spec.materials)
         return [torch.exp(-scale * count[m])[:, None] * error for m, error in zip(materials, errors, strict=True)]
 
-    @staticmethod
-    def _weighted(batch: HeteroData, materials: Iterable[str], errors: list[Tensor]) -> list[Tensor]:
+    def _weighted(self, batch: HeteroData, materials: Iterable[str], errors: list[Tensor]) -> list[Tensor]:
         """Return errors [node, …] of each material, multiplied by the weights of their graphs."""
-        weight = batch.weight.float()
+        weight = batch.weight.to(self.device).float()  # graphs that were built on a GPU have numbers, which a batch collects on the CPU
         return [weight[batch[m].batch][:, None] * error for m, error in zip(materials, errors, strict=True)]
 
     def _fractions(self, *errors: list[Tensor]) -> list[float]:

@@ -269,3 +269,11 @@ def test_a_gradient_that_is_not_finite_is_dropped(caplog: pytest.LogCaptureFixtu
     optimizer.step()
     assert "gradient norm is nan for (trajectory, frame) = (3, 17)" in caplog.text
     assert torch.equal(parameter, before)
+
+
+def test_numbers_of_graphs_that_were_built_on_a_gpu_meet_errors_there() -> None:
+    m, data, other = module(), HeteroData(), torch.device("meta")  # a device that every machine has, with shapes and without values
+    m._device = other
+    data.weight, data["sand"].batch = torch.ones(2), torch.zeros(5, dtype=torch.int64, device=other)
+    (weighted,) = m._weighted(data, ["sand"], [torch.zeros(5, 2, device=other)])
+    assert weighted.device == other and weighted.shape == (5, 2)
