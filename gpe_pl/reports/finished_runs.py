@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from gpe_pl.evaluation.rollout_cost import read_cost
 from gpe_pl.evaluation.rollouts import LEARNED, MetricsError, Row, read_rows
 from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError, config_in
 from gpe_pl.reports import run_archive
@@ -38,6 +39,7 @@ class Run:
         rows: metrics: a table with the fields of ``evaluation.rollouts.Row`` as columns.
         data: checksums of the data, by key of the configuration.
         curve: validation curve of an archived run; None if it is in the run's folder (see ``validation_curve``).
+        cost: processor time of rollouts per simulated second (see ``evaluation.rollout_cost``); None if it was not measured.
     """
 
     folder: Path
@@ -45,6 +47,7 @@ class Run:
     rows: pd.DataFrame
     data: dict[str, str] = field(default_factory=dict)
     curve: Curve | None = None
+    cost: float | None = None
 
 
 WITHOUT_CONSEQUENCE = {"evaluation.num_pictures", "evaluation.export", "evaluation.material_controls"}
@@ -66,6 +69,7 @@ def archive(runs: list[Run], root: Path, folder: Path) -> None:
         settings = {f"{CONFIG}{key}": value for key, value in run.config.items()} | {
             f"{DATA}{key}": value for key, value in run.data.items()
         }
+        settings |= {} if run.cost is None else {COST: run.cost}
         about[run_name(run, root)] = settings | dict(zip(CURVE, (array.tolist() for array in validation_curve(run)), strict=True))
     run_archive.write_archive(folder, about, {run_name(run, root): run.rows for run in runs})
 
@@ -78,6 +82,7 @@ def evaluation_in(folder: Path) -> Run:
 CONFIG, DATA = "config:", "data:"
 """Prefixes of an archive's keys for the configuration of a run and for the checksums of its data."""
 CURVE = ("validation_steps", "validation_losses")
+COST = "seconds_per_simulated_second"
 
 
 def run_name(run: Run, root: Path) -> str:
@@ -91,7 +96,7 @@ def _archived(folder: Path) -> list[Run]:
     for name, known in about.items():
         config, data = ({key.removeprefix(kind): value for key, value in known.items() if key.startswith(kind)} for kind in (CONFIG, DATA))
         curve = np.array(known[CURVE[0]], int), np.array(known[CURVE[1]], float)
-        runs.append(Run(folder / name, config, rows[name], data, curve))
+        runs.append(Run(folder / name, config, rows[name], data, curve, known.get(COST)))
     return runs
 
 
@@ -119,7 +124,7 @@ def finished_runs(folder: Path) -> list[Run]:
                         raise RunError(
                             f"{config}: {key} is {said[key]!r}, which this package did not write; delete the folder {path.parent}"
                         )
-                runs.append(Run(path.parent, said, table_of(read_rows(path)), data))
+                runs.append(Run(path.parent, said, table_of(read_rows(path)), data, cost=read_cost(path.parent)))
             else:
                 log.warning(
                     "%s is not a training run (its configuration lacks %s) and is left out of the report",

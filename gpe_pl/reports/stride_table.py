@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from itertools import compress
+
 import numpy as np
 
 from gpe_pl.evaluation.horizons import FULL, time_of
-from gpe_pl.evaluation.rollout_cost import read_cost
 from gpe_pl.evaluation.rollouts import LEARNED
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import bootstrap_ratio
 from gpe_pl.reports.finished_runs import Run, shared_table, shared_trajectories, splits_of, values_by_seed
 
+STRIDES_MD = "strides.md"
+"""Name of the file with these lines alone."""
 AXIS = "data.stride"
+LENGTHS = ("training.num_steps", "training.val_interval")
+"""Keys that differ between runs of equal time and are left out."""
 ERROR = "final_mse"
 NOTE = (
     "Position MSE ×1e-3 [m²] at the instant, nodes and axes: median over trajectories and seeds, and the ratio of the means to the first row with its 95 % "
@@ -31,7 +36,8 @@ def stride_lines(axes: list[str], variants: dict[tuple[str, ...], list[Run]]) ->
         return []
     first, *_ = variants.values()
     instants = _shared_instants(variants)
-    names = [axis.rpartition(".")[2] for axis in axes]
+    shown = [axis not in LENGTHS for axis in axes]
+    names = [axis.rpartition(".")[2] for axis in compress(axes, shown)]
     header = [*names, "split", *(f"at {instant}" for instant in instants), "failed", "cost [s/s]", "edges per node"]
     lines = [table_row(header), "|" + "---|" * len(header)]
     for split in splits_of(first[0]):
@@ -41,7 +47,16 @@ def stride_lines(axes: list[str], variants: dict[tuple[str, ...], list[Run]]) ->
             failed = f"{int(np.sum(~np.isfinite(ends)))} of {len(ends)}"
             edges = [value for seed in values_by_seed(runs, LEARNED, split, "edges_per_node", FULL) for value in seed.values()]
             lines.append(
-                table_row([*key, split, *errors, failed, _cost(runs, first), f"{np.mean(edges):.1f}" if edges else "not measured"])
+                table_row(
+                    [
+                        *compress(key, shown),
+                        split,
+                        *errors,
+                        failed,
+                        _cost(runs, first),
+                        f"{np.mean(edges):.1f}" if edges else "not measured",
+                    ]
+                )
             )
     return [*lines, "", NOTE]
 
@@ -68,7 +83,7 @@ def _error(runs: list[Run], first: list[Run], split: str, instant: str, variants
 
 
 def _cost(runs: list[Run], first: list[Run]) -> str:
-    own, reference = ([cost for run in some if (cost := read_cost(run.folder)) is not None] for some in (runs, first))
+    own, reference = ([run.cost for run in some if run.cost is not None] for some in (runs, first))
     if not own:
         return "not measured"
     ratio = f" (×{np.mean(own) / np.mean(reference):.2f})" if reference and runs is not first else ""

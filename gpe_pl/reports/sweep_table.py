@@ -37,7 +37,7 @@ from gpe_pl.reports.finished_runs import (
 )
 from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, verdict, write_material_figure
 from gpe_pl.reports.parameter_curves import PARAMETER_FIGURE, parameter_curves
-from gpe_pl.reports.stride_table import stride_lines
+from gpe_pl.reports.stride_table import STRIDES_MD, stride_lines
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.viz.saving import save_figure
 
@@ -85,7 +85,7 @@ def variants_of(runs: list[Run]) -> tuple[list[str], dict[Variant, list[Run]]]:
 
 
 def _report(folder: Path, runs: list[Run]) -> None:
-    """Write ``table.csv``, ``table.md`` and these figures.
+    """Write ``table.csv``, ``table.md``, ``strides.md`` if variants differ in their stride, and these figures.
 
     - ``validation_loss.png``, if every variant has a validation curve.
     - ``reads_material.png``, if a variant has controls of the material.
@@ -97,6 +97,8 @@ def _report(folder: Path, runs: list[Run]) -> None:
     _write_csv(folder / "table.csv", axes, runs)
     ratios = forward_time_ratios(folder, variants)
     replace_text(folder / SWEEP_MD, _markdown(axes, variants, ratios))
+    if strides := stride_lines(axes, variants):
+        replace_text(folder / STRIDES_MD, "\n".join([*strides, ""]))
     curves = {", ".join(v) or LEARNED: [validation_curve(r) for r in members] for v, members in variants.items()}
     curves = {k: [c for c in v if len(c[0])] for k, v in curves.items()}
     if all(curves.values()):

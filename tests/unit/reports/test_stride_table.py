@@ -8,7 +8,7 @@ from gpe_pl.evaluation.rollout_cost import Timed, read_cost, write_cost
 from gpe_pl.evaluation.rollouts import LEARNED, Row, write_rows
 from gpe_pl.files import sealed
 from gpe_pl.reports import sweep_table
-from gpe_pl.reports.finished_runs import finished_runs
+from gpe_pl.reports.finished_runs import archive, finished_runs
 from gpe_pl.rollout.baselines import ConstantVelocity
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -37,7 +37,20 @@ def test_a_sweep_over_strides_has_a_table_of_instants_and_costs(tmp_path: Path) 
     table = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[start : start + 4] if "---" not in line]
     assert table[0] == ["stride", "split", "at 0.02s", "at 0.1s", "failed", "cost [s/s]", "edges per node"]
     assert table[1] == ["1", "test", "1e+03", "4", "0 of 3", "0.8", "10.0"]
+    assert lines[start:] == (tmp_path / "strides.md").read_text().splitlines()
     assert table[2] == ["4", "test", "1e+03 (×1.00 [1.00, 1.00])", "2 (×0.50 [0.50, 0.50])", "1 of 3", "0.25 (×0.31)", "40.0"]
+
+
+def test_an_archive_keeps_the_costs(tmp_path: Path) -> None:
+    for stride in (1, 4):
+        write_run(tmp_path / "runs" / str(stride), stride, {"0.1s": [1e-3, 2e-3], "full": [1.0, 1.0]}, step=0.004)
+    runs = finished_runs(tmp_path / "runs")
+    (tmp_path / "kept").mkdir()
+    archive(runs, tmp_path / "runs", tmp_path / "kept")
+    for folder in ("runs", "kept"):
+        sweep_table.report_sweep(tmp_path / folder, finished_runs(tmp_path / folder))
+    tables = [(tmp_path / folder / "strides.md").read_text() for folder in ("runs", "kept")]
+    assert tables[0] == tables[1] and "0.8" in tables[0]
 
 
 def test_what_was_not_measured_is_said(tmp_path: Path) -> None:
