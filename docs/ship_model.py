@@ -34,7 +34,7 @@ def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows
     lines = [
         *_opening(name, acceptance.NOT_MEASURED),
         f"{model} with {size:,} parameters, for {', '.join(metadata.materials)} in {metadata.dim}D: data set `{metadata.dataset}`, "
-        f"frames of {1e3 * metadata.frame_dt:g} ms, nodes {metadata.spacing:.4g} m apart. Other frame intervals and spacings are refused.",
+        f"frames of {1e3 * metadata.frame_dt:g} ms, nodes {metadata.spacing:.4g} m apart. Other frame intervals and spacings are refused.{_law(simulator)}",
         "",
         f"Trained with `{command}` (commit {commit}), {training['num_steps']:,} steps of {training['batch_size']} graphs.",
         "",
@@ -51,6 +51,13 @@ def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows
         "It knows boxes with the obstacles of that data set. Fracture, other contact laws and other materials are beyond it.",
     ]
     return "\n".join(lines) + "\n"
+
+
+def _law(simulator: LearnedSimulator) -> str:
+    """Sentences on a model that is told the form of a law."""
+    if not simulator.model.settings.get("elastic"):
+        return ""
+    return " It is given the form of the solver's elastic law and learned its constants. It cannot be exported as a program, and refuses walls that move."
 
 
 def _clamping(settings: dict[str, object]) -> str:

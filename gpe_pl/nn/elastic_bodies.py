@@ -20,11 +20,8 @@ from gpe_pl.system.compiled import is_wanted
 
 MAX_CACHED = 64
 """Largest number of batches whose cells at rest are kept in memory; 400 triangles take about 40 kB."""
-
-
-MOST_ON_HOST = 16
-"""Largest number of scenes whose bodies move on the host if the model is on a GPU."""
 ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "cell_index", "corner_index", "corner")
+"""Entries of a material's store that the law reads."""
 
 
 class CellError(GpeError, ValueError):
@@ -113,8 +110,8 @@ class ElasticBodies(nn.Module):
             raise CellError("PyTorch Geometric's Batch does not renumber cells; join graphs with gpe_pl.graphs.batching.batched")
         own = data[m].body_pos.new_empty(len(mass), 0) if params is None else params.to(data[m].body_pos.dtype)
         constants = cast(Constants, self.constants[m])(own)
-        # the compiled pass on the host takes less time than a GPU needs to start the operations of some scenes
-        device = mass.device if len(data.gravity) > MOST_ON_HOST or not is_wanted() else torch.device("cpu")
+        # an H200 needs 0.1 to 0.4 s to start the operations of all substeps one by one; the compiled pass on the host takes 1 ms with both copies
+        device = torch.device("cpu") if is_wanted() else mass.device
         store = {key: data[m][key].to(device) for key in ENTRIES}
         scene = data[m].batch.to(device) if "batch" in data[m] else None
         unit, spacing, friction_factor, forcing = (

@@ -34,6 +34,7 @@ def test_a_card_says_how_bodies_bend(ship_model: ModuleType) -> None:
     assert "have 20 % of the mean error of ballistic flight. Medians over these rollouts" in text
     assert "relative to the ground truth: deformation 0.70, bounce height 0.90." in text
     assert "deformation_ratio" in text.split("```")[1]
+    assert ("It is given the form of the solver's elastic law" in text) == simulator.model.settings["elastic"]
     assert "clamp" not in text
     unclamped = {**settings, "evaluation": {"clamp_parameters": False}}
     assert "`evaluation.clamp_parameters=false`" in ship_model.card("fem", "python -m gpe_pl.fit", "abc", simulator, errors, unclamped)
