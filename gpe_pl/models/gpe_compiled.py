@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from functools import lru_cache
+from operator import is_
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -56,10 +57,13 @@ class CompiledGPE:
     def __init__(self, model: GPE) -> None:
         modules = [*model.modules()]
         self._hooks = [hooks for m in modules[1:] for hooks in (m._forward_hooks, m._forward_pre_hooks)]
-        self._modules = [(m._modules, name, child) for m in modules for name, child in m._modules.items()]
-        named = [(m._parameters, name, p) for m in modules for name, p in m._parameters.items() if p is not None]
-        self._weights = [(own, name, p, p.data_ptr(), _version(p)) for own, name, p in named]
-        self._are_tracked = not any(p.is_inference() for _, _, p in named)
+        parts = [
+            (own, name, part) for m in modules for own in (m._modules, m._parameters) for name, part in own.items() if part is not None
+        ]
+        self._places, self._parts = [(own, name) for own, name, _ in parts], [part for *_, part in parts]
+        self._weights = [part for part in self._parts if isinstance(part, Tensor)]
+        self._are_tracked = not any(p.is_inference() for p in self._weights)
+        self._state = self._state_of_weights()
         with torch.no_grad():
             written = GPEProgram(model)
         self.written, self.spec, self.dtype = written, model.spec, written.program.dtype
@@ -97,9 +101,11 @@ class CompiledGPE:
 
     def is_current(self) -> bool:
         """Tell whether the model still has the layers and weights of the program."""
-        return all(own.get(name) is child for own, name, child in self._modules) and all(
-            own.get(name) is p and p.data_ptr() == address and _version(p) == version for own, name, p, address, version in self._weights
-        )
+        return all(map(is_, [own.get(name) for own, name in self._places], self._parts)) and self._state_of_weights() == self._state
+
+    def _state_of_weights(self) -> tuple[list[int], list[int]]:
+        """Return addresses of the weights, and numbers that rise whenever they change; weights that were made in inference mode have no such number."""
+        return [p.data_ptr() for p in self._weights], [p._version for p in self._weights] if self._are_tracked else []
 
     def __call__(self, data: HeteroData, skips: Skips, keep_absent: bool) -> Decoded | None:
         """Return what the network decodes from a graph with standardised features; None if it cannot be used.
@@ -175,8 +181,3 @@ class _UnexpectedError(Exception):
 
 def _table(rows: list[Any], columns: int) -> np.ndarray:
     return np.array(rows, np.int64).reshape(-1, columns)
-
-
-def _version(parameter: Tensor) -> int:
-    """Return a number that rises whenever a parameter is changed in place; parameters that were made in inference mode have none."""
-    return 0 if parameter.is_inference() else parameter._version
