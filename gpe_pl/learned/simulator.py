@@ -179,9 +179,7 @@ class LearnedSimulator(nn.Module):
         if stress:
             rms = torch.cat(stress).double().square().mean().sqrt()
             self.stress_std.copy_(torch.where(rms > 0, rms, 1.0))
-        scales, square = self.builder.scales, self.builder.scales.frame_dt**2
-        stress_unit = float(self.stress_std / self.standardizer.mass) * square
-        self.model.set_units(float(self.acceleration_std) * square, scales.spacing, stress_unit)
+        self.set_units_of(self.model)
         for k, material in enumerate(self.builder.spec.materials):
             mass = torch.cat([g[material].mass for g in sample.of(material)])
             if len(mass):
@@ -194,6 +192,12 @@ class LearnedSimulator(nn.Module):
         for material, trained in self.trained_ranges():
             if material in parameter_ranges:
                 trained.copy_(parameter_ranges[material])
+
+    def set_units_of(self, model: Model) -> None:
+        """Tell a model the units of the data set (``Model.set_units``). The statistics must be set."""
+        scales, square = self.builder.scales, self.builder.scales.frame_dt**2
+        stress_unit = float(self.stress_std / self.standardizer.mass) * square
+        model.set_units(float(self.acceleration_std) * square, scales.spacing, stress_unit)
 
     @torch.no_grad()
     def start_from(self, trained: LearnedSimulator) -> None:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch_geometric.data import Batch
 
+from gpe_pl.benchmarks.stability.subject import in_flight
 from gpe_pl.export.program import export_model
 from gpe_pl.geometry.shape_values import moved as moved_shape
 from gpe_pl.graphs.builder import GraphBuilder, GraphError
@@ -370,6 +371,23 @@ def test_nodes_stop_at_the_distance_of_walls(wall_distance: float, way: float) -
     graph["elastomer"].wall = torch.tensor([0.0, 1.0, 1.2 * scenes.SPACING, 0.0]).expand(len(state.pos), 4)
     change = simulated(graph).acceleration["elastomer"][:, 1] * ACCELERATION * DT**2  # of the way over a frame
     torch.testing.assert_close(change / scenes.SPACING, torch.full_like(change, way + 0.5), rtol=0, atol=1e-4)
+
+
+def test_nodes_without_cells_keep_the_mean_velocities_of_free_flight() -> None:
+    simulated, state = simulator(network=0.0), bodies(walls=False)
+    state = in_flight(replace(state, cells=None, rest_pos=None), DT)
+    after = simulated.step(state)
+    torch.testing.assert_close(after.vel, state.vel + DT * state.gravity, rtol=0, atol=1e-6)
+    assert after.frame_velocity is not None
+    torch.testing.assert_close(after.frame_velocity, after.vel + 0.5 * DT * state.gravity, rtol=0, atol=1e-6)
+
+
+def test_a_fresh_model_gets_the_units_of_a_simulator() -> None:
+    simulated = simulator()
+    fresh = GPE(simulated.builder.spec, **simulated.model.settings)
+    simulated.set_units_of(fresh)
+    assert float(fresh.get_buffer("elastic_bodies.acceleration_unit")) == pytest.approx(ACCELERATION * DT**2)
+    assert float(fresh.get_buffer("elastic_bodies.spacing")) == pytest.approx(scenes.SPACING)
 
 
 def test_cells_without_volume_are_refused() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, inapplicable, no_boundary, shifted, stress_test
+from gpe_pl.benchmarks.stability.subject import Outcome, Subject, acceleration, in_flight, inapplicable, no_boundary, shifted, stress_test
 from gpe_pl.errors import GpeError
 from gpe_pl.graphs.neighbors import radius_pairs
 from gpe_pl.learned.testing.changes import permuted
@@ -42,7 +42,7 @@ def coincident(subject: Subject) -> Outcome:
 @stress_test(13, "isolated, one and no particle", "no crash, ballistic: |a − g| < 1e-6 of the acceleration scale")
 def isolated(subject: Subject) -> Outcome:
     simulator = subject.simulator
-    state = replace(subject.state(), boundary=no_boundary(subject.state()))
+    state = in_flight(replace(subject.state(), boundary=no_boundary(subject.state())), subject.dt)
     far = torch.zeros_like(state.pos)
     far[0] = 32 * simulator.builder.scales.radius
     alone = permuted(replace(state, pos=state.pos + far, cells=None, rest_pos=None), torch.arange(state.num_nodes))

@@ -190,6 +190,7 @@ def trained(subject: Subject, graphs: list[HeteroData], learning_rate: float) ->
     simulator.model = type(subject.simulator.model)(
         simulator.builder.spec, **{**settings, **({"stress": False} if "stress" in settings else {})}
     )
+    simulator.set_units_of(simulator.model)
     module = TrainingModule(simulator, len(graphs), learning_rate, compile="off")
     optimizer = torch.optim.Adam(simulator.parameters(), lr=learning_rate)
     losses = []

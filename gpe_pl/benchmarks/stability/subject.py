@@ -76,9 +76,9 @@ class Subject:
         return self.simulator.initial_state(truth, frame)
 
     def free_state(self, scene: int = 0, fraction: float = 0.5) -> State:
-        """Return the same state without gravity and boundary."""
+        """Return the same state without gravity and boundary, in free flight."""
         state = self.state(scene, fraction)
-        return replace(state, gravity=torch.zeros_like(state.gravity), boundary=no_boundary(state))
+        return in_flight(replace(state, gravity=torch.zeros_like(state.gravity), boundary=no_boundary(state)), self.dt)
 
     def guard(self) -> Guard:
         """Return the limits of a stable rollout: one connectivity radius outside the domain, and three times the largest speed in training."""
@@ -196,6 +196,11 @@ def shifted(state: State, offset: Tensor) -> State:
     boundary = replace(state.boundary, pos=state.boundary.pos + offset, shapes=shapes)
     rest = None if state.rest_pos is None else state.rest_pos + offset
     return replace(state, pos=state.pos + offset, rest_pos=rest, boundary=boundary)
+
+
+def in_flight(state: State, dt: float) -> State:
+    """Return the state with the velocities at the frame that free flight has: the mean over the last frame, and half of what gravity adds within a frame."""
+    return state if state.frame_velocity is None else replace(state, frame_velocity=state.vel + 0.5 * dt * state.gravity)
 
 
 def with_velocities(state: State, change: Callable[[Tensor], Tensor]) -> State:
