@@ -146,7 +146,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
 def _models(runs: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[str, tuple[LearnedSimulator, float]]:
     """Return trained simulators, with variants that repeat predictions, and the seconds of their training, by label."""
     found = {}
-    for label, (simulator, run) in trained_on(spec, runs).items():
+    for label, (simulator, run) in trained_on(spec, runs, with_strides=True).items():
         seconds = training_seconds(run)
         found[label] = simulator.to(settings.device), seconds
         for repeats in settings.repeats:
@@ -170,7 +170,7 @@ def training_seconds(run: Run) -> float:
 
 def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]], settings: Settings) -> tuple[list[Point], float]:
     """Run all simulators on the same scenes; return their points and the solver's observed order of convergence."""
-    history = max(simulator.builder.config.history for simulator, _ in models.values())
+    first = max(simulator.stride * simulator.builder.config.history for simulator, _ in models.values())
     points: dict[str, Point] = {}
     orders = []
     for index in range(settings.num_trajectories):
@@ -178,10 +178,10 @@ def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]]
         start = initial_state(spec, settings.split, index)
         reference = _reference(spec, start, data)
         orders.append(_order(spec, start, data, reference))
-        truth = reference.frames(history)
-        for name, family, simulator, at in _simulators(spec, start, data, models, history, settings):
+        truth = reference.frames(first)
+        for name, family, simulator, at in _simulators(spec, start, data, models, first, settings):
             point = points.setdefault(name, Point(name, family))
-            prediction, seconds = _timed(simulator, at, data, history)
+            prediction, seconds = _timed(simulator, at, data, first)
             point.seconds.append(seconds)
             error = _squared_error(prediction, truth)[1:]
             for horizon in (*(h for h in settings.horizons if h <= len(error)), None):
@@ -202,7 +202,7 @@ class _Restricted:
 
     Attributes:
         resolved: its state, and the map from its positions to those of the scene's nodes.
-        from_start: whether it starts at frame 0, not at the first frame with enough history.
+        from_start: whether it starts at frame 0, not where all learned models have enough history.
         frames_per_step: number of frames that one step advances.
     """
 
@@ -216,10 +216,10 @@ def _simulators(
     start: State,
     data: Trajectory,
     models: dict[str, tuple[LearnedSimulator, float]],
-    history: int,
+    first: int,
     settings: Settings,
 ) -> Iterator[tuple[str, Family, Simulator, _Restricted]]:
-    """Yield the simulators. Solvers start at frame 0, all others at the first frame with enough history for learned models."""
+    """Yield the simulators. Solvers start at frame 0, all others at frame ``first``, where all learned models have enough history."""
     same = Resolved(start, lambda pos: pos)
     yield DATA, "solver", spec.label_solver, _Restricted(same, True)
     if spec.fine > 1:
@@ -238,10 +238,11 @@ def _simulators(
             yield f"solver, {STEPS}{longer}", "solver", solver, _Restricted(same, True, longer)
     dt = spec.solver.frame_dt
     for label, (simulator, _) in models.items():
-        at = _Restricted(Resolved(simulator.initial_state(data, history), lambda pos: pos), False)
-        yield label, "learned", Contained(approximate(simulator), dt), at
+        seen = data.frames(first % simulator.stride).every(simulator.stride)
+        at = _Restricted(Resolved(simulator.initial_state(seen, first // simulator.stride), lambda pos: pos), False, simulator.stride)
+        yield label, "learned", Contained(approximate(simulator), simulator.stride * dt), at
     for name, baseline in BASELINES.items():
-        state = data.state(history, history)
+        state = data.state(first, first)
         yield name.replace("_", " "), "trivial", baseline(dt), _Restricted(Resolved(state, lambda pos: pos), False)
 
 
@@ -307,15 +308,15 @@ def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Traject
     return float(np.log2(second / first))
 
 
-def _timed(simulator: Any, at: _Restricted, data: Trajectory, history: int) -> tuple[Trajectory, float]:
-    """Run from the start ``at`` to the end of the data. Return the rollout from frame ``history`` on, and its wall time over its simulated time.
+def _timed(simulator: Any, at: _Restricted, data: Trajectory, kept_from: int) -> tuple[Trajectory, float]:
+    """Run from the start ``at`` to the end of the data. Return the rollout from frame ``kept_from`` on, and its wall time over its simulated time.
 
     The rollout has the nodes of the scene. The first step runs twice and is timed once, so that compilation and first use of memory do not count. A failed
     rollout ends early. Frames within a step are interpolated.
     """
     start: Any = at.resolved.state
     dt = data.metadata.frame_dt
-    first, every = 0 if at.from_start else history, at.frames_per_step
+    first, every = 0 if at.from_start else kept_from, at.frames_per_step
     wanted = data.num_frames - first
     frames, seconds, num_steps = [_numpy(start)], 0.0, 0
     try:
@@ -335,7 +336,7 @@ def _timed(simulator: Any, at: _Restricted, data: Trajectory, history: int) -> t
         log.info("%s stopped: %s", type(simulator).__name__, error)
     pos = np.stack([at.resolved.restrict(p) for p, _ in frames[:wanted]])
     vel = np.stack([(at.resolved.restrict(p + dt * v) - at.resolved.restrict(p)) / dt for p, v in frames[:wanted]])
-    trajectory = replace(data, pos=pos, vel=vel, stress=None).frames(history - first)
+    trajectory = replace(data, pos=pos, vel=vel, stress=None).frames(kept_from - first)
     return trajectory, seconds / max(1, num_steps) / (every * dt)
 
 

@@ -34,7 +34,7 @@ def runs_in(folders: Sequence[str]) -> list[Run]:
 
 
 class StrideError(GpeError, ValueError):
-    """Raised for a model with a stride, because suites run models on stored frames; the message names the model and its stride."""
+    """Raised for a model with a stride, because most suites run models on stored frames; the message names the model and its stride."""
 
 
 def of_stored_frames(checkpoint: Path | str) -> LearnedSimulator:
@@ -53,20 +53,27 @@ def of_stored_frames(checkpoint: Path | str) -> LearnedSimulator:
     return simulator
 
 
-def trained_on(spec: DatasetSpec, runs: Iterable[Run]) -> dict[str, tuple[LearnedSimulator, Run]]:
+def trained_on(spec: DatasetSpec, runs: Iterable[Run], with_strides: bool = False) -> dict[str, tuple[LearnedSimulator, Run]]:
     """Return simulators that were trained on a data set of this name and size, and their runs, by label.
 
-    A label names the model, and the settings of training and graph in which its runs differ. The length of training is no part of it. Of runs with the same
-    label, such as runs with other seeds, the first is returned.
+    A label names the model, its stride if that is not 1, and the settings of training and graph in which its runs differ. The length of training is no part of
+    it. Of runs with the same label, such as runs with other seeds, the first is returned.
+
+    Args:
+        spec: the data set.
+        runs: finished runs; those on other data sets are left out.
+        with_strides: whether models may have a stride.
 
     Raises:
-        StrideError: a run has another ``data.stride`` than 1.
+        StrideError: a run has another ``data.stride`` than 1, unless ``with_strides``.
     """
     same: dict[str, list[tuple[LearnedSimulator, Run]]] = defaultdict(list)
     for run in runs:
         if (run.config["data.name"], run.config["size.name"]) == (spec.name, spec.size):
-            simulator = of_stored_frames(run.folder / "checkpoints" / "best.ckpt")
-            same[model_label(simulator)].append((simulator, run))
+            checkpoint = run.folder / "checkpoints" / "best.ckpt"
+            simulator = LearnedSimulator.from_checkpoint(checkpoint) if with_strides else of_stored_frames(checkpoint)
+            label = model_label(simulator) + (f", stride {simulator.stride}" if simulator.stride > 1 else "")
+            same[label].append((simulator, run))
     found: dict[str, tuple[LearnedSimulator, Run]] = {}
     for label, members in same.items():
         these = [run for _, run in members]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from gpe_pl.benchmarks import runtime_vs_error as module
 from gpe_pl.benchmarks.runtime_vs_error import (
@@ -103,10 +104,11 @@ def test_hypervolume_is_the_area_of_steps() -> None:
     assert hypervolume([point("slow", 20.0, 1e-2)], "full", (10.0, 1.0)) == 0
 
 
-def untrained() -> LearnedSimulator:
+def untrained(stride: int = 1) -> LearnedSimulator:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
-    builder = GraphBuilder(GraphConfig(history=2), trajectory_metadata(spec, "test", 0))
-    return LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder)
+    builder = GraphBuilder(GraphConfig(history=2), trajectory_metadata(spec, "test", 0).every(stride))
+    torch.manual_seed(0)
+    return LearnedSimulator(GPE(builder.spec, num_message_passing_steps=1, hidden_channels=8), builder, stride)
 
 
 def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
@@ -120,6 +122,15 @@ def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
     assert all(p.cost > 0 and set(p.mse) == {"10", "full"} for p in points)
     assert by_name["GPE 1 × 8"].overhead > 60.0
     assert np.isfinite(order)
+
+
+def test_a_model_with_longer_frames_starts_with_the_others_and_is_seen_at_all_frames() -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES))
+    models = {"every": (untrained(), 0.0), "third": (untrained(3), 0.0)}  # before training they fall freely
+    points, _ = compare(spec, models, Settings({}, [], factors=[], step_factors=[], num_trajectories=1, horizons=[9]))
+    by_name = {p.name: p for p in points}
+    assert by_name["third"].error("9") == pytest.approx(by_name["every"].error("9"), rel=0.3)
+    assert np.isfinite(by_name["third"].error("full")) and set(by_name["third"].mse) == {"9", "full"}
 
 
 def test_training_took_its_steps_at_the_step_time_of_its_sweep(tmp_path: Path) -> None:
@@ -157,7 +168,7 @@ def test_solvers_on_a_grid_have_longer_steps_up_to_a_cell() -> None:
 def test_every_model_also_repeats_its_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator = untrained()
     simulator.model = GNS(simulator.builder.spec, num_message_passing_steps=1, hidden_channels=8)
-    monkeypatch.setattr(module, "trained_on", lambda *_: {"GNS": (simulator, None)})
+    monkeypatch.setattr(module, "trained_on", lambda *_, **__: {"GNS": (simulator, None)})
     monkeypatch.setattr(module, "training_seconds", lambda _: 120.0)
     models = _models([], dataset_spec(compose("simulate", *OVERRIDES)), Settings({}, [], repeats=[2, 4]))
     assert {label: (s.skips.repeat_frames, seconds) for label, (s, seconds) in models.items()} == {
