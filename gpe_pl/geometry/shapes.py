@@ -546,6 +546,8 @@ def thickness(shape: Shape) -> float:
 def outward_normal(shape: Shape, points: Array, step: float) -> Array:
     """Return unit vectors [..., dim] into free space: gradients of the signed distance by central differences of ``step`` [m]; zero where undefined."""
     xp = array_namespace(points)
+    if isinstance(shape, Wall):
+        return xp.zeros_like(points) + _like(shape.normal, points)
     columns = []
     for axis in range(points.shape[-1]):
         offset = _like([step if k == axis else 0.0 for k in range(points.shape[-1])], points)

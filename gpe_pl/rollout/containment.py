@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from array_api_compat import array_namespace
+import numpy as np
+from array_api_compat import array_namespace, device
 
-from gpe_pl.geometry.shapes import outward_normal, signed_distance, surface_tolerance
+from gpe_pl.geometry.shapes import Shape, outward_normal, signed_distance, surface_tolerance
 from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
 from gpe_pl.trajectory.boundary import Array
 from gpe_pl.trajectory.state import State
@@ -33,21 +34,32 @@ def contain(state: State, dt: float) -> tuple[State, Array]:
     if not bool(xp.any(inside)):
         return state, inside
     rows = xp.nonzero(inside)[0]
-    moved = pos[rows]
-    for _ in range(4):  # corners need a pass per surface
-        before = moved
-        for shape in shapes:
-            depth = xp.clip(-shape.signed_distance(moved), 0.0, None)
-            if bool(xp.any(depth > 0)):  # normals are expensive, and most shapes contain no node
-                moved = moved + depth[:, None] * outward_normal(shape, moved, step=tolerance)
-        if moved is before:
-            break
+    moved = xp.asarray(_on_surfaces(shapes, _plain(pos[rows]), tolerance))
     caught = signed_distance(shapes, moved) < -tolerance
     moved = xp.where(caught[:, None], pos[rows] - state.vel[rows] * dt, moved)
     new_pos, vel = xp.asarray(pos, copy=True), xp.asarray(state.vel, copy=True)
     new_pos[rows] = state.periodicity.wrapped(moved)
     vel[rows] = vel[rows] + (moved - pos[rows]) / dt
     return state.corrected(new_pos, vel), inside
+
+
+def _plain(points: Array) -> Array:
+    """Return points on a CPU as a NumPy array, whose operations on few points take less time than PyTorch's."""
+    return points if str(device(points)) != "cpu" or getattr(points, "requires_grad", False) else np.asarray(points)
+
+
+def _on_surfaces(shapes: tuple[Shape, ...], points: Array, tolerance: float) -> Array:
+    """Move points along the normals of all shapes that they are inside of."""
+    xp = array_namespace(points)
+    for _ in range(4):  # corners need a pass per surface
+        if not bool(xp.any(signed_distance(shapes, points) < 0)):
+            break
+        for shape in shapes:
+            distance = shape.signed_distance(points)
+            depth = xp.maximum(-distance, xp.zeros_like(distance))
+            if bool(xp.any(depth > 0)):  # normals are expensive, and most shapes contain no node
+                points = points + depth[:, None] * outward_normal(shape, points, step=tolerance)
+    return points
 
 
 @dataclass(frozen=True)
