@@ -150,6 +150,9 @@ class Group:
         flight = self.flight
         if flight.num_free:
             disturbed, free, islands = flight.num_disturbed, flight.num_free, flight.num_islands
+            advice = "above 0.1 % choose a larger connectivity_radius, unless positions are measured or air resists"
+            if fine_provenance.factor_of(self.metadata) != 1:
+                advice = "tracers of a finer solver are also moved by parts of particles that are not stored"
             yield f"free groups accelerate by {vector(flight.typical)} (median), gravity is {vector(np.median(flight.gravity, axis=0))}"
             yield (
                 f"{disturbed} of {free} free groups do not accelerate with gravity "
@@ -157,7 +160,7 @@ class Group:
                 + (
                     "they agree on another acceleration: gravity, frame_dt or the unit of length does not fit the data"
                     if flight.agrees_on_another
-                    else "above 0.1 % choose a larger connectivity_radius, unless positions are measured or air resists"
+                    else advice
                 )
             )
         elif flight.num_islands:

@@ -86,7 +86,9 @@ def test_plain_data_are_specified_as_before() -> None:
 
 
 def test_validation_checks_the_provenance(folder: Path, tmp_path: Path) -> None:
-    assert not validate([folder]).violations
+    found = validate([folder])
+    assert not found.violations
+    assert "moved by parts of particles that are not stored" in str(found.groups["sand_fine2", "train"])
     good = read_trajectory(folder / "val" / "shard-00000.h5", "00000")
 
     def messages(*trajectories: Any) -> list[str]:
