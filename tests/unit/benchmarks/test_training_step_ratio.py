@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from gpe_pl.benchmark import _training
 from gpe_pl.benchmarks import training_step_ratio
 from gpe_pl.benchmarks.training_step_ratio import training_records, training_table
 from gpe_pl.config.datasets import dataset
@@ -35,3 +36,8 @@ def test_every_record_has_its_place_in_the_table(push_fraction: float, monkeypat
     assert found.keys() == {"training_step_time", "training_product_time", "training_step_ratio"}
     assert found["training_step_ratio"] == pytest.approx(found["training_step_time"] / found["training_product_time"])
     assert f"| sand | {1e3 * found['training_step_time']:.1f} |" in training_table(records)
+
+
+def test_settings_are_those_of_shipped_models() -> None:
+    """Solids are trained with a law and without push-forward, sand with it."""
+    assert _training("data=fem", "size=small").push_fraction == 0 < _training("data=sand", "size=small").push_fraction
