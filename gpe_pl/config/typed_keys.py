@@ -21,6 +21,8 @@ UNREAD: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "training.push_steps": ("training.push_fraction", lambda fraction: fraction == 0),
     "training.push_correction": ("training.push_fraction", lambda fraction: fraction == 0),
     "training.stress_weight": ("model.stress", lambda stress: stress is False),
+    "model.wall_distance": ("model.elastic", lambda elastic: elastic is False),
+    "model.only_contacts": ("model.elastic", lambda elastic: elastic is False),
     "graph.num_levels": ("graph.mesh", lambda mesh: not mesh),
     "dimension": ("data.size", lambda size: size == "imported"),
 }

@@ -185,6 +185,8 @@ class GPE(Model):
             stay bounded in any rollout. ``none`` follows the paper.
         elastic: cells of meshes move their nodes through the whole frame by a constitutive law that the model learns (see ``nn.elastic_bodies``).
         wall_distance: with ``elastic``, distance from walls at which nodes stop before training, in rest spacings. Training changes it.
+        only_contacts: with ``elastic`` and the ``contact`` decoder, the network adds forces between bodies, and between bodies and walls, and nothing within
+            bodies.
         island_momentum: conserve the ``linear``, or also the ``angular``, momentum of freely flying islands exactly (see ``nn.island_momentum``); or
             ``ignored``.
 
@@ -211,6 +213,7 @@ class GPE(Model):
         island_momentum: IslandMomentum = "ignored",
         elastic: bool = False,
         wall_distance: Annotated[float, Field(ge=0)] = 0.0,
+        only_contacts: bool = False,
     ) -> None:
         super().__init__(
             spec,
@@ -227,6 +230,7 @@ class GPE(Model):
             island_momentum=island_momentum,
             elastic=elastic,
             wall_distance=wall_distance,
+            only_contacts=only_contacts,
         )
         if elastic and not (spec.cells and spec.meshes and spec.islands):
             raise CellError(
@@ -395,7 +399,7 @@ class GPE(Model):
         forces, own = torch.cat([*contact.values()]), torch.cat([acceleration[m] for m in contact])
         groups = torch.where(in_body, body, count), count + 1
         if self.settings["elastic"]:  # forces act where the contact is, and cells pass them on
-            change = forces - rigid_part(own, mass, pos, *groups)
+            change = forces - (own if self.settings["only_contacts"] else rigid_part(own, mass, pos, *groups))
         else:
             change = rigid_part(forces - own, mass, pos, *groups)
         parts = torch.where(in_body[:, None], change, 0.0).split([a.shape[0] for a in contact.values()])

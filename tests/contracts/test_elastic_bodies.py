@@ -390,6 +390,13 @@ def test_a_fresh_model_gets_the_units_of_a_simulator() -> None:
     assert float(fresh.get_buffer("elastic_bodies.spacing")) == pytest.approx(scenes.SPACING)
 
 
+@pytest.mark.parametrize("only_contacts", [True, False])
+def test_with_contacts_alone_the_network_leaves_free_bodies_to_the_law(only_contacts: bool) -> None:
+    state = bodies(kind="lattice", walls=False, gap=20.0)
+    law, both = (simulator(network=size, decoder="contact", island_momentum="angular", only_contacts=only_contacts) for size in (0.0, 0.1))
+    assert torch.equal(step(law, state)[0], step(both, state)[0]) == only_contacts
+
+
 def test_cells_without_volume_are_refused() -> None:
     simulated, state = simulator(), bodies(kind="triangles")
     assert state.rest_pos is not None and state.cells is not None

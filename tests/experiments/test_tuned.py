@@ -78,7 +78,9 @@ def test_a_law_sets_model_graph_and_training_together(data: str, model: str, law
     assert set(found.values()) == {is_elastic}, found
     assert is_elastic or cfg.training.push_fraction > 0
     of_grid = (data, model, law) == ("elastomer", "gpe_tuned", "elastic")
-    assert (cfg.training.loss, cfg.model.wall_distance) == (("log", 1.0) if of_grid else ("square", 0.0))
+    assert (cfg.training.loss, cfg.model.wall_distance, cfg.model.only_contacts) == (
+        ("log", 1.0, True) if of_grid else ("square", 0.0, False)
+    )
 
 
 WITH_LAW = {"elastic_bodies", "fem_stress", "unseen_materials", "mixed_materials", "sand", "smoke"}
