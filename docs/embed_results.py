@@ -51,10 +51,12 @@ def collect(run: Path, name: str, note: str = "") -> None:
     """Copy what is worth citing of a run into ``docs/results/{name}``."""
     target = RESULTS / name
     target.mkdir(parents=True, exist_ok=True)
+    runs = finished_runs(run)
     is_table1 = (run / "table1.csv").exists()
     for pattern in FILES:
         for path in sorted(run.glob(pattern)):
-            if not (is_table1 and path.stem == "table"):  # of all its runs at once, which says nothing
+            is_made_again = bool(runs) and path.name == "table.csv"  # from the results of single rollouts
+            if not is_made_again and not (is_table1 and path.stem == "table"):  # of all its runs at once, which says nothing
                 shutil.copy(path, target / path.name)
     for pattern in PICTURES:
         for path in sorted(run.glob(pattern)):
@@ -63,7 +65,6 @@ def collect(run: Path, name: str, note: str = "") -> None:
         picture(path, target / f"rollout_{path.parts[-4].removeprefix('data=')}.png")
     if (run / FILM).exists():
         film(run / FILM, (target / FILM).with_suffix(".webp"))
-    runs = finished_runs(run)
     if runs:
         archive(runs, run, target)
     seeds = sorted({int(found.config["seed"]) for found in runs if "seed" in found.config})
