@@ -20,13 +20,26 @@ import numpy as np
 import torch
 from pydantic import Field
 
+from gpe_pl.benchmarks.cost_and_error import (
+    WINNING_HORIZONS,
+    Family,
+    Point,
+    break_even,
+    cost_at_error,
+    error_at_cost,
+    front,
+    hypervolume,
+    paired_ratio,
+    ratio_at_cost,
+    winners,
+)
 from gpe_pl.benchmarks.trained import Case, runs_in, trained_on
 from gpe_pl.data.ground_truth import DatasetSpec, generate_trajectory, initial_state
 from gpe_pl.errors import GpeError
 from gpe_pl.files.markdown import table_row
 from gpe_pl.learned.approximate import approximate
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.metrics import bootstrap_interval, energy_distance
+from gpe_pl.metrics import Interval, bootstrap_interval, energy_distance
 from gpe_pl.reports.finished_runs import Run
 from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.rollout.containment import Contained
@@ -43,7 +56,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Family = Literal["solver", "learned", "trivial"]
 Frame = tuple[np.ndarray, np.ndarray]
 """Positions [node, dim] in m and velocities [node, dim] in m/s."""
 
@@ -88,35 +100,6 @@ class Settings:
     @property
     def device(self) -> str:
         return "cuda" if self.accelerator == "gpu" else "cpu"
-
-
-@dataclass
-class Point:
-    """Cost and error of one simulator.
-
-    Attributes:
-        name: name of the simulator.
-        family: kind of simulator.
-        seconds: wall time over simulated time, of each scene.
-        mse: mean square error [m²] over the frames up to each horizon, of each scene; infinite if it failed.
-        distance: energy distance [m] to the reference in the last frame, of each scene. It compares distributions, for times at which errors of single nodes
-            carry no information.
-        overhead: seconds of training and of generating its data.
-    """
-
-    name: str
-    family: Family
-    seconds: list[float] = field(default_factory=list)
-    mse: dict[str, list[float]] = field(default_factory=dict)
-    distance: list[float] = field(default_factory=list)
-    overhead: float = 0.0
-
-    def error(self, horizon: str) -> float:
-        return float(np.mean(self.mse[horizon]))
-
-    @property
-    def cost(self) -> float:
-        return float(np.median(self.seconds))
 
 
 def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[str, Any]], str]:
@@ -363,59 +346,6 @@ def _distance(prediction: Trajectory, truth: Trajectory) -> float:
     return energy_distance(prediction.pos[-1], truth.pos[-1], prediction.mass, truth.mass)
 
 
-# --- conclusions from the points --------------------------------------------------------------------------------------------------------------
-
-
-def front(points: Sequence[Point], horizon: str) -> list[Point]:
-    """Return the points that no other point beats in both cost and error, from the cheapest on."""
-    best: list[Point] = []
-    for point in sorted(points, key=lambda p: (p.cost, p.error(horizon))):
-        if np.isfinite(point.error(horizon)) and (not best or point.error(horizon) < best[-1].error(horizon)):
-            best.append(point)
-    return best
-
-
-def hypervolume(points: Sequence[Point], horizon: str, worst: tuple[float, float]) -> float:
-    """Return the area in decades² that the points dominate, up to the worst cost and error; larger is better."""
-    area, limit = 0.0, worst[1]
-    for point in front(points, horizon):
-        if point.cost < worst[0] and point.error(horizon) < limit:
-            area += float(np.log10(worst[0] / point.cost) * np.log10(limit / point.error(horizon)))
-            limit = point.error(horizon)
-    return area
-
-
-def cost_at_error(points: Sequence[Point], error: float, horizon: str) -> float:
-    """Return the cost of a solver of this error, interpolated along the logarithmic front; the cheapest cost for larger errors, infinite for smaller ones."""
-    best = front(points, horizon)
-    if not best or error < best[-1].error(horizon):
-        return float("inf")
-    if error >= best[0].error(horizon):
-        return best[0].cost
-    errors = np.log([p.error(horizon) for p in best[::-1]])
-    costs = np.log([p.cost for p in best[::-1]])
-    return float(np.exp(np.interp(np.log(error), errors, costs)))
-
-
-def error_at_cost(points: Sequence[Point], cost: float, horizon: str) -> float:
-    """Return the error of a solver of this cost, as ``cost_at_error``; the smallest error for larger costs, infinite for smaller ones."""
-    best = front(points, horizon)
-    if not best or cost < best[0].cost:
-        return float("inf")
-    return float(np.exp(np.interp(np.log(cost), np.log([p.cost for p in best]), np.log([p.error(horizon) for p in best]))))
-
-
-def break_even(point: Point, solvers: Sequence[Point], horizon: str, duration: float) -> float:
-    """Return the number of rollouts of a duration [s] after which training has paid off against a solver of the same error.
-
-    It is infinite if training never pays off, 0 if no solver has so small an error, and NaN if the training time is not known.
-    """
-    saved = (cost_at_error(solvers, point.error(horizon), horizon) - point.cost) * duration
-    if saved <= 0:
-        return float("inf")
-    return 0.0 if np.isinf(saved) else point.overhead / saved
-
-
 def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[str, Any]]:
     yield {"metric": "observed_order", "case": case, "value": order, "unit": "1"}
     solvers = [p for p in points if p.family == "solver"]
@@ -429,6 +359,11 @@ def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[
         for horizon in point.mse if point.family == "learned" else ():
             ratio = cost_at_error(solvers, point.error(horizon), horizon) / point.cost
             yield {"metric": "time_ratio_at_equal_error", **about, "horizon": horizon, "value": ratio, "unit": "1"}
+            if (paired := ratio_at_cost(point, solvers, horizon)) is not None:
+                yield {"metric": "error_ratio_at_equal_time", **about, "horizon": horizon, **_of_interval(paired)}
+            for data in (p for p in solvers if p.name == DATA):
+                paired = paired_ratio(point.mse[horizon], data.mse[horizon])
+                yield {"metric": "error_ratio_to_training_data", **about, "horizon": horizon, **_of_interval(paired)}
             yield {
                 "metric": "break_even",
                 **about,
@@ -441,6 +376,10 @@ def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[
         for family in ("solver", "learned"):
             value = hypervolume([p for p in points if p.family == family], horizon, worst)
             yield {"metric": "hypervolume", "case": case, "family": family, "horizon": horizon, "value": value, "unit": "decade²"}
+
+
+def _of_interval(interval: Interval) -> dict[str, Any]:
+    return {"value": interval.estimate, "low": interval.low, "high": interval.high, "unit": "1"}
 
 
 def _points(records: Sequence[dict[str, Any]], case: str) -> list[Point]:
@@ -473,7 +412,7 @@ def _section(case: str, points: Sequence[Point], order: float, num_trajectories:
         f"{order:.1f} (positions, first 20 frames): mean and 95 % interval over scenes. `{DATA}` is the error in the "
         "training data. Times: one core, warm, neighbour search and features included."
     )
-    lost = ["", "**Where the learned models lose**: time of a solver of the same error over theirs", ""]
+    lost = ["", *_ratios(points, horizons), "", "**Where the learned models lose**: time of a solver of the same error over theirs", ""]
     lost += [table_row(["", *(f"@{h}" for h in horizons)]), "|" + "---|" * (1 + len(horizons))]
     for point in (p for p in points if p.family == "learned"):
         lost.append(table_row([point.name, *(_against(point, solvers, h) for h in horizons)]))
@@ -489,6 +428,33 @@ def _section(case: str, points: Sequence[Point], order: float, num_trajectories:
         lost += [table_row(["", *(f"@{h}" for h in horizons)]), "|" + "---|" * (1 + len(horizons))]
         lost += [table_row([name, *map(_pays_off, values)]) for name, values in after.items()]
     return "\n".join([f"### {case}", "", *lines, "", note, "", "**At equal error**", "", *verdicts(points, horizons), *lost])
+
+
+def _ratios(points: Sequence[Point], horizons: Sequence[str]) -> Iterator[str]:
+    """Yield a table of learned models against the solvers at equal time and against the solver of their data, and who wins."""
+    solvers = [p for p in points if p.family == "solver"]
+    data = next((p for p in solvers if p.name == DATA), None)
+    yield from (
+        "**At equal time**: error over that of a solver of the same cost, and over that of the training data's solver at its own cost",
+        "",
+    )
+    yield table_row(["", "against", *(f"@{h}" for h in horizons)])
+    yield "|" + "---|" * (2 + len(horizons))
+    for point in (p for p in points if p.family == "learned"):
+        at_cost = [ratio_at_cost(point, solvers, h) for h in horizons]
+        yield table_row([point.name, "solver of the same cost", *map(_ratio, at_cost)])
+        if data is not None:
+            yield table_row([point.name, "solver of the data", *(_ratio(paired_ratio(point.mse[h], data.mse[h])) for h in horizons)])
+    winning = winners(points, horizons)
+    rule = f"A model wins if the 95 % interval over paired scenes lies below 1 at equal time, at {WINNING_HORIZONS} horizons or more."
+    yield from ("", f"{rule} {'**' + ', '.join(winning) + '** wins.' if winning else 'None does.'}")
+
+
+def _ratio(interval: Interval | None) -> str:
+    if interval is None:
+        return "every solver costs more"
+    text = f"{interval.estimate:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
+    return f"**{text}**" if interval.high < 1 else text
 
 
 def _pays_off(seconds: float) -> str:
@@ -567,7 +533,9 @@ def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
                         if others not in point.name:
                             lines[label].append(place)
                 elif point.family == "learned":
-                    marks.setdefault(point.name.partition(" ")[0] + (", repeated" if REPEATED in point.name else ""), []).append(place)
+                    kind = point.name.partition(" ")[0] + (", repeated" if REPEATED in point.name else "")
+                    kind += f", stride{point.name.partition(', stride')[2].partition(',')[0]}" if ", stride" in point.name else ""
+                    marks.setdefault(kind, []).append(place)
             levels = {p.name: p.error(horizon) for p in points if p.family == "trivial"}
             panels[f"frames 1 – {horizon}" if horizon != "full" else "all frames"] = CostAndError(
                 {label: places for label, places in lines.items() if len(places) > 1}, marks, levels

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,23 +11,27 @@ import pytest
 import torch
 
 from gpe_pl.benchmarks import runtime_vs_error as module
+from gpe_pl.benchmarks.cost_and_error import (
+    Family,
+    Point,
+    break_even,
+    cost_at_error,
+    error_at_cost,
+    front,
+    hypervolume,
+    ratio_at_cost,
+    winners,
+)
 from gpe_pl.benchmarks.runtime_vs_error import (
     DATA,
     ComparisonError,
-    Family,
-    Point,
     Settings,
     _models,
     _Restricted,
     _timed,
     _with_longer_steps,
-    break_even,
     compare,
-    cost_at_error,
-    error_at_cost,
     figures,
-    front,
-    hypervolume,
     run,
     training_seconds,
     verdicts,
@@ -87,6 +92,22 @@ def test_the_verdict_says_who_is_below_the_curve_or_what_the_nearest_lacks() -> 
     assert "as the cheapest of the solvers (coarse). Nearest is careless: it would have to be 50 times more accurate" in verdict(
         careless, lost
     )
+
+
+def test_errors_at_equal_time_are_compared_scene_by_scene() -> None:
+    def scenes(name: str, cost: float, errors: list[float], family: Family = "solver") -> Point:
+        return Point(name, family, [cost], dict.fromkeys(("20", "50"), errors))
+
+    hard = np.array([1.0, 10.0, 100.0, 3.0])  # scenes differ more than simulators
+    solvers = [scenes("cheap", 1.0, list(4e-3 * hard)), scenes("dear", 4.0, list(1e-3 * hard))]
+    better, worse = (scenes(name, 2.0, list(factor * 2e-3 * hard), "learned") for name, factor in (("better", 0.5), ("worse", 1.5)))
+    ratio = ratio_at_cost(better, solvers, "20")
+    assert ratio is not None and (ratio.low, ratio.estimate, ratio.high) == pytest.approx((0.5, 0.5, 0.5))
+    assert ratio_at_cost(scenes("free", 0.5, [1e-3] * 4, "learned"), solvers, "20") is None
+    once = replace(better, name="once", mse={"20": better.mse["20"], "50": worse.mse["50"]})
+    assert winners([*solvers, better, worse, once], ["20", "50"]) == ["better"]
+    dearest = ratio_at_cost(replace(better, seconds=[100.0]), solvers, "20")
+    assert dearest is not None and dearest.estimate == pytest.approx(1.0)
 
 
 def test_training_pays_off_after_what_it_saves() -> None:

@@ -1,0 +1,126 @@
+"""Cost and error of simulators: which of them nothing beats, and what others have at equal cost or at equal error."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from gpe_pl.metrics import Interval, bootstrap_ratio
+
+Family = Literal["solver", "learned", "trivial"]
+
+WINNING_HORIZONS = 2
+"""Number of horizons at which a model has to be below the solvers' curve to win."""
+
+
+@dataclass
+class Point:
+    """Cost and error of one simulator.
+
+    Attributes:
+        name: name of the simulator.
+        family: kind of simulator.
+        seconds: wall time over simulated time, of each scene.
+        mse: mean square error [m²] over the frames up to each horizon, of each scene; infinite if it failed.
+        distance: energy distance [m] to the reference in the last frame, of each scene. It compares distributions, for times at which errors of single nodes
+            carry no information.
+        overhead: seconds of training and of generating its data.
+    """
+
+    name: str
+    family: Family
+    seconds: list[float] = field(default_factory=list)
+    mse: dict[str, list[float]] = field(default_factory=dict)
+    distance: list[float] = field(default_factory=list)
+    overhead: float = 0.0
+
+    def error(self, horizon: str) -> float:
+        return float(np.mean(self.mse[horizon]))
+
+    @property
+    def cost(self) -> float:
+        return float(np.median(self.seconds))
+
+
+def front(points: Sequence[Point], horizon: str) -> list[Point]:
+    """Return the points that no other point beats in both cost and error, from the cheapest on."""
+    best: list[Point] = []
+    for point in sorted(points, key=lambda p: (p.cost, p.error(horizon))):
+        if np.isfinite(point.error(horizon)) and (not best or point.error(horizon) < best[-1].error(horizon)):
+            best.append(point)
+    return best
+
+
+def hypervolume(points: Sequence[Point], horizon: str, worst: tuple[float, float]) -> float:
+    """Return the area in decades² that the points dominate, up to the worst cost and error; larger is better."""
+    area, limit = 0.0, worst[1]
+    for point in front(points, horizon):
+        if point.cost < worst[0] and point.error(horizon) < limit:
+            area += float(np.log10(worst[0] / point.cost) * np.log10(limit / point.error(horizon)))
+            limit = point.error(horizon)
+    return area
+
+
+def cost_at_error(points: Sequence[Point], error: float, horizon: str) -> float:
+    """Return the cost of a solver of this error, interpolated along the logarithmic front; the cheapest cost for larger errors, infinite for smaller ones."""
+    best = front(points, horizon)
+    if not best or error < best[-1].error(horizon):
+        return float("inf")
+    if error >= best[0].error(horizon):
+        return best[0].cost
+    errors = np.log([p.error(horizon) for p in best[::-1]])
+    costs = np.log([p.cost for p in best[::-1]])
+    return float(np.exp(np.interp(np.log(error), errors, costs)))
+
+
+def error_at_cost(points: Sequence[Point], cost: float, horizon: str) -> float:
+    """Return the error of a solver of this cost, as ``cost_at_error``; the smallest error for larger costs, infinite for smaller ones."""
+    best = front(points, horizon)
+    if not best or cost < best[0].cost:
+        return float("inf")
+    return float(np.exp(np.interp(np.log(cost), np.log([p.cost for p in best]), np.log([p.error(horizon) for p in best]))))
+
+
+def ratio_at_cost(point: Point, solvers: Sequence[Point], horizon: str) -> Interval | None:
+    """Return a simulator's mean error over that of the solvers at its cost, with its 95 % interval over paired scenes.
+
+    The solvers' error of each scene is interpolated along the logarithmic front of the means, with the same weights in all scenes. Return None if every solver
+    costs more.
+    """
+    best = front(solvers, horizon)
+    if not best or point.cost < best[0].cost:
+        return None
+    place = float(np.interp(np.log(point.cost), np.log([p.cost for p in best]), np.arange(len(best))))
+    cheaper, dearer = (np.log(best[k].mse[horizon]) for k in (math.floor(place), math.ceil(place)))
+    return paired_ratio(point.mse[horizon], np.exp(cheaper + (place % 1) * (dearer - cheaper)))
+
+
+def paired_ratio(values: Sequence[float], reference: Sequence[float] | np.ndarray) -> Interval:
+    """Return the ratio of the means of two errors over the same scenes, with its 95 % interval over scenes."""
+    return bootstrap_ratio(np.array([values]), np.array([reference]), statistic=np.mean)
+
+
+def winners(points: Sequence[Point], horizons: Sequence[str]) -> list[str]:
+    """Return the learned models that win: their 95 % interval lies below the solvers' curve at equal time, at two horizons or more."""
+    solvers = [p for p in points if p.family == "solver"]
+    found = []
+    for point in (p for p in points if p.family == "learned"):
+        ratios = [ratio_at_cost(point, solvers, h) for h in horizons]
+        if sum(ratio is not None and ratio.high < 1 for ratio in ratios) >= WINNING_HORIZONS:
+            found.append(point.name)
+    return found
+
+
+def break_even(point: Point, solvers: Sequence[Point], horizon: str, duration: float) -> float:
+    """Return the number of rollouts of a duration [s] after which training has paid off against a solver of the same error.
+
+    It is infinite if training never pays off, 0 if no solver has so small an error, and NaN if the training time is not known.
+    """
+    saved = (cost_at_error(solvers, point.error(horizon), horizon) - point.cost) * duration
+    if saved <= 0:
+        return float("inf")
+    return 0.0 if np.isinf(saved) else point.overhead / saved
