@@ -10,6 +10,7 @@ import lightning as L
 import numpy as np
 import torch
 from lightning.pytorch.callbacks import Callback, WeightAveraging
+from torch.autograd.graph import increment_version
 
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics import per_frame_mse
@@ -45,6 +46,12 @@ class WarmAverage(WeightAveraging):
         super().setup(trainer, pl_module, stage)
         if self._average_model is not None:
             self._parameters = [*self._average_model.module.parameters()], [*pl_module.parameters()]
+
+    def _swap_models(self, pl_module: L.LightningModule) -> None:
+        """Swap weights and averages, and count this as a change of the weights, which compiled rollouts have to notice. Lightning copies past the count."""
+        super()._swap_models(pl_module)
+        for parameter in pl_module.parameters():
+            increment_version(parameter)
 
     def _weight_of_next(self, num_averaged: int) -> float:
         return 1 - min(self.decay, (1 + num_averaged) / (10 + num_averaged))

@@ -229,6 +229,22 @@ def test_averaging_constant_weights_changes_nothing() -> None:
         assert torch.equal(value, before[key]), key
 
 
+def test_rollouts_during_a_validation_have_the_averaged_weights() -> None:
+    m, callback = module(), WarmAverage(0.9)
+    callback.setup(L.Trainer(logger=False, enable_checkpointing=False), m, "fit")
+    with torch.no_grad():
+        for parameter in m.parameters():
+            parameter.add_(torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)), alpha=0.1)
+    state, simulator = scenes.state(20, MATERIALS, history=1).to_torch(), m.simulator.eval()
+    found = [simulator.step(state).pos]
+    for _ in range(2):
+        callback._swap_models(m)
+        found.append(simulator.step(state).pos)
+    assert torch.equal(found[0], found[2]) and not torch.equal(found[0], found[1])
+    expected = module().simulator.eval().step(state).pos  # the averages are still the weights of the start
+    torch.testing.assert_close(found[1], expected, rtol=1e-6, atol=1e-9)
+
+
 @pytest.mark.parametrize("decay", [0.0, 0.3, 0.999])
 def test_the_decay_warms_up(decay: float) -> None:
     model = Network()
