@@ -1,8 +1,8 @@
-"""Benchmark of labels of a finer solver: how much nearer than the solver at the spacing of the scene they are to a solution that is finer still.
+"""Benchmark of labels of a finer solver (``data.fine=2``): their distance from a still finer solution, over that of the solver at the spacing of the scene.
 
 The same scenes are solved at their spacing, at half of it and at a quarter. The last solution is the reference. Solutions are compared at the nodes of the
 scene, at equal times. Two other choices of tracers are compared with the one of ``solvers.finer``: the mean of the parts into which a particle was divided, and
-one of them, with its displacement from the start.
+the start of the node plus the displacement of one part.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from gpe_pl.system.workers import pool, results
 from gpe_pl.trajectory.state import State
 
 REFERENCE = 4
-"""Number of parts into which the reference divides the spacing."""
+"""Factor by which the reference divides the spacing."""
 
 SAME = 1e-18
-"""Mean squared distance [m²] up to which solutions are the same but for rounding."""
+"""Mean squared distance [m²] up to which solutions differ only by rounding."""
 
 COARSE, TRACERS = "solver at the spacing of the scene", "tracers at half the spacing (`data.fine=2`)"
 MEAN, PART = "mean of the parts", "one of the parts"
@@ -48,7 +48,7 @@ class Settings:
     Attributes:
         cases: data sets, by label.
         split, num_scenes: split and number of the scenes per data set.
-        times: instants that are compared [s].
+        times: compared times after the start [s], in ascending order. Each is taken at the nearest frame.
         num_workers: number of processes, each of which solves one scene.
     """
 
@@ -65,7 +65,7 @@ class Solution:
 
     Attributes:
         pos: positions of each choice of tracers [instant, node, dim] in m, by name.
-        momentum: difference of the mean velocity of tracers and parts [instant, dim] in m/s, by name; weighted by mass.
+        momentum: mean velocity of the tracers, less that of all parts, weighted by mass [instant, dim] in m/s, by name.
         seconds: processor time per simulated second.
     """
 
@@ -75,7 +75,7 @@ class Solution:
 
 
 def solved(spec: DatasetSpec, start: State, factor: int, frames: Sequence[int]) -> Solution:
-    """Solve a scene at ``1 / factor`` of its spacing up to the last of some frames.
+    """Solve a scene at ``1 / factor`` of its spacing, and keep the solution at some frames, which must ascend.
 
     Raises:
         SimulationError: the solver stopped.
@@ -103,7 +103,7 @@ def solved(spec: DatasetSpec, start: State, factor: int, frames: Sequence[int]) 
 
 
 def scene_records(spec: DatasetSpec, label: str, split: Split, index: int, times: Sequence[float]) -> list[dict[str, Any]]:
-    """Return the distances of one scene.
+    """Return records of one scene: squared distances from the reference [m²], errors of momentum [m/s], and processor time.
 
     Raises:
         LabelsError: a solver stopped.
@@ -133,7 +133,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
     """Return records of each scene, and Markdown tables.
 
     Raises:
-        LabelsError: a solver stopped, or a data set has too few scenes or frames.
+        LabelsError: a solver stopped, or a data set has too few scenes.
     """
     for label, spec in specs.items():
         if spec.counts[settings.split] < settings.num_scenes:
@@ -149,7 +149,7 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
 
 
 def report(records: list[dict[str, Any]]) -> str:
-    """Return the tables: distances and their ratio by case, then the other choices of tracers, momentum and cost."""
+    """Return the tables: ratios of distances with the cost, distances of all choices of tracers, and errors of momentum."""
     cases = list(dict.fromkeys(r["case"] for r in records))
     times = next(r["times"] for r in records if r["metric"] == "squared_distance")
     num_scenes = len({(r["case"], r["scene"]) for r in records}) // len(cases)
@@ -199,7 +199,7 @@ def report(records: list[dict[str, Any]]) -> str:
 
 
 def _values(records: list[dict[str, Any]], case: str, metric: str) -> dict[str, np.ndarray]:
-    """Return values [scene, instant] by the name of the labels."""
+    """Return the values of a metric [scene, instant] by choice of tracers."""
     found: dict[str, list[list[float]]] = {}
     for r in records:
         if r["case"] == case and r["metric"] == metric:

@@ -1,7 +1,8 @@
-"""Benchmark of seven ratios of times to those of matrix products, and its comparison with earlier results.
+"""Benchmark that tells whether the package has become slower.
 
-Timed are a rollout step of each of the five shipped models, a step of several scenes together, and a training step. Ratios differ less between machines than
-times do. A ratio that grew by half is named. ``docs/results/performance`` holds the results to compare with.
+It has seven cases: a rollout step of each of the five shipped models, a rollout step of several scenes together, and a training step. The time of each is
+divided by the time that its matrix products take on this machine, because such ratios differ less between machines than times do. A ratio that is at least
+``GROWN`` times the earlier one in ``docs/results/performance`` is reported.
 """
 
 from __future__ import annotations
@@ -39,12 +40,13 @@ TRAINS = True
 """Whether the suite also takes the settings of a training on each data set."""
 
 GROWN = 1.5
-"""Factor from which on a ratio has grown."""
+"""A ratio that is at least this many times the earlier one is reported."""
 
 RATIOS = {"step_ratio": "rollout step", "training_step_ratio": "training step"}
-"""Compared metrics, and what they measure."""
+"""Compared metrics, and the step that each measures."""
 
 TIMES = {"step_ratio": ("step_time", "product_time"), "training_step_ratio": ("training_step_time", "training_product_time")}
+"""Metrics with the times [s] of which each ratio is made: of the step, and of its products."""
 
 TRAINING_ROUNDS = 5
 """Number of rounds of training steps."""
@@ -63,7 +65,7 @@ class Settings:
     Attributes:
         cases: data sets of shipped models, by the name of the model.
         several: case of which several scenes together, and a training step, are timed as well.
-        reference: ``results.json`` of an earlier run to compare with; None if there is none. A file that does not exist is not compared with.
+        reference: ``results.json`` of an earlier run. With None, or if the file does not exist, ratios are not compared.
         num_rounds: number of rollouts per case. The shortest processor time counts, because other work on the machine only makes it longer.
         num_scenes: number of scenes that are rolled out together.
         num_threads: threads of PyTorch.
@@ -78,7 +80,7 @@ class Settings:
 
 
 def run(settings: Settings, specs: dict[str, DatasetSpec], trainings: dict[str, TrainingSettings]) -> tuple[list[dict[str, Any]], str]:
-    """Return records of times [s] and ratios, and a Markdown table. Ratios that grew are logged.
+    """Return records of times [s] and ratios, and a Markdown table. The lines of ``comparison`` are logged.
 
     Raises:
         PerformanceError: the file to compare with cannot be read, or there is no case ``several``.
@@ -98,11 +100,11 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], trainings: dict[str, 
 
 
 def rollout_records(name: str, spec: DatasetSpec, num_scenes: int, num_rounds: int) -> list[dict[str, Any]]:
-    """Return records of a rollout step of several test scenes together: its time [s], that of its products [s], and their ratio.
+    """Return records of a rollout step of one or several test scenes together: its time [s], that of its products [s], and their ratio.
 
     Args:
         name: name of a shipped model.
-        spec: its data set. Scenes are used again if it has fewer test scenes.
+        spec: its data set. If it has fewer test scenes than ``num_scenes``, they are used again.
         num_scenes, num_rounds: numbers of scenes and of timed rollouts.
     """
     simulator = LearnedSimulator.from_checkpoint(name)
@@ -133,7 +135,7 @@ def ratios_in(path: str | None) -> dict[tuple[str, str], float] | None:
     """Return the ratios in a file of results by metric and case, or None if there is no file.
 
     Raises:
-        PerformanceError: the file cannot be read, or has no ratios.
+        PerformanceError: the file cannot be read, or does not hold records.
     """
     if path is None or not Path(path).exists():
         return None
@@ -151,7 +153,17 @@ def ratios(records: list[dict[str, Any]]) -> dict[tuple[str, str], float]:
 
 
 def comparison(records: list[dict[str, Any]], earlier: dict[tuple[str, str], float] | None, path: str | None) -> Iterator[str]:
-    """Yield a line for each ratio that grew by half, and one that says how to renew the file; or one line that says that nothing is compared, or none grew."""
+    """Compare ratios with earlier ones.
+
+    Yields:
+        A line for each ratio that grew by half, and for each that the file lacks. The last line says how to renew the file, or that no ratio grew. If
+        ``earlier`` is None, one line says that the file was not found; without a path there is no line.
+
+    Args:
+        records: records of this run.
+        earlier: earlier ratios by metric and case, as ``ratios_in`` returns them.
+        path: file of the earlier ratios, for the lines.
+    """
     if earlier is None:
         if path is not None:
             yield f"{path}: not found in {Path.cwd()}, so ratios are not compared; begin in a clone of the repository, or set suite.reference"

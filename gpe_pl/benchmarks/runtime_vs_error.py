@@ -1,10 +1,10 @@
 """Run time against error of solvers and learned models: accuracy at equal cost, and cost at equal accuracy.
 
-The reference is the solver at half the spacing of the one that made the data, which may be finer than that of the nodes (``data.fine``). It is seen at the
-nodes of the scene (``solvers.finer``). Its substeps are half as long where waves or speeds limit them. A substep that takes a whole frame stays as long. The
-observed order of convergence is reported. Everything is compared with the reference, also the solver that made the training data. No model can be expected to
-have a smaller error than that solver. The protocol follows McGreivy and Hakim 2024 (arXiv 2407.07218): a solver can always run at a lower resolution, so a
-fair comparison is at equal cost or at equal accuracy.
+The reference is the solver at half the spacing at which the data were solved. With ``data.fine``, that is already finer than the spacing of the nodes. The
+reference is compared at the nodes of the scene (``solvers.finer``). Its substeps are half as long where waves or speeds limit them. A substep that takes a
+whole frame stays as long. The observed order of convergence is reported. Everything is compared with the reference, also the solver that made the training
+data. No model can be expected to have a smaller error than that solver. The protocol follows McGreivy and Hakim 2024 (arXiv 2407.07218): a solver can always
+run at a lower resolution, so a fair comparison is at equal cost or at equal accuracy.
 """
 
 from __future__ import annotations
@@ -272,7 +272,7 @@ def _reference(spec: DatasetSpec, start: State, data: Trajectory) -> Trajectory:
 def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Trajectory, num_frames: int = 20) -> float:
     """Return the observed order P = log₂ (|u_2h − u_h| / |u_h − u_{h/2}|) over the first frames; NaN if there is no rollout with spacing 2h.
 
-    The data have the spacing h.
+    h is the spacing at which the data were solved.
     """
     is_fine = spec.fine > 1
     solver = spec.refined(spec.fine // 2) if is_fine else _solver(spec, 2.0)

@@ -1,7 +1,7 @@
 """Time of a rollout step of the shipped models over the time of its matrix products.
 
 The step is a frame of a rollout as ``evaluate`` makes it: search, features, network, integration, containment, guard and recording. The scene is a
-trajectory of the solver, at a frame with contacts. Two networks replace the model for comparison, with the same search and features.
+trajectory of the solver, at a frame with contacts. For comparison, the same step is timed with two other networks, with the same search and features.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ NUM_STEPS = 5
 """Number of frames of a timed rollout."""
 NOTE = (
     "Rollout step: search, features, network, integration, containment, guard and recording, in the scene of a shipped model. Products: those of the factored "
-    "network at the rate measured for its nodes. Both are the shortest of all rounds. Than plain: than the same model and weights by PyG's operations "
-    "(`implementation=plain`). Than GNS: than an untrained GNS of the same width and depth. Both have the same search and features."
+    "network at the rate measured for its nodes. Both are the shortest of all rounds. Faster than plain: the time with the same model and weights by PyG's "
+    "operations (`implementation=plain`), over that of the step. Than GNS: the time with an untrained GNS of the same width and depth, over that of the step. "
+    "Both have the same search and features."
 )
 
 
@@ -53,8 +54,8 @@ def start_of(simulator: LearnedSimulator, spec: DatasetSpec) -> tuple[State, Met
 def step_records(specs: dict[str, DatasetSpec], num_rounds: int) -> list[dict[str, Any]]:
     """Return records of every shipped model: the time of a step [s], that of its products [s], and their ratio ``step_ratio``.
 
-    ``step_speedup_vs_plain`` and ``step_speedup_vs_gns`` are the times of ``_others`` over that of the model. Times are the shortest of all rounds, because
-    other work on the machine only makes them longer.
+    ``step_speedup_vs_plain`` and ``step_speedup_vs_gns`` are the times of a step with the same model by PyG's operations, and with GNS of the same width and
+    depth, over that of the model. Times are the shortest of all rounds, because other work on the machine only makes them longer.
 
     Args:
         specs: data set of each shipped model, by its name.

@@ -41,7 +41,7 @@ def of_stored_frames(checkpoint: Path | str) -> LearnedSimulator:
     """Return the simulator of a checkpoint that was trained on all stored frames.
 
     Raises:
-        StrideError: it was trained with another ``data.stride`` than 1.
+        StrideError: it was trained with ``data.stride`` above 1.
         CheckpointError: as ``LearnedSimulator.from_checkpoint``.
     """
     simulator = LearnedSimulator.from_checkpoint(checkpoint)
@@ -65,7 +65,7 @@ def trained_on(spec: DatasetSpec, runs: Iterable[Run], with_strides: bool = Fals
         with_strides: whether models may have a stride.
 
     Raises:
-        StrideError: a run has another ``data.stride`` than 1, unless ``with_strides``.
+        StrideError: a model was trained with ``data.stride`` above 1, unless ``with_strides``.
     """
     same: dict[str, list[tuple[LearnedSimulator, Run]]] = defaultdict(list)
     for run in runs:

@@ -117,7 +117,7 @@ def scene_metadata(cfg: DictConfig, split: str, strided: bool = True) -> Metadat
     Args:
         cfg: configuration of a command.
         split: split of the data set.
-        strided: with frames as long as ``data.stride`` says; else as stored.
+        strided: whether its frames are as long as ``data.stride`` says. Otherwise they are those that are stored.
     """
     from gpe_pl.data.ground_truth import trajectory_metadata
     from gpe_pl.trajectory.store import iter_trajectories

@@ -90,6 +90,8 @@ class FitRun:
         """Generate missing data and controls, after checking that noise, evaluation and the model of ``start_from`` fit the scenes. Choose the device.
 
         Raises:
+            NoiseError: the noise is too large for the spacing of the scenes.
+            SceneError: the model of ``start_from`` does not fit the scenes.
             StartError: ``evaluation.start_time`` leaves too little history, or is between frames.
             ConfigError: evaluated data have frames of another length.
         """

@@ -91,9 +91,9 @@ class TrajectoryDataModule(L.LightningDataModule):
         sampling: how often each training window is drawn.
         solver: gives the targets of noisy and unrolled states; see ``WindowDataset``.
         mirror: mirror training windows at random; see ``WindowDataset``.
-        unroll_steps: steps of an unroll with gradients; see ``WindowDataset``.
+        unroll_steps: number of steps of an unroll with gradients; see ``WindowDataset``.
         num_statistics_windows: number of windows from which features are standardised, evenly spread over the ``train`` split.
-        stride: number of stored frames in a frame. Training windows begin at any stored frame, validation windows at every ``stride``-th.
+        stride: number of stored frames in a frame of the model. Training windows begin at any stored frame, validation windows at every ``stride``-th.
 
     Attributes:
         push_forward: settings of the push-forward trick; None if it is not used. In steps with push-forward, batches contain starts of unrolls instead of

@@ -84,16 +84,16 @@ data."""
 
 @dataclass(frozen=True)
 class StoredTrajectory:
-    """The place of a stored trajectory, and the trajectory itself if it is cached. With a stride, it is the view of every ``stride``-th stored frame.
+    """The place of a stored trajectory, and the trajectory itself if it is cached. With a stride, its frames are every ``stride``-th stored frame.
 
     Attributes:
         path: shard.
         name: name of the trajectory in the shard.
         num_stored: number of stored frames.
         num_nodes: number of dynamic nodes.
-        cached: the trajectory if the split is cached in memory and its values are valid, else None.
+        cached: the trajectory with all stored frames if the split is cached in memory and its values are valid, else None.
         stride: number of stored frames in a frame.
-        phase: stored frame that is frame 0.
+        phase: number of the stored frame that is frame 0.
     """
 
     path: Path
@@ -342,7 +342,9 @@ class Unroll:
         return Unroll(self.graph.to(device), self.state.to_torch(device), self.reference.to(device), stress, self.about)
 
     def graph_after(self, builder: GraphBuilder, state: State, step: int) -> HeteroData:
-        """Create the training graph of the state after ``step`` steps. The target leads to the reference; its gradients lead to the state.
+        """Create the training graph of the state after ``step`` steps.
+
+        The target is the acceleration that leads to the next reference position. Gradients of the loss pass through the target to the state, too.
 
         Raises:
             SimulationError: as ``GraphBuilder.topology``.
@@ -401,7 +403,7 @@ class WindowDataset(Dataset[HeteroData | Start | Unroll]):
     """Windows x[t−H … t+1] of a split as graphs at frame t.
 
     Every material's store has ``target`` [node, dim] in m/s²: the acceleration from t to t+1 without gravity, from float64 differences. For error
-    messages, the graph has the number of its ``trajectory`` in the split and of its stored ``frame``.
+    messages, the graph has the numbers ``trajectory``, among the usable ones of the split, and ``frame``, among the stored ones.
 
     Args:
         trajectories: trajectories of the split, or views of them as ``every`` returns them.
@@ -412,7 +414,7 @@ class WindowDataset(Dataset[HeteroData | Start | Unroll]):
         solver: gives the targets of noisy and unrolled states; None takes those that lead back to the trajectory.
         mirror: mirror each window at random. Every axis without gravity is mirrored with probability 1/2, independently of the others.
         stress: also give the Cauchy stress at t+1 of materials that have one, as ``stress_target`` [node, component] in Pa.
-        unroll_steps: steps of an unroll with gradients. Windows then end early enough for that many true frames after t.
+        unroll_steps: number of steps of an unroll with gradients. Each window then has at least that many true frames after t.
 
     Attributes:
         probability: probability of drawing each window [window], or None if all are equal. With it, graphs have a ``weight``: the uniform probability

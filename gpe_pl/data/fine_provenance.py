@@ -1,4 +1,4 @@
-"""What the metadata of trajectories say about finer labels: tracers of a solver at a finer spacing (``DatasetSpec.fine``)."""
+"""Reads and checks what the metadata of trajectories say about labels of a finer solver (``DatasetSpec.fine``)."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from gpe_pl.trajectory.trajectory import Metadata
 
 
 def factor_of(metadata: Metadata) -> Any:
-    """Return the number of parts into which the solver divided the spacing, as the metadata say; 1 if they say nothing."""
+    """Return the factor by which the solver divided the spacing, as the metadata say, unchecked; 1 if they say nothing."""
     return _settings(metadata).get("fine", 1)
 
 
 def faults(metadata: Metadata) -> Iterator[str]:
-    """Describe what the metadata say about finer labels and what cannot be."""
+    """Yield the faults in what the metadata say about labels of a finer solver."""
     settings = _settings(metadata)
     if settings.keys().isdisjoint(("fine", "fine_solver")):
         return

@@ -143,7 +143,7 @@ class DatasetSpec:
         num_frames: number of stored frames per trajectory, including the initial one.
         trajectories_per_shard: number of trajectories in a shard, the unit of work and of resuming.
         seed: seed of the data set.
-        fine: number of parts into which the solver divides the spacing of the scene. Above 1, the nodes are tracers of the finer solution (``solvers.finer``).
+        fine: factor by which the solver divides the spacing of the scene. Above 1, the nodes are tracers of the finer solution (``solvers.finer``).
         scene: distribution of scenes.
         solver: solver that simulates them.
     """
@@ -223,7 +223,7 @@ class DatasetSpec:
 
     @property
     def label_solver(self) -> Solver:
-        """The solver of the trajectories: ``solver``, or that for a finer spacing."""
+        """The solver whose solution is stored: ``solver`` or, with ``fine`` above 1, that for the finer spacing."""
         return self.refined(self.fine)
 
     @property

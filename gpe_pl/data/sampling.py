@@ -148,7 +148,7 @@ class BatchSampler(Sampler[list[Key]]):
     """Samples of this rank in each optimiser step. All ranks together follow the order that a single process would follow.
 
     Args:
-        data: training windows. If they have more than one of ``unroll_steps``, samples are unrolls with gradients.
+        data: training windows. If their ``unroll_steps`` is above 1, samples are unrolls with gradients.
         size: size of the batches.
         seed: seed of the order.
         step: returns the number of optimiser steps already taken; called when iteration begins.

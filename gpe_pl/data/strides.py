@@ -1,14 +1,15 @@
 """Data at every ``stride``-th stored frame: their statistics, and the connectivity radius that the longer frames need.
 
-A node has to see what it meets within a frame. With the radius R of the data and frames k times as long, the radius is
+An edge has to connect a node with what it meets within a frame. With the radius R of the data and frames k times as long, the radius is
 
     R_k = max(R, min(REACH v k Δt, MOST_RADII R))
 
 where v is the largest speed in the train split and Δt the time between stored frames. In periodic domains it also stays below half a period.
 
-REACH was chosen by two measurements. At k = 2, 4 and 8, groups of nodes of sand and snow that see nothing else have less than 3e-4 of the accelerations (mean
-square, without gravity) with REACH = 1/2, and up to 1e-2 with R alone. And after 4,000 steps, models of sand with k = 4 had errors within a quarter of each
-other, in both directions, with REACH = 1/2 and REACH = 1 (one seed, 20 scenes); the latter took 1.4 times as long.
+REACH was chosen by two measurements. The first is how much groups of nodes accelerate that no edge connects with anything else, in sand and snow at k = 2, 4
+and 8. Their mean squared acceleration without gravity is less than 3e-4 of that of all nodes with REACH = 1/2, and up to 1e-2 with R alone. The second
+compares models of sand with k = 4 after 4,000 steps (one seed, 20 scenes). With REACH = 1/2 and REACH = 1 their errors are within a quarter of each other,
+neither always lower. REACH = 1 took 1.4 times as long.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from gpe_pl.trajectory.store import StoreError
 from gpe_pl.trajectory.trajectory import Metadata
 
 REACH = 0.5
-"""Fraction of the largest way of a node in a frame that the radius covers."""
+"""Radius as a fraction of the largest distance that a node moves in a frame."""
 MOST_RADII = 2.0
-"""Largest radius with a stride, as a multiple of the radius of the data. In 3D, eight times as many edges is the most that a step should cost."""
+"""Largest radius with a stride, as a multiple of the radius of the data. In 3D this already means eight times as many edges."""
 OF_PERIOD = 0.49
 """Largest radius with a stride in a periodic domain, as a fraction of the period."""
 
@@ -84,7 +85,7 @@ def connectivity_radius(metadata: Metadata, stride: int, max_speed: float) -> fl
         max_speed: largest speed of a node [m/s].
 
     Raises:
-        StoreError: a node may move by half a period or more in a frame, so that its way is not known.
+        StoreError: a node may move by half a period or more in a frame, so that its direction is not known.
     """
     radius, step, most = metadata.connectivity_radius, max_speed * stride * metadata.frame_dt, MOST_RADII * metadata.connectivity_radius
     if stride > 1 and metadata.periodicity:

@@ -12,8 +12,8 @@ FULL = "full"
 def labels(seconds: Sequence[float], frame_dt: float) -> dict[int, str]:
     """Return the label of each horizon by its number of frames.
 
-    A horizon is at the frame nearest to the time, but not at frame 0. Its label is the time of that frame: with frames of 0.02 s, the horizon 0.25 s becomes
-    ``0.24s``.
+    A horizon is at the frame nearest to the time, but at least at frame 1. Its label is the time of that frame: with frames of 0.02 s, the horizon 0.25 s
+    becomes ``0.24s``. Times with the same nearest frame become one horizon.
 
     Args:
         seconds: times after the start [s].
@@ -23,7 +23,7 @@ def labels(seconds: Sequence[float], frame_dt: float) -> dict[int, str]:
 
 
 def time_of(label: str) -> float:
-    """Return the time of a label [s], by which horizons are sorted; infinite for ``full``. Labels of earlier versions are numbers of frames.
+    """Return the number by which a label is sorted: its time [s], infinity for ``full``, and the number of frames for labels of earlier versions.
 
     Raises:
         ValueError: the text is no label.

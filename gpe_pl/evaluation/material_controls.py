@@ -37,7 +37,7 @@ MOST_DRAWS = 100
 """Number of permutations from which the one with the fewest scenes that keep their values is taken."""
 
 AtValue = tuple[str, Trajectory, Trajectory]
-"""Caption with the values of a scene's parameters, run of the solver and rollout of the model."""
+"""A scene at some values of its parameters: caption with the values, run of the solver, rollout of the model."""
 
 
 class ControlError(GpeError):

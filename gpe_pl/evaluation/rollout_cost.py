@@ -1,4 +1,7 @@
-"""Processor time of rollouts per simulated second, which compares models whose frames differ in length."""
+"""Processor time of rollouts per simulated second, which compares models whose frames differ in length.
+
+Only the time of this process on CPUs counts. Work on a GPU is not in it.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +45,9 @@ class Timed:
 
 
 def write_cost(folder: Path, seconds: list[float], frame_dt: float) -> None:
-    """Write the median time of a step and the cost of rollouts, so that compilation in the first steps does not count; nothing without a step.
+    """Write the median processor time of a step of one scene [s], and that time per simulated second [s/s]. Without a step, nothing is written.
+
+    The median leaves out the compilation in the first steps.
 
     Args:
         folder: folder of the run or evaluation.

@@ -141,14 +141,15 @@ def evaluate(
 
     All rollouts start at ``settings.first_frame`` and run to the end of the ground truth. The files are ``metrics.csv`` with its digest, ``rollout_cost.json``
     (see ``rollout_cost``) and ``error_curve_*.png``. The first ``settings.num_pictures`` trajectories of each split also get ``rollout_*.png``,
-    ``rollout_*.gif``, ``rollout_*.html`` (a viewer), ``stress_*.png`` if the model decodes a stress, and the files of ``settings.export``. With ``controls``
-    they get ``parameters_*.png``, too: the solver and the model at three values of the material parameters.
+    ``rollout_*.gif``, ``rollout_*.html`` (a viewer), ``stress_*.png`` if the model decodes a stress, and the files of ``settings.export``. With ``controls``,
+    those of ``test_unseen`` also get ``parameters_*.png``: the solver and the model at three values of the material parameters.
 
     These metrics are computed here, beside those of ``metrics.rollout_metrics``:
 
     - ``one_step_nmse``: one value for each split (see ``one_step_nmse``).
     - ``num_good_frames``: number of frames that the rollout reached.
-    - ``edges_per_node``: number of edges within the radius over that of nodes, in the graph of the ground truth at half of its length.
+    - ``edges_per_node``: number of edges within the radius over that of dynamic nodes, in the graph of the middle frame of the ground truth. Each pair of
+      nodes has one edge.
     - ``fraction_outside_at_end``: fraction of particles inside a wall or obstacle in the last frame.
     - ``fraction_corrected``: fraction of particle-steps that containment corrects.
     - ``fraction_outside_uncontained``: fraction of particle-frames inside a wall or obstacle with containment off, for the first ``settings.num_uncontained``
@@ -242,9 +243,10 @@ def _predict(
     num_pictured: int,
     seconds: list[float],
 ) -> Iterator[tuple[dict[str, Trajectory], dict[str, float], list[AtValue]]]:
-    """Yield for each trajectory the predictions by model, further metrics of the learned model by name, and pictures' scenes at three parameter values.
+    """Yield for each trajectory the predictions by model, further metrics of the learned model by name, and the scene at three parameter values.
 
-    ``first`` is the number of the first trajectory. The first ``num_pictured`` ones have scenes at three values. Times of steps are added to ``seconds``.
+    ``first`` is the number of the first trajectory. Only the first ``num_pictured`` trajectories have scenes at three values, for pictures. Processor times
+    of steps [s] are added to ``seconds``.
     """
     truths = [trajectory.frames(start_frame) for trajectory in trajectories]
     starts = [start_of(simulator, start_frame, *pair) for pair in zip(trajectories, truths, strict=True)]
@@ -291,7 +293,7 @@ def _predict(
 
 
 def _edges_per_node(simulator: LearnedSimulator, trajectory: Trajectory) -> float:
-    """Return the number of edges within the radius over that of nodes, in the graph of the frame at half of a trajectory."""
+    """Return the number of edges within the radius over that of dynamic nodes, in the graph of the middle frame of a trajectory."""
     history = simulator.builder.config.history
     graph = simulator.builder(trajectory.state(max(history, trajectory.num_frames // 2), history).to_torch())
     edges = (graph[relation].edge_index.shape[1] for relation in simulator.builder.spec.relations if relation[1] == RADIUS)

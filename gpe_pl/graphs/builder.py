@@ -292,7 +292,7 @@ class GraphBuilder:
 
 
 def _with_gradient(arm: Tensor, pos: Tensor, islands: IslandTopology) -> Tensor:
-    """Return lever arms that a search has found, with their gradients with respect to positions. Those of islands around the domain stay constant."""
+    """Return lever arms that a search has found, with gradients with respect to positions. Arms of islands that wrap around a periodic domain get none."""
     if not pos.requires_grad:
         return arm
     num_islands = islands.is_free.shape[0]

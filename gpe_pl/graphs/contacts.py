@@ -152,7 +152,7 @@ def _surface_edges(data: bytes, num_corners: int) -> np.ndarray:
 
 
 def _neighbours_apart(edges: np.ndarray) -> np.ndarray:
-    """Return the edges in another order: first some that share no node, then some of the others, and so on."""
+    """Return the edges in the order of sets: no two edges of a set share a node, and each set takes as many of the remaining edges as it can."""
     sets: list[tuple[set[int], list[int]]] = []
     for number, ends in enumerate(edges.tolist()):
         nodes, numbers = next((own for own in sets if own[0].isdisjoint(ends)), (set(), []))
@@ -164,7 +164,7 @@ def _neighbours_apart(edges: np.ndarray) -> np.ndarray:
 
 
 def surface_edges(cells: np.ndarray) -> np.ndarray:
-    """Return the edges that belong to one plane cell [edge, 2], in the order of its corners. The result for the same cells is kept.
+    """Return the edges that belong to only one plane cell [edge, 2], each in the direction of the cell's corners. The result for the same cells is kept.
 
     Edges that share a node are far from each other in the result, so that contacts with many edges are computed together (``nn.elastic_motion``).
     """

@@ -60,10 +60,10 @@ class Sleeping(Batched):
     An island wakes up when a node that is awake, or a wall that moves with a prescribed motion, comes within the radius of the graph.
 
     An island (see ``graphs.islands``) falls asleep if all its nodes have been at rest in the last ``Skips.sleep_after`` predictions.
-    ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` define rest. They are compared with the velocities at the frame where the model knows
-    them. Islands sleep as a whole, so no edge connects a sleeping node to one that is awake. For awake nodes, the model gets all nodes that can influence
-    them, also sleeping ones. An island that falls asleep loses its momentum. New states contain this loss (``State.lost_impulse``) and the number of sleeping
-    nodes (``State.num_asleep``).
+    ``Skips.rest_step_spacings`` and ``Skips.rest_step_change_spacings`` limit velocities at rest: those at the frame if the model predicts them, otherwise
+    mean velocities. Islands sleep as a whole, so no edge connects a sleeping node to one that is awake. For awake nodes, the model gets all nodes that can
+    influence them, also sleeping ones. An island that falls asleep loses its momentum. New states contain this loss (``State.lost_impulse``) and the number of
+    sleeping nodes (``State.num_asleep``).
 
     Args:
         simulator: simulator, whose ``skips`` set when islands sleep.

@@ -63,7 +63,7 @@ class LearnedSimulator(nn.Module):
     Args:
         model: the network; its ``settings`` rebuild it from a checkpoint.
         builder: makes the graphs.
-        stride: number of stored frames of the training data in a frame of the model; for messages.
+        stride: number of stored frames of the training data in a frame of the model. Messages name it.
 
     Attributes:
         skips: levels of skipping.
@@ -315,7 +315,7 @@ class LearnedSimulator(nn.Module):
         return same_scales and same_channels and {*scene.materials} <= {*own.materials}  # materials can share their parameters
 
     def check_scene(self, scene: Metadata, choice: str = "") -> None:
-        """Raise an error for a scene that does not fit. The message recommends a ``choice`` of the data set; by default a stride if that is enough.
+        """Raise an error for a scene that does not fit. The message recommends ``choice``; by default a stride if one makes the scene fit.
 
         Raises:
             SceneError: the scene does not fit (``fits``).

@@ -184,7 +184,7 @@ class GPE(Model):
         node_norm: ``layer`` normalises the encoded state of every node and the update of each step, as GNS does. With the ``node`` decoder, accelerations then
             stay bounded in any rollout. ``none`` follows the paper.
         elastic: cells of meshes move their nodes through the whole frame by a constitutive law that the model learns (see ``nn.elastic_bodies``).
-        wall_distance: with ``elastic``, distance from walls at which nodes stop before training, in rest spacings. Training changes it.
+        wall_distance: with ``elastic``, initial value of the learned distance from walls at which nodes stop, in rest spacings.
         only_contacts: with ``elastic`` and the ``contact`` decoder, the network adds forces between bodies, and between bodies and walls, and nothing within
             bodies.
         island_momentum: conserve the ``linear``, or also the ``angular``, momentum of freely flying islands exactly (see ``nn.island_momentum``); or

@@ -1,7 +1,11 @@
 """Runs a GPE as a program in one compiled call, on a CPU without gradients.
 
-Models use it by themselves in evaluation mode. ``nn.fused.unfused`` switches it off. PyTorch's operations take over, with a notice, where a submodule has
-hooks, where a subclass may compute something else, and for graphs of another precision or other shapes than the weights.
+``GPE.forward`` uses it in evaluation mode without gradients. ``system.compiled.unfused`` switches it off. PyTorch's operations take over, with a notice in
+the log, if a submodule has hooks, if the model is a subclass of ``GPE``, if the weights were made in inference mode, or if a graph has another precision,
+device or shape than the weights.
+
+The program has a copy of the weights. It is written again when PyTorch counts a change of a weight, and after ``train()``. Writing through ``weight.data`` or
+NumPy in evaluation mode is not counted: call ``model.train()`` and ``model.eval()`` afterwards.
 """
 
 from __future__ import annotations
@@ -43,7 +47,7 @@ class Decoded(NamedTuple):
 
 @lru_cache
 def notice(reason: str) -> None:
-    """Log once why a model is not compiled."""
+    """Log a reason why a model is not compiled, each reason once per process."""
     log.info("the network runs by PyTorch's operations, which is slower: %s", reason)
 
 
@@ -104,11 +108,11 @@ class CompiledGPE:
         return all(map(is_, [own.get(name) for own, name in self._places], self._parts)) and self._state_of_weights() == self._state
 
     def _state_of_weights(self) -> tuple[list[int], list[int]]:
-        """Return addresses of the weights, and numbers that rise whenever they change; weights that were made in inference mode have no such number."""
+        """Return addresses of the weights and PyTorch's counts of their changes. Weights that were made in inference mode have no such count."""
         return [p.data_ptr() for p in self._weights], [p._version for p in self._weights] if self._are_tracked else []
 
     def __call__(self, data: HeteroData, skips: Skips, keep_absent: bool) -> Decoded | None:
-        """Return what the network decodes from a graph with standardised features; None if it cannot be used.
+        """Return what the network decodes from a graph with standardised features; None if the program cannot be used.
 
         Args:
             data: the graph.

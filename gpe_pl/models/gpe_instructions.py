@@ -1,7 +1,7 @@
 """GPE as a program of instructions, for rollouts on a CPU (see ``nn.compiled_network``).
 
-The program computes what ``GPE.compute`` computes, up to rounding. Products of constant matrices are taken once, when the program is written. These are the
-last map of the messages with the first map of the update, and the material embedding with the first map of the encoder.
+The program computes what ``GPE.compute`` computes, up to rounding. Two pairs of linear maps are multiplied once, when the program is written: the last map of
+the messages with the first map of the update, and the material embedding with the first map of the encoder.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ if TYPE_CHECKING:
     from gpe_pl.models.gpe import GPE
 
 Place = tuple[int, int]
-"""A matrix, and the first of some of its columns."""
+"""Number of a matrix of the program, and of the first of some of its columns."""
 
 
 class GPEProgram:
-    """Writes the program of a GPE.
+    """Writes the program of a GPE. Matrices and sets of rows are named by their number in the program (``nn.compiled_network``).
 
     Attributes:
         program: the program.
-        types: node type of the weights of each node type of the graph that takes part.
-        relations: relation of the weights of each relation of the graph that takes part.
-        features: matrix of the features of each node type.
-        params, mass: matrices of these inputs of each material.
-        edges, states: matrix of the features or states of each relation, and that of the opposite direction or ``NONE``.
-        acceleration, stress, contact: matrices of the results of each material.
-        stress_rows: a set that has rows if stresses are wanted.
+        types: name of the weights (``type_key``) for each node type of the graph that the network reads; several types may share weights.
+        relations: the same for each relation: the names of the weights of its ends, and its own name.
+        features: matrix of the node features, by name in ``types``.
+        params, mass: matrices of material parameters and masses, by material.
+        edges, states: matrix of the edge features or edge states, and that of the opposite direction or ``NONE``, by name in ``relations``.
+        acceleration, stress, contact: matrices of the results, by material; see ``gpe_compiled.Decoded``.
+        stress_rows: set of rows that is empty if no stress is wanted.
     """
 
     def __init__(self, model: GPE) -> None:
@@ -72,7 +72,7 @@ class GPEProgram:
         return self.model.edge_state == "latent" and step < self.model.num_message_passing_steps - 1
 
     def _used_columns(self, step: int) -> dict[str, dict[tuple[Any, ...], int]]:
-        """Return where the sums of messages of a step begin, by node type and by what is summed."""
+        """Return the first column of each sum of messages of a step, by node type and by what is summed."""
         found: dict[str, dict[tuple[Any, ...], int]] = {t: {} for t in self.program.node_types}
         for joined, conv in self._layers(step):
             for t in dict.fromkeys((joined[2], joined[0])):
@@ -191,7 +191,10 @@ class GPEProgram:
         return 2 if joined[0] == joined[2] or conv.interaction == "directed" else 1
 
     def _projected_places(self, step: int) -> dict[tuple[EdgeType, str], Place]:
-        """Return where the first (a) and second (b) map of sources and targets of each relation are, as ``a target``, ``b source`` and so on."""
+        """Return the places of the products of node states with the first (a) and second (b) map of the messages.
+
+        Keys are a relation, and the map with the end whose states it takes: ``a target``, ``b source`` and so on.
+        """
         used = dict.fromkeys(self.program.node_types, 0)
         places: dict[tuple[EdgeType, str], Place] = {}
 
@@ -283,7 +286,7 @@ class GPEProgram:
                     send(w, state, (1, target, 1), (0, source, -1))
 
     def _between_layers(self, t: str, step: int | None, following: int) -> None:
-        """Write the update of a node type after a step, and the products that the following step needs."""
+        """Write the update of a node type after a step, and the products of node states that the following step needs."""
         with self.program.segment(self.program.node_types[t].connected):
             if step is not None and t in self._updated(step):
                 self._update(t, step)
@@ -314,7 +317,7 @@ class GPEProgram:
     # --- decoders ----------------------------------------------------------------------------------------------------------------------------
 
     def _falls_freely(self, material: str) -> bool:
-        """Tell whether nodes of a material without edges need no state."""
+        """Tell whether nodes of a material without edges need no state: only pair forces accelerate them, and no stress is decoded."""
         return self.model.decoder == "pair" and not (self.model.settings["stress"] and material in self.model.spec.stress_channels)
 
     def _force_relations(self) -> list[EdgeType]:

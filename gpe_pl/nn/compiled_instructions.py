@@ -4,17 +4,18 @@ A *segment* is a list of instructions on the rows of one set: the nodes of a typ
 What one instruction writes is then still in the cache when the next one reads it. Matrices are in one array, ``work``, and weights in another.
 ``compiled_network`` writes the instructions.
 
-Instructions, their arguments, and what they compute (φ is a PReLU, i the target and j the source of an edge; the letters before the semicolon are matrices and
-places of weights, ``column`` is the first of the columns that are read, ``to`` the first that are written, and n the number of columns)::
+The table lists instructions, their arguments, and what they compute. Arguments are the numbers of matrices, the places of weights (W, b, gain, shift, ε, and
+the slope of the PReLU φ), and counts. ``column`` is the first of the columns that are read, ``to`` the first that are written, and n the number of columns.
+In GATHER_ODD, a and b are columns of one matrix, ``nodes``. An edge has the target i and the source j. ``end`` is 1 for the target, 0 for the source::
 
-    PRODUCT        y x column channels W n to mode          y = x W,  y += x W,  or y += x W unless it is the first of a segment that writes to y
+    PRODUCT        y x column channels W n to mode          y = x W,  y += x W,  or the latter except in the first such product of a segment
     BIAS           y to b n                                 y += b
     DEGREE         y d b n column                           y += d b, d a column of numbers
-    ACTIVATE       y b φ n fills                            y = φ(y + b), with y = 0 if ``fills`` and no product has written to y
+    ACTIVATE       y b φ n fills                            y = φ(y + b), with y = 0 if ``fills`` and no product was joined
     NORMALIZE      y h b gain shift ε n adds                h = LayerNorm(y + b),  or h += LayerNorm(y + b)
     RESIDUAL       y h b n                                  h += y + b
     ZERO           y                                        y = 0
-    DIVIDE         y d                                      y = y / d, with y = 0 if no product has written to y
+    DIVIDE         y d                                      y = y / d, with y = 0 if no product was joined
     MESSAGES       w a column b column n φ T to S to        x = φ(a_i + b_j + w),  T_i += x,  S_j −= x
     GATHER         w a column b column n φ end              w = φ(a_i + b_j + w), or with i and j exchanged if ``end`` is 0
     GATHER_ODD     w nodes a b u n φ                        x = φ(a_i + b_j + u + w),  y = φ(a_j + b_i + u − w),  w = x − y,  u = x + y
@@ -54,7 +55,7 @@ BLOCK = 256
     COUNT,
 ) = range(15)
 SET, ADD, JOIN = 0, 1, 2
-"""Whether a product replaces y, is added to it, or is added unless it is the first."""
+"""A product replaces y, is added to it, or is joined: the first joined product of a segment replaces y, later ones are added. One segment joins to one y."""
 NONE = -1
 """Number of a matrix or set of rows that an instruction does without."""
 OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}

@@ -1,4 +1,4 @@
-"""A network as data: sets of rows, matrices, weights and instructions, which ``compiled_instructions.run`` executes in one call.
+"""A network as a list of instructions, with sets of rows, matrices and weights, which ``compiled_instructions.run`` executes in one call.
 
 A model writes its layers with the methods of ``Program``. Weights are copied when the program is written, so write it again when they change.
 """
@@ -26,7 +26,7 @@ ALIGNED = 16
 
 @dataclass(frozen=True)
 class NodeType:
-    """Sets of rows of a type of nodes: all of them, those with an edge, and those without."""
+    """Number of a type of nodes, and its sets of rows: all nodes, those with an edge, and those without."""
 
     number: int
     every: int
@@ -59,18 +59,18 @@ class Program:
     # --- rows, matrices and weights ---------------------------------------------------------------------------------------------------------
 
     def node_type(self, name: str) -> NodeType:
-        """Add a type of nodes."""
+        """Add a type of nodes with new sets of rows."""
         first = self.new_set(), self.new_set(), self.new_set()
         self.node_types[name] = NodeType(len(self.node_types), *first)
         return self.node_types[name]
 
     def new_set(self) -> int:
-        """Add a set of rows."""
+        """Add a set of rows, and return its number."""
         self.num_sets += 1
         return self.num_sets - 1
 
     def matrix(self, rows: int, columns: int) -> int:
-        """Add a matrix with these rows, or with the rows of one block for ``NONE``."""
+        """Add a matrix with the rows of a set, or for ``NONE`` with those of one block, and return its number."""
         self.matrices.append((rows, max(columns, 1)))
         return len(self.matrices) - 1
 
@@ -83,7 +83,7 @@ class Program:
 
     @contextmanager
     def segment(self, rows: int) -> Iterator[None]:
-        """Add a segment: the instructions that are written in this context, for these rows."""
+        """Add a segment: the instructions that are written in this context, for the rows of a set."""
         first = len(self.instructions)
         yield
         if len(self.instructions) > first:
@@ -162,11 +162,11 @@ class Program:
 
 
 class Tables(NamedTuple):
-    """What a program reads and writes; see ``compiled_network_inputs`` for the columns.
+    """What a program reads and writes, a table for each kind; see ``compiled_network_inputs`` for the columns.
 
     Attributes:
-        nodes, edges, bodies: inputs of nodes, relations, and bodies of nodes.
-        results: results of nodes.
+        nodes, edges, bodies: inputs: features of nodes, edges of relations, and the body of each node.
+        results: results at nodes.
     """
 
     nodes: np.ndarray
@@ -196,12 +196,12 @@ class Executable:
         self._free: list[np.ndarray] = []
 
     def __call__(self, tensors: Tables, num_nodes: np.ndarray, size: np.ndarray, apart: bool, sorts: bool) -> int | None:
-        """Run the program, unless an edge names a node that does not exist. Return the number of its relation, or None.
+        """Run the program and return None. If an edge names a node that does not exist, return the number of its relation and run nothing.
 
         Args:
             tensors: addresses and sizes of the inputs and results, whose memory must stay in use. Sizes are not checked.
             num_nodes: number of nodes of each type.
-            size: number of rows of each set: of nodes all, of edges all.
+            size: number of rows of each set: of all nodes of a type, or of all edges of a relation. Sets of nodes with or without an edge are counted here.
             apart: leave nodes without an edge out of message passing.
             sorts: order nodes in memory by their edges.
         """

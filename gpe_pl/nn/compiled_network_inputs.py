@@ -1,7 +1,7 @@
 """Reads a graph into the matrices of a compiled network, and writes the results back.
 
-Nodes are renumbered. Nodes with an edge come first, in their own order or, in large scenes, in the order in which edges first reach them. Neighbours are then
-near each other in memory.
+Nodes are renumbered. Nodes with an edge come first if isolated nodes are set apart. In large scenes, nodes have the order in which edges first reach them, so
+that neighbours are near each other in memory.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gpe_pl.nn.pointers import matrix_at
 @njit(**OPTIONS)
 @no_type_check
 def find_wrong_edges(edge_kinds, edge_arrays, num_nodes):
-    """Return the first relation with an edge that names no node, or ``NONE``; arguments as in ``number_nodes``."""
+    """Return the first relation with an edge that names a node that does not exist, or ``NONE``; arguments as in ``number_nodes``."""
     for r in range(len(edge_kinds)):
         index = matrix_at(edge_arrays[r, 0], 2, edge_arrays[r, 3], num_nodes)
         for end in range(2):
@@ -39,7 +39,7 @@ def number_nodes(edge_kinds, edge_arrays, first_node, num_nodes, number, connect
         first_node: row in ``number`` at which the nodes of a type start [type].
         num_nodes: number of nodes [type].
         number: the results [node].
-        connected: number of nodes with an edge [type], or of all nodes; a result.
+        connected: number of nodes with an edge, or of all nodes if they are not set apart [type]; a result.
         apart: set nodes without an edge apart.
         sorts: number nodes in the order in which edges reach them.
     """

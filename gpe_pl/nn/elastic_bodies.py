@@ -19,7 +19,7 @@ from gpe_pl.nn.elastic_motion import Cells, Constants, Corners, Walls, cauchy_st
 from gpe_pl.system.compiled import is_wanted
 
 MAX_CACHED = 64
-"""Largest number of batches whose cells at rest are kept in memory; 400 triangles take about 40 kB."""
+"""Largest number of graphs whose cells at rest are kept in memory; 400 triangles take about 40 kB."""
 ENTRIES = ("body_pos", "rest_pos", "velocity", "wall", "cell_index", "corner_index", "corner")
 """Entries of a material's store that the law reads."""
 
@@ -136,7 +136,7 @@ class ElasticBodies(nn.Module):
 
 
 def _cells_at_rest(material: str, cell_index: Tensor, rest_pos: Tensor, mass: Tensor, scene: Tensor | None) -> Cells:
-    """Return the cells of a graph at rest. They are found once for equal arrays, because only the positions change in a rollout.
+    """Return the cells of a graph at rest. They are computed once for equal arrays, because only positions and velocities change in a rollout.
 
     Raises:
         CellError: a cell has no volume, or there are several kinds of cells.

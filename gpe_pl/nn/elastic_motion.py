@@ -159,7 +159,7 @@ class Motion(NamedTuple):
     Attributes:
         displacement: in m [node, dim].
         velocity: velocity at the end in m/frame [node, dim].
-        law: the law of each cell, softened where ``MAX_SUBSTEPS`` would not suffice.
+        law: the law of each cell [cell], softened where ``MAX_SUBSTEPS`` would not suffice.
     """
 
     displacement: Float[Tensor, "node dim"]
@@ -223,7 +223,7 @@ def plain_motion(
     cells: Cells,
     number: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the results of ``elastic_motion`` by PyTorch's operations. Scenes with fewer substeps than others stop earlier."""
+    """Return displacement and velocity of ``elastic_motion`` by PyTorch's operations. Scenes with fewer substeps than others stop earlier."""
     own = number.repeat_interleave(cells.node_start.diff(), output_size=len(pos))
     step = (1.0 / own.double())[:, None]
     rounds = [torch.from_numpy(some).to(pos.device) for some in _in_rounds(pair, len(pos))]
@@ -267,7 +267,7 @@ def _in_rounds(pair: Int64[Tensor, "pair 2"], num_nodes: int) -> Iterator[Int64[
 
 
 def _stopped_by_corners(velocity: Tensor, y: Tensor, mass: Tensor, corners: Sequence[Corners], step: Tensor) -> Tensor:
-    """Return velocities after contact of corners with edges, one round of ``_in_rounds`` after the other."""
+    """Return velocities after contacts of corners with edges, which are given by rounds of ``_in_rounds``."""
     for one in corners:
         ends = one.nodes.T
         with torch.no_grad():
@@ -286,8 +286,11 @@ def _corner_contact(
     mass: Float[Tensor, "2 pair"],
     step: Float[Tensor, " pair"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return normal [pair, dim], place on the edge, allowed velocity along the normal, fraction of tangential velocity that stops [pair, 1], and factors of
-    both ends [2, pair, 1]. Without contact all of them are zero.
+    """Compute contacts of corners with edges. Where there is none, all results are zero.
+
+    Returns:
+        Normal of the edge [pair, dim], place on the edge as a fraction of it [pair, 1], allowed velocity along the normal [pair, 1] in m/frame, fraction of the
+        tangential velocity that stops [pair, 1], and factors that distribute the change of velocity to both ends [2, pair, 1].
     """
     d, from_first = y[1] - y[0], corners.point - y[0]
     square = d.square().sum(dim=1)

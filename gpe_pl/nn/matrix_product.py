@@ -1,6 +1,6 @@
 """The product of matrices in compiled functions, by the BLAS library that PyTorch uses.
 
-``np.dot`` has no sum of products, and copies matrices whose rows are not adjacent. ``gemm`` does with both.
+``np.dot`` cannot add to its result, and copies matrices whose rows are not adjacent in memory. ``gemm`` adds and takes strides of rows.
 """
 
 from __future__ import annotations
@@ -33,7 +33,17 @@ def gemm_address(dtype: Any) -> int:
 @intrinsic
 @no_type_check
 def gemm(typing_context, like, address, turns_a, turns_b, m, n, k, a, a_stride, b, b_stride, adds, c, c_stride):
-    """Compute C = A B, or C += A B, for matrices with rows of given strides at addresses in memory; A or B may be stored transposed."""
+    """Compute C = A B, or C += A B, for A [m, k], B [k, n] and C [m, n] at addresses in memory.
+
+    Args:
+        like: array of the precision of the matrices.
+        address: ``gemm_address`` of this precision.
+        turns_a, turns_b: 1 if A or B is stored transposed, else 0.
+        m, n, k: sizes.
+        a, b, c: addresses of the matrices.
+        a_stride, b_stride, c_stride: distances between stored rows [elements].
+        adds: 1 to add to C, 0 to replace it.
+    """
     is_double = like.dtype == types.float64
     signature = types.void(like, *[types.int64] * 13)
 

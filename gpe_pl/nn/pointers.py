@@ -22,7 +22,7 @@ def pointer(_, address):
 @njit(cache=True, nogil=True)
 @no_type_check
 def matrix_at(address, rows, columns, like):
-    """Return the matrix at an address, of the precision of another array."""
+    """Return the matrix [rows, columns] at an address, with the precision of the array ``like``."""
     return carray(pointer(address), (rows, columns), like.dtype)
 
 

@@ -176,7 +176,7 @@ def _check(folder: Path, domains: list[str], by_cell: dict[tuple[str, str], list
 
 
 def _start(run: Run) -> str | None:
-    """Start of a run's rollouts: a time, or a frame if frames of unknown length; None if its configuration does not have it."""
+    """Return the start of a run's rollouts: its time, or its frame if the length of frames is not known. None if the configuration does not have it."""
     time, frame_dt = run.config.get("evaluation.start_time"), run.config.get("data.solver.frame_dt")
     if time is not None:
         return f"{time:g} s"

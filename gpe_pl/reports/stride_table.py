@@ -13,10 +13,10 @@ from gpe_pl.metrics import bootstrap_ratio
 from gpe_pl.reports.finished_runs import Run, shared_table, shared_trajectories, splits_of, values_by_seed
 
 STRIDES_MD = "strides.md"
-"""Name of the file with these lines alone."""
+"""Name of the file that holds only these lines."""
 AXIS = "data.stride"
 LENGTHS = ("training.num_steps", "training.val_interval")
-"""Keys that differ between runs of equal time and are left out."""
+"""Keys that the table leaves out, because they always differ between runs of equal training time."""
 ERROR = "final_mse"
 NOTE = (
     "Position MSE ×1e-3 [m²] at the instant, nodes and axes: median over trajectories and seeds, and the ratio of the means to the first row with its 95 % "

@@ -24,11 +24,11 @@ CROWDING_LIMIT = 32
 FINEST = 0.01
 """Width of a cell whose nodes count as coincident [rest spacings]. If too many nodes of a start coincide, its limit on crowding is not raised."""
 TUNNEL_DEPTH = 0.25
-"""A path between two frames may be this deep in a wall or obstacle without having gone through it [rest spacings]."""
+"""Depth in a wall or obstacle up to which a path between two frames does not count as going through it [rest spacings]."""
 MAX_PATH_SAMPLES = 4096
 """Maximum number of samples of a path. Paths longer than this many eighths of a spacing are sampled more coarsely."""
 NUM_BISECTIONS = 20
-"""Number of halvings of the part of a way in which it crosses a surface."""
+"""Number of bisections that find where a way crosses a surface."""
 SUSPECTS_AT_ONCE = 1000
 """Number of nodes whose paths are sampled together, as finely as the fastest of them needs."""
 
@@ -169,7 +169,7 @@ def _depth_through(shapes: tuple[Shape, ...], start: np.ndarray, way: np.ndarray
     """Return the largest depth [m] in shapes of the straight ways that go through one; 0 for other ways.
 
     A way goes through if it is deeper than ``tolerance`` and leaves by a face that is turned by more than 90° from the one where it enters. Other ways cut a
-    corner, around which a node may have moved between the frames.
+    corner, around which a node may have moved between the frames. If a way crosses several shapes, only its first entry and its last exit are compared.
 
     Args:
         shapes: walls and obstacles.

@@ -1,7 +1,7 @@
-"""``FinerSolver``: a solver at a finer spacing, whose solution is seen at the nodes of the scene.
+"""``FinerSolver``: solves a scene at a finer spacing, and returns the solution at the nodes of the scene.
 
-A model at the spacing of the scene can learn such a solution. The nodes are tracers: a fixed subset of the particles of the finer solution. At the start they
-have the positions and velocities of the scene. Each has the mass of all particles into which a node of the scene was divided. ``resolution`` divides scenes.
+A model at the spacing of the scene can learn such a solution. The nodes are tracers: a fixed subset of the particles or mesh nodes of the finer solution. At
+the start they have the positions and velocities of the scene. Each keeps the mass of its node in the scene. ``resolution`` divides scenes.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from gpe_pl.solvers.resolution import Divided, divided_mesh, divided_particles
 from gpe_pl.trajectory.state import State, Stress
 
 FACTORS = (1, 2, 4)
-"""Numbers of parts into which spacings can be divided."""
+"""Factors by which the spacing can be divided."""
 
 TRACERS = "1"
-"""Version of the division of scenes into parts. Another version has other results."""
+"""Version of how scenes are divided into parts; data sets store it. Raise it with every change of results."""
 
 
 @runtime_checkable
@@ -27,7 +27,7 @@ class Refinable(Simulator, Protocol):
     """A solver that can solve scenes at a finer spacing.
 
     Attributes:
-        has_mesh: whether its nodes are those of a mesh, whose cells are divided for a finer spacing. Other nodes are particles.
+        has_mesh: whether it solves on a mesh, whose cells are divided for a finer spacing. Otherwise particles are divided.
     """
 
     has_mesh: ClassVar[bool]
@@ -41,12 +41,12 @@ class Refinable(Simulator, Protocol):
 class FinerSolver:
     """A solver at a finer spacing for scenes at their own spacing; a ``Simulator``.
 
-    A state must be the start of a scene or a state that ``step`` returned: the nodes of the scene do not tell the positions of all particles. Other material
-    parameters may be set in between. The particles get those of the nodes from which they come.
+    A state must be the start of a scene or a state that ``step`` returned, because the nodes of the scene do not tell where all particles are. Material
+    parameters may be changed in between. Each particle gets those of the node from which it comes.
 
     Attributes:
         solver: the solver for the finer spacing, a ``Refinable``.
-        factor: number of parts into which the spacing is divided, one of ``FACTORS``.
+        factor: factor by which the spacing is divided, one of ``FACTORS``.
         spacing: spacing of the nodes of the scene [m].
     """
 

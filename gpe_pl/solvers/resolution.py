@@ -1,6 +1,7 @@
 """Scenes at another resolution, with a map back to the original nodes: divided for finer solutions, merged or meshed again for coarser ones.
 
-``divided`` splits particles and cells of meshes, and ``coarser`` merges them. Both conserve mass.
+``divided_particles`` and ``divided_mesh`` split particles and cells. ``coarser`` merges particles, and fills outlines of meshes with larger cells. The total
+mass is conserved.
 """
 
 from __future__ import annotations
@@ -76,9 +77,11 @@ def coarser(state: State, spacing: float, factor: float = 2.0) -> Resolved:
 
 
 def divided_particles(state: State, spacing: float, factor: int) -> Divided:
-    """Divide every particle into ``factor`` parts along each axis, around a particle of nearly no mass at its position.
+    """Divide every particle into ``factor`` parts along each axis. A further particle of nearly no mass stays at its position (``MARKER``).
 
-    The parts form a lattice. Its axes are those of the lattice that the cells describe, for materials with cells, otherwise those of space.
+    The parts form a lattice. For materials with cells it has the axes of the lattice that the cells describe, otherwise those of space.
+
+    Node k of the scene keeps the number k. Its parts follow after all nodes, in the order of the nodes.
 
     Args:
         state: start of a scene.
@@ -145,7 +148,7 @@ def _check_start(state: State) -> None:
 
 
 def divided_mesh(state: State, factor: int) -> Divided:
-    """Divide every cell into parts of equal volume, ``factor`` along each edge. Original nodes keep their numbers and positions.
+    """Divide every cell into ``factor`` ** dim parts of equal volume. Original nodes keep their numbers and positions.
 
     Part k of cell c has the number ``k num_cells + c``.
 

@@ -1,7 +1,7 @@
 """How errors of accelerations count in the loss: penalties other than the square, and weights by the number of neighbours.
 
-Source of ``root`` and of the weights: Ummenhofer et al. 2020, "Lagrangian Fluid Simulation with Continuous Convolutions", ICLR, section 4, whose loss is the
-mean of exp(−n/40) |error|^0.5 with n neighbours, 40 being about their mean.
+Source of ``root`` and of the weights: Ummenhofer et al. 2020, "Lagrangian Fluid Simulation with Continuous Convolutions", ICLR, section 4. Their loss is the
+mean of exp(−n/40) |error|^0.5, where n is the number of neighbours, and 40 is about its mean.
 """
 
 from __future__ import annotations
@@ -26,6 +26,11 @@ def penalty(error: Float[Tensor, "node dim"], loss: Loss, least: Float[Tensor, "
     """Return how errors e count in the loss.
 
     ``square`` is e² of each component, ``log`` is s² log(1 + e²/s²) of each with s = ``SMALL_ERROR``, and ``root`` is (|e|² + least²)^(1/4) of each node.
+
+    Args:
+        error: errors of normalised accelerations.
+        loss: kind of the penalty.
+        least: error in the same unit below which ``root`` is smooth; used for ``root`` only.
     """
     if loss == "root":
         return (error.square().sum(dim=1, keepdim=True) + least.square()) ** 0.25
@@ -33,7 +38,7 @@ def penalty(error: Float[Tensor, "node dim"], loss: Loss, least: Float[Tensor, "
 
 
 def num_neighbors(data: HeteroData, materials: Sequence[str]) -> dict[str, Float[Tensor, " node"]]:
-    """Return the number of edges of each node of these materials to other nodes of materials, within the radius and along cells."""
+    """Return the number of edges that connect each node of these materials with other nodes of these materials, within the radius and along cells."""
     count = {m: torch.zeros(data[m].x.shape[0], device=data[m].x.device) for m in materials}
     for relation in data.edge_types:
         source, _, target = relation

@@ -45,7 +45,7 @@ RESUMED = {
 }
 """Keys that a checkpoint needs for a run to resume from it."""
 OF_AVERAGE = {"current_model_state", "averaging_state"}
-"""Further keys that it needs if the run averages its weights."""
+"""Further keys that a checkpoint needs if the run averages its weights."""
 
 log = logging.getLogger(__name__)
 
@@ -186,7 +186,7 @@ class TrainingModule(L.LightningModule):
         return self._loss_of(batch, predicted)
 
     def _mean_loss(self, steps: Iterable[tuple[HeteroData, Prediction]], count: int) -> Tensor:
-        """Return the mean loss over ``count`` steps. Steps that are missing, because no scene is left, count as zero."""
+        """Return the mean loss over ``count`` steps. Steps in which no scene is left count as zero."""
         losses: list[Tensor] = []
         for batch, predicted in steps:
             if not losses:
@@ -218,7 +218,7 @@ class TrainingModule(L.LightningModule):
 
     def _penalty(self, error: Tensor) -> Tensor:
         """Return ``errors.penalty`` of errors [node, dim] of normalised accelerations."""
-        unit = self.simulator.builder.scales.acceleration / self.simulator.acceleration_std  # one rest spacing, as positions
+        unit = self.simulator.builder.scales.acceleration / self.simulator.acceleration_std  # moves a node by one rest spacing in a frame
         return penalty(error, self.loss_kind, (LEAST_ERROR * unit).to(error.dtype))
 
     def _weighted_by_neighbors(self, batch: HeteroData, materials: Iterable[str], errors: list[Tensor]) -> list[Tensor]:

@@ -21,7 +21,7 @@ from gpe_pl.rollout.loop import SimulationError
 def predictions(simulator: LearnedSimulator, unrolls: Sequence[Unroll]) -> Iterator[tuple[HeteroData, Prediction]]:
     """Yield the batch of training graphs and its prediction for each step of unrolls of equal length.
 
-    A scene of which no graph can be built any more takes no part in the remaining steps. If no scene is left, the remaining steps are missing.
+    A scene leaves the unroll when no graph of its state can be built. If no scene is left, fewer steps are yielded.
     """
     scenes, states, graphs = list(unrolls), [u.state for u in unrolls], [u.graph for u in unrolls]
     for step in range(1, unrolls[0].num_steps + 1):

@@ -44,7 +44,7 @@ class Motion:
         return Motion(self.pos[start:stop], self.vel[start:stop], self.normal[start:stop])
 
     def every(self, stride: int) -> Motion:
-        """Return every ``stride``-th frame from the first on. Velocities are means over the frames until the next one that is returned."""
+        """Return every ``stride``-th frame from the first on. Velocities are means over the frames up to, and without, the next returned one."""
         first = np.arange(0, self.num_frames, stride)
         count = np.minimum(first + stride, self.num_frames) - first
         vel = np.add.reduceat(self.vel, first, axis=0) / count[:, None, None]

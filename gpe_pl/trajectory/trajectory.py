@@ -297,7 +297,7 @@ class Trajectory:
         """Return the state at a frame.
 
         Without ``history``, the velocities are the stored ones. With ``history`` > 0, they are differences of the last ``history + 1`` stored positions in
-        float64, as a learned simulator needs them, and the stored ones are the velocities at the frame.
+        float64, as a learned simulator needs them, and the stored ones become ``State.frame_velocity``.
 
         Raises:
             IndexError: ``frame`` is out of range, or has fewer than ``history`` frames before it.

@@ -50,7 +50,7 @@ def rollout_figure(
 
 
 def parameter_strip(scenes: Sequence[tuple[str, Trajectory, Trajectory]], num_columns: int = 5) -> Figure:
-    """Draw a scene at several values of its material parameters: for each the solver's run and the model's rollout below, time to the right.
+    """Draw a scene at several values of its material parameters. Each value has a row of the solver above a row of the model; time is to the right.
 
     Colours are the stress if all rows have one, else the materials if there are several, else the height at the start.
 

@@ -37,7 +37,10 @@ def _cross(r: Tensor, f: Tensor) -> Tensor:
 
 
 def _exact(subject: Subject) -> tuple[bool, bool]:
-    """Tell whether linear and angular momentum are exact by construction. Bodies that cells turn within a frame have no exact angular momentum of means."""
+    """Tell whether linear and angular momentum are exact by construction.
+
+    With an elastic law, cells turn bodies within a frame, so the angular momentum of the mean velocities over frames is not exact.
+    """
     settings = subject.simulator.description()["settings"]
     island = settings.get("island_momentum", "ignored")
     return settings.get("decoder") == "pair" or island != "ignored", island == "angular" and not settings.get("elastic")

@@ -199,7 +199,7 @@ def shifted(state: State, offset: Tensor) -> State:
 
 
 def in_flight(state: State, dt: float) -> State:
-    """Return the state with the velocities at the frame that free flight has: the mean over the last frame, and half of what gravity adds within a frame."""
+    """Return the state with the velocities at the frame of free flight [m/s]: the mean over the last frame, plus half of what gravity adds in a frame."""
     return state if state.frame_velocity is None else replace(state, frame_velocity=state.vel + 0.5 * dt * state.gravity)
 
 

@@ -1,7 +1,7 @@
 """Contract of models whose cells move bodies (``model.elastic``): the units of gravity and of stress.
 
-Gravity and stress reach these models in other units than the features, so a wrong factor would leave all symmetries of ``contract`` as they are. A check raises
-``AssertionError`` if a model fails.
+The law reads gravity and returns stress in other units than the network. The symmetries in ``contract`` hold for any factor between these units, so they would
+not find a wrong one. A check raises ``AssertionError`` if a model fails.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gpe_pl.trajectory.strain import shape_gradients
 
 SOLID = "solid"
 HEAVY = 1e6
-"""Factor of masses with which bodies hardly move within a frame, so that their stress is the same at its start and its end."""
+"""Factor of masses. Bodies this heavy hardly move within a frame, so their stress is the same at its start and its end."""
 
 
 def check_gravity(make: Factory, kind: str) -> None:
