@@ -169,7 +169,7 @@ def _depth_through(shapes: tuple[Shape, ...], start: np.ndarray, way: np.ndarray
     """Return the largest depth [m] in shapes of the straight ways that go through one; 0 for other ways.
 
     A way goes through if it is deeper than ``tolerance`` and leaves by a face that is turned by more than 90° from the one where it enters. Other ways cut a
-    corner, around which a node may have moved between the frames. If a way crosses several shapes, only its first entry and its last exit are compared.
+    corner, around which a node may have moved between the frames. A way that is inside several times has to go through once.
 
     Args:
         shapes: walls and obstacles.
@@ -181,16 +181,21 @@ def _depth_through(shapes: tuple[Shape, ...], start: np.ndarray, way: np.ndarray
     if count < 2:
         return np.zeros(len(start))
     depth = np.stack([-signed_distance(shapes, start + k / count * way) for k in range(1, count)])
-    deepest = depth.max(axis=0)
-    deep = np.flatnonzero(deepest > tolerance)
-    found, inside = np.zeros(len(start)), depth[:, deep] > 0
-    first, last = 1 + inside.argmax(axis=0), count - 1 - inside[::-1].argmax(axis=0)
+    deep = np.flatnonzero(depth.max(axis=0) > tolerance)
+    found, inside = np.zeros(len(start)), np.zeros((len(deep), count + 1), bool)
+    inside[:, 1:-1] = depth[:, deep].T > 0
+    change = np.diff(inside.astype(np.int8), axis=1)
+    (number, before), (_, last) = (
+        np.nonzero(change == 1),
+        np.nonzero(change == -1),
+    )  # of each stretch inside: its way, the sample before it, its last sample
     enters, leaves = (
-        _normals_at_surface(shapes, start[deep], way[deep], out / count, within / count)
-        for out, within in ((first - 1, first), (last + 1, last))
+        _normals_at_surface(shapes, start[deep[number]], way[deep[number]], out / count, within / count)
+        for out, within in ((before, before + 1), (last + 1, last))
     )
-    through = np.einsum("nd,nd->n", enters, leaves) < 0
-    found[deep[through]] = deepest[deep[through]]
+    deepest = np.array([depth[a:b, deep[k]].max() for k, a, b in zip(number, before, last, strict=True)])
+    through = (np.einsum("nd,nd->n", enters, leaves) < 0) & (deepest > tolerance)
+    np.maximum.at(found, deep[number[through]], deepest[through])
     return found
 
 

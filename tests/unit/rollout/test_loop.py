@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from gpe_pl.rollout.guard import Guard
+from gpe_pl.geometry.shapes import Box
+from gpe_pl.rollout.guard import Guard, _depth_through
 from gpe_pl.rollout.loop import Replay, SimulationError, Simulator, Start, fraction_outside, frames, rollout, rollouts
 from gpe_pl.trajectory import integrators
 from gpe_pl.trajectory.state import State
@@ -217,6 +218,21 @@ def test_who_may_have_moved_around_a_corner_did_not_go_through(new_trajectory: N
     before = replace(one.state(0), pos=np.array([[0.38, 0.01]]))  # the straight line over the corner at (0.4, 0.1) is 0.035 m deep
     stop = Guard(spacing=one.metadata.spacing).check(replace(before, pos=np.array([to])), 1, before)
     assert (stop is not None) == goes_through
+
+
+PLATE, BLOCK = Box((0.28, 0.2), (0.32, 0.8), 0.0), Box((0.5, 0.3), (0.7, 0.5), 0.0)
+
+
+@pytest.mark.parametrize(("shapes", "goes_through"), [((PLATE,), True), ((BLOCK,), False), ((PLATE, BLOCK), True), ((BLOCK, PLATE), True)])
+def test_each_obstacle_on_a_way_is_seen(shapes: tuple[Box, ...], goes_through: bool) -> None:
+    start, way = (
+        np.array([[0.1, 0.36], [0.1, 0.36]]),
+        np.array([[0.65, 0.2], [0.1, 0.0]]),
+    )  # through the plate and over a corner of the block; stops before
+    depth = _depth_through(shapes, start, way, 200, 0.001)
+    assert (depth > 0).tolist() == [goes_through, False]
+    if goes_through:
+        assert depth[0] == pytest.approx(0.02, abs=0.002)
 
 
 def test_who_goes_through_an_obstacle_slowly_is_seen_inside(new_trajectory: New) -> None:
