@@ -34,7 +34,7 @@ from gpe_pl.models.lookup import model_class
 from gpe_pl.reports.finished_runs import Run, rollout_errors, table_of
 from gpe_pl.rollout.loop import Restartable
 from gpe_pl.training.budget import PauseForMeasurements, mean_step_time, step_time_key, within_budget
-from gpe_pl.training.errors import mean_num_neighbors
+from gpe_pl.training.loss_terms import mean_num_neighbors
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.parallel import end_later_processes
 from gpe_pl.training.run import TrainerSettings, TrainingSettings, adopt, seed, set_up, train

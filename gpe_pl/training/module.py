@@ -24,10 +24,10 @@ from gpe_pl.metrics import OneStepNMSE
 from gpe_pl.models.base import Prediction
 from gpe_pl.system import ranks
 from gpe_pl.system.machine import has_cpp_compiler
-from gpe_pl.training.errors import LEAST_ERROR, Loss, num_neighbors, penalty
+from gpe_pl.training.loss_terms import LEAST_ERROR, Loss, num_neighbors, penalty
 from gpe_pl.training.optimizer import OnePassAdam, clip
 from gpe_pl.training.push_forward import Excursions
-from gpe_pl.training.unroll import predictions
+from gpe_pl.training.unroll_gradients import predictions
 
 Schedule = Literal["cosine", "exponential", "staircase"]
 Compile = Literal["auto", "on", "off"]
@@ -73,7 +73,7 @@ class TrainingModule(L.LightningModule):
         schedule: ``exponential`` decays geometrically (paper: 5e-5 to 1e-6); ``cosine`` warms up and follows a half cosine (short budgets); ``staircase`` keeps
             the rate for half of the steps, then falls after every tenth of the steps by the same factor, to the final rate in the last tenth.
         warmup_steps: steps of linear warm-up in the ``cosine`` schedule.
-        loss: ``square``, ``log`` or ``root``: how errors of normalised accelerations count; see ``errors.penalty``. Stress always has the squared error.
+        loss: ``square``, ``log`` or ``root``: how errors of normalised accelerations count; see ``loss_terms.penalty``. Stress always has the squared error.
         stress_weight: weight of the mean squared error of the normalised stress, relative to that of the acceleration; used if the model decodes a stress.
         neighbor_weight: c in the weight exp(−c n/n̄) of the acceleration of a node with n neighbours; see ``errors.num_neighbors``. None weights all alike.
         mean_neighbors: n̄, the mean number of neighbours of a node in the training data.
@@ -170,7 +170,7 @@ class TrainingModule(L.LightningModule):
     def loss(self, samples: Samples) -> Tensor:
         """Return the mean error of the normalised accelerations, plus that of the normalised stress if the model decodes one.
 
-        ``errors.penalty`` says how an error counts. With several ranks, the loss is this rank's part of the sum. For push-forward samples, the
+        ``loss_terms.penalty`` says how an error counts. With several ranks, the loss is this rank's part of the sum. For push-forward samples, the
         graphs show the states that the unrolls have reached, and the predictions advance these unrolls by one step. For unrolls with gradients, the loss is the
         mean over their steps. Its errors are those of positions after each step, in units of the acceleration scale times the squared frame interval.
         """
@@ -217,7 +217,7 @@ class TrainingModule(L.LightningModule):
         return loss
 
     def _penalty(self, error: Tensor) -> Tensor:
-        """Return ``errors.penalty`` of errors [node, dim] of normalised accelerations."""
+        """Return ``loss_terms.penalty`` of errors [node, dim] of normalised accelerations."""
         unit = self.simulator.builder.scales.acceleration / self.simulator.acceleration_std  # moves a node by one rest spacing in a frame
         return penalty(error, self.loss_kind, (LEAST_ERROR * unit).to(error.dtype))
 

@@ -28,8 +28,8 @@ from gpe_pl.files.run_folder import CONFIG, RunError, config_in, differences
 from gpe_pl.system.machine import keep_freed_memory
 from gpe_pl.training.callbacks import RolloutValidation, StepProgress, WarmAverage
 from gpe_pl.training.checkpoints import AtomicCheckpoints, Checkpoints
-from gpe_pl.training.errors import Loss
 from gpe_pl.training.interruption import Interruption
+from gpe_pl.training.loss_terms import Loss
 from gpe_pl.training.module import Compile, Schedule, TrainingError, TrainingModule
 from gpe_pl.training.parallel import SummedGradients
 

@@ -17,7 +17,7 @@ from torch_geometric.data import Batch, HeteroData
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.training.callbacks import WarmAverage
-from gpe_pl.training.errors import mean_num_neighbors
+from gpe_pl.training.loss_terms import mean_num_neighbors
 from gpe_pl.training.module import TrainingError, TrainingModule
 from tests import scenes
 
