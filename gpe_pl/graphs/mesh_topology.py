@@ -82,6 +82,7 @@ def mesh_parts(state: State, spec: FeatureSpec, scales: Scales) -> MeshParts | N
 
 
 @lru_cache(maxsize=MAX_CACHED)
+@torch.inference_mode(False)  # a rollout may be the first to ask, and training the next
 def _parts(
     mesh: MultiscaleGraph,
     cells: bytes,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from gpe_pl.data.sampling import BatchSampler, BatchSize
 from gpe_pl.geometry.periodicity import Periodicity
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
+from gpe_pl.graphs.mesh_topology import _parts
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.base import Model
 from gpe_pl.models.cconv import ContinuousConvNet
@@ -110,6 +112,17 @@ def case(name: str) -> tuple[type[Model], dict[str, Any], GraphBuilder, State]:
 
 
 CASES = ("gns", "two materials", "cconv in 3D", "dpinet on meshes", "gpe on meshes with stress", "periodic, with islands", "moving walls")
+
+
+def test_a_rollout_may_be_the_first_to_see_a_mesh() -> None:
+    model, settings, builder, scene = case("dpinet on meshes")
+    _parts.cache_clear()
+    with torch.inference_mode():
+        unroll(builder, scene, 2, 0, bool(settings.get("stress")))
+    unrolls = [unroll(builder, scene, 2, 0, bool(settings.get("stress")))]
+    loss = TrainingModule(simulator_of(model, builder, [unrolls[0].graph], **settings), num_steps=10).loss(unrolls)
+    loss.backward()
+    assert math.isfinite(float(loss))
 
 
 @pytest.mark.parametrize("name", CASES)
