@@ -78,7 +78,7 @@ class Settings:
         cases: data sets, by name.
         runs: folders of finished runs; their models take part in the case whose data set they were trained on.
         factors: factors by which the solver is also run at a coarser spacing than the data.
-        step_factors: factors by which the solver's steps may also be longer, at the spacing of the data.
+        step_factors: factors by which the solver's steps may also be longer, at the spacing of the data and at coarser ones.
         repeats: numbers of frames for which predictions are repeated, each a further variant of every model (``Skips.repeat_frames``).
         split, num_trajectories: split and number of the scenes.
         horizons: numbers of frames over which errors are averaged; the full length is always added.
@@ -207,6 +207,9 @@ def _simulators(
     yield DATA, "solver", spec.label_solver, _Restricted(same, True)
     if spec.fine > 1:
         yield NODES, "solver", spec.solver, _Restricted(same, True)
+    for longer in settings.step_factors:
+        if (solver := _with_longer_steps(spec.solver, longer)) is not None:
+            yield f"solver, {STEPS}{longer}", "solver", solver, _Restricted(same, True, longer)
     for factor in settings.factors:
         solver = _solver(spec, factor)
         try:
@@ -214,11 +217,12 @@ def _simulators(
         except ValueError as error:
             log.info("%s: no scene %g times coarser (%s)", spec.name, factor, error)
             continue
-        if solver is not None:
-            yield f"solver, {SPACING}{factor:g}", "solver", solver, _Restricted(resolved, True)
-    for longer in settings.step_factors:
-        if (solver := _with_longer_steps(spec, longer)) is not None:
-            yield f"solver, {STEPS}{longer}", "solver", solver, _Restricted(same, True, longer)
+        if solver is None:
+            continue
+        yield f"solver, {SPACING}{factor:g}", "solver", solver, _Restricted(resolved, True)
+        for longer in settings.step_factors:
+            if (both := _with_longer_steps(solver, longer)) is not None:
+                yield f"solver, {SPACING}{factor:g}, {STEPS}{longer}", "solver", both, _Restricted(resolved, True, longer)
     dt = spec.solver.frame_dt
     for label, (simulator, _) in models.items():
         seen = data.frames(first % simulator.stride).every(simulator.stride)
@@ -247,12 +251,11 @@ def _solver(spec: DatasetSpec, factor: float) -> Any | None:
         return None
 
 
-def _with_longer_steps(spec: DatasetSpec, factor: int) -> Any | None:
-    """Return the solver with frames ``factor`` times as long. Its substeps may grow as much, up to a distance of one cell per substep.
+def _with_longer_steps(solver: Any, factor: int) -> Any | None:
+    """Return a solver with frames ``factor`` times as long. Its substeps may grow as much, up to a distance of one cell per substep.
 
     Return None for a solver without a grid, whose substeps are already as long as is stable.
     """
-    solver: Any = spec.solver
     if getattr(solver, "grid_spacing", None) is None:
         return None
     return replace(solver, frame_dt=factor * solver.frame_dt, cfl=min(1.0, factor * solver.cfl))
@@ -524,13 +527,18 @@ def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
         points = _points(records, case)
         panels = {}
         for horizon in points[0].mse:
-            lines: dict[str, list[tuple[float, float]]] = {"solver, coarser to the left": [], "solver, longer steps": []}
+            lines: dict[str, list[tuple[float, float]]] = {
+                "solver, coarser to the left": [],
+                "solver, longer steps": [],
+                "solver, both": [],
+            }
             marks: dict[str, list[tuple[float, float]]] = {}
             for point in points:
                 place = point.cost, point.error(horizon)
                 if point.family == "solver":
-                    for label, others in zip(lines, (STEPS, SPACING), strict=True):
-                        if others not in point.name:
+                    is_coarser, has_longer_steps = SPACING in point.name, STEPS in point.name
+                    for label, belongs in zip(lines, (not has_longer_steps, not is_coarser, is_coarser and has_longer_steps), strict=True):
+                        if belongs:
                             lines[label].append(place)
                 elif point.family == "learned":
                     kind = point.name.partition(" ")[0] + (", repeated" if REPEATED in point.name else "")

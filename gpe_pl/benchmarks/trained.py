@@ -18,7 +18,8 @@ DEPTHS = ("num_message_passing_steps", "num_propagation_steps", "num_convolution
 """Names that models give to their number of layers."""
 
 
-LENGTHS = ("training.num_steps", "training.val_interval", "training.budget_minutes")
+NOT_IN_LABELS = ("training.num_steps", "training.val_interval", "training.budget_minutes", "training.num_val_rollouts")
+"""Settings of training that no label names: its length, and how often and on what it is validated."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +57,8 @@ def of_stored_frames(checkpoint: Path | str) -> LearnedSimulator:
 def trained_on(spec: DatasetSpec, runs: Iterable[Run], with_strides: bool = False) -> dict[str, tuple[LearnedSimulator, Run]]:
     """Return simulators that were trained on a data set of this name and size, and their runs, by label.
 
-    A label names the model, its stride if that is not 1, and the settings of training and graph in which its runs differ. The length of training is no part of
-    it. Of runs with the same label, such as runs with other seeds, the first is returned.
+    A label names the model, its stride if that is not 1, and the settings of training and graph in which its runs differ, without those in
+    ``NOT_IN_LABELS``. Of runs with the same label, such as runs with other seeds, the first is returned.
 
     Args:
         spec: the data set.
@@ -77,7 +78,7 @@ def trained_on(spec: DatasetSpec, runs: Iterable[Run], with_strides: bool = Fals
     found: dict[str, tuple[LearnedSimulator, Run]] = {}
     for label, members in same.items():
         these = [run for _, run in members]
-        axes = [axis for axis in axes_of(these) if axis.startswith(("training.", "graph.")) and axis not in LENGTHS]
+        axes = [axis for axis in axes_of(these) if axis.startswith(("training.", "graph.")) and axis not in NOT_IN_LABELS]
         axes = [axis for axis in axes if all(run.config.get(axis) is not None for run in these)]  # others follow from these
         for simulator, run in members:
             differences = [f"{axis.rpartition('.')[2]}={run.config.get(axis)}" for axis in axes]

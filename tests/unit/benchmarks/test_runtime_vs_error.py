@@ -140,6 +140,7 @@ def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
     assert {DATA, "GPE 1 × 8", "ballistic", "stops at walls", "constant velocity"} < set(by_name)
     assert by_name[DATA].error("10") < by_name["solver, spacing × 2"].error("10") < by_name["constant velocity"].error("10")
     assert by_name[DATA].error("10") < by_name["solver, steps × 2"].error("10") < by_name["constant velocity"].error("10")
+    assert by_name["solver, steps × 2"].error("10") < by_name["solver, spacing × 2, steps × 2"].error("10")
     assert all(p.cost > 0 and set(p.mse) == {"10", "full"} for p in points)
     assert by_name["GPE 1 × 8"].overhead > 60.0
     assert np.isfinite(order)
@@ -180,10 +181,10 @@ def test_longer_steps_are_as_many_frames_and_what_lies_between_is_interpolated()
 
 def test_solvers_on_a_grid_have_longer_steps_up_to_a_cell() -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
-    longer = _with_longer_steps(spec, 4)
+    longer = _with_longer_steps(spec.solver, 4)
     assert longer is not None
     assert (longer.frame_dt, longer.cfl) == (4 * spec.solver.frame_dt, 1.0)
-    assert _with_longer_steps(dataset_spec(compose("simulate", "data=fem", "size=tiny")), 4) is None
+    assert _with_longer_steps(dataset_spec(compose("simulate", "data=fem", "size=tiny")).solver, 4) is None
 
 
 def test_every_model_also_repeats_its_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
