@@ -150,10 +150,10 @@ def ensure_split(cfg: DictConfig, split: str) -> Path:
 
 
 def evaluated_config(cfg: DictConfig) -> DictConfig:
-    """Return the config with the evaluated data: those of training, changed by ``evaluation.data``."""
+    """Return the config with the evaluated data: those of training, changed by ``evaluation.data``, if that is not null."""
     from omegaconf import OmegaConf
 
-    merged: Any = OmegaConf.merge(cfg, {"data": cfg.evaluation.data})
+    merged: Any = OmegaConf.merge(cfg, {"data": cfg.evaluation.data or {}})
     return merged
 
 
