@@ -19,7 +19,7 @@ DEPTHS = ("num_message_passing_steps", "num_propagation_steps", "num_convolution
 
 
 NOT_IN_LABELS = ("training.num_steps", "training.val_interval", "training.budget_minutes", "training.num_val_rollouts")
-"""Settings of training that no label names: its length, and how often and on what it is validated."""
+"""No label names these settings, which say how long training takes, and how often and on what it is validated."""
 
 
 @dataclass(frozen=True)

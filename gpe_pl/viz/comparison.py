@@ -121,7 +121,7 @@ class CostAndError:
     """Content of a panel, by label; infinite errors are left out.
 
     Attributes:
-        lines: costs and errors that form a line, such as the resolutions of a solver.
+        lines: costs and errors that form a line, such as the resolutions of a solver. Every third one is drawn without the line.
         marks: separate costs and errors. Marks have one colour if their labels agree up to the first comma; those with a comma are hollow.
         levels: errors without a cost.
     """
@@ -145,7 +145,7 @@ def cost_error_figure(panels: Mapping[str, CostAndError], x_label: str, y_label:
     for axes, (title, panel) in zip(all_axes, panels.items(), strict=True):
         axes.set_xscale("log")
         axes.set_yscale("log")
-        for style, (label, points) in zip(("s-", "D--"), panel.lines.items(), strict=False):
+        for style, (label, points) in zip(itertools.cycle(("s-", "D--", "^")), panel.lines.items(), strict=False):
             shown = sorted(p for p in points if np.isfinite(p[1]))
             axes.plot([c for c, _ in shown], [e for _, e in shown], style, markersize=3.5, linewidth=1, color="0.3", label=label)
         colors = {name: PALETTE[k % len(PALETTE)] for k, name in enumerate(dict.fromkeys(label.partition(",")[0] for label in panel.marks))}

@@ -211,6 +211,8 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
         point("exact model", 9.0, 1e-5, "learned"),
         point("careless model", 0.1, 5e-2, "learned"),
         point("ballistic", 0.01, 0.1, "trivial"),
+        point("solver, spacing × 2, steps × 2", 0.4, 1.1e-2),
+        point("solver, spacing × 2, steps × 4", 0.3, 1.2e-2),
     ]
     for p in points:
         p.distance = [1e-3]
@@ -224,7 +226,7 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
     assert "@full: **below the solver's curve**: model, exact model." in table
     assert "order of convergence is 1.3" in table
     axes = figures(records)["cost_error_sand"].axes[0]
-    labels = ["solver, coarser to the left", "solver, longer steps", "model", "slow", "exact", "careless", "ballistic"]
+    labels = ["solver, coarser to the left", "solver, longer steps", "solver, both", "model", "slow", "exact", "careless", "ballistic"]
     assert axes.get_title() == "all frames" and [line.get_label() for line in axes.lines] == labels
 
 
