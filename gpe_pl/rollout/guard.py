@@ -185,10 +185,8 @@ def _depth_through(shapes: tuple[Shape, ...], start: np.ndarray, way: np.ndarray
     found, inside = np.zeros(len(start)), np.zeros((len(deep), count + 1), bool)
     inside[:, 1:-1] = depth[:, deep].T > 0
     change = np.diff(inside.astype(np.int8), axis=1)
-    (number, before), (_, last) = (
-        np.nonzero(change == 1),
-        np.nonzero(change == -1),
-    )  # of each stretch inside: its way, the sample before it, its last sample
+    # of each stretch inside: number of its way, the sample before it, its last sample
+    (number, before), (_, last) = np.nonzero(change == 1), np.nonzero(change == -1)
     enters, leaves = (
         _normals_at_surface(shapes, start[deep[number]], way[deep[number]], out / count, within / count)
         for out, within in ((before, before + 1), (last + 1, last))

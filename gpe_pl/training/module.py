@@ -75,7 +75,7 @@ class TrainingModule(L.LightningModule):
         warmup_steps: steps of linear warm-up in the ``cosine`` schedule.
         loss: ``square``, ``log`` or ``root``: how errors of normalised accelerations count; see ``loss_terms.penalty``. Stress always has the squared error.
         stress_weight: weight of the mean squared error of the normalised stress, relative to that of the acceleration; used if the model decodes a stress.
-        neighbor_weight: c in the weight exp(−c n/n̄) of the acceleration of a node with n neighbours; see ``errors.num_neighbors``. None weights all alike.
+        neighbor_weight: c in the weight exp(−c n/n̄) of the acceleration of a node with n neighbours; see ``loss_terms.num_neighbors``. None weights all alike.
         mean_neighbors: n̄, the mean number of neighbours of a node in the training data.
         compile: whether to apply ``torch.compile`` to the model. ``auto`` compiles if the run is long enough, the model has no fused passes for the device
             (``is_fused``, on a CPU) and a C++ compiler is found.
