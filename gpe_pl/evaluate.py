@@ -26,7 +26,8 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     A split that is missing is generated first. The first printed line says which acceptance checks the model fails, or that it was not checked.
     """
     from gpe_pl.config.datasets import check_material_controls, ensure_split, evaluated_config, material_controls, scene_metadata, stride_of
-    from gpe_pl.evaluation.rollouts import EvaluationSettings, evaluate
+    from gpe_pl.evaluation.rollouts import evaluate
+    from gpe_pl.evaluation.settings import EvaluationSettings
     from gpe_pl.files.names import run_name
     from gpe_pl.files.run_folder import claim, release, without_orphans
     from gpe_pl.learned.acceptance import headline
@@ -41,9 +42,9 @@ def evaluate_checkpoint(cfg: DictConfig) -> None:
     if not isinstance(cfg.checkpoint, str):
         shipped = f", or a shipped model: {', '.join(names())}" if names() else ""
         raise ConfigError(f"checkpoint={cfg.checkpoint!r}: name the folder of a run, such as runs/sand, or a checkpoint{shipped}")
-    settings = construct(
-        EvaluationSettings, {**{k: v for k, v in cfg.evaluation.items() if k != "data"}, "splits": [cfg.split]}, "evaluation"
-    )
+    if cfg.evaluation.data or list(cfg.evaluation.splits) != [cfg.split]:
+        raise ConfigError("evaluation.data, evaluation.splits: are keys of fit; evaluate takes data=… and split=…, one split in each run")
+    settings = construct(EvaluationSettings, {k: v for k, v in cfg.evaluation.items() if k != "data"}, "evaluation")
     check_material_controls(cfg, settings)
     device = set_up(construct(TrainerSettings, cfg.trainer, "trainer"))
     simulator = LearnedSimulator.from_checkpoint(cfg.checkpoint, device)

@@ -15,7 +15,7 @@ from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.config.entry_point import ConfigError
 from gpe_pl.data.ground_truth import trajectory_metadata
 from gpe_pl.evaluate import evaluate_checkpoint
-from gpe_pl.evaluation.rollouts import Row, read_rows
+from gpe_pl.evaluation.metric_rows import Row, read_rows
 from gpe_pl.files.run_folder import RunError
 from gpe_pl.fit import fit
 from gpe_pl.graphs.builder import GraphBuilder
@@ -161,6 +161,12 @@ def test_film_and_model_are_exported_on_request(tiny_data: Path, tmp_path: Path)
 def test_an_unknown_format_is_refused(tiny_data: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"evaluation\.export\.0='vtu': input should be 'vtk', 'npz', 'mp4' or 'model'"):
         evaluate(tiny_data, tmp_path, "x.ckpt", "evaluation.export=[vtu]")
+
+
+@pytest.mark.parametrize("key", ["evaluation.splits=[test,test_unseen]", "+evaluation.data.scene=column"])
+def test_keys_of_fit_are_refused(key: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"evaluation\.splits: are keys of fit; evaluate takes data=… and split=…"):
+        evaluate(tmp_path, tmp_path, "sand", key)
 
 
 def test_a_summary_has_a_line_per_metric_and_a_column_per_horizon() -> None:
