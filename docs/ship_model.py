@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gpe_pl.evaluation.rollouts import LEARNED, Row, read_rows
+from gpe_pl.evaluation.metric_rows import LEARNED, Row, read_rows
 from gpe_pl.learned import acceptance
 from gpe_pl.learned.pretrained import FOLDER
 from gpe_pl.learned.simulator import LearnedSimulator

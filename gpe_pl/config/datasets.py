@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from gpe_pl.data.ground_truth import DatasetSpec
     from gpe_pl.evaluation.material_controls import MaterialControls
-    from gpe_pl.evaluation.rollouts import EvaluationSettings
+    from gpe_pl.evaluation.settings import EvaluationSettings
     from gpe_pl.trajectory.trajectory import Metadata
 
 IMPORTED = "imported"

@@ -25,7 +25,9 @@ from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.dataset import every, open_split, window_counts
 from gpe_pl.data.sampling import BatchSize
-from gpe_pl.evaluation.rollouts import LEARNED, EvaluationSettings, evaluate, means, read_rows
+from gpe_pl.evaluation.metric_rows import LEARNED, means, read_rows
+from gpe_pl.evaluation.rollouts import evaluate
+from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError, claim, without_tables
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.pretrained import fingerprint

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from gpe_pl.evaluation.rollouts import StartError, start_of
+from gpe_pl.evaluation.predictions import start_of
+from gpe_pl.evaluation.settings import StartError
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.metrics.mirror import equivariance_error
 from gpe_pl.rollout.containment import Contained

@@ -19,7 +19,7 @@ import pandas as pd
 
 from gpe_pl.errors import GpeError
 from gpe_pl.evaluation.horizons import time_of
-from gpe_pl.evaluation.rollouts import LEARNED
+from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.files.atomic import replace_text, replacing
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import Interval, bootstrap_interval, bootstrap_ratio, median_of_means

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from gpe_pl.evaluation.metric_rows import LEARNED, MetricsError, Row, read_rows
 from gpe_pl.evaluation.rollout_cost import read_cost
-from gpe_pl.evaluation.rollouts import LEARNED, MetricsError, Row, read_rows
 from gpe_pl.files.run_folder import DATA_CHECKSUMS, RunError, config_in
 from gpe_pl.reports import run_archive
 
@@ -36,7 +36,7 @@ class Run:
     Attributes:
         folder: folder of the run; for an archived run, the folder before archiving.
         config: values of the configuration by keys such as ``training.num_steps``.
-        rows: metrics: a table with the fields of ``evaluation.rollouts.Row`` as columns.
+        rows: metrics: a table with the fields of ``evaluation.metric_rows.Row`` as columns.
         data: checksums of the data, by key of the configuration.
         curve: validation curve of an archived run; None if it is in the run's folder (see ``validation_curve``).
         cost: processor time of rollouts per simulated second (see ``evaluation.rollout_cost``); None if it was not measured.

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, label_of
-from gpe_pl.evaluation.rollouts import LEARNED
+from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import Interval, bootstrap_ratio, median_of_means
 from gpe_pl.reports.finished_runs import Run, Values, rollout_errors, shared_table, shared_trajectories, values_by_seed

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gpe_pl.evaluation.rollouts import LEARNED
+from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.reports.finished_runs import Run, rollout_errors
 from gpe_pl.schema import MATERIALS
 

@@ -7,7 +7,7 @@ from itertools import compress
 import numpy as np
 
 from gpe_pl.evaluation.horizons import FULL, time_of
-from gpe_pl.evaluation.rollouts import LEARNED
+from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import bootstrap_ratio
 from gpe_pl.reports.finished_runs import Run, shared_table, shared_trajectories, splits_of, values_by_seed

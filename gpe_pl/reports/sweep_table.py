@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from gpe_pl.evaluation.horizons import time_of
-from gpe_pl.evaluation.rollouts import EXACT, LEARNED, read_rows
+from gpe_pl.evaluation.metric_rows import EXACT, LEARNED, read_rows
 from gpe_pl.files import sealed
 from gpe_pl.files.atomic import replace_text, replacing
 from gpe_pl.files.markdown import table_row

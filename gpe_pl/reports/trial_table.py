@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from gpe_pl.evaluation.rollouts import LEARNED
+from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.files.atomic import replace_text, replacing
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import BOTH, bootstrap_interval, median_of_means

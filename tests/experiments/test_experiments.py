@@ -12,7 +12,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from gpe_pl.config.folder import CONF
-from gpe_pl.evaluation.rollouts import read_rows
+from gpe_pl.evaluation.metric_rows import read_rows
 from gpe_pl.files.run_folder import without_tables
 from gpe_pl.fit import fit
 from tests.runs import compose, first_choices, tiny

@@ -21,7 +21,7 @@ from gpe_pl.config.folder import CONF
 from gpe_pl.convert import convert
 from gpe_pl.data.importers import ImportFailure, save_dataset
 from gpe_pl.evaluate import evaluate_checkpoint
-from gpe_pl.evaluation.rollouts import read_rows
+from gpe_pl.evaluation.metric_rows import read_rows
 from gpe_pl.fit import fit
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.trajectory.store import StoreError

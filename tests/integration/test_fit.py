@@ -24,7 +24,8 @@ from gpe_pl.data import sampling
 from gpe_pl.data.datamodule import TrajectoryDataModule
 from gpe_pl.data.noise import NoiseError
 from gpe_pl.errors import GpeError
-from gpe_pl.evaluation.rollouts import StartError, read_rows, write_rows
+from gpe_pl.evaluation.metric_rows import read_rows, write_rows
+from gpe_pl.evaluation.settings import StartError
 from gpe_pl.files.run_folder import RunError, claim
 from gpe_pl.fit import fit
 from gpe_pl.learned.simulator import LearnedSimulator

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from gpe_pl.config.launcher import ProcessLauncher, default_processes
-from gpe_pl.evaluation.rollouts import read_rows
+from gpe_pl.evaluation.metric_rows import read_rows
 from gpe_pl.trajectory.store import iter_trajectories
 from tests.runs import DATA, RUN
 

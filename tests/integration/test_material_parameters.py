@@ -10,7 +10,7 @@ import torch
 from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.data.generation import generate
 from gpe_pl.data.validate import validate
-from gpe_pl.evaluation.rollouts import read_rows
+from gpe_pl.evaluation.metric_rows import read_rows
 from gpe_pl.export.program import scene_of
 from gpe_pl.fit import fit
 from gpe_pl.learned.simulator import LearnedSimulator

@@ -12,7 +12,10 @@ import torch
 from gpe_pl.config.datasets import dataset_spec
 from gpe_pl.evaluation import rollouts
 from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, ControlError, MaterialControls, label_of
-from gpe_pl.evaluation.rollouts import EvaluationSettings, Row, evaluate, start_of
+from gpe_pl.evaluation.metric_rows import Row
+from gpe_pl.evaluation.predictions import start_of
+from gpe_pl.evaluation.rollouts import evaluate
+from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -27,7 +30,7 @@ SETTINGS = EvaluationSettings(splits=["test", "test_unseen"], horizons=[0.025], 
 
 @pytest.fixture(autouse=True)
 def _without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rollouts, "_error_curve", lambda *_: None)
+    monkeypatch.setattr(rollouts, "write_error_curve", lambda *_: None)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +91,7 @@ def test_pictured_scenes_are_at_three_values_in_ascending_order(controls: Materi
 
 
 def test_controls_give_a_picture_of_three_values(controls: MaterialControls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rollouts, "_pictures", lambda *_: None)
+    monkeypatch.setattr(rollouts, "write_pictures", lambda *_: None)
     evaluate(simulator(controls.root, "affine"), controls.root, replace(SETTINGS, num_pictures=1), tmp_path, controls=controls)
     assert [path.name for path in tmp_path.glob("*.png")] == ["parameters_test_unseen_00.png"]
 

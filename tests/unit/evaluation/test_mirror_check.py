@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gpe_pl.evaluation.mirror_check import mirror_equivariance_error
-from gpe_pl.evaluation.rollouts import StartError
+from gpe_pl.evaluation.settings import StartError
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator

@@ -12,16 +12,10 @@ import numpy as np
 import pytest
 
 from gpe_pl.evaluation.horizons import labels, time_of
-from gpe_pl.evaluation.rollouts import (
-    EvaluationSettings,
-    MetricsError,
-    Row,
-    StartError,
-    _fraction_outside,
-    _parameter,
-    read_rows,
-    write_rows,
-)
+from gpe_pl.evaluation.metric_rows import MetricsError, Row, read_rows, write_rows
+from gpe_pl.evaluation.predictions import _fraction_outside
+from gpe_pl.evaluation.rollouts import _parameter
+from gpe_pl.evaluation.settings import EvaluationSettings, StartError
 from gpe_pl.trajectory.trajectory import Termination, Trajectory
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from gpe_pl.benchmarks.faults.side_files import raw_arrays
 from gpe_pl.data.importers import ImportFailure, ImportSettings, import_dataset
-from gpe_pl.evaluation.rollouts import MetricsError, read_rows
+from gpe_pl.evaluation.metric_rows import MetricsError, read_rows
 from gpe_pl.files import regular_files, sealed
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes in folders")

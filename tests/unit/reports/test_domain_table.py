@@ -12,7 +12,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from gpe_pl.config.entry_point import Report
-from gpe_pl.evaluation.rollouts import LEARNED, Row, read_rows, write_rows
+from gpe_pl.evaluation.metric_rows import LEARNED, Row, read_rows, write_rows
 from gpe_pl.files import sealed
 from gpe_pl.reports import domain_table
 from gpe_pl.reports.domain_table import TableError, compares_models, report_domains

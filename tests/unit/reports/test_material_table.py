@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, label_of
-from gpe_pl.evaluation.rollouts import LEARNED, Row, write_rows
+from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
 from gpe_pl.files import sealed
 from gpe_pl.reports import sweep_table
 from gpe_pl.reports.domain_table import report_domains

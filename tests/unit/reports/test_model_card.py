@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-from gpe_pl.evaluation.rollouts import LEARNED, Row
+from gpe_pl.evaluation.metric_rows import LEARNED, Row
 from gpe_pl.learned.simulator import LearnedSimulator
 
 

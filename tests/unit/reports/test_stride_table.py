@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
 from gpe_pl.evaluation.rollout_cost import Timed, read_cost, write_cost
-from gpe_pl.evaluation.rollouts import LEARNED, Row, write_rows
 from gpe_pl.files import sealed
 from gpe_pl.reports import sweep_table
 from gpe_pl.reports.finished_runs import archive, finished_runs

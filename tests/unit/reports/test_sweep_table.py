@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from gpe_pl.evaluation.rollouts import LEARNED, MetricsError, Row, read_rows, write_rows
+from gpe_pl.evaluation.metric_rows import LEARNED, MetricsError, Row, read_rows, write_rows
 from gpe_pl.files import sealed
 from gpe_pl.files.run_folder import RunError
 from gpe_pl.reports import sweep_table

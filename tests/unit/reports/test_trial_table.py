@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gpe_pl.evaluation.rollouts import LEARNED, Row, write_rows
+from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
 from gpe_pl.files import sealed
 from gpe_pl.reports.finished_runs import finished_runs
 from gpe_pl.reports.trial_table import compares_settings, report_trials

@@ -21,7 +21,9 @@ from gpe_pl.data.importers.source import SMALLEST, number
 from gpe_pl.data.noise import Noise
 from gpe_pl.data.sampling import BatchSize
 from gpe_pl.evaluation import rollouts
-from gpe_pl.evaluation.rollouts import EvaluationSettings, Row, evaluate
+from gpe_pl.evaluation.metric_rows import Row
+from gpe_pl.evaluation.predictions import start_of
+from gpe_pl.evaluation.settings import EvaluationSettings
 from gpe_pl.geometry.shapes import Box, Shape, Sphere, domain_walls
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
@@ -130,7 +132,7 @@ def trained(folder: Path, root: Path, length: float, time: float) -> tuple[list[
     best = train(module, datamodule, settings, TrainerSettings(progress=False), [CSVLogger(root, name="log")], root)
     step = torch.load(best, weights_only=True)["global_step"]
     evaluation = EvaluationSettings(["test"], [3 * FRAME_DT * time, 8 * FRAME_DT * time], num_pictures=0)
-    rows = evaluate(LearnedSimulator.from_checkpoint(best), datamodule.root, evaluation, root)
+    rows = rollouts.evaluate(LearnedSimulator.from_checkpoint(best), datamodule.root, evaluation, root)
     return module.losses, step, rows
 
 
@@ -141,7 +143,7 @@ def in_metres(folder: Path) -> tuple[list[float], int, list[Row]]:
 
 @pytest.fixture(autouse=True)
 def _without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rollouts, "_error_curve", lambda *_: None)
+    monkeypatch.setattr(rollouts, "write_error_curve", lambda *_: None)
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +221,7 @@ def test_limits_of_evaluated_rollouts_follow_the_scene(still: bool, folder: Path
         if still:
             trajectory = replace(trajectory, pos=np.repeat(trajectory.pos[:1], NUM_FRAMES, axis=0), vel=np.zeros_like(trajectory.vel))
         simulator = new_module(datamodule, "GPE").simulator
-        guard = rollouts.start_of(simulator, 2, trajectory, trajectory.frames(2)).guard
+        guard = start_of(simulator, 2, trajectory, trajectory.frames(2)).guard
         assert guard is not None
         guards.append(guard)
     usual, scaled = guards

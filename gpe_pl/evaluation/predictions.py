@@ -1,0 +1,187 @@
+"""Rolls out the scenes of a split: with the learned simulator, with controls, and with the trivial baselines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.data.dataset import long_enough
+from gpe_pl.evaluation.material_controls import UNSEEN, AtValue, MaterialControls, label_of
+from gpe_pl.evaluation.metric_rows import EXACT
+from gpe_pl.evaluation.rollout_cost import Timed
+from gpe_pl.evaluation.settings import EvaluationSettings
+from gpe_pl.geometry.shapes import surface_tolerance
+from gpe_pl.learned.approximate import approximate
+from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.metrics import per_frame_mse
+from gpe_pl.rollout.baselines import BASELINES
+from gpe_pl.rollout.containment import Contained
+from gpe_pl.rollout.guard import Guard
+from gpe_pl.rollout.loop import Simulator, Start, fraction_outside, rollout, rollouts
+from gpe_pl.schema import RADIUS, Split
+from gpe_pl.trajectory.state import State
+from gpe_pl.trajectory.trajectory import Trajectory
+
+MAX_SPEED_FACTOR = 20.0
+"""A learned rollout has exploded if a particle's speed exceeds this factor times a reference speed. The reference is the speed of the fastest particle of the
+ground truth, or the speed that crosses the domain within the trajectory if that is larger."""
+SCENES_AT_ONCE = 16
+"""Number of scenes, or windows, in one pass of the model."""
+
+
+@dataclass(frozen=True)
+class PredictedScene:
+    """A scene of a split after its rollouts.
+
+    Attributes:
+        trajectory: the stored scene, with the frames before the start.
+        truth: the ground truth from the start on.
+        predictions: rollouts by model.
+        counts: metrics of the learned rollout that need more than its positions, by name (see ``rollouts.evaluate``).
+        solver_runs: runs of the solver with other parameters, by label, each with the trajectory that it is compared with.
+        at_values: the scene at three values of its parameters, if a picture shows them; else empty.
+    """
+
+    trajectory: Trajectory
+    truth: Trajectory
+    predictions: dict[str, Trajectory]
+    counts: dict[str, float]
+    solver_runs: dict[str, tuple[Trajectory, Trajectory]]
+    at_values: list[AtValue]
+
+
+@dataclass
+class Predictor:
+    """Rolls scenes out.
+
+    Attributes:
+        simulator: trained simulator.
+        settings: what to evaluate.
+        label: name of the model.
+        controls: prepared controls of scenes with unseen parameters.
+        stride: number of stored frames in a frame of the simulator.
+        start_frame: frame at which rollouts start.
+        seconds: processor times of the steps so far [s].
+    """
+
+    simulator: LearnedSimulator
+    settings: EvaluationSettings
+    label: str
+    controls: MaterialControls | None
+    stride: int
+    start_frame: int
+    seconds: list[float]
+
+    def scenes(self, root: Path, split: Split) -> Iterator[PredictedScene]:
+        """Yield the first ``settings.num_trajectories`` scenes of a split, in its order."""
+        trajectories = islice(long_enough(root, split, self.start_frame, self.stride), self.settings.num_trajectories)
+        controls = self.controls if split == UNSEEN else None
+        first = 0
+        while batch := list(islice(trajectories, SCENES_AT_ONCE)):
+            yield from self._batch(batch, first, controls)
+            first += len(batch)
+
+    def _batch(self, trajectories: list[Trajectory], first: int, controls: MaterialControls | None) -> Iterator[PredictedScene]:
+        """Roll several scenes out at once. ``first`` is the number of the first one in its split."""
+        truths = [trajectory.frames(self.start_frame) for trajectory in trajectories]
+        starts = [start_of(self.simulator, self.start_frame, *pair) for pair in zip(trajectories, truths, strict=True)]
+        totals = [{"num_corrected": 0.0, "num_asleep": 0.0, "lost_impulse": 0.0} for _ in starts]
+
+        def count(scene: int, _: int, state: State) -> None:
+            for name in totals[scene]:
+                totals[scene][name] += getattr(state, name)
+
+        def within_walls(inner: Simulator) -> Simulator:
+            return Contained(inner, truths[0].metadata.frame_dt) if self.settings.containment else inner
+
+        runner = approximate(self.simulator)
+        predicted = rollouts(Timed(within_walls(runner), self.seconds), starts, count)
+        free = self._uncontained(runner, starts, first) if self.settings.containment else predicted
+        exact = None if runner is self.simulator else rollouts(within_walls(self.simulator), starts)
+        others = None if controls is None else controls.predictions(within_walls(runner), starts, first)
+        for scene, (trajectory, truth) in enumerate(zip(trajectories, truths, strict=True)):
+            prediction, number = predicted[scene], first + scene
+            predictions = {self.label: prediction} if exact is None else {self.label: prediction, EXACT: exact[scene]}
+            for name, baseline in BASELINES.items():
+                start = trajectory.state(self.start_frame, self.start_frame)
+                predictions[name] = rollout(baseline(truth.metadata.frame_dt), start, truth.num_frames - 1, truth.metadata)
+            if others is not None:
+                predictions |= {label_of(self.label, control): other for control, other in others[scene].items()}
+            counts = self._counts(trajectory, truth, prediction, free[scene] if scene < len(free) else None, totals[scene])
+            if exact is not None:
+                counts |= _cost_of_skipping(prediction, exact[scene], totals[scene])
+            at_values: list[AtValue] = []
+            if controls is not None and number < self.settings.num_pictures:
+                at_values = controls.at_three_values(within_walls(runner), starts[scene], number, truth, prediction)
+            solver_runs = {} if controls is None else controls.solver_runs(number, truth)
+            yield PredictedScene(trajectory, truth, predictions, counts, solver_runs, at_values)
+
+    def _uncontained(self, runner: Simulator, starts: list[Start], first: int) -> list[Trajectory]:
+        """Roll out those of the scenes without containment that ``settings.num_uncontained`` includes."""
+        wanted = self.settings.num_uncontained
+        return rollouts(runner, starts if wanted is None else starts[: max(0, wanted - first)])
+
+    def _counts(
+        self, trajectory: Trajectory, truth: Trajectory, prediction: Trajectory, free: Trajectory | None, totals: dict[str, float]
+    ) -> dict[str, float]:
+        """Return counts of a learned rollout. ``free`` is the rollout without containment, if there is one."""
+        counts = {"num_good_frames": float(prediction.num_frames - 1), "edges_per_node": _edges_per_node(self.simulator, trajectory)}
+        if truth.boundary.shapes:  # a boundary of nodes alone has no inside
+            steps = truth.num_frames - 1
+            counts["fraction_outside_at_end"] = _fraction_outside(
+                prediction, steps, steps, tolerance=surface_tolerance(truth.boundary.shapes)
+            )
+            counts["fraction_corrected"] = totals["num_corrected"] / _particle_steps(prediction)
+            if free is not None:
+                counts["fraction_outside_uncontained"] = _fraction_outside(free, 1, steps, tolerance=1e-3 * truth.metadata.spacing)
+        return counts
+
+
+def start_of(simulator: LearnedSimulator, start_frame: int, trajectory: Trajectory, truth: Trajectory) -> Start:
+    """Return the start of a rollout, with a guard whose limits are far beyond the ground truth."""
+    bounds = truth.metadata.bounds
+    size = max(high - low for low, high in bounds)
+    across = size / (trajectory.num_frames * truth.metadata.frame_dt)  # the reference where everything rests
+    speed = float(np.linalg.norm(trajectory.vel, axis=-1).max(initial=0.0))
+    guard = Guard(max_speed=MAX_SPEED_FACTOR * max(speed, across), bounds=bounds, margin=size, spacing=truth.metadata.spacing)
+    return Start(simulator.initial_state(trajectory, start_frame), truth.num_frames - 1, truth.metadata, guard)
+
+
+def _cost_of_skipping(prediction: Trajectory, exact: Trajectory, totals: dict[str, float]) -> dict[str, float]:
+    """Return what approximate levels change in a rollout, and how much they skip."""
+    shared = prediction.frames(0, min(prediction.num_frames, exact.num_frames))
+    return {
+        "skipping_mse": float(per_frame_mse(shared, exact)[1:].mean()),
+        "fraction_asleep": totals["num_asleep"] / _particle_steps(prediction),
+        "lost_impulse": totals["lost_impulse"],
+    }
+
+
+def _particle_steps(prediction: Trajectory) -> int:
+    return prediction.num_nodes * max(1, prediction.num_frames - 1)
+
+
+def _edges_per_node(simulator: LearnedSimulator, trajectory: Trajectory) -> float:
+    """Return the number of edges within the radius over that of dynamic nodes, in the graph of the middle frame of a trajectory."""
+    history = simulator.builder.config.history
+    graph = simulator.builder(trajectory.state(max(history, trajectory.num_frames // 2), history).to_torch())
+    edges = (graph[relation].edge_index.shape[1] for relation in simulator.builder.spec.relations if relation[1] == RADIUS)
+    return sum(edges) / trajectory.num_nodes
+
+
+def _fraction_outside(prediction: Trajectory, first: int, last: int, tolerance: float) -> float:
+    """Return the fraction of particle-frames that are inside a wall or obstacle in frames ``first … last``.
+
+    All particles of the frames that a stopped rollout lacks count as inside.
+
+    Args:
+        prediction: rollout; frame 0 is its start.
+        first, last: frames.
+        tolerance: depth [m] up to which a particle is not counted.
+    """
+    wanted, good = last - first + 1, prediction.frames(first, last + 1)
+    return (fraction_outside(good, tolerance) * good.num_frames + wanted - good.num_frames) / wanted

@@ -1,0 +1,80 @@
+"""Pictures, animations, viewers and exports of an evaluated scene."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+
+from gpe_pl.errors import GpeError
+from gpe_pl.evaluation.material_controls import AtValue
+from gpe_pl.evaluation.metric_rows import LEARNED
+from gpe_pl.evaluation.settings import Export
+from gpe_pl.trajectory.trajectory import Trajectory
+from gpe_pl.viz.saving import save_figure
+
+VIEWER_BYTES = 2**26
+"""Maximum size of a viewer's arrays before compression [bytes]; the viewer of a longer rollout skips frames."""
+
+
+class ExportError(GpeError):
+    """Raised when a requested export cannot be written; the message says what is missing."""
+
+
+def check_formats(formats: list[Export]) -> None:
+    """Check, before any rollout, that the formats can be written.
+
+    Raises:
+        ExportError: a format needs a package that is not installed.
+    """
+    if "mp4" in formats and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ExportError(
+            "evaluation.export: mp4 needs imageio-ffmpeg: `pip install imageio-ffmpeg`, or leave it out (a GIF is always written)"
+        )
+
+
+def write_pictures(run_dir: Path, split: str, number: int, truth: Trajectory, predictions: dict[str, Trajectory]) -> None:
+    """Write a figure, an animation and a viewer of a scene to ``run_dir``, and a figure of the stress if all trajectories have one."""
+    from gpe_pl.viz.figures import rollout_figure
+    from gpe_pl.viz.video import write_animation
+    from gpe_pl.viz.viewer import write_viewer
+
+    stem = run_dir / f"rollout_{split}_{number:02d}"
+    save_figure(rollout_figure(truth, predictions), stem.with_suffix(".png"), dpi=150, bbox_inches="tight")
+    if truth.stress is not None and all(p.stress is not None for p in predictions.values()):
+        figure = rollout_figure(truth, predictions, color="von_mises")
+        save_figure(figure, run_dir / f"stress_{split}_{number:02d}.png", dpi=150, bbox_inches="tight")
+    stride = max(1, truth.num_frames // 60)
+    write_animation(stem.with_suffix(".gif"), truth, predictions, fps=20, stride=stride)
+    size = (1 + len(predictions)) * (truth.pos.nbytes + truth.vel.nbytes)
+    write_viewer(stem.with_suffix(".html"), truth, predictions, stride=-(-size // VIEWER_BYTES))
+
+
+def write_parameter_picture(path: Path, scenes: list[AtValue]) -> None:
+    """Draw a scene at several values of its material parameters."""
+    from gpe_pl.viz.figures import parameter_strip
+
+    save_figure(parameter_strip(scenes), path, dpi=150, bbox_inches="tight")
+
+
+def write_exports(run_dir: Path, split: str, number: int, truth: Trajectory, prediction: Trajectory, formats: list[Export]) -> None:
+    """Write the ground truth and the rollout of a scene to ``run_dir``, in those of the formats that hold trajectories."""
+    from gpe_pl.export.trajectories import write_npz, write_vtk
+    from gpe_pl.viz.video import write_animation
+
+    for kind, trajectory in (("ground_truth", truth), ("rollout", prediction)):
+        stem = run_dir / f"{kind}_{split}_{number:02d}"
+        if "vtk" in formats:
+            write_vtk(stem.with_suffix(".pvd"), trajectory, None if trajectory is truth else truth)
+        if "npz" in formats:
+            write_npz(stem.with_suffix(".npz"), trajectory)
+    if "mp4" in formats:
+        write_animation(stem.with_suffix(".mp4"), truth, {LEARNED: prediction}, fps=20, stride=max(1, truth.num_frames // 200))
+
+
+def write_error_curve(path: Path, curves: dict[str, list[np.ndarray]], frame_dt: float) -> None:
+    """Draw the mean error over time. ``curves`` has errors of each frame [m²], by model and scene."""
+    from gpe_pl.viz.figures import error_curve_figure
+
+    save_figure(error_curve_figure(curves, frame_dt), path, dpi=150)
