@@ -204,33 +204,7 @@ def train(
     ]
     if trainer_settings.progress:
         own.append(StepProgress())
-    is_parallel = trainer_settings.num_processes > 1
-    if is_parallel:
-        os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # else Lightning divides all cores between the processes
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    try:
-        trainer = L.Trainer(
-            accelerator=trainer_settings.accelerator,
-            devices=trainer_settings.devices,
-            num_nodes=trainer_settings.num_nodes,
-            strategy=SummedGradients() if is_parallel else "auto",
-            use_distributed_sampler=False,  # the data module's samplers know the ranks
-            max_steps=training.num_steps,
-            max_epochs=-1,
-            val_check_interval=min(training.val_interval, training.num_steps),
-            check_val_every_n_epoch=None,
-            gradient_clip_val=training.gradient_clip,
-            num_sanity_val_steps=0,
-            callbacks=[*own, *callbacks],
-            logger=loggers,
-            log_every_n_steps=min(50, training.num_steps),
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            default_root_dir=run_dir,
-            plugins=[AtomicCheckpoints(), *([SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else [])],
-        )
-    except MisconfigurationException as error:
-        raise RunError(f"trainer.accelerator={trainer_settings.accelerator}, trainer.devices={trainer_settings.devices}: {error}") from None
+    trainer = _trainer(training, trainer_settings, loggers, run_dir, [*own, *callbacks])
     last = checkpoints.last if checkpoints.last.exists() else None
     if last is not None:
         log.info("resuming from %s", last)
@@ -255,6 +229,43 @@ def train(
             f"{error}; {'no checkpoint was saved yet' if saved is None else f'the last good checkpoint is kept: {saved}'}"
         ) from None
     return checkpoints.best
+
+
+def _trainer(
+    training: TrainingSettings, trainer_settings: TrainerSettings, loggers: list[Logger], run_dir: Path, callbacks: list[Callback]
+) -> L.Trainer:
+    """Return Lightning's trainer.
+
+    Raises:
+        RunError: the accelerator or devices are not available.
+    """
+    is_parallel = trainer_settings.num_processes > 1
+    if is_parallel:
+        os.environ.setdefault("OMP_NUM_THREADS", str(torch.get_num_threads()))  # else Lightning divides all cores between the processes
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    try:
+        return L.Trainer(
+            accelerator=trainer_settings.accelerator,
+            devices=trainer_settings.devices,
+            num_nodes=trainer_settings.num_nodes,
+            strategy=SummedGradients() if is_parallel else "auto",
+            use_distributed_sampler=False,  # the data module's samplers know the ranks
+            max_steps=training.num_steps,
+            max_epochs=-1,
+            val_check_interval=min(training.val_interval, training.num_steps),
+            check_val_every_n_epoch=None,
+            gradient_clip_val=training.gradient_clip,
+            num_sanity_val_steps=0,
+            callbacks=callbacks,
+            logger=loggers,
+            log_every_n_steps=min(50, training.num_steps),
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            default_root_dir=run_dir,
+            plugins=[AtomicCheckpoints(), *([SLURMEnvironment(auto_requeue=False)] if SLURMEnvironment.detect() else [])],
+        )
+    except MisconfigurationException as error:
+        raise RunError(f"trainer.accelerator={trainer_settings.accelerator}, trainer.devices={trainer_settings.devices}: {error}") from None
 
 
 def seed(number: int) -> None:
