@@ -3,8 +3,10 @@
 ``python docs/ship_model.py RUN_FOLDER NAME COMMIT 'COMMAND'`` writes weights without the optimiser's state, and a model card whose numbers are the run's
 own, to ``gpe_pl/learned/pretrained``. COMMAND is what trained it, with the code of COMMIT.
 
-``python docs/ship_model.py --acceptance RUN_FOLDER`` takes the results of ``python -m gpe_pl.benchmark suite=acceptance`` on shipped models from the suite's
-folder, stores them beside the checkpoints, and begins the cards with what fails.
+``python docs/ship_model.py --verdicts RUN_FOLDER`` takes the results of ``python -m gpe_pl.benchmark suite=acceptance`` or ``suite=stability size=small`` on
+shipped models from the suite's folder, stores them beside the checkpoints, and begins the cards with what fails.
+
+``python docs/ship_model.py --static-friction NAME FRACTION`` sets the static friction of a shipped model and says so on its card. Run both suites again.
 """
 
 from __future__ import annotations
@@ -16,12 +18,15 @@ from pathlib import Path
 import numpy as np
 
 from gpe_pl.evaluation.metric_rows import LEARNED, Row, read_rows
-from gpe_pl.learned import acceptance
+from gpe_pl.learned import verdicts
 from gpe_pl.learned.pretrained import FOLDER
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.verdicts import Suite
 from gpe_pl.reports.domain_table import EVALUATED, NOT_LEARNED
 from gpe_pl.reports.finished_runs import table_of
 from gpe_pl.reports.sweep_table import summary
+
+REFUSED = "Other frame intervals and spacings are refused."
 
 
 def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows: list[Row], settings: dict[str, object]) -> str:
@@ -32,9 +37,9 @@ def card(name: str, command: str, commit: str, simulator: LearnedSimulator, rows
     training = settings["training"]
     assert isinstance(training, dict)
     lines = [
-        *_opening(name, acceptance.NOT_MEASURED),
+        *_opening(name, verdicts.NOT_MEASURED),
         f"{model} with {size:,} parameters, for {', '.join(metadata.materials)} in {metadata.dim}D: data set `{metadata.dataset}`, "
-        f"frames of {1e3 * metadata.frame_dt:g} ms, nodes {metadata.spacing:.4g} m apart. Other frame intervals and spacings are refused.{_law(simulator)}",
+        f"frames of {1e3 * metadata.frame_dt:g} ms, nodes {metadata.spacing:.4g} m apart. {REFUSED}{_law(simulator)}{_resting(simulator)}",
         "",
         f"Trained with `{command}` (commit {commit}), {training['num_steps']:,} steps of {training['batch_size']} graphs.",
         "",
@@ -58,6 +63,17 @@ def _law(simulator: LearnedSimulator) -> str:
     if not simulator.model.settings.get("elastic"):
         return ""
     return " It is given the form of the solver's elastic law and learned its constants. It cannot be exported as a program, and refuses walls that move."
+
+
+def _resting(simulator: LearnedSimulator) -> str:
+    """Sentence on a model that keeps slow nodes on walls in place."""
+    fraction = simulator.static_friction
+    if not fraction:
+        return ""
+    return (
+        f" Its static friction is {fraction:g}: a node at rest on a wall moves only if the unbalanced part of gravity exceeds this fraction. The errors below "
+        "were measured without it."
+    )
 
 
 def _clamping(settings: dict[str, object]) -> str:
@@ -96,30 +112,52 @@ def _opening(name: str, headline: str) -> list[str]:
     return [f"# {name}", "", f"**{headline[0].upper()}{headline[1:].replace('|', '/').replace('*', '')}.**", ""]
 
 
-def accepted(results: Path) -> None:
-    """Store acceptance results of shipped models beside their checkpoints, and write what fails into their cards.
+def judged(results: Path) -> None:
+    """Store results of suites on shipped models beside their checkpoints, and write what fails into their cards.
 
     Raises:
         SealError: a file of results is damaged.
         ValueError: the results are of another checkpoint.
     """
-    for path in sorted(results.glob(f"*{acceptance.SUFFIX}")):
-        checkpoint = FOLDER / f"{path.name.removesuffix(acceptance.SUFFIX)}.ckpt"
-        measured = acceptance.read(path)
-        if measured.checkpoint != acceptance.checksum(checkpoint):
-            raise ValueError(f"{path}: of another checkpoint than {checkpoint}; run suite=acceptance again")
-        acceptance.write(acceptance.path_beside(checkpoint), measured)
-        about = checkpoint.with_suffix(".md")
-        _, _, rest = about.read_text().partition("\n\n")
-        if rest.startswith("**"):  # the headline of earlier results
-            _, _, rest = rest.partition("\n\n")
-        about.write_text("\n".join([*_opening(checkpoint.stem, acceptance.headline(checkpoint)), rest]))
+    suites: tuple[Suite, ...] = ("acceptance", "stability")
+    for suite in suites:
+        for path in sorted(results.glob(f"*{verdicts.suffix(suite)}")):
+            checkpoint = FOLDER / f"{path.name.removesuffix(verdicts.suffix(suite))}.ckpt"
+            measured = verdicts.read(path)
+            if measured.checkpoint != verdicts.checksum(checkpoint):
+                raise ValueError(f"{path}: of another checkpoint than {checkpoint}; run suite={suite} again")
+            verdicts.write(verdicts.path_beside(checkpoint, suite), measured)
+            _write_headline(checkpoint)
+
+
+def _write_headline(checkpoint: Path) -> None:
+    """Begin the card of a shipped model with what fails."""
+    about = checkpoint.with_suffix(".md")
+    _, _, rest = about.read_text().partition("\n\n")
+    if rest.startswith("**"):  # the headline of earlier results
+        _, _, rest = rest.partition("\n\n")
+    about.write_text("\n".join([*_opening(checkpoint.stem, verdicts.headline(checkpoint)), rest]))
+
+
+def rested(name: str, fraction: float) -> None:
+    """Set the static friction of a shipped model, and say so on its card. The headline is then that of a model which no suite has seen."""
+    checkpoint = FOLDER / f"{name}.ckpt"
+    simulator = LearnedSimulator.from_checkpoint(checkpoint)
+    about = checkpoint.with_suffix(".md")
+    text = about.read_text().replace(_resting(simulator), "") if simulator.static_friction else about.read_text()
+    simulator.static_friction = fraction
+    simulator.save(checkpoint)
+    about.write_text(text.replace(REFUSED, f"{REFUSED}{_resting(simulator)}", 1))
+    _write_headline(checkpoint)
 
 
 def main(arguments: list[str]) -> int:
     """Write checkpoint and card; the exit status."""
-    if arguments[0] == "--acceptance":
-        accepted(Path(arguments[1]))
+    if arguments[0] == "--verdicts":
+        judged(Path(arguments[1]))
+        return 0
+    if arguments[0] == "--static-friction":
+        rested(arguments[1], float(arguments[2]))
         return 0
     run, (name, commit, command) = Path(arguments[0]), arguments[1:]
     simulator = LearnedSimulator.from_checkpoint(run / "checkpoints" / "best.ckpt")

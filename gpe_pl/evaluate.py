@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 def evaluate_checkpoint(cfg: DictConfig) -> None:
     """Roll a trained model out on one split of a data set, and in the data set's showcase if it has one. Results go to ``{paths.runs}/{name}``.
 
-    A split that is missing is generated first. The first printed line says which acceptance checks the model fails, or that it was not checked.
+    A split that is missing is generated first. The first printed line says which acceptance checks and stress tests the model fails.
     """
     from gpe_pl.config.datasets import check_material_controls, ensure_split, evaluated_config, material_controls, scene_metadata, stride_of
     from gpe_pl.evaluation.rollouts import evaluate
     from gpe_pl.evaluation.settings import EvaluationSettings
     from gpe_pl.files.names import run_name
     from gpe_pl.files.run_folder import claim, release, without_orphans
-    from gpe_pl.learned.acceptance import headline
     from gpe_pl.learned.pretrained import names
     from gpe_pl.learned.simulator import LearnedSimulator
+    from gpe_pl.learned.verdicts import headline
     from gpe_pl.reports.sweep_table import conclusion, report_evaluation
     from gpe_pl.rollout.skips import Skips
     from gpe_pl.system.locks import locked

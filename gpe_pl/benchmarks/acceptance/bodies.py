@@ -24,7 +24,7 @@ from gpe_pl.benchmarks.acceptance.trial import (
     shown,
     tried,
 )
-from gpe_pl.learned.acceptance import Check
+from gpe_pl.learned.verdicts import Check
 from gpe_pl.metrics.bodies import Bodies, body_metrics
 from gpe_pl.metrics.contact import NEAR, bounce_heights
 from gpe_pl.metrics.mirror import mirror_error, mirrors

@@ -23,9 +23,9 @@ from gpe_pl.benchmarks.trained import Case, checkpoint_label, of_stored_frames
 from gpe_pl.data.ground_truth import DatasetSpec
 from gpe_pl.errors import GpeError
 from gpe_pl.files.markdown import table_row
-from gpe_pl.learned import acceptance
-from gpe_pl.learned.acceptance import Acceptance, Check
+from gpe_pl.learned import verdicts
 from gpe_pl.learned.pretrained import FOLDER, checkpoint_path
+from gpe_pl.learned.verdicts import Check, Verdict
 from gpe_pl.viz.saving import save_figure
 
 log = logging.getLogger(__name__)
@@ -80,10 +80,10 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
         own = [record for scene in _scenes(candidate) for record in _measured(candidate, path, scene, folder, parts)]
         records += own
         checks = [Check(**{key: r[key] for key in ("name", "passed", "measured", "solver", "limit")}) for r in own]
-        result = Acceptance(acceptance.checksum(path), checks)
-        acceptance.write(folder / f"{candidate.name}{acceptance.SUFFIX}", result)
+        verdict = Verdict(verdicts.checksum(path), checks)
+        verdicts.write(folder / f"{candidate.name}{verdicts.suffix('acceptance')}", verdict)
         if path.parent != FOLDER:
-            acceptance.write(acceptance.path_beside(path), result)
+            verdicts.write(verdicts.path_beside(path, "acceptance"), verdict)
     parts.clear()
     return records, _report(records)
 
@@ -115,7 +115,7 @@ def _measured(candidate: Candidate, path: Path, scene: str, folder: Path, parts:
     """Return the records of a scene: those of a stopped suite, or new ones, whose figure is written first."""
     spec = candidate.spec
     (material,) = spec.scene.materials
-    identity = {"scene": scene, "model": candidate.name, "checkpoint": acceptance.checksum(path), "data": spec.as_dict()}
+    identity = {"scene": scene, "model": candidate.name, "checkpoint": verdicts.checksum(path), "data": spec.as_dict()}
     if (stored := parts.get(identity)) is not None:
         return stored
     log.info("%s: %s", candidate.name, scene)

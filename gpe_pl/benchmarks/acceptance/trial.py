@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from gpe_pl.benchmarks.acceptance.scenes import material_of, values_of
 from gpe_pl.benchmarks.half_steps import HalfSteps
 from gpe_pl.data.ground_truth import DatasetSpec
-from gpe_pl.learned.acceptance import Check
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.verdicts import Check
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Simulator, rollout, steps

@@ -179,6 +179,7 @@ def in_double(simulator: LearnedSimulator) -> LearnedSimulator:
     """Return the simulator with the same weights in double precision, as a reference for rounding errors."""
     twin = _DoubleSimulator(copy.deepcopy(simulator.model), _DoubleBuilder(simulator.builder.config, simulator.builder.metadata))
     twin.load_state_dict(simulator.state_dict())
+    twin.static_friction = simulator.static_friction
     return twin.double().eval()
 
 

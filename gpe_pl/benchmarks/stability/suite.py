@@ -29,7 +29,10 @@ from gpe_pl.benchmarks.trained import Case, checkpoint_label, fingerprint_of, of
 from gpe_pl.data.ground_truth import DatasetSpec, generate_trajectory
 from gpe_pl.errors import GpeError
 from gpe_pl.files.markdown import table_row
+from gpe_pl.learned import verdicts
+from gpe_pl.learned.pretrained import FOLDER, checkpoint_path
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.verdicts import Check, Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,7 +88,8 @@ class Settings:
 def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tuple[list[dict[str, Any]], str]:
     """Return a record per test and model, and a Markdown table per domain. Data sets without a model are not tested.
 
-    Tests that had finished when an earlier run was stopped are not repeated. ``folder`` keeps their records until the suite ends.
+    Tests that had finished when an earlier run was stopped are not repeated. ``folder`` keeps their records until the suite ends. If all tests were run, the
+    verdict on each checkpoint is written beside it, or to ``folder`` for a shipped model.
 
     Raises:
         NothingToTestError: no data set has a model, or two models of a data set have one name.
@@ -107,8 +111,24 @@ def run(settings: Settings, specs: dict[str, DatasetSpec], folder: Path) -> tupl
             f"{', '.join(f'{s.name} {s.size}' for s in specs.values())}; train with `python -m gpe_pl.fit data={untested[0]} model=gpe_tuned` or set "
             "suite.runs or suite.checkpoints"
         )
+    if not settings.tests:
+        for name, spec in tested.items():
+            for label, _, path in _models(spec, settings):
+                _write_verdict(path, [r for r in records if (r["domain"], r["model"]) == (name, label)], folder)
     parts.clear()
     return records, _report(records, untested)
+
+
+def _write_verdict(path: Path, records: Sequence[dict[str, Any]], folder: Path) -> None:
+    """Write the verdict on a checkpoint. Tests that do not apply are left out."""
+    checks = [
+        Check(r["test"], r["status"] == "passed", r["measured"], "", r["criterion"]) for r in records if r["status"] != "not_applicable"
+    ]
+    verdict = Verdict(verdicts.checksum(path), checks)
+    if path.parent == FOLDER:
+        verdicts.write(folder / f"{path.stem}{verdicts.suffix('stability')}", verdict)
+    else:
+        verdicts.write(verdicts.path_beside(path, "stability"), verdict)
 
 
 def _show_progress() -> None:
@@ -120,7 +140,7 @@ def _test_domain(name: str, spec: DatasetSpec, settings: Settings, parts: Finish
     """Return the records of all models of a data set."""
     torch.set_num_threads(settings.num_threads)
     models: dict[str, LearnedSimulator] = {}
-    for label, simulator in _models(spec, settings):
+    for label, simulator, _ in _models(spec, settings):
         if label in models:
             raise NothingToTestError(f"two models of {spec.name} are called {label}; copy one of the checkpoints to a file of another name")
         models[label] = simulator
@@ -157,7 +177,9 @@ def test(subject: Subject, numbers: Sequence[int] = (), parts: FinishedParts | N
                     "measured": outcome.measured,
                     "status": {True: "passed", False: "failed", None: "not_applicable"}[outcome.passed],
                     "gating": subject.is_gating,
-                    "curves": {k: [v if math.isfinite(v) else None for v in values] for k, values in outcome.curves.items()},
+                    "curves": {
+                        k: [float(f"{v:.5g}") if math.isfinite(v) else None for v in values] for k, values in outcome.curves.items()
+                    },
                 }
                 if parts is not None:
                     parts.put(known, [record])
@@ -193,11 +215,9 @@ def _outcome(stress_test: StressTest, subject: Subject) -> Outcome:
 
 
 def subjects(domain: str, spec: DatasetSpec, models: dict[str, LearnedSimulator], settings: Settings) -> list[Subject]:
-    """Return the models of a data set with their test data, the gating ones first. Static friction of the models is switched off."""
+    """Return the models of a data set with their test data, the gating ones first."""
     scenes = [generate_trajectory(spec, "test", k) for k in range(settings.num_scenes)]
     speed = horizon.max_speed(spec, generate_trajectory, settings.num_scenes)
-    for simulator in models.values():
-        simulator.static_friction = 0.0  # tests measure the network alone
     found = [
         Subject(
             name,
@@ -222,14 +242,15 @@ def is_gating(simulator: LearnedSimulator, gating: dict[str, str]) -> bool:
     return bool(gating) and all(own.get(key) == value for key, value in gating.items())
 
 
-def _models(spec: DatasetSpec, settings: Settings) -> Iterator[tuple[str, LearnedSimulator]]:
-    """Yield the names and simulators of all models of a data set."""
-    yield from ((name, simulator) for name, (simulator, _) in trained_on(spec, runs_in(settings.runs)).items())
+def _models(spec: DatasetSpec, settings: Settings) -> Iterator[tuple[str, LearnedSimulator, Path]]:
+    """Yield the names, simulators and checkpoints of all models of a data set."""
+    found = trained_on(spec, runs_in(settings.runs))
+    yield from ((name, simulator, checkpoint_path(run.folder)) for name, (simulator, run) in found.items())
     for checkpoint in settings.checkpoints:
         simulator = of_stored_frames(checkpoint)
         metadata = simulator.builder.metadata
         if (metadata.dataset, metadata.spacing) == (spec.name, spec.scene.spacing):
-            yield checkpoint_label(checkpoint), simulator
+            yield checkpoint_label(checkpoint), simulator, checkpoint_path(checkpoint)
 
 
 def failures(records: Sequence[dict[str, Any]]) -> list[str]:

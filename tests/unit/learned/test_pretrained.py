@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from gpe_pl.learned.acceptance import headline
 from gpe_pl.learned.pretrained import FOLDER, checkpoint_path, model_name, names
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.verdicts import headline
 
 LIMIT = 2_000_000
 

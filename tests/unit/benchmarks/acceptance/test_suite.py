@@ -15,8 +15,8 @@ from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec, trajectory_metadata
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
-from gpe_pl.learned.acceptance import headline
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.verdicts import headline
 from gpe_pl.models.gpe import GPE
 
 

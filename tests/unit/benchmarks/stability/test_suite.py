@@ -24,6 +24,7 @@ from gpe_pl.data.ground_truth import DatasetSpec, generate_trajectory
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
+from gpe_pl.learned.verdicts import headline
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
 from gpe_pl.reports.finished_runs import Run, table_of
@@ -223,6 +224,40 @@ def test_a_stopped_run_continues_with_the_next_test(
     assert measured == [1, 5, 5, 12] and [r["test"].split()[0] for r in records] == ["1", "5", "12"]
     run(settings, {"sand": spec}, tmp_path / "results")
     assert measured == [1, 5, 5, 12, 1, 5, 12]  # after the end, a run measures everything again
+
+
+def test_a_pile_rests_by_the_static_friction_that_ships(
+    spec: DatasetSpec, scenes: list[Trajectory], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = subject(spec, scenes, **SHIPPED)
+    still = replace(own.state(), vel=torch.zeros_like(own.state().vel))
+    monkeypatch.setattr(horizon, "settle", lambda _: still)
+    fractions: list[float] = []
+
+    def stays(tested: Subject, _: State) -> Outcome:
+        fractions.append(tested.simulator.static_friction)
+        return Outcome(fractions[-1] > 0.1, "farthest 0")
+
+    monkeypatch.setattr(horizon, "stays", stays)
+    for fraction, other, passed in ((0.0, 0.5, False), (0.25, 0.0, True)):
+        own.simulator.static_friction = fraction
+        (kept,) = suite.subjects("sand", spec, {"GPE": own.simulator}, Settings({}, num_scenes=1))
+        outcome = horizon.rest(kept)
+        assert (fractions[-2:], outcome.passed) == ([fraction, other], passed)
+        assert outcome.measured.startswith("without static friction: " if fraction == 0 else "with static friction 0.25: ")
+        assert invariances.in_double(own.simulator).static_friction == fraction
+
+
+@pytest.mark.parametrize("tests", [[], [1]])
+def test_verdicts_are_stored_beside_the_checkpoint_after_all_tests(
+    spec: DatasetSpec, scenes: list[Trajectory], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tests: list[int]
+) -> None:
+    subject(spec, scenes, **SHIPPED).simulator.save(tmp_path / "own.ckpt")
+    verdicts = {1: True, 2: False, 5: None}
+    monkeypatch.setattr(suite, "_outcome", lambda stress_test, _: Outcome(verdicts.get(stress_test.number, True), "4 spacings"))
+    settings = Settings({"sand": Case([])}, [], [str(tmp_path / "own.ckpt")], SHIPPED, 1, [1.0], 5, tests)
+    run(settings, {"sand": spec}, tmp_path / "results")
+    assert headline(tmp_path / "own.ckpt").partition(". ")[2] == ("" if tests else "Fails 1 of 29 stress tests: 2 edge orientation")
 
 
 def test_failures_of_gating_models_fail_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
