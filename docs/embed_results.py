@@ -3,6 +3,8 @@
 ``python docs/embed_results.py RUN_FOLDER NAME [NOTE]`` takes from a finished run, sweep or suite its tables, its figures in fewer colours, the first film, and
 where all of it comes from (``provenance.json``). It keeps the results of single rollouts in two small files (``gpe_pl.reports.run_archive``), from which
 ``python -m gpe_pl.reports docs/results/NAME`` makes the tables again. NOTE is what a reader should know besides, such as other work on the machine.
+RUN_FOLDER may also hold several evaluations by ``evaluate``, and their table by ``python -m gpe_pl.reports RUN_FOLDER``. The first scene of each at three
+values of the material parameter is then copied, too.
 ``python docs/embed_results.py`` only renews the README and the list in ``docs/results/README.md``; ``--check`` fails if one differs from the files.
 """
 
@@ -11,13 +13,14 @@ from __future__ import annotations
 import re
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from PIL import Image, ImageSequence
 
 from gpe_pl.files import sealed
 from gpe_pl.files.markdown import table_row
-from gpe_pl.reports.finished_runs import archive, finished_runs
+from gpe_pl.reports.finished_runs import archive, evaluations_below, finished_runs
 from gpe_pl.system.provenance import ADVICE, PROVENANCE, sessions
 
 DOCS = Path(__file__).resolve().parent
@@ -37,6 +40,7 @@ PICTURES = (
     *("acceptance_fem_beam.png", "acceptance_elastomer_square.png", "acceptance_sand_column.png"),
     *("acceptance_snow_cylinder.png", "acceptance_fluid_dam_break.png"),
 )
+AT_VALUES = "parameters_test_unseen_00.png"
 FILM = "rollout_test_00.gif"
 MAX_WIDTH = 1400
 NUM_COLORS = 128
@@ -63,12 +67,19 @@ def collect(run: Path, name: str, note: str = "") -> None:
             picture(path, target / path.name)
     for path in sorted(run.glob("data=*/model=gpe_tuned/seed=0/rollout_test_unseen_00.png")) if is_table1 else ():
         picture(path, target / f"rollout_{path.parts[-4].removeprefix('data=')}.png")
+    evaluations = [] if runs else evaluations_below(run)
+    for path in (found.folder / AT_VALUES for found in evaluations):
+        if path.exists():
+            picture(path, target / f"parameters_{path.parent.relative_to(run).as_posix().replace('/', '_')}.png")
     if (run / FILM).exists():
         film(run / FILM, (target / FILM).with_suffix(".webp"))
     if runs:
         archive(runs, run, target)
+    if evaluations:
+        archive([replace(found, rows=found.rows[found.rows["horizon"] == "full"]) for found in evaluations], run, target)
     seeds = sorted({int(found.config["seed"]) for found in runs if "seed" in found.config})
-    sealed.write(target / PROVENANCE, {"sessions": sessions(run), "seeds": seeds, "note": note})
+    every = sessions(run) or [session for found in evaluations for session in sessions(found.folder)]
+    sealed.write(target / PROVENANCE, {"sessions": every, "seeds": seeds, "note": note})
 
 
 def picture(source: Path, target: Path) -> None:

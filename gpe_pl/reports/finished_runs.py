@@ -135,6 +135,26 @@ def finished_runs(folder: Path) -> list[Run]:
     return runs
 
 
+EVALUATED = ("checkpoint", "split", "data.name")
+"""Keys that the configuration of every evaluation by ``evaluate`` has."""
+
+
+def is_evaluation(run: Run) -> bool:
+    """Tell whether a run was written by ``evaluate``, which trains nothing."""
+    return run.config.keys() >= {*EVALUATED} and not run.config.keys() >= TRAINED.keys()
+
+
+def evaluations_below(folder: Path) -> list[Run]:
+    """Return all finished evaluations by ``evaluate`` below a folder, in order of their paths.
+
+    Raises:
+        RunError: a configuration cannot be read.
+        MetricsError: a ``metrics.csv`` is damaged.
+    """
+    found = [evaluation_in(path.parent) for path in sorted(folder.rglob("metrics.csv")) if (path.parent / "config.json").exists()]
+    return [run for run in found if is_evaluation(run)]
+
+
 def _warn_of_replaced_data(runs: list[Run]) -> None:
     """Warn if two runs used different data with the same description, for example data that were imported again under the same name."""
     first: dict[str, Run] = {}

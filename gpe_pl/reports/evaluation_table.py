@@ -1,0 +1,83 @@
+"""Table of evaluations by ``evaluate`` below one folder: errors of trained models, and whether they read the material parameter.
+
+Evaluations of the same split of a data set are compared with the first of them, scene by scene. They may differ in the checkpoint or in settings of the
+rollout, such as ``evaluation.static_friction``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from gpe_pl.evaluation.material_controls import UNSEEN
+from gpe_pl.evaluation.rollouts import LEARNED
+from gpe_pl.files.atomic import replace_text
+from gpe_pl.files.markdown import table_row
+from gpe_pl.metrics import bootstrap_interval, bootstrap_ratio, median_of_means
+from gpe_pl.reports.finished_runs import Run, Values, axes_of, rollout_errors, shared_table, shared_trajectories, values_by_seed
+from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, write_material_figure
+
+EVALUATIONS_MD = "table.md"
+NOT_IN_LABELS = ("data", "split", "evaluation.material_controls", "evaluation.num_pictures")
+"""Prefixes of keys that no label names."""
+
+Labelled = dict[tuple[str, str], dict[str, Run]]
+"""Evaluations by domain and split, then by label."""
+
+
+def report_evaluations(folder: Path, runs: Sequence[Run]) -> None:
+    """Write ``table.md``, and ``reads_material.png`` if there are evaluations with controls of the material."""
+    groups = labelled(runs)
+    controlled = {(domain, label): [run] for (domain, split), own in groups.items() if split == UNSEEN for label, run in own.items()}
+    lines = _error_lines(groups)
+    if materials := material_lines(controlled):
+        lines += ["", *materials]
+    replace_text(folder / EVALUATIONS_MD, "\n".join([*lines, ""]))
+    write_material_figure(folder / MATERIALS_FIGURE, controlled)
+
+
+def labelled(runs: Sequence[Run]) -> Labelled:
+    """Return evaluations by domain and split, and by the settings in which those of a domain differ; the name of the checkpoint if they differ in none."""
+    groups: Labelled = {}
+    for domain in dict.fromkeys(str(run.config["data.name"]) for run in runs):
+        own = [run for run in runs if run.config["data.name"] == domain]
+        axes = [axis for axis in axes_of(own) if not axis.startswith(NOT_IN_LABELS)]
+        for run in own:
+            values = {axis.rpartition(".")[2]: run.config.get(axis) for axis in axes}
+            label = ", ".join(f"{name}={value}" for name, value in values.items()) or str(run.config["checkpoint"]).partition(".ckpt")[0]
+            groups.setdefault((domain, str(run.config["split"])), {})[label] = run
+    return groups
+
+
+def _error_lines(groups: Labelled) -> list[str]:
+    header = ["domain", "split", "model", "scenes", "rollout MSE ×1e-3 [m²]", "over the first", "failed", "corrected"]
+    lines = [table_row(header), "|" + "---|" * len(header)]
+    for (domain, split), own in groups.items():
+        errors = {label: rollout_errors([run], split, "full") for label, run in own.items()}
+        first = next(iter(errors.values()))
+        for label, run in own.items():
+            raw = [value for seed in values_by_seed([run], LEARNED, split, "rollout_mse", "full") for value in seed.values()]
+            moved = values_by_seed([run], LEARNED, split, "fraction_corrected", "full")
+            mean = bootstrap_interval(1e3 * shared_table(errors[label]), statistic=median_of_means)
+            cells = [
+                *(domain, split, label, str(len(raw))),
+                f"{mean.estimate:.3g} [{mean.low:.3g}, {mean.high:.3g}]",
+                _over(errors[label], first),
+                str(sum(value == float("inf") for value in raw)),
+                f"{100 * float(shared_table(moved).mean()):.2g} %" if moved else "–",
+            ]
+            lines.append(table_row(cells))
+    note = (
+        "Whole rollouts: mean over scenes with its 95 % bootstrap interval, and the ratio to the first model of the same split over the same scenes. A failed "
+        "rollout counts as ballistic flight in the same scene. Corrected: fraction of particle-steps that containment moves."
+    )
+    return [*lines, "", note]
+
+
+def _over(errors: Values, first: Values) -> str:
+    """Return the ratio of two models' errors in the scenes of both, with its interval; empty for the first model itself."""
+    scenes = shared_trajectories(errors, first)
+    if errors is first or not scenes:
+        return ""
+    ratio = bootstrap_ratio(shared_table(errors, scenes), shared_table(first, scenes), statistic=median_of_means, is_paired=True)
+    return f"{ratio.estimate:.3g} [{ratio.low:.3g}, {ratio.high:.3g}]"

@@ -1,0 +1,99 @@
+"""Tables of evaluations compare models of one domain scene by scene, and show whether each reads its material."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, label_of
+from gpe_pl.evaluation.rollouts import LEARNED, Row, write_rows
+from gpe_pl.files import sealed
+from gpe_pl.reports.evaluation_table import labelled
+from gpe_pl.reports.finished_runs import archive, evaluations_below, finished_runs
+from gpe_pl.reports.tables import main
+
+HARD = (1.0, 2.0, 4.0, 8.0, 3.0, 5.0)
+"""Errors of six scenes [1e-3 m²]."""
+
+
+def write_evaluation(
+    folder: Path, data: str, factor: float, friction: float | None = None, nearest: float = 0.0, split: str = UNSEEN
+) -> None:
+    """Write an evaluation whose errors are those of ``HARD`` times a factor, with controls if ``nearest`` is above 0."""
+    folder.mkdir(parents=True)
+    parameters = {data: {"seen": [20.0, 30.0]}}
+    config = {
+        "checkpoint": f"{data}.ckpt (sha256 0123)",
+        "split": split,
+        "data_sha256": {split: data},
+        "data": {"name": data, "parameters": parameters},
+        "evaluation": {"static_friction": friction},
+    }
+    sealed.write(folder / "config.json", config)
+    factors = {LEARNED: factor, "ballistic": 50.0}
+    if nearest:
+        factors |= {label_of(LEARNED, control): nearest for control in CONTROLS} | {SOLVER_NEAREST: 0.2, SOLVER_ENDS: 4.0}
+    rows = [
+        Row(model, split, k, "interpolated", 20.5 + k, "rollout_mse", "full", 1e-3 * scale * error)
+        for model, scale in factors.items()
+        for k, error in enumerate(HARD)
+    ]
+    write_rows(folder / "metrics.csv", rows)
+
+
+def cells(text: str, *beginning: str) -> list[str]:
+    """Return the cells of the one line of a table that begins with these cells."""
+    lines = [[cell.strip() for cell in line.strip("| ").split(" | ")] for line in text.splitlines()]
+    (found,) = (line for line in lines if line[: len(beginning)] == [*beginning])
+    return found
+
+
+def test_evaluations_of_a_domain_are_compared_with_the_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, friction, factor in (("a", 0.0, 1.0), ("b", 0.5, 1.5)):
+        write_evaluation(tmp_path / "sand" / name, "sand", factor, friction)
+        write_evaluation(tmp_path / "sand" / f"{name}-test", "sand", factor, friction, split="test")
+    write_evaluation(tmp_path / "snow", "snow", 3.0, 0.5)
+    assert main([str(tmp_path)]) == 0
+    text = (tmp_path / "table.md").read_text()
+    assert text == capsys.readouterr().out[:-1]
+    for split in (UNSEEN, "test"):
+        first, second = (cells(text, "sand", split, f"static_friction={value}") for value in ("0.0", "0.5"))
+        assert first[4].startswith("3.83 [") and first[5:7] == ["", "0"]
+        assert second[4].startswith("5.75 [") and second[5] == "1.5 [1.5, 1.5]"
+    assert cells(text, "snow", UNSEEN, "snow")[3] == "6"
+    assert "reads the material" not in text
+
+
+def test_each_domain_says_whether_it_reads_the_material(tmp_path: Path) -> None:
+    write_evaluation(tmp_path / "runs" / "sand", "sand", 0.5, nearest=1.0)
+    write_evaluation(tmp_path / "runs" / "fluid", "fluid", 1.0, nearest=1.0)
+    assert main([str(tmp_path / "runs")]) == 0
+    text = (tmp_path / "runs" / "table.md").read_text()
+    assert cells(text, "sand", "sand", "1.92")[-3:] == ["0.50 [0.50, 0.50]", "yes", "0.12"]
+    assert cells(text, "fluid", "fluid", "3.83")[-3:] == ["1.00 [1.00, 1.00]", "no", "0.25"]
+    assert (tmp_path / "runs" / "reads_material.png").stat().st_size > 1000
+    archived = tmp_path / "archive"
+    archived.mkdir()
+    archive(evaluations_below(tmp_path / "runs"), tmp_path / "runs", archived)
+    assert main([str(archived)]) == 0
+    assert (archived / "table.md").read_text() == text
+
+
+def test_training_runs_and_evaluations_are_told_apart(tmp_path: Path) -> None:
+    write_evaluation(tmp_path / "sand", "sand", 1.0)
+    assert not finished_runs(tmp_path) and [run.folder.name for run in evaluations_below(tmp_path)] == ["sand"]
+    assert list(labelled(evaluations_below(tmp_path))) == [("sand", UNSEEN)]
+    folder = tmp_path / "trained"
+    folder.mkdir()
+    config = {
+        "data": {"name": "sand"},
+        "model": {"_target_": "gpe_pl.models.gpe.GPE"},
+        "training": {"num_steps": 1},
+        "checkpoint": "a",
+        "split": "test",
+    }
+    sealed.write(folder / "config.json", config)
+    write_rows(folder / "metrics.csv", [Row(LEARNED, "test", 0, "seen", 20.0, "rollout_mse", "full", 1.0)])
+    assert [run.folder.name for run in finished_runs(tmp_path)] == ["trained"]
+    assert [run.folder.name for run in evaluations_below(tmp_path)] == ["sand"]
