@@ -28,23 +28,33 @@ WITHOUT = "none"
 """Value of ``model.material_embedding`` of models without the parameter."""
 EMBEDDING = "model.material_embedding"
 
+FARTHER = ("middle", "shuffled")
+"""Controls that differ from a scene's own parameters by more than the nearest trained ones."""
+
 Groups = Mapping[tuple[str, str], Sequence[Run]]
 """Runs that differ in their seeds only, by domain and label."""
 
 
 def reads_material(runs: Sequence[Run]) -> tuple[bool, Interval, int] | None:
-    """Return whether a model reads the material, the ratio behind it, and the number of scenes.
+    """Return whether a model reads the material, the ratio behind it (``_over``), and the number of scenes.
 
-    The ratio is that of the errors with own and with nearest trained parameters: means over scenes, median over seeds, with the bootstrap interval over both.
     Return None unless all runs have controls and share scenes with interpolated parameters.
     """
-    own, nearest = _errors(runs, LEARNED), _errors(runs, label_of(LEARNED, "nearest"))
-    scenes = shared_trajectories(own, nearest)
-    if not scenes or len(own) != len(nearest):
+    found = _over(runs, "nearest")
+    return None if found is None else (found[0].high < 1, *found)
+
+
+def _over(runs: Sequence[Run], control: str) -> tuple[Interval, int] | None:
+    """Return the ratio of the errors with own parameters and with those of a control, and the number of scenes.
+
+    Errors are means over scenes, median over seeds, and the bootstrap interval is over both.
+    """
+    own, other = _errors(runs, LEARNED), _errors(runs, label_of(LEARNED, control))
+    scenes = shared_trajectories(own, other)
+    if not scenes or len(own) != len(other):
         return None
-    tables = shared_table(own, scenes), shared_table(nearest, scenes)
-    ratio = bootstrap_ratio(*tables, statistic=median_of_means, is_paired=True)
-    return ratio.high < 1, ratio, len(scenes)
+    tables = shared_table(own, scenes), shared_table(other, scenes)
+    return bootstrap_ratio(*tables, statistic=median_of_means, is_paired=True), len(scenes)
 
 
 def verdict(runs: Sequence[Run]) -> str:
@@ -65,7 +75,8 @@ def material_lines(groups: Groups) -> list[str]:
     if not shown:
         return []
     header = [
-        "domain", "model", "own", *CONTROLS, "without the parameter", "solver, nearest", "effect", "own / nearest", "reads the material", "own / effect",
+        "domain", "model", "own", *CONTROLS, "without the parameter", "solver, nearest", "effect", "own / nearest", "reads the material",
+        *(f"own / {control}" for control in FARTHER), "own / effect",
     ]  # fmt: skip
     lines = [table_row(header), "|" + "---|" * len(header)]
     for (domain, label), runs in shown.items():
@@ -75,14 +86,15 @@ def material_lines(groups: Groups) -> list[str]:
         found = reads_material(runs)
         assert found is not None
         fraction = f"{own / effect:.2f}" if effect > 0 else "–"
-        lines.append(table_row([domain, label, *map(_text, means), _ratio(found[1]), _answer(*found), fraction]))
+        farther = [_ratio(ratio[0]) if (ratio := _over(runs, control)) else "–" for control in FARTHER]
+        lines.append(table_row([domain, label, *map(_text, means), _ratio(found[1]), _answer(*found), *farther, fraction]))
     note = (
         "Does the model read the material parameter? Rollout MSE ×1e-3 [m²] over all frames, mean over scenes with interpolated parameters, median over seeds: "
         "with a scene's own parameters, and the same model with the nearest, the middle and the farthest trained ones and with those of another scene; a model "
         "trained without the parameter; the solver with the nearest trained parameters; effect: the solver with the lowest against the highest trained "
         "parameters. A model reads the material if own / nearest has a 95 % interval below 1, over the same scenes and seeds; "
-        f"fewer than {FEWEST_SCENES} scenes are too few to say. A rollout that had to be stopped "
-        "has failed, and counts as ballistic flight in the same scene."
+        f"fewer than {FEWEST_SCENES} scenes are too few to say. A model that uses the parameter, but is too inaccurate for the difference between neighbouring "
+        "values, has only own / middle and own / shuffled below 1. A rollout that had to be stopped has failed, and counts as ballistic flight in that scene."
     )
     return [*lines, "", note]
 

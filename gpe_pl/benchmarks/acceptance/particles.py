@@ -1,7 +1,8 @@
-"""Acceptance of models of sand and snow: a column that collapses, a pile at rest, and a ball of snow on a cylinder."""
+"""Acceptance of models of sand and snow: a column that collapses, a pile at rest, one that is too steep, and a ball of snow on a cylinder."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -16,6 +17,7 @@ from gpe_pl.benchmarks.acceptance.trial import (
     follows_parameter,
     near_solver,
     not_above_solver,
+    of_size,
     shown,
     tried,
 )
@@ -73,6 +75,19 @@ def pile(candidate: Candidate) -> Result:
         at_most("pile at rest: change of height", [100 * trial.measured(sinking)[0]], MAX_SINKING, " %"),
         contained("pile at rest", [trial]),
     ]
+    return Result(checks, shown(candidate, [trial], 0.0, 0.25, 0.5, 0.75, 1.0))
+
+
+def slump(candidate: Candidate) -> Result:
+    """Let a column collapse in the solver at the highest friction angle. At the lowest one its pile is too steep, and has to flow.
+
+    A model with too much static friction keeps it where it is.
+    """
+    spec, (lowest, _, highest) = candidate.spec, candidate.values
+    settled = advanced(spec.solver, scenes.column(spec, highest, COLUMNS, ROWS), 2 * round(SECONDS / spec.solver.frame_dt))
+    steep = replace(settled, material_params=np.full_like(settled.material_params, lowest))
+    trial = tried(candidate, lowest, steep, SECONDS)
+    checks = [of_size("pile that is too steep: way", [trial.measured(creep)], " spacings/s"), contained("pile that is too steep", [trial])]
     return Result(checks, shown(candidate, [trial], 0.0, 0.25, 0.5, 0.75, 1.0))
 
 

@@ -38,6 +38,7 @@ SCENES: dict[str, dict[str, Callable[[Candidate], Result]]] = {
     "square": {m: partial(bodies.dropped, 12, 10, "square block") for m in ("solid", "elastomer")},
     "column": {"sand": particles.column},
     "pile": {"sand": particles.pile},
+    "slump": {"sand": particles.slump},
     "cylinder": {"snow": particles.ball_on_cylinder},
     "pool": {"fluid": liquid.pool_at_rest},
     "dam_break": {"fluid": liquid.dam_break},

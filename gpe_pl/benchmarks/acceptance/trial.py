@@ -190,6 +190,12 @@ def follows_parameter(name: str, values: Sequence[tuple[float, float, float]], u
     return [Check(name, passed, *_both(model.tolist(), solver.tolist(), unit), limit)]
 
 
+def of_size(name: str, values: Sequence[tuple[float, float, float]], unit: str) -> Check:
+    """Return the check that a quantity is half to twice the solver's in the same scenes."""
+    passed = all(0.5 * solver <= own <= 2 * solver for own, solver, _ in values)
+    return Check(name, passed, *_both([m for m, _, _ in values], [s for _, s, _ in values], unit), "half to twice the solver's")
+
+
 def contained(name: str, trials: Sequence[Trial]) -> Check:
     """Return the check that the model does not need containment to stay out of walls."""
     return at_most(f"{name}: particle-steps that containment corrected", [100 * t.corrected for t in trials], 100 * MAX_CORRECTED, " %")

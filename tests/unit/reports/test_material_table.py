@@ -88,11 +88,12 @@ def test_few_scenes_give_no_verdict(sweep: Path) -> None:
 def test_the_table_of_a_sweep_has_every_control(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sweep_table.report_sweep(sweep, finished_runs(sweep))
     text = (sweep / "table.md").read_text()
-    rows = {cells[1]: cells for line in text.splitlines() if len(cells := [c.strip() for c in line.strip("|").split("|")]) == 13}
+    rows = {cells[1]: cells for line in text.splitlines() if len(cells := [c.strip() for c in line.strip("|").split("|")]) == 15}
     factors = [READS[name] for name in ("own", *CONTROLS)] + [1.2]
     means = [f"{f * HARD.mean() * 1.15:.3g}" for f in factors] + [f"{READS[name] * HARD.mean():.3g}" for name in ("solver", "ends")]
-    assert rows["affine"] == ["sand", "affine", *means, "0.90 [0.90, 0.90]", "yes", f"{0.9 * 1.15 / 1.5:.2f}"]
-    assert rows["none"][11] == "no"
+    farther = [f"{ratio:.2f} [{ratio:.2f}, {ratio:.2f}]" for ratio in (0.9 / READS["middle"], 0.9 / READS["shuffled"])]
+    assert rows["affine"] == ["sand", "affine", *means, "0.90 [0.90, 0.90]", "yes", *farther, f"{0.9 * 1.15 / 1.5:.2f}"]
+    assert rows["none"][11:14] == ["no", "1.00 [1.00, 1.00]", "1.00 [1.00, 1.00]"]
     assert (sweep / "reads_material.png").stat().st_size > 10_000
     rollouts = [line for line in text.splitlines() if "nearest value" in line]
     assert not rollouts  # controls are no baselines
@@ -105,7 +106,7 @@ def test_tables_of_domains_have_the_controls_of_every_model(tmp_path: Path) -> N
     report_domains(tmp_path, finished_runs(tmp_path))
     lines = (tmp_path / "table1.md").read_text().splitlines()
     cells = [[c.strip() for c in line.strip("|").split("|")] for line in lines]
-    assert [(c[0], c[1], c[11]) for c in cells if len(c) == 13 and c[0] == "sand"] == [("sand", "GNS", "no"), ("sand", "GPE", "yes")]
+    assert [(c[0], c[1], c[11]) for c in cells if len(c) == 15 and c[0] == "sand"] == [("sand", "GNS", "no"), ("sand", "GPE", "yes")]
     table = (tmp_path / "table1.csv").read_text()
     assert "sand,GNS at nearest value,0,test_unseen,rollout_mse" in table and "sand,solver at nearest value,,test_unseen" in table
     assert (tmp_path / "reads_material.png").exists()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gpe_pl.benchmarks.acceptance import flight, particles, scenes
-from gpe_pl.benchmarks.acceptance.trial import at_most, follows_parameter, near_solver, not_above_solver
+from gpe_pl.benchmarks.acceptance.trial import at_most, follows_parameter, near_solver, not_above_solver, of_size
 from gpe_pl.config.datasets import dataset
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.solvers.scenes import describe
@@ -41,6 +41,12 @@ def test_values_are_compared_with_the_solver_and_its_uncertainty() -> None:
     assert not near((NAN, 1.0, 1.0))
     assert near((0.65, 1.0, 1.2)) and not near((0.55, 1.0, 1.2))  # twice the solver's own change
     assert near((0.01, 0.0, 0.0)) and not near((0.02, 0.0, 0.0))
+
+
+def test_a_way_of_the_right_size_is_half_to_twice_the_solvers() -> None:
+    assert of_size("way", [(0.5, 1.0, 1.0), (2.0, 1.0, 1.0)], "").passed
+    for own in (0.49, 2.1, NAN):
+        assert not of_size("way", [(1.0, 1.0, 1.0), (own, 1.0, 1.0)], "").passed
 
 
 SOLVER = (0.3, 0.2, 0.1)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from gpe_pl.benchmarks.acceptance import scenes, suite
+from gpe_pl.benchmarks.acceptance import particles, scenes, suite
 from gpe_pl.benchmarks.acceptance.suite import AcceptanceError, Settings, failures, run
-from gpe_pl.benchmarks.acceptance.trial import Candidate, Result, at_most, shown, tried
+from gpe_pl.benchmarks.acceptance.trial import Candidate, Result, Trial, at_most, shown, tried
 from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec, trajectory_metadata
 from gpe_pl.graphs.builder import GraphBuilder
@@ -18,6 +19,8 @@ from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.learned.verdicts import headline
 from gpe_pl.models.gpe import GPE
+from gpe_pl.rollout.loop import rollout
+from gpe_pl.trajectory.state import State
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +93,22 @@ def test_every_domain_has_scenes() -> None:
     cases = {"sand": "sand", "snow": "snow", "elastomer": "elastomer", "fluid": "fluid", "fem": "solid"}
     for name, material in cases.items():
         assert sum(material in materials for materials in suite.SCENES.values()) >= 2, name
+
+
+@pytest.mark.slow
+def test_a_pile_that_is_too_steep_has_to_flow(spec: DatasetSpec, checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    candidate = Candidate("own", LearnedSimulator.from_checkpoint(checkpoint), spec)
+    for frozen in (True, False):
+
+        def known(_: Candidate, value: float, start: State, seconds: float, frozen: bool = frozen) -> Trial:
+            truth = rollout(spec.solver, start, round(seconds / spec.solver.frame_dt), candidate.metadata())
+            model = replace(truth, pos=np.repeat(truth.pos[:1], truth.num_frames, axis=0)) if frozen else truth
+            assert value == start.material_params.max() == 20.0
+            return Trial(value, truth, truth, model, 0.0)
+
+        monkeypatch.setattr(particles, "tried", known)
+        way, corrected = particles.slump(candidate).checks
+        assert way.passed is not frozen and corrected.passed
 
 
 @pytest.mark.slow
