@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gpe_pl.evaluation.material_controls import UNSEEN
-from gpe_pl.evaluation.rollouts import LEARNED
+from gpe_pl.evaluation.metric_rows import LEARNED
 from gpe_pl.files.atomic import replace_text
 from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import bootstrap_interval, bootstrap_ratio, median_of_means

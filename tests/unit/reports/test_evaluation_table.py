@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gpe_pl.evaluation.material_controls import CONTROLS, SOLVER_ENDS, SOLVER_NEAREST, UNSEEN, label_of
-from gpe_pl.evaluation.rollouts import LEARNED, Row, write_rows
+from gpe_pl.evaluation.metric_rows import LEARNED, Row, write_rows
 from gpe_pl.files import sealed
 from gpe_pl.reports.evaluation_table import labelled
 from gpe_pl.reports.finished_runs import archive, evaluations_below, finished_runs
