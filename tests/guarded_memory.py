@@ -14,7 +14,7 @@ from unittest import mock
 
 import numpy as np
 
-from gpe_pl.nn import compiled_network
+from gpe_pl.nn import network_program
 
 ZONE = 64
 """Length of a zone [element]."""
@@ -57,7 +57,7 @@ def array_at(address: int, size: int, dtype: Any) -> np.ndarray:
 def guarded() -> Iterator[list[int]]:
     """Run compiled networks in guarded memory inside this block. The list gets the number of guarded matrices of each run."""
     runs: list[int] = []
-    run = compiled_network._run
+    run = network_program._run
 
     def guarded_run(
         address: int, segments: Any, instructions: Any, offset: Any, stride: Any, is_block: Any, height: Any, weights: Any, work: Any, size: Any,
@@ -109,5 +109,5 @@ def guarded() -> Iterator[list[int]]:
         runs.append(len(length))
         return wrong
 
-    with mock.patch.object(compiled_network, "_run", guarded_run):
+    with mock.patch.object(network_program, "_run", guarded_run):
         yield runs

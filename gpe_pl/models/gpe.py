@@ -22,7 +22,7 @@ from torch_geometric.data import HeteroData
 
 from gpe_pl.errors import GpeError
 from gpe_pl.models.base import Model, Prediction
-from gpe_pl.models.gpe_compiled import CompiledGPE, Decoded, notice
+from gpe_pl.models.gpe_program_runner import Decoded, GPEProgramRunner, notice
 from gpe_pl.nn.blocks import MLP, NORM_EPS
 from gpe_pl.nn.connected import Edges, order_of_edges, renumbered, reordered, touched
 from gpe_pl.nn.elastic_bodies import CellError, ElasticBodies
@@ -253,7 +253,7 @@ class GPE(Model):
                 f"model.stress=true, but the data set stores no stress of {', '.join(spec.materials)}; choose model.stress=false or data=fem"
             )
         self.interaction, self.decoder, self.edge_state = interaction, decoder, edge_state
-        self._program: CompiledGPE | None = None
+        self._program: GPEProgramRunner | None = None
         self.level_weights = level_weights
         self.num_message_passing_steps = num_message_passing_steps
         hidden, norm = hidden_channels, node_norm == "layer"
@@ -366,7 +366,7 @@ class GPE(Model):
         return Prediction(acceleration, stress, velocity)
 
     def _compiled(self, data: HeteroData, keep_absent: bool) -> Decoded | None:
-        """Return what the network decodes from one compiled call, or None where that is impossible (see ``models.gpe_compiled``)."""
+        """Return what the network decodes from one compiled call, or None where that is impossible (see ``models.gpe_program_runner``)."""
         weight = self.updates[0][self.type_key(self.spec.materials[0])][0].weight  # type: ignore[index]
         if self.training or torch.is_grad_enabled() or not works_on(weight) or self.settings["implementation"] != "factored":
             return None
@@ -375,7 +375,7 @@ class GPE(Model):
         if type(self) is not GPE:
             return notice(f"{type(self).__name__} is a subclass of GPE")
         if self._program is None or not self._program.is_current():
-            self._program = CompiledGPE(self)
+            self._program = GPEProgramRunner(self)
         return self._program(data, self.skips, keep_absent)
 
     def _uncompiled(self, data: HeteroData, keep_absent: bool) -> Decoded:

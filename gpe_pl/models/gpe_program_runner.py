@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 from torch_geometric.data import HeteroData
 
-from gpe_pl.models.gpe_instructions import GPEProgram
-from gpe_pl.nn.compiled_network import Executable, Tables
+from gpe_pl.models.gpe_program import GPEProgram
+from gpe_pl.nn.network_program import Executable, Tables
 from gpe_pl.rollout.skips import Skips
 from gpe_pl.schema import is_symmetric
 
@@ -51,7 +51,7 @@ def notice(reason: str) -> None:
     log.info("the network runs by PyTorch's operations, which is slower: %s", reason)
 
 
-class CompiledGPE:
+class GPEProgramRunner:
     """A GPE that is ready to run, with its present weights.
 
     Args:

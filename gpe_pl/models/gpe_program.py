@@ -1,4 +1,4 @@
-"""GPE as a program of instructions, for rollouts on a CPU (see ``nn.compiled_network``).
+"""GPE as a program of instructions, for rollouts on a CPU (see ``nn.network_program``).
 
 The program computes what ``GPE.compute`` computes, up to rounding. Two pairs of linear maps are multiplied once, when the program is written: the last map of
 the messages with the first map of the update, and the material embedding with the first map of the encoder.
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from gpe_pl.nn.compiled_instructions import ADD, JOIN, NONE
-from gpe_pl.nn.compiled_network import Program
+from gpe_pl.nn.network_program import NetworkProgram
+from gpe_pl.nn.network_program_kernels import ADD, JOIN, NONE
 from gpe_pl.schema import CELL, RADIUS, EdgeType
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ Place = tuple[int, int]
 
 
 class GPEProgram:
-    """Writes the program of a GPE. Matrices and sets of rows are named by their number in the program (``nn.compiled_network``).
+    """Writes the program of a GPE. Matrices and sets of rows are named by their number in the program (``nn.network_program``).
 
     Attributes:
         program: the program.
@@ -32,13 +32,13 @@ class GPEProgram:
         features: matrix of the node features, by name in ``types``.
         params, mass: matrices of material parameters and masses, by material.
         edges, states: matrix of the edge features or edge states, and that of the opposite direction or ``NONE``, by name in ``relations``.
-        acceleration, stress, contact: matrices of the results, by material; see ``gpe_compiled.Decoded``.
+        acceleration, stress, contact: matrices of the results, by material; see ``gpe_program_runner.Decoded``.
         stress_rows: set of rows that is empty if no stress is wanted.
     """
 
     def __init__(self, model: GPE) -> None:
         weight = next(model.parameters())
-        self.model, self.program = model, Program(weight.dtype)
+        self.model, self.program = model, NetworkProgram(weight.dtype)
         self.hidden: int = model.settings["hidden_channels"]
         spec, program = model.spec, self.program
         self.types = {t: model.type_key(t) for t in spec.node_types if model.type_key(t) in model.node_encoder}

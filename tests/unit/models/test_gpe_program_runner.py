@@ -16,7 +16,7 @@ from torch_geometric.data import HeteroData
 from gpe_pl.graphs.batching import batched
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.learned.simulator import LearnedSimulator
-from gpe_pl.models import gpe_compiled
+from gpe_pl.models import gpe_program_runner
 from gpe_pl.models.base import Prediction
 from gpe_pl.models.gpe import GPE
 from gpe_pl.nn.fused import unfused
@@ -219,7 +219,7 @@ def test_tensors_of_another_shape_are_left_to_pytorch(key: str, caplog: pytest.L
     model, data = build(scenes.builder().spec, decoder="pair"), scenes.graph()
     store = data["sand"] if key in data["sand"] else data["sand", "radius", "sand"]
     store[key] = store[key][:, :-1] if key == "edge_index" else store[key][:-1]
-    gpe_compiled.notice.cache_clear()
+    gpe_program_runner.notice.cache_clear()
     with torch.inference_mode(), caplog.at_level(logging.INFO):
         assert model._compiled(data, False) is None
     assert "shape" in caplog.records[-1].message
@@ -268,7 +268,7 @@ class Changed(GPE):
 
 def test_subclasses_and_weights_of_inference_mode_give_way_with_a_notice(caplog: pytest.LogCaptureFixture) -> None:
     data, spec = scenes.graph(), scenes.builder().spec
-    gpe_compiled.notice.cache_clear()
+    gpe_program_runner.notice.cache_clear()
     with torch.inference_mode(), caplog.at_level(logging.INFO):
         made = build(spec)
         changed = Changed(spec, **made.settings).double().eval()
@@ -283,7 +283,7 @@ def test_subclasses_and_weights_of_inference_mode_give_way_with_a_notice(caplog:
 def test_where_it_gives_way(caplog: pytest.LogCaptureFixture) -> None:
     model, data = build(scenes.builder().spec), scenes.graph()
     seen: list[int] = []
-    gpe_compiled.notice.cache_clear()
+    gpe_program_runner.notice.cache_clear()
     with caplog.at_level(logging.INFO), torch.inference_mode():
         handle = model.updates[0]["sand"].register_forward_hook(lambda *_: seen.append(1))  # type: ignore[index,union-attr]
         hooked = [model(data) for _ in range(2)]

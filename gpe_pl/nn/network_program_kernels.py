@@ -2,7 +2,7 @@
 
 A *segment* is a list of instructions on the rows of one set: the nodes of a type, or the edges of a relation. It is executed for a block of rows at a time.
 What one instruction writes is then still in the cache when the next one reads it. Matrices are in one array, ``work``, and weights in another.
-``compiled_network`` writes the instructions.
+``network_program`` writes the instructions.
 
 The table lists instructions, their arguments, and what they compute. Arguments are the numbers of matrices, the places of weights (W, b, gain, shift, ε, and
 the slope of the PReLU φ), and counts. ``column`` is the first of the columns that are read, ``to`` the first that are written, and n the number of columns.

@@ -1,6 +1,6 @@
-"""A network as a list of instructions, with sets of rows, matrices and weights, which ``compiled_instructions.run`` executes in one call.
+"""A network as a list of instructions, with sets of rows, matrices and weights, which ``network_program_kernels.run`` executes in one call.
 
-A model writes its layers with the methods of ``Program``. Weights are copied when the program is written, so write it again when they change.
+A model writes its layers with the methods of ``NetworkProgram``. Weights are copied when the program is written, so write it again when they change.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import torch
 from numba import njit
 from torch import Tensor
 
-from gpe_pl.nn import compiled_instructions, matrix_product
-from gpe_pl.nn.compiled_instructions import BLOCK, NONE, SET, run
-from gpe_pl.nn.compiled_network_inputs import find_wrong_edges, load_bodies, load_edges, load_nodes, number_nodes, store
+from gpe_pl.nn import matrix_product
+from gpe_pl.nn import network_program_kernels as kernels
+from gpe_pl.nn.network_program_io import find_wrong_edges, load_bodies, load_edges, load_nodes, number_nodes, store
+from gpe_pl.nn.network_program_kernels import BLOCK, NONE, SET, run
 
 NUM_ARGUMENTS = 14
 ALIGNED = 16
@@ -35,7 +36,7 @@ class NodeType:
 
 
 @dataclass
-class Program:
+class NetworkProgram:
     """A network as instructions.
 
     Args:
@@ -92,29 +93,29 @@ class Program:
     def _add(self, code: int, *arguments: int, needs: int = NONE) -> None:
         self.instructions.append([code, needs, *arguments, *[0] * (NUM_ARGUMENTS - len(arguments))])
 
-    # --- instructions of rows, see ``compiled_instructions`` ----------------------------------------------------------------------------------------
+    # --- instructions of rows, see ``network_program_kernels`` --------------------------------------------------------------------------------
 
     def product(self, y: int, x: int, weight: Tensor, mode: int = SET, column: int = 0, to: int = 0, needs: int = NONE) -> None:
         """Write y[:, to:] = x[:, column:] Wᵀ, for a weight W [out, in] as PyTorch stores it."""
         out, channels = weight.shape
         if channels:
-            self._add(compiled_instructions.PRODUCT, y, x, column, channels, self.weight(weight.t()), out, to, mode, needs=needs)
+            self._add(kernels.PRODUCT, y, x, column, channels, self.weight(weight.t()), out, to, mode, needs=needs)
         elif mode == SET:
-            self._add(compiled_instructions.ZERO, y, needs=needs)
+            self._add(kernels.ZERO, y, needs=needs)
 
     def bias(self, y: int, bias: Tensor, column: int = 0, needs: int = NONE) -> None:
-        self._add(compiled_instructions.BIAS, y, column, self.weight(bias), len(bias), needs=needs)
+        self._add(kernels.BIAS, y, column, self.weight(bias), len(bias), needs=needs)
 
     def degree(self, y: int, degree: int, column: int, bias: Tensor, needs: int = NONE) -> None:
-        self._add(compiled_instructions.DEGREE, y, degree, self.weight(bias), len(bias), column, needs=needs)
+        self._add(kernels.DEGREE, y, degree, self.weight(bias), len(bias), column, needs=needs)
 
     def activate(self, y: int, bias: Tensor, slope: Tensor, needs: int = NONE, fills: bool = False) -> None:
-        self._add(compiled_instructions.ACTIVATE, y, self.weight(bias), self.weight(slope), len(bias), int(fills), needs=needs)
+        self._add(kernels.ACTIVATE, y, self.weight(bias), self.weight(slope), len(bias), int(fills), needs=needs)
 
     def normalize(self, h: int, y: int, bias: Tensor, norm: torch.nn.LayerNorm, adds: bool) -> None:
         eps = self.weight(torch.tensor([norm.eps], dtype=torch.float64))
         self._add(
-            compiled_instructions.NORMALIZE,
+            kernels.NORMALIZE,
             y,
             h,
             self.weight(bias),
@@ -126,43 +127,43 @@ class Program:
         )
 
     def residual(self, h: int, y: int, bias: Tensor) -> None:
-        self._add(compiled_instructions.RESIDUAL, y, h, self.weight(bias), len(bias))
+        self._add(kernels.RESIDUAL, y, h, self.weight(bias), len(bias))
 
     def zero(self, y: int) -> None:
-        self._add(compiled_instructions.ZERO, y)
+        self._add(kernels.ZERO, y)
 
     def divide(self, y: int, divisor: int) -> None:
-        self._add(compiled_instructions.DIVIDE, y, divisor)
+        self._add(kernels.DIVIDE, y, divisor)
 
     # --- instructions of edges; ends are 1 for the target and 0 for the source ---------------------------------------------------------------
 
     def messages(self, w: int, width: int, slope: Tensor, target: tuple[int, int], source: tuple[int, int], at_target: tuple[int, int], at_source: tuple[int, int]) -> None:  # fmt: skip  # noqa: E501
         """Gather a (target) and b (source), add w, activate, and add to the sums at the target, and subtract from those at the source."""
-        self._add(compiled_instructions.MESSAGES, w, *target, *source, width, self.weight(slope), *at_target, *at_source)
+        self._add(kernels.MESSAGES, w, *target, *source, width, self.weight(slope), *at_target, *at_source)
 
     def gather(self, w: int, width: int, slope: Tensor, own: tuple[int, int], other: tuple[int, int], end: int = 1) -> None:
         """Replace w by the activation of a (at ``end``), b (at the other end) and w."""
-        self._add(compiled_instructions.GATHER, w, *own, *other, width, self.weight(slope), end)
+        self._add(kernels.GATHER, w, *own, *other, width, self.weight(slope), end)
 
     def gather_odd(self, w: int, u: int, width: int, slope: Tensor, nodes: int, a: int, b: int) -> None:
-        self._add(compiled_instructions.GATHER_ODD, w, nodes, a, b, u, width, self.weight(slope))
+        self._add(kernels.GATHER_ODD, w, nodes, a, b, u, width, self.weight(slope))
 
     def activate_odd(self, w: int, u: int, bias: Tensor, slope: Tensor) -> None:
-        self._add(compiled_instructions.ACTIVATE_ODD, w, u, self.weight(bias), self.weight(slope), len(bias))
+        self._add(kernels.ACTIVATE_ODD, w, u, self.weight(bias), self.weight(slope), len(bias))
 
     def update(self, m: int, e: int, bias: Tensor) -> None:
-        self._add(compiled_instructions.UPDATE, m, e, self.weight(bias), len(bias))
+        self._add(kernels.UPDATE, m, e, self.weight(bias), len(bias))
 
     def scatter(self, x: int, width: int, sums: tuple[int, int], sign: int, end: int, bodies: tuple[int, int] = (NONE, NONE)) -> None:
         """Add rows to the sums at one end, or subtract them; edges within one body are left out if the types of their bodies are given."""
-        self._add(compiled_instructions.SCATTER, x, width, *sums, sign, end, *bodies)
+        self._add(kernels.SCATTER, x, width, *sums, sign, end, *bodies)
 
     def count(self, degree: tuple[int, int], sign: int, end: int, bodies: tuple[int, int] = (NONE, NONE)) -> None:
-        self._add(compiled_instructions.COUNT, *degree, sign, end, *bodies)
+        self._add(kernels.COUNT, *degree, sign, end, *bodies)
 
 
 class Tables(NamedTuple):
-    """What a program reads and writes, a table for each kind; see ``compiled_network_inputs`` for the columns.
+    """What a program reads and writes, a table for each kind; see ``network_program_io`` for the columns.
 
     Attributes:
         nodes, edges, bodies: inputs: features of nodes, edges of relations, and the body of each node.
@@ -183,7 +184,7 @@ class Executable:
         kinds: what each input and result is.
     """
 
-    def __init__(self, program: Program, kinds: Tables) -> None:
+    def __init__(self, program: NetworkProgram, kinds: Tables) -> None:
         self.kinds = kinds
         self.instructions = np.array(program.instructions, np.int64).reshape(-1, NUM_ARGUMENTS + 2)
         self.segments = np.array(program.segments, np.int64).reshape(-1, 3)

@@ -11,7 +11,7 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from gpe_pl.nn.compiled_instructions import NONE, OPTIONS
+from gpe_pl.nn.network_program_kernels import NONE, OPTIONS
 from gpe_pl.nn.pointers import matrix_at
 
 
@@ -81,7 +81,7 @@ def load_nodes(kinds, arrays, number, first_node, work, offset, stride, height):
         kinds: type, matrix, and number of columns of each input [input, 3].
         arrays: address, number of rows, and number of the first node of each tensor [input, 3].
         number, first_node: see ``number_nodes``.
-        work, offset, stride, height: matrices, see ``compiled_instructions.run``.
+        work, offset, stride, height: matrices, see ``network_program_kernels.run``.
     """
     for k in range(len(kinds)):
         t, m, columns = kinds[k]
@@ -104,8 +104,8 @@ def load_edges(kinds, arrays, number, first_node, ends, first_edge, work, offset
             for the features of the opposite direction or ``NONE`` [relation, 8].
         arrays: addresses of indices, odd and even features, number of edges, and numbers of the first source and target of each relation [relation, 6].
         number, first_node: see ``number_nodes``.
-        ends, first_edge: source and target of all edges; a result. See ``compiled_instructions.run``.
-        work, offset, stride: matrices, see ``compiled_instructions.run``.
+        ends, first_edge: source and target of all edges; a result. See ``network_program_kernels.run``.
+        work, offset, stride: matrices, see ``network_program_kernels.run``.
     """
     filled = np.zeros(len(first_edge), np.int64)
     for r in range(len(kinds)):
@@ -167,7 +167,7 @@ def store(kinds, arrays, number, first_node, work, offset, stride):
         kinds: type, matrix, and number of columns of each result [result, 3].
         arrays: address, number of rows, and number of the first node of each tensor [result, 3].
         number, first_node: see ``number_nodes``.
-        work, offset, stride: matrices, see ``compiled_instructions.run``.
+        work, offset, stride: matrices, see ``network_program_kernels.run``.
     """
     for k in range(len(kinds)):
         t, m, columns = kinds[k]
