@@ -8,7 +8,7 @@ For node states h of each type, edge features f, and every relation from j to i 
     h_i ← h_i + N(R φ(Q t_i + q) + r)     N is a LayerNorm, or the identity
 
 PyTorch would run several hundred small operations per training step, each with a node in the graph of autograd. Here the backward pass is written out, and both
-passes are compiled functions (``nn.compiled_processor``). They keep arrays over nodes and no array over edges; the activations of edges are computed again.
+passes are compiled functions (``fused_processor_kernels``). They keep arrays over nodes and no array over edges; the activations of edges are computed again.
 As C and Q are linear, Q C is multiplied first, once per relation.
 """
 
@@ -24,9 +24,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gpe_pl.nn import compiled_processor, matrix_product
-from gpe_pl.nn.compiled_processor import C_AT_SOURCE, C_AT_TARGET, C_G_SOURCE, C_G_TARGET
+from gpe_pl.nn import fused_processor_kernels as kernels
+from gpe_pl.nn import matrix_product
 from gpe_pl.nn.fused import plain_gradients
+from gpe_pl.nn.fused_processor_kernels import C_AT_SOURCE, C_AT_TARGET, C_G_SOURCE, C_G_TARGET
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class Step:
 
 
 class _Tables:
-    """The steps for one graph as tables of ``nn.compiled_processor``, with the memory for all matrices.
+    """The steps for one graph as tables of ``nn.fused_processor_kernels``, with the memory for all matrices.
 
     Args:
         relations, steps, h: as in ``fused_processor``.
@@ -122,7 +123,7 @@ class _Tables:
 
     def forward(self, eps: float) -> list[Tensor]:
         """Return the final states."""
-        compiled_processor.forward(*self.given, *self.edges, self.work, self.scratch, self.width, eps, self.channels)
+        kernels.forward(*self.given, *self.edges, self.work, self.scratch, self.width, eps, self.channels)
         return [self._view(offset, n).clone() for offset, n in zip(self.states[-1], self.sizes, strict=True)]
 
     def backward(self, grads: Sequence[Tensor]) -> list[Tensor]:
@@ -130,7 +131,7 @@ class _Tables:
         self._write(self.of_states, grads)
         result = self.like.new_zeros(self.num_grads)
         offsets = np.array(self.of_states)
-        compiled_processor.backward(*self.given, *self.edges, self.work, self.scratch, self.width, self.channels, offsets, result.numpy())
+        kernels.backward(*self.given, *self.edges, self.work, self.scratch, self.width, self.channels, offsets, result.numpy())
         tensors = [t for step in self.steps for t in step.tensors]
         parts = result.split([t.numel() for t in tensors])
         of_states = [self._view(offset, n).clone() for offset, n in zip(self.of_states, self.sizes, strict=True)]

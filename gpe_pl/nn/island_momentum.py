@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gpe_pl.nn.compiled_islands import remove_rigid_part
 from gpe_pl.nn.fused import works_on
+from gpe_pl.nn.island_momentum_kernels import remove_rigid_part
 
 IslandMomentum = Literal["ignored", "linear", "angular"]
 SMALLEST_PRINCIPAL_FRACTION = 1e-4
@@ -75,7 +75,7 @@ def rigid_part(
 
 
 def _compiles(*tensors: Tensor) -> bool:
-    """Tell whether ``compiled_islands`` can be used in the present context."""
+    """Tell whether ``island_momentum_kernels`` can be used in the present context."""
     return not torch.is_grad_enabled() and works_on(*tensors)
 
 

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from gpe_pl.nn import fused_processor as module
 from gpe_pl.nn import matrix_product
-from gpe_pl.nn.compiled_processor import EDGES
 from gpe_pl.nn.fused_processor import Conv, Relation, Step, Update, fused_processor, plain_processor
+from gpe_pl.nn.fused_processor_kernels import EDGES
 
 WIDTH, EPS = 6, 1e-5
 NODES = [9, 4, 7]
