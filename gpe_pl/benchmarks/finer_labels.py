@@ -1,8 +1,8 @@
-"""Benchmark of labels of a finer solver (``data.fine=2``): their distance from a still finer solution, over that of the solver at the spacing of the scene.
+"""Benchmark of finer labels (``data.fine=2``): their distance from a still finer solution, over that of the solver at the spacing of the scene.
 
 The same scenes are solved at their spacing, at half of it and at a quarter. The last solution is the reference. Solutions are compared at the nodes of the
-scene, at equal times. Two other choices of tracers are compared with the one of ``solvers.finer``: the mean of the parts into which a particle was divided, and
-the start of the node plus the displacement of one part.
+scene, at equal times. Two other choices of tracers are compared with the one of ``solvers.finer_solver``: the mean of the parts into which a particle
+was divided, and the start of the node plus the displacement of one part.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gpe_pl.files.markdown import table_row
 from gpe_pl.metrics import bootstrap_ratio
 from gpe_pl.rollout.loop import SimulationError, steps
 from gpe_pl.schema import Split
-from gpe_pl.solvers.finer import FinerSolver
+from gpe_pl.solvers.finer_solver import FinerSolver
 from gpe_pl.system.progress import progress_bar
 from gpe_pl.system.workers import pool, results
 from gpe_pl.trajectory.state import State

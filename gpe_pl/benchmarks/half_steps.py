@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
-from gpe_pl.solvers.finer import FinerSolver
+from gpe_pl.solvers.finer_solver import FinerSolver
 from gpe_pl.trajectory.state import State
 
 

@@ -1,10 +1,10 @@
 """Run time against error of solvers and learned models: accuracy at equal cost, and cost at equal accuracy.
 
-The reference is the solver at half the spacing at which the data were solved. With ``data.fine``, that is already finer than the spacing of the nodes. The
-reference is compared at the nodes of the scene (``solvers.finer``). Its substeps are half as long where waves or speeds limit them. A substep that takes a
-whole frame stays as long. The observed order of convergence is reported. Everything is compared with the reference, also the solver that made the training
-data. No model can be expected to have a smaller error than that solver. The protocol follows McGreivy and Hakim 2024 (arXiv 2407.07218): a solver can always
-run at a lower resolution, so a fair comparison is at equal cost or at equal accuracy.
+The reference is the solver at half the spacing at which the data were solved. With finer labels (``data.fine``), the data were themselves solved at a smaller
+spacing than that of the nodes. Errors are distances from the reference at the nodes of the scene (``solvers.finer_solver``). Substeps of the reference are half
+as long where waves or speeds limit them. A substep that takes a whole frame stays as long. The observed order of convergence is reported. The solver that made
+the training data is compared with the reference, too. No model can be expected to have a smaller error than that solver. The protocol follows McGreivy and
+Hakim 2024 (arXiv 2407.07218): a solver can always run at a lower resolution, so a fair comparison is at equal cost or at equal accuracy.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from gpe_pl.rollout.baselines import BASELINES
 from gpe_pl.rollout.containment import Contained
 from gpe_pl.rollout.loop import SimulationError, Simulator, steps
 from gpe_pl.schema import Split
-from gpe_pl.solvers.finer import FinerSolver, Refinable
+from gpe_pl.solvers.finer_solver import FinerSolver, Refinable
 from gpe_pl.solvers.resolution import Resolved, coarser
 from gpe_pl.training.budget import read_times
 from gpe_pl.trajectory.state import State

@@ -22,7 +22,7 @@ from gpe_pl.geometry.shapes import ON_SURFACE
 from gpe_pl.rollout.guard import Guard
 from gpe_pl.rollout.loop import Simulator, rollout
 from gpe_pl.schema import MATERIALS, SPLITS, MaterialParameter, MaterialValues, ParameterGroup, param_names, parameters_by_name
-from gpe_pl.solvers.finer import TRACERS, FinerSolver, Refinable
+from gpe_pl.solvers.finer_solver import TRACERS, FinerSolver, Refinable
 from gpe_pl.solvers.materials import limits_fault
 from gpe_pl.solvers.scenes import Scene, describe
 from gpe_pl.trajectory.state import State
@@ -143,7 +143,7 @@ class DatasetSpec:
         num_frames: number of stored frames per trajectory, including the initial one.
         trajectories_per_shard: number of trajectories in a shard, the unit of work and of resuming.
         seed: seed of the data set.
-        fine: factor by which the solver divides the spacing of the scene. Above 1, the nodes are tracers of the finer solution (``solvers.finer``).
+        fine: factor by which the solver divides the spacing of the scene. Above 1, the nodes are tracers of the finer solution (``solvers.finer_solver``).
         scene: distribution of scenes.
         solver: solver that simulates them.
     """

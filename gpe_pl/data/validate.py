@@ -22,7 +22,7 @@ from typing import get_args
 import h5py
 import numpy as np
 
-from gpe_pl.data import fine_provenance
+from gpe_pl.data import finer_labels_metadata
 from gpe_pl.data.free_flight import FreeFlight, free_flights, joined, vector
 from gpe_pl.data.motion import motion_of, rounding_fault
 from gpe_pl.files.hdf5_arrays import attribute, is_named
@@ -151,7 +151,7 @@ class Group:
         if flight.num_free:
             disturbed, free, islands = flight.num_disturbed, flight.num_free, flight.num_islands
             advice = "above 0.1 % choose a larger connectivity_radius, unless positions are measured or air resists"
-            if fine_provenance.factor_of(self.metadata) != 1:
+            if finer_labels_metadata.factor_of(self.metadata) != 1:
                 advice = "tracers of a finer solver are also moved by parts of particles that are not stored"
             yield f"free groups accelerate by {vector(flight.typical)} (median), gravity is {vector(np.median(flight.gravity, axis=0))}"
             yield (
@@ -216,7 +216,7 @@ def _check_file(path: Path, result: Result, seen: dict[str, str], reference: dic
                 for key in SAME_IN_A_DATASET:
                     if getattr(metadata, key) != getattr(common, key):
                         violation(name, key, f"is {getattr(metadata, key)}, but {getattr(common, key)} in {first} of the same data set")
-                own, others = map(fine_provenance.factor_of, (metadata, common))
+                own, others = map(finer_labels_metadata.factor_of, (metadata, common))
                 if own != others:
                     violation(name, "config", f"fine is {own}, but {others} in {first} of the same data set")
                 if len(result.violations) == before:
@@ -287,7 +287,7 @@ def _check_metadata(m: Metadata, path: Path) -> Iterator[Finding]:
         parsed(m.config)
     except ValueError:
         yield "config", "is not JSON"
-    yield from (("config", fault) for fault in fine_provenance.faults(m))
+    yield from (("config", fault) for fault in finer_labels_metadata.faults(m))
     if m.split not in SPLITS:
         yield "split", f"is {m.split!r}, must be one of {', '.join(SPLITS)}"
     folder = path.absolute().parent.name

@@ -102,7 +102,7 @@ class FEM:
         return min(self.frame_dt, self.cfl / _critical_rate(mesh.scale * stiffest, mesh.scale * most_viscous))
 
     def finer(self, factor: int) -> FEM:
-        """Return the solver for meshes with ``1 / factor`` of the spacing: ``max_substeps`` is ``factor`` times as large; see ``solvers.finer``."""
+        """Return the solver for meshes with ``1 / factor`` of the spacing: ``max_substeps`` is ``factor`` times as large; see ``solvers.finer_solver``."""
         return replace(self, max_substeps=factor * self.max_substeps)
 
     can_restart: ClassVar[bool] = True

@@ -189,7 +189,7 @@ class FLIP:
         return replace(state, velocity_history=None, stress=None)
 
     def finer(self, factor: int) -> FLIP:
-        """Return the solver with ``1 / factor`` of the grid spacing, and ``factor`` times as many substeps allowed; see ``solvers.finer``."""
+        """Return the solver with ``1 / factor`` of the grid spacing, and ``factor`` times as many substeps allowed; see ``solvers.finer_solver``."""
         return replace(self, grid_spacing=self.grid_spacing / factor, max_substeps=factor * self.max_substeps)
 
     def step(self, state: State) -> State:

@@ -168,7 +168,7 @@ class MPM:
         return state.later(self.frame_dt, particles.pos, particles.vel, velocity_history=None, num_substeps=num_substeps, internal=internal)
 
     def finer(self, factor: int) -> MPM:
-        """Return the solver with ``1 / factor`` of the grid spacing, and ``factor`` times as many substeps allowed; see ``solvers.finer``."""
+        """Return the solver with ``1 / factor`` of the grid spacing, and ``factor`` times as many substeps allowed; see ``solvers.finer_solver``."""
         return replace(self, grid_spacing=self.grid_spacing / factor, max_substeps=factor * self.max_substeps)
 
     @property

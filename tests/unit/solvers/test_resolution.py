@@ -1,4 +1,4 @@
-"""A coarser scene has the same mass and momentum at the same place, and maps back to its original nodes; ``test_finer`` tests finer scenes."""
+"""A coarser scene has the same mass and momentum at the same place, and maps back to its original nodes; ``test_finer_solver`` tests finer scenes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reads and checks what the metadata of trajectories say about labels of a finer solver (``DatasetSpec.fine``)."""
+"""Reads and checks what the metadata of a trajectory say about finer labels (``DatasetSpec.fine``)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from gpe_pl.files.json_text import parsed
-from gpe_pl.solvers.finer import FACTORS
+from gpe_pl.solvers.finer_solver import FACTORS
 from gpe_pl.trajectory.trajectory import Metadata
 
 
@@ -17,7 +17,7 @@ def factor_of(metadata: Metadata) -> Any:
 
 
 def faults(metadata: Metadata) -> Iterator[str]:
-    """Yield the faults in what the metadata say about labels of a finer solver."""
+    """Yield a message for each fault in what the metadata say about finer labels."""
     settings = _settings(metadata)
     if settings.keys().isdisjoint(("fine", "fine_solver")):
         return

@@ -11,7 +11,7 @@ import pytest
 from gpe_pl.config.datasets import dataset
 from gpe_pl.data.ground_truth import DatasetSpec, initial_state
 from gpe_pl.rollout.loop import SimulationError, steps
-from gpe_pl.solvers.finer import FinerSolver
+from gpe_pl.solvers.finer_solver import FinerSolver
 from gpe_pl.solvers.resolution import MARKER, Divided
 from gpe_pl.trajectory.state import State
 
