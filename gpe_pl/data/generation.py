@@ -27,7 +27,7 @@ import numpy as np
 
 from gpe_pl.data.checksum import split_checksum
 from gpe_pl.data.ground_truth import DatasetSpec, GenerationError, generate_trajectory, initial_state
-from gpe_pl.data.motion import ROUNDING_FRACTION, motion_of, rounding_fault, rounding_of
+from gpe_pl.data.position_rounding import ROUNDING_FRACTION, motion_of, rounding_fault, rounding_of
 from gpe_pl.data.statistics import STATISTICS_FILE, combined, shard_moments
 from gpe_pl.files import sealed
 from gpe_pl.files.atomic import free_bytes, replace_text

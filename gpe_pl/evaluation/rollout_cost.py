@@ -15,7 +15,7 @@ from gpe_pl.files import sealed
 from gpe_pl.rollout.loop import SimulationError, Simulator, step_all
 from gpe_pl.trajectory.state import State
 
-COST = "rollout_cost.json"
+COST_FILE = "rollout_cost.json"
 """File with the cost of rollouts in the folder of a run or evaluation."""
 
 
@@ -56,7 +56,7 @@ def write_cost(folder: Path, seconds: list[float], frame_dt: float) -> None:
     """
     if seconds:
         step = float(np.median(seconds))
-        sealed.write(folder / COST, {"seconds_per_step": step, "seconds_per_simulated_second": step / frame_dt})
+        sealed.write(folder / COST_FILE, {"seconds_per_step": step, "seconds_per_simulated_second": step / frame_dt})
 
 
 def read_cost(folder: Path) -> float | None:
@@ -65,6 +65,6 @@ def read_cost(folder: Path) -> float | None:
     Raises:
         SealError: the file was changed or damaged.
     """
-    if not (folder / COST).is_file():
+    if not (folder / COST_FILE).is_file():
         return None
-    return float(sealed.read(folder / COST, "delete it to do without")["seconds_per_simulated_second"])
+    return float(sealed.read(folder / COST_FILE, "delete it to do without")["seconds_per_simulated_second"])

@@ -30,10 +30,10 @@ from gpe_pl.graphs.compiled_graph import works_on
 from gpe_pl.graphs.features import GraphConfig, history_of
 from gpe_pl.graphs.standardizer import GraphStandardizer, StatisticsSample, named
 from gpe_pl.graphs.standards import Standards
-from gpe_pl.learned import motion
+from gpe_pl.learned import next_states
 from gpe_pl.learned.checkpoint_file import CheckpointError as CheckpointError
 from gpe_pl.learned.checkpoint_file import load_checkpoint, reason
-from gpe_pl.learned.motion import per_scene
+from gpe_pl.learned.next_states import per_scene
 from gpe_pl.learned.pretrained import checkpoint_path
 from gpe_pl.learned.training_ranges import outside_masses, outside_parameters, stored_ranges
 from gpe_pl.models.base import Model, Prediction
@@ -423,11 +423,11 @@ class LearnedSimulator(nn.Module):
     def moved(self, states: list[State], graphs: list[HeteroData], predicted: Prediction) -> list[State]:
         """Return the next states from the prediction for a batch of their graphs."""
         acceleration, dt = predicted.acceleration, self.builder.metadata.frame_dt
-        if not self.static_friction and motion.works_on_all(states, acceleration):
-            new = motion.moved(states, graphs, acceleration, float(self.acceleration_std), dt)
+        if not self.static_friction and next_states.works_on_all(states, acceleration):
+            new = next_states.moved(states, graphs, acceleration, float(self.acceleration_std), dt)
         else:
             new = [self.advance(state, acc) for state, acc in zip(states, self.accelerations(states, graphs, acceleration), strict=True)]
-        new = motion.with_frame_velocity(new, graphs, predicted.frame_velocity, dt)
+        new = next_states.with_frame_velocity(new, graphs, predicted.frame_velocity, dt)
         if not self.static_friction:
             return new
         return [self._with_static_friction(*parts) for parts in zip(states, new, graphs, strict=True)]
@@ -473,7 +473,7 @@ class LearnedSimulator(nn.Module):
 
     def _with_stress(self, states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor]) -> list[State]:
         components = next(iter(self.builder.spec.stress_channels.values()))
-        return motion.with_stress(states, graphs, predicted, self.stress_std, components)
+        return next_states.with_stress(states, graphs, predicted, self.stress_std, components)
 
     def advance(self, state: State, acc: Tensor) -> State:
         """Return the next state under an acceleration [node, dim] in m/s² that includes gravity, without static friction."""

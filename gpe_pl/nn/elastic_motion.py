@@ -153,7 +153,7 @@ class Corners:
     friction: Float[Tensor, " pair"]
 
 
-class Motion(NamedTuple):
+class ElasticMotion(NamedTuple):
     """Motion over a frame, in double precision.
 
     Attributes:
@@ -176,7 +176,7 @@ def elastic_motion(
     cells: Cells,
     walls: Walls,
     corners: Corners | None = None,
-) -> Motion:
+) -> ElasticMotion:
     """Return the motion over a frame.
 
     Args:
@@ -196,7 +196,7 @@ def elastic_motion(
     values = [t.double() for t in (pos, vel, forcing, mass, *softened, walls.normal, gap, walls.friction, corners.point, corners.friction)]
     move: Any = _Motion.apply if works_on(*values) else plain_motion
     displacement, velocity = move(*values, corners.nodes, cells, number)
-    return Motion(displacement, velocity, softened)
+    return ElasticMotion(displacement, velocity, softened)
 
 
 def _softened_law(pos: Float[Tensor, "node dim"], law: Law, cells: Cells) -> tuple[Law, Int64[Tensor, " scene"]]:

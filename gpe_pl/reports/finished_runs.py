@@ -69,7 +69,7 @@ def archive(runs: list[Run], root: Path, folder: Path) -> None:
         settings = {f"{CONFIG}{key}": value for key, value in run.config.items()} | {
             f"{DATA}{key}": value for key, value in run.data.items()
         }
-        settings |= {} if run.cost is None else {COST: run.cost}
+        settings |= {} if run.cost is None else {COST_KEY: run.cost}
         about[run_name(run, root)] = settings | dict(zip(CURVE, (array.tolist() for array in validation_curve(run)), strict=True))
     run_archive.write_archive(folder, about, {run_name(run, root): run.rows for run in runs})
 
@@ -82,7 +82,9 @@ def evaluation_in(folder: Path) -> Run:
 CONFIG, DATA = "config:", "data:"
 """Prefixes of an archive's keys for the configuration of a run and for the checksums of its data."""
 CURVE = ("validation_steps", "validation_losses")
-COST = "seconds_per_simulated_second"
+"""Keys of an archive for the validation losses of a run and their training steps."""
+COST_KEY = "seconds_per_simulated_second"
+"""Key of an archive for the processor time of a run's rollouts per simulated second [s]."""
 
 
 def run_name(run: Run, root: Path) -> str:
@@ -96,7 +98,7 @@ def _archived(folder: Path) -> list[Run]:
     for name, known in about.items():
         config, data = ({key.removeprefix(kind): value for key, value in known.items() if key.startswith(kind)} for kind in (CONFIG, DATA))
         curve = np.array(known[CURVE[0]], int), np.array(known[CURVE[1]], float)
-        runs.append(Run(folder / name, config, rows[name], data, curve, known.get(COST)))
+        runs.append(Run(folder / name, config, rows[name], data, curve, known.get(COST_KEY)))
     return runs
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from gpe_pl.errors import GpeError
 from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.rollout.guard import Guard, unsound
-from gpe_pl.trajectory.boundary import Motion, as_numpy
+from gpe_pl.trajectory.boundary import BoundaryMotion, as_numpy
 from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.trajectory import Metadata, Termination, Trajectory
 
@@ -236,7 +236,7 @@ class _Recording:
         self.vel: list[np.ndarray] = []
         self.frame_velocity: list[np.ndarray | None] = []
         self.stress: list[Stress | None] = []
-        self.motion: list[Motion] = []
+        self.motion: list[BoundaryMotion] = []
         self.termination: Termination | None = None
         self.add(start.state)
 
@@ -249,7 +249,7 @@ class _Recording:
         self.frame_velocity.append(None if item.frame_velocity is None else _numpy(item.frame_velocity))
         if self.start.state.boundary.motion is not None:
             b = item.boundary
-            self.motion.append(Motion(*(np.array(_numpy(x)) for x in (b.pos, b.vel, b.normal))))
+            self.motion.append(BoundaryMotion(*(np.array(_numpy(x)) for x in (b.pos, b.vel, b.normal))))
         self.stress.append(None if item.stress is None else Stress(_numpy(item.stress.node), _numpy(item.stress.cell)))
 
     def _velocities(self) -> list[np.ndarray]:
@@ -264,7 +264,11 @@ class _Recording:
         state = self.start.state
         known = [stress for stress in self.stress if stress is not None]
         has_stress = len(known) == len(self.stress)
-        motion = Motion(*(np.stack([getattr(m, name) for m in self.motion]) for name in ("pos", "vel", "normal"))) if self.motion else None
+        motion = (
+            BoundaryMotion(*(np.stack([getattr(m, name) for m in self.motion]) for name in ("pos", "vel", "normal")))
+            if self.motion
+            else None
+        )
         return Trajectory(
             self.start.metadata,
             np.stack(self.pos),

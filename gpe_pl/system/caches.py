@@ -25,7 +25,7 @@ COMPILED = (
     "graphs/features.py",
     "graphs/islands.py",
     "graphs/mesh_topology.py",
-    "learned/motion.py",
+    "learned/next_states.py",
     "nn/*_kernels.py",
     "nn/fused*.py",
     "nn/matrix_product.py",

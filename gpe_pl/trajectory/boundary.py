@@ -1,4 +1,4 @@
-"""``Boundary``: walls and obstacles as nodes with a boundary condition, and their prescribed ``Motion``."""
+"""``Boundary``: walls and obstacles as nodes with a boundary condition. ``BoundaryMotion``: how those nodes move."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Array = Any
 
 
 @dataclass(frozen=True)
-class Motion:
+class BoundaryMotion:
     """Prescribed motion of boundary nodes from the current frame on, as NumPy arrays [frame, boundary_node, dim].
 
     Attributes:
@@ -39,20 +39,20 @@ class Motion:
     def num_frames(self) -> int:
         return len(self.pos)
 
-    def frames(self, start: int, stop: int | None = None) -> Motion:
+    def frames(self, start: int, stop: int | None = None) -> BoundaryMotion:
         """Return the motion in the frames ``start:stop``."""
-        return Motion(self.pos[start:stop], self.vel[start:stop], self.normal[start:stop])
+        return BoundaryMotion(self.pos[start:stop], self.vel[start:stop], self.normal[start:stop])
 
-    def every(self, stride: int) -> Motion:
+    def every(self, stride: int) -> BoundaryMotion:
         """Return every ``stride``-th frame from the first on. Velocities are means over the frames up to, and without, the next returned one."""
         first = np.arange(0, self.num_frames, stride)
         count = np.minimum(first + stride, self.num_frames) - first
         vel = np.add.reduceat(self.vel, first, axis=0) / count[:, None, None]
-        return Motion(self.pos[::stride], vel.astype(self.vel.dtype), self.normal[::stride])
+        return BoundaryMotion(self.pos[::stride], vel.astype(self.vel.dtype), self.normal[::stride])
 
-    def take(self, nodes: np.ndarray) -> Motion:
+    def take(self, nodes: np.ndarray) -> BoundaryMotion:
         """Return the motion of some boundary nodes, given by row numbers or a mask."""
-        return Motion(self.pos[:, nodes], self.vel[:, nodes], self.normal[:, nodes])
+        return BoundaryMotion(self.pos[:, nodes], self.vel[:, nodes], self.normal[:, nodes])
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Boundary:
     friction: Array = field(metadata=NODE)
     restitution: Array = field(metadata=NODE)
     shapes: tuple[Shape, ...] = field(default=(), metadata=SCENE)
-    motion: Motion | None = field(default=None, metadata=SCENE)
+    motion: BoundaryMotion | None = field(default=None, metadata=SCENE)
 
     @classmethod
     def sample(cls, shapes: tuple[Shape, ...], spacing: float, dim: int, periodicity: Periodicity = NOWHERE) -> Boundary:
@@ -174,7 +174,7 @@ class Boundary:
         vel = np.concatenate([steps, steps[-1:]]) / positive("frame_dt", frame_dt, "seconds")
         normals = _unit(normal) if given else carried_along(path, np.asarray(first.normal, np.float64), periodicity)
         inside = np.stack([periodicity.wrapped(frame) for frame in path])
-        return replace(first, motion=Motion(inside, vel, normals)).at(0)
+        return replace(first, motion=BoundaryMotion(inside, vel, normals)).at(0)
 
     def inside(self, periodicity: Periodicity) -> Boundary:
         """Return this boundary of NumPy arrays, prepared for a periodic domain; the same object if no axis is periodic.

@@ -8,7 +8,7 @@ from typing import Any
 
 from array_api_compat import array_namespace, device
 
-from gpe_pl.trajectory.boundary import Boundary, Motion
+from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
 from gpe_pl.trajectory.state import State, Stress
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -54,7 +54,7 @@ class Reflection:
         """Return the image of a boundary; it has nodes and no shapes."""
         motion = boundary.motion
         if motion is not None:
-            motion = Motion(self.point(motion.pos), self.vector(motion.vel), self.vector(motion.normal))
+            motion = BoundaryMotion(self.point(motion.pos), self.vector(motion.vel), self.vector(motion.normal))
         return replace(
             boundary,
             pos=self.point(boundary.pos),

@@ -30,7 +30,7 @@ from gpe_pl.files.late_failure import LateFailure
 from gpe_pl.geometry.shape_values import shape_from_dict, shape_to_dict, shapes_fault
 from gpe_pl.geometry.shapes import Shape
 from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, SCHEMA_VERSION, node_code
-from gpe_pl.trajectory.boundary import Boundary, Motion
+from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
 from gpe_pl.trajectory.state import Stress
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 from gpe_pl.trajectory.values import faults, size_conflicts
@@ -368,7 +368,7 @@ def read_trajectory(path: Path | str, name: str, verify: bool = False, frames: s
         raise UnsoundError(f"{path}:{name}", wrong)
     for fault in faults(arrays, names, metadata.materials, metadata.param_names, first_frame):
         raise UnsoundError(f"{path}:{name}", str(fault))
-    motion = Motion(arrays["boundary_pos"], arrays["boundary_vel"], arrays["boundary_normal"])
+    motion = BoundaryMotion(arrays["boundary_pos"], arrays["boundary_vel"], arrays["boundary_normal"])
     boundary = Boundary(
         motion.pos[0],
         motion.vel[0],

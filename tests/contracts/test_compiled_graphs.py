@@ -18,7 +18,7 @@ from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import node_code, param_names
 from gpe_pl.system.compiled import unfused
-from gpe_pl.trajectory.boundary import Boundary, Motion
+from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
 from gpe_pl.trajectory.state import State
 from tests import scenes
 
@@ -68,7 +68,7 @@ def periodic_mesh() -> Scene:
 def moving_walls() -> Scene:
     build, s = particles()
     b, steps = s.boundary, np.arange(4)[:, None, None]
-    motion = Motion(b.pos + 0.002 * steps, np.full((4, *b.pos.shape), 0.4), np.repeat(b.normal[None], 4, axis=0))
+    motion = BoundaryMotion(b.pos + 0.002 * steps, np.full((4, *b.pos.shape), 0.4), np.repeat(b.normal[None], 4, axis=0))
     return build, replace(s, boundary=replace(b, motion=motion).at(1))
 
 

@@ -25,7 +25,7 @@ from gpe_pl.learned.pretrained import names
 from gpe_pl.learned.simulator import CheckpointError, LearnedSimulator
 from gpe_pl.models.gpe import GPE
 from gpe_pl.schema import STICKY
-from gpe_pl.trajectory.boundary import Boundary, Motion
+from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
 from gpe_pl.trajectory.scene_ranges import described, scene_range, united
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import read_trajectory, trajectory_names, write_shard
@@ -46,7 +46,7 @@ def sliding(speed: float, frames: int = 4) -> Boundary:
     b = boundary()
     vel = np.zeros((frames, *b.pos.shape))
     vel[2, :, 0] = speed
-    return replace(b, motion=Motion(np.stack([b.pos] * frames), vel, np.stack([b.normal] * frames)))
+    return replace(b, motion=BoundaryMotion(np.stack([b.pos] * frames), vel, np.stack([b.normal] * frames)))
 
 
 def ranges(*scenes_: tuple[tuple[float, float], Boundary]) -> np.ndarray:
@@ -199,7 +199,7 @@ def test_the_range_is_that_of_all_training_trajectories(store: Path) -> None:
     held = [read_trajectory(shard, name) for name in trajectory_names(shard)]
     count, frames = len(held[0].boundary.pos), held[0].num_frames
     still = replace(held[0].boundary, restitution=np.full(count, 0.25, np.float32))
-    way = Motion(np.stack([still.pos] * frames), np.zeros((frames, count, 2), np.float32), np.stack([still.normal] * frames))
+    way = BoundaryMotion(np.stack([still.pos] * frames), np.zeros((frames, count, 2), np.float32), np.stack([still.normal] * frames))
     way.vel[-1, :, 0] = 3.0
     pos = (held[0].pos[:1] + 1e-3 * np.sin(np.arange(frames))[:, None, None]).astype(np.float32)
     calm = replace(held[0], pos=pos)

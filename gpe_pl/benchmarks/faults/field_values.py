@@ -24,7 +24,7 @@ from gpe_pl.data.validate import validate
 from gpe_pl.errors import GpeError
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import FIELDS, MOTION, NODE_TYPES, Values, node_code
-from gpe_pl.trajectory.boundary import Boundary, Motion
+from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import digest, read_trajectory, stored_arrays, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -186,7 +186,7 @@ def _trajectory(sound: Trajectory, arrays: dict[str, np.ndarray]) -> Trajectory:
     wall: dict[str, Any] = {name: arrays[f"boundary_{name}"] for name in ("pos", "vel", "normal")}
     moves = sound.boundary.motion is not None
     fixed: dict[str, Any] = {name: arrays[f"boundary_{name}"] for name in ("friction", "restitution")}
-    motion = Motion(wall["pos"], wall["vel"], wall["normal"]) if moves else None
+    motion = BoundaryMotion(wall["pos"], wall["vel"], wall["normal"]) if moves else None
     boundary: Boundary = replace(sound.boundary, **({name: array[0] for name, array in wall.items()} | fixed), motion=motion)
     names = ("pos", "vel", "node_type", "mass", "material_params", "rest_pos", "cells")
     values: dict[str, Any] = {name: arrays[name] for name in names if name in arrays}

@@ -23,7 +23,7 @@ from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 from gpe_pl.geometry.shapes import domain_walls
 from gpe_pl.schema import BOUNDARY, MATERIALS, NODE_TYPES, MaterialValues, parameters_by_name
 from gpe_pl.trajectory.arrays import estimated_normals, numbers
-from gpe_pl.trajectory.boundary import Boundary, Motion
+from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
 from gpe_pl.trajectory.trajectory import Trajectory
 
 Format = Literal["gns", "lagrangebench", "meshgraphnets", "dpinet", "dmcf", "arrays"]
@@ -387,7 +387,7 @@ def joined(dim: int, *parts: Boundary) -> Boundary:
             now = np.asarray(getattr(part, name), np.float32)
             return np.broadcast_to(now, (num_frames, *now.shape)) if part.motion is None else getattr(part.motion, name)
 
-        motion = Motion(*(np.concatenate([way(part, name) for part in parts], axis=1) for name in ("pos", "vel", "normal")))
+        motion = BoundaryMotion(*(np.concatenate([way(part, name) for part in parts], axis=1) for name in ("pos", "vel", "normal")))
     return Boundary(pos, vel, normal, friction, restitution, tuple(shape for part in parts for shape in part.shapes), motion)
 
 

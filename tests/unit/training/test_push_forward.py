@@ -23,7 +23,7 @@ from gpe_pl.rollout.loop import SimulationError
 from gpe_pl.training.module import TrainingModule
 from gpe_pl.training.push_forward import unrolled
 from gpe_pl.training.run import TrainingSettings
-from gpe_pl.trajectory.boundary import Motion
+from gpe_pl.trajectory.boundary import BoundaryMotion
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -168,7 +168,7 @@ def test_walls_that_move_go_on_moving_on_the_way(
     """A first visit knows the walls for one frame only, later ones farther."""
     still = new_trajectory(0, num_frames=6)
     pos = still.boundary.pos + 0.01 * np.arange(6)[:, None, None].astype(np.float32)
-    motion = Motion(pos, np.ones_like(pos), np.repeat(still.boundary.normal[None], 6, axis=0))
+    motion = BoundaryMotion(pos, np.ones_like(pos), np.repeat(still.boundary.normal[None], 6, axis=0))
     write_shard(store / "moving" / "shard-00000.h5", [replace(still, boundary=replace(still.boundary, vel=motion.vel[0], motion=motion))])
     data = WindowDataset(stored := open_split(store, "moving"), GraphBuilder(GraphConfig(history=2), stored[0].window(0, 1).metadata))
     module = TrainingModule(

@@ -18,7 +18,7 @@ from gpe_pl.geometry.repeated_shapes import Repeated
 from gpe_pl.geometry.shapes import Box, Polygon, Shape, Sphere, Wall
 from gpe_pl.rollout.loop import rollout
 from gpe_pl.schema import FIELDS, LARGEST, MATERIALS, NODE_TYPES, node_code, param_names
-from gpe_pl.trajectory.boundary import Boundary, Motion
+from gpe_pl.trajectory.boundary import Boundary, BoundaryMotion
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.store import StoreError, UnsoundError, read_trajectory, stored_arrays, write_shard
 from gpe_pl.trajectory.trajectory import Trajectory
@@ -158,7 +158,7 @@ def test_moving_boundaries_are_looked_at_in_every_frame(tmp_path: Path, trajecto
     b, count = trajectory.boundary, trajectory.num_frames
     way = {key: np.repeat(np.asarray(getattr(b, key))[None], count, axis=0) for key in ("pos", "vel", "normal")}
     way[name][4, 2] = value
-    broken = replace(trajectory, boundary=replace(b, motion=Motion(**way)))
+    broken = replace(trajectory, boundary=replace(b, motion=BoundaryMotion(**way)))
     write_shard(tmp_path / "a.h5", [broken])
     with pytest.raises(UnsoundError, match=rf"field 'boundary_{name}': frame 4, boundary_node 2"):
         read_trajectory(tmp_path / "a.h5", "00000")

@@ -12,7 +12,7 @@ import pytest
 
 from gpe_pl.data.importers import ImportFailure, ImportSettings, Report, import_dataset, save_dataset
 from gpe_pl.data.importers.sampled import degrees_of
-from gpe_pl.data.motion import motion_of
+from gpe_pl.data.position_rounding import motion_of
 from gpe_pl.data.validate import validate
 from gpe_pl.geometry.shapes import Shape, Sphere, domain_walls
 from gpe_pl.trajectory import integrators
