@@ -24,11 +24,11 @@ class Point:
     Attributes:
         name: name of the simulator.
         family: kind of simulator.
-        seconds: wall time over simulated time, of each scene.
+        seconds: computing time over simulated time, of each scene.
         mse: mean square error [m²] over the frames up to each horizon, of each scene; infinite if it failed.
         distance: energy distance [m] to the reference in the last frame, of each scene. It compares distributions, for times at which errors of single nodes
             carry no information.
-        overhead: seconds of training and of generating its data.
+        overhead: seconds of tuning, training and generating their data.
     """
 
     name: str

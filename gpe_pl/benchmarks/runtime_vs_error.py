@@ -5,6 +5,9 @@ spacing than that of the nodes. Errors are distances from the reference at the n
 as long where waves or speeds limit them. A substep that takes a whole frame stays as long. The observed order of convergence is reported. The solver that made
 the training data is compared with the reference, too. No model can be expected to have a smaller error than that solver. The protocol follows McGreivy and
 Hakim 2024 (arXiv 2407.07218): a solver can always run at a lower resolution, so a fair comparison is at equal cost or at equal accuracy.
+
+Solvers start at frame 0, learned models where they have enough history. The solver at the spacing of the nodes computes this history, also if the labels are of
+a finer solver, and its time is part of the models' cost. A model thus gets no positions that are more accurate than what it pays for.
 """
 
 from __future__ import annotations
@@ -33,6 +36,8 @@ from gpe_pl.benchmarks.cost_and_error import (
     ratio_at_cost,
     winners,
 )
+from gpe_pl.benchmarks.solver_rungs import DATA, MODULI, NODES, SPACING, STEPS, coarser_solver, rungs
+from gpe_pl.benchmarks.spent_before import Spent, spent_on
 from gpe_pl.benchmarks.trained import Case, runs_in, trained_on
 from gpe_pl.data.ground_truth import DatasetSpec, generate_trajectory, initial_state
 from gpe_pl.errors import GpeError
@@ -47,7 +52,6 @@ from gpe_pl.rollout.loop import SimulationError, Simulator, steps
 from gpe_pl.schema import Split
 from gpe_pl.solvers.finer_solver import FinerSolver, Refinable
 from gpe_pl.solvers.resolution import Resolved, coarser
-from gpe_pl.training.budget import read_times
 from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Trajectory
 
@@ -59,9 +63,6 @@ log = logging.getLogger(__name__)
 Frame = tuple[np.ndarray, np.ndarray]
 """Positions [node, dim] in m and velocities [node, dim] in m/s."""
 
-DATA = "solver, as for the data"
-SPACING, STEPS = "spacing × ", "steps × "
-NODES = "solver, spacing of the nodes"
 BALLISTIC = "ballistic"
 REPEATED = ", repeated predictions"
 
@@ -79,7 +80,9 @@ class Settings:
         runs: folders of finished runs; their models take part in the case whose data set they were trained on.
         factors: factors by which the solver is also run at a coarser spacing than the data.
         step_factors: factors by which the solver's steps may also be longer, at the spacing of the data and at coarser ones.
+        soft_factors: factors by which the solver's elastic moduli may also be smaller, where they are constants of the solver (``solver_rungs.softer``).
         repeats: numbers of frames for which predictions are repeated, each a further variant of every model (``Skips.repeat_frames``).
+        tuning: folders of further runs that were trained to choose settings; the break-even counts their training.
         split, num_trajectories: split and number of the scenes.
         horizons: numbers of frames over which errors are averaged; the full length is always added.
         num_threads: threads of PyTorch; the solvers use one.
@@ -90,7 +93,9 @@ class Settings:
     runs: list[str]
     factors: list[Annotated[float, Field(gt=1)]] = field(default_factory=lambda: [1.5, 2.0, 3.0])
     step_factors: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
+    soft_factors: list[Annotated[float, Field(gt=1)]] = field(default_factory=lambda: [4.0])
     repeats: list[Annotated[int, Field(gt=1)]] = field(default_factory=lambda: [2, 4])
+    tuning: list[str] = field(default_factory=list)
     split: Split = "test_unseen"
     num_trajectories: Annotated[int, Field(ge=1)] = 5
     horizons: list[Annotated[int, Field(ge=1)]] = field(default_factory=lambda: [20, 50, 100])
@@ -126,34 +131,22 @@ def run(settings: Settings, specs: dict[str, DatasetSpec]) -> tuple[list[dict[st
     return records, "\n\n".join(parts)
 
 
-def _models(runs: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[str, tuple[LearnedSimulator, float]]:
-    """Return trained simulators, with variants that repeat predictions, and the seconds of their training, by label."""
-    found = {}
-    for label, (simulator, run) in trained_on(spec, runs, with_strides=True).items():
-        seconds = training_seconds(run)
-        found[label] = simulator.to(settings.device), seconds
+def _models(finished: Sequence[Run], spec: DatasetSpec, settings: Settings) -> dict[str, tuple[LearnedSimulator, Spent]]:
+    """Return trained simulators, with variants that repeat predictions, and what they cost before, by label."""
+    found, tuning = {}, runs_in(settings.tuning)
+    for label, (simulator, run) in trained_on(spec, finished, with_strides=True).items():
+        spent = spent_on(run, finished, tuning)
+        found[label] = simulator.to(settings.device), spent
         for repeats in settings.repeats:
             repeating = simulator.configured(skips=replace(simulator.skips, repeat_frames=repeats))
-            found[f"{label}{REPEATED} × {repeats}"] = repeating, seconds
+            found[f"{label}{REPEATED} × {repeats}"] = repeating, spent
     return found
 
 
-def training_seconds(run: Run) -> float:
-    """Return the training time of a run [s]: its number of steps times the step time that its sweep measured.
-
-    Of several measured times, the largest counts with which the run stays within its time budget. NaN if there is none.
-    """
-    path = next((p for folder in run.folder.parents if (p := folder / "step_times.json").exists()), None)
-    model = str(run.config["model._target_"]).rpartition(".")[2]
-    about = f"{run.config['data.name']} {run.config['size.name']} {model} "
-    steps, budget = float(run.config["training.num_steps"]), 60 * float(run.config.get("size.comparison.budget_minutes") or math.inf)
-    times = {} if path is None else read_times(path)
-    return max((steps * t for key, t in times.items() if key.startswith(about) and steps * t <= budget), default=math.nan)
-
-
-def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]], settings: Settings) -> tuple[list[Point], float]:
+def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, Spent]], settings: Settings) -> tuple[list[Point], float]:
     """Run all simulators on the same scenes; return their points and the solver's observed order of convergence."""
     first = max(simulator.stride * simulator.builder.config.history for simulator, _ in models.values())
+    nodes = DATA if spec.fine == 1 else NODES
     points: dict[str, Point] = {}
     orders = []
     for index in range(settings.num_trajectories):
@@ -162,17 +155,21 @@ def compare(spec: DatasetSpec, models: dict[str, tuple[LearnedSimulator, float]]
         reference = _reference(spec, start, data)
         orders.append(_order(spec, start, data, reference))
         truth = reference.frames(first)
-        for name, family, simulator, at in _simulators(spec, start, data, models, first, settings):
+        history = data if spec.fine == 1 else generate_trajectory(replace(spec, fine=1), settings.split, index, num_frames=first + 1)
+        for name, family, simulator, at in _simulators(spec, start, history, models, first, settings):
             point = points.setdefault(name, Point(name, family))
             prediction, seconds = _timed(simulator, at, data, first)
+            if family == "learned":
+                fraction = first / (data.num_frames - 1)
+                seconds = fraction * points[nodes].seconds[-1] + (1 - fraction) * seconds
             point.seconds.append(seconds)
             error = _squared_error(prediction, truth)[1:]
             for horizon in (*(h for h in settings.horizons if h <= len(error)), None):
                 point.mse.setdefault("full" if horizon is None else str(horizon), []).append(float(np.mean(error[:horizon])))
             point.distance.append(_distance(prediction, truth))
-    generation = points[DATA].cost * spec.num_train * (spec.num_frames - 1) * spec.solver.frame_dt
-    for label, (_, training) in models.items():
-        points[label].overhead = training + generation
+    rates: dict[int, float] = {spec.fine: points[DATA].cost, 1: points[nodes].cost}
+    for label, (_, spent) in models.items():
+        points[label].overhead = spent.seconds(rates, float(getattr(spec.scene, "num_particles", math.nan)))
     return [*points.values()], float(np.nanmedian(orders))
 
 
@@ -197,68 +194,22 @@ class _Restricted:
 def _simulators(
     spec: DatasetSpec,
     start: State,
-    data: Trajectory,
-    models: dict[str, tuple[LearnedSimulator, float]],
+    history: Trajectory,
+    models: dict[str, tuple[LearnedSimulator, Spent]],
     first: int,
     settings: Settings,
 ) -> Iterator[tuple[str, Family, Simulator, _Restricted]]:
-    """Yield the simulators. Solvers start at frame 0, all others at frame ``first``, where all learned models have enough history."""
-    same = Resolved(start, lambda pos: pos)
-    yield DATA, "solver", spec.label_solver, _Restricted(same, True)
-    if spec.fine > 1:
-        yield NODES, "solver", spec.solver, _Restricted(same, True)
-    for longer in settings.step_factors:
-        if (solver := _with_longer_steps(spec.solver, longer)) is not None:
-            yield f"solver, {STEPS}{longer}", "solver", solver, _Restricted(same, True, longer)
-    for factor in settings.factors:
-        solver = _solver(spec, factor)
-        try:
-            resolved = coarser(start, spec.scene.spacing, factor)
-        except ValueError as error:
-            log.info("%s: no scene %g times coarser (%s)", spec.name, factor, error)
-            continue
-        if solver is None:
-            continue
-        yield f"solver, {SPACING}{factor:g}", "solver", solver, _Restricted(resolved, True)
-        for longer in settings.step_factors:
-            if (both := _with_longer_steps(solver, longer)) is not None:
-                yield f"solver, {SPACING}{factor:g}, {STEPS}{longer}", "solver", both, _Restricted(resolved, True, longer)
+    """Yield the simulators. Solvers start at frame 0, all others at frame ``first`` of ``history``, where all learned models have enough of it."""
+    for rung in rungs(spec, start, settings.factors, settings.step_factors, settings.soft_factors):
+        yield rung.name, "solver", rung.solver, _Restricted(rung.start, True, rung.frames_per_step)
     dt = spec.solver.frame_dt
     for label, (simulator, _) in models.items():
-        seen = data.frames(first % simulator.stride).every(simulator.stride)
+        seen = history.frames(first % simulator.stride).every(simulator.stride)
         at = _Restricted(Resolved(simulator.initial_state(seen, first // simulator.stride), lambda pos: pos), False, simulator.stride)
         yield label, "learned", Contained(approximate(simulator), simulator.stride * dt), at
     for name, baseline in BASELINES.items():
-        state = data.state(first, first)
+        state = history.state(first, first)
         yield name.replace("_", " "), "trivial", baseline(dt), _Restricted(Resolved(state, lambda pos: pos), False)
-
-
-def _solver(spec: DatasetSpec, factor: float) -> Any | None:
-    """Return the solver with about ``factor`` times the grid spacing, for nodes with ``factor`` times the spacing.
-
-    A solver without a grid is returned unchanged. Return None if such a grid does not fit the domain.
-    """
-    solver: Any = spec.solver
-    spacing = getattr(solver, "grid_spacing", None)
-    if spacing is None:
-        return solver
-    cells = [max(1, round((high - low) / (factor * spacing))) for low, high in solver.bounds]
-    wanted = (solver.bounds[0][1] - solver.bounds[0][0]) / cells[0]
-    try:
-        return replace(solver, grid_spacing=wanted)
-    except ValueError as error:
-        log.info("%s: no grid %g times coarser (%s)", spec.name, factor, error)
-        return None
-
-
-def _with_longer_steps(solver: Any, factor: int) -> Any | None:
-    """Return a solver with frames ``factor`` times as long. Its substeps may grow as much, up to a distance of one cell per substep.
-
-    Return None for a solver without a grid, whose substeps are already as long as is stable.
-    """
-    if getattr(solver, "grid_spacing", None) is None:
-        return None
-    return replace(solver, frame_dt=factor * solver.frame_dt, cfl=min(1.0, factor * solver.cfl))
 
 
 def _reference(spec: DatasetSpec, start: State, data: Trajectory) -> Trajectory:
@@ -278,7 +229,7 @@ def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Traject
     h is the spacing at which the data were solved.
     """
     is_fine = spec.fine > 1
-    solver = spec.refined(spec.fine // 2) if is_fine else _solver(spec, 2.0)
+    solver = spec.refined(spec.fine // 2) if is_fine else coarser_solver(spec, 2.0)
     try:
         resolved = Resolved(start, lambda pos: pos) if is_fine else coarser(start, spec.scene.spacing, 2.0)
     except ValueError:
@@ -295,29 +246,31 @@ def _order(spec: DatasetSpec, start: State, data: Trajectory, reference: Traject
 
 
 def _timed(simulator: Any, at: _Restricted, data: Trajectory, kept_from: int) -> tuple[Trajectory, float]:
-    """Run from the start ``at`` to the end of the data. Return the rollout from frame ``kept_from`` on, and its wall time over its simulated time.
+    """Run from the start ``at`` to the end of the data. Return the rollout from frame ``kept_from`` on, and its computing time over its simulated time.
 
-    The rollout has the nodes of the scene. The first step runs twice and is timed once, so that compilation and first use of memory do not count. A failed
-    rollout ends early. Frames within a step are interpolated.
+    The rollout has the nodes of the scene. The first step runs twice and is timed once, so that compilation and first use of memory do not count. Time is
+    processor time on a CPU, which counts every thread and depends less on other work, and wall time on a GPU. A failed rollout ends early. Frames within a step
+    are interpolated.
     """
     start: Any = at.resolved.state
     dt = data.metadata.frame_dt
     first, every = 0 if at.from_start else kept_from, at.frames_per_step
     wanted = data.num_frames - first
+    clock = time.perf_counter if isinstance(start.pos, torch.Tensor) and start.pos.is_cuda else time.process_time
     frames, seconds, num_steps = [_numpy(start)], 0.0, 0
     try:
         simulator.step(start)
-        begun = time.perf_counter()
+        begun = clock()
         for state in steps(simulator, start, -(-(wanted - 1) // every)):
             if isinstance(state.pos, torch.Tensor) and state.pos.is_cuda:
                 torch.cuda.synchronize()
-            seconds += time.perf_counter() - begun
+            seconds += clock() - begun
             num_steps += 1
             pos, vel = _numpy(state)
             if not np.isfinite(pos).all():
                 break
             frames += [_between(frames[-1], (pos, vel), k / every) for k in range(1, every)] + [(pos, vel)]
-            begun = time.perf_counter()
+            begun = clock()
     except SimulationError as error:
         log.info("%s stopped: %s", type(simulator).__name__, error)
     pos = np.stack([at.resolved.restrict(p) for p, _ in frames[:wanted]])
@@ -354,10 +307,17 @@ def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[
     solvers = [p for p in points if p.family == "solver"]
     for point in points:
         about = {"case": case, "simulator": point.name, "family": point.family}
-        yield {"metric": "time_per_simulated_second", **about, "value": point.cost, "values": point.seconds, "unit": "1"}
-        yield {"metric": "energy_distance", **about, "value": float(np.mean(point.distance)), "values": point.distance, "unit": "m"}
+        yield {"metric": "time_per_simulated_second", **about, "value": point.cost, "values": _short(point.seconds), "unit": "1"}
+        yield {"metric": "energy_distance", **about, "value": float(np.mean(point.distance)), "values": _short(point.distance), "unit": "m"}
         for horizon, values in point.mse.items():
-            yield {"metric": "rollout_mse", **about, "horizon": horizon, "value": float(np.mean(values)), "values": values, "unit": "m²"}
+            yield {
+                "metric": "rollout_mse",
+                **about,
+                "horizon": horizon,
+                "value": float(np.mean(values)),
+                "values": _short(values),
+                "unit": "m²",
+            }
         yield {"metric": "overhead", **about, "value": point.overhead, "unit": "s"}
         for horizon in point.mse if point.family == "learned" else ():
             ratio = cost_at_error(solvers, point.error(horizon), horizon) / point.cost
@@ -379,6 +339,11 @@ def _records(case: str, points: Sequence[Point], order: float) -> Iterator[dict[
         for family in ("solver", "learned"):
             value = hypervolume([p for p in points if p.family == family], horizon, worst)
             yield {"metric": "hypervolume", "case": case, "family": family, "horizon": horizon, "value": value, "unit": "decade²"}
+
+
+def _short(values: Sequence[float]) -> list[float]:
+    """Round to five digits, far below the scatter of times and errors, so that files of results stay small."""
+    return [float(f"{value:.5g}") for value in values]
 
 
 def _of_interval(interval: Interval) -> dict[str, Any]:
@@ -407,21 +372,26 @@ def _section(case: str, points: Sequence[Point], order: float, num_trajectories:
     solvers = [p for p in points if p.family == "solver"]
     header = ["", "time per simulated second", *(f"MSE @{h}" for h in horizons), "energy distance [mm]"]
     lines = [table_row(header), "|" + "---|" * len(header)]
-    for point in sorted(points, key=lambda p: (("solver", "learned", "trivial").index(p.family), -p.cost)):
+    best = {DATA, NODES} | {p.name for h in horizons for p in front(solvers, h)}
+    shown = [p for p in points if p.family != "solver" or p.name in best]
+    for point in sorted(shown, key=lambda p: (("solver", "learned", "trivial").index(p.family), -p.cost)):
         cells = [_interval(point.mse[h], 1e3) for h in horizons]
         lines.append(table_row([point.name, f"{point.cost:.3g}", *cells, f"{1e3 * np.mean(point.distance):.3g}"]))
     note = (
         f"{num_trajectories} scenes. MSE ×1e-3 [m²] to the solver at half the spacing of the data's, whose observed order of convergence is "
         f"{order:.1f} (positions, first 20 frames): mean and 95 % interval over scenes. `{DATA}` is the error in the "
-        "training data. Times: one core, warm, neighbour search and features included."
+        "training data. Times: processor time of one core, warm, neighbour search and features included. Those of learned models include the solver "
+        "that computes the frames before their first."
     )
+    if len(shown) < len(points):
+        note += f" Of the solvers, {len(points) - len(shown)} are only in `results.json`: at each horizon, another one is at least as fast and as accurate."
     lost = ["", *_ratios(points, horizons), "", "**Where the learned models lose**: time of a solver of the same error over theirs", ""]
     lost += [table_row(["", *(f"@{h}" for h in horizons)]), "|" + "---|" * (1 + len(horizons))]
     for point in (p for p in points if p.family == "learned"):
         lost.append(table_row([point.name, *(_against(point, solvers, h) for h in horizons)]))
     lost += [
         "",
-        "**Break-even**: seconds of simulation after which training and its data have paid off, against a solver of the same error",
+        "**Break-even**: seconds of simulation after which tuning, training and their data have paid off, against a solver of the same error",
         "",
     ]
     after = {p.name: [break_even(p, solvers, h, duration=1.0) for h in horizons] for p in points if p.family == "learned"}
@@ -529,15 +499,15 @@ def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
         for horizon in points[0].mse:
             lines: dict[str, list[tuple[float, float]]] = {
                 "solver, coarser to the left": [],
-                "solver, longer steps": [],
+                "solver, longer steps or softer": [],
                 "solver, both": [],
             }
             marks: dict[str, list[tuple[float, float]]] = {}
             for point in points:
                 place = point.cost, point.error(horizon)
                 if point.family == "solver":
-                    is_coarser, has_longer_steps = SPACING in point.name, STEPS in point.name
-                    for label, belongs in zip(lines, (not has_longer_steps, not is_coarser, is_coarser and has_longer_steps), strict=True):
+                    is_coarser, is_changed = SPACING in point.name, STEPS in point.name or MODULI in point.name
+                    for label, belongs in zip(lines, (not is_changed, not is_coarser, is_coarser and is_changed), strict=True):
                         if belongs:
                             lines[label].append(place)
                 elif point.family == "learned":
@@ -548,5 +518,5 @@ def figures(records: list[dict[str, Any]]) -> dict[str, Figure]:
             panels[f"frames 1 – {horizon}" if horizon != "full" else "all frames"] = CostAndError(
                 {label: places for label, places in lines.items() if len(places) > 1}, marks, levels
             )
-        found[f"cost_error_{case}".replace(" ", "_")] = cost_error_figure(panels, "wall time per simulated second", "rollout MSE [m²]")
+        found[f"cost_error_{case}".replace(" ", "_")] = cost_error_figure(panels, "computing time per simulated second", "rollout MSE [m²]")
     return found

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,32 +22,21 @@ from gpe_pl.benchmarks.cost_and_error import (
     ratio_at_cost,
     winners,
 )
-from gpe_pl.benchmarks.runtime_vs_error import (
-    DATA,
-    ComparisonError,
-    Settings,
-    _models,
-    _Restricted,
-    _timed,
-    _with_longer_steps,
-    compare,
-    figures,
-    run,
-    training_seconds,
-    verdicts,
-)
+from gpe_pl.benchmarks.runtime_vs_error import ComparisonError, Settings, _models, _Restricted, _timed, compare, figures, run, verdicts
+from gpe_pl.benchmarks.solver_rungs import DATA, NODES
+from gpe_pl.benchmarks.spent_before import Simulated, Spent
 from gpe_pl.benchmarks.trained import Case
-from gpe_pl.config.datasets import dataset_spec
+from gpe_pl.config.datasets import dataset, dataset_spec
 from gpe_pl.data.ground_truth import generate_trajectory, initial_state, trajectory_metadata
-from gpe_pl.files import sealed
 from gpe_pl.graphs.builder import GraphBuilder
 from gpe_pl.graphs.features import GraphConfig
 from gpe_pl.learned.simulator import LearnedSimulator
 from gpe_pl.models.gns import GNS
 from gpe_pl.models.gpe import GPE
-from gpe_pl.reports.finished_runs import Run, table_of
 from gpe_pl.rollout.baselines import ConstantVelocity
+from gpe_pl.rollout.containment import Contained
 from gpe_pl.solvers.resolution import Resolved
+from gpe_pl.trajectory.trajectory import Trajectory
 from tests.runs import compose
 
 OVERRIDES = ["data=sand", "size=tiny", "data.sizes.tiny.num_frames=24"]
@@ -135,36 +124,46 @@ def untrained(stride: int = 1) -> LearnedSimulator:
 def test_every_simulator_is_timed_and_compared_with_the_reference() -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
     settings = Settings({}, [], factors=[2.0], step_factors=[2], num_trajectories=1, horizons=[10])
-    points, order = compare(spec, {"GPE 1 × 8": (untrained(), 60.0)}, settings)
+    points, order = compare(spec, {"GPE 1 × 8": (untrained(), Spent(60.0, (Simulated(1, 150.0, 10.0),)))}, settings)
     by_name = {p.name: p for p in points}
     assert {DATA, "GPE 1 × 8", "ballistic", "stops at walls", "constant velocity"} < set(by_name)
     assert by_name[DATA].error("10") < by_name["solver, spacing × 2"].error("10") < by_name["constant velocity"].error("10")
     assert by_name[DATA].error("10") < by_name["solver, steps × 2"].error("10") < by_name["constant velocity"].error("10")
     assert by_name["solver, steps × 2"].error("10") < by_name["solver, spacing × 2, steps × 2"].error("10")
     assert all(p.cost > 0 and set(p.mse) == {"10", "full"} for p in points)
-    assert by_name["GPE 1 × 8"].overhead > 60.0
+    assert by_name["GPE 1 × 8"].overhead == pytest.approx(60.0 + 10 * by_name[DATA].cost)
     assert np.isfinite(order)
 
 
 def test_a_model_with_longer_frames_starts_with_the_others_and_is_seen_at_all_frames() -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
-    models = {"every": (untrained(), 0.0), "third": (untrained(3), 0.0)}  # before training they fall freely
-    points, _ = compare(spec, models, Settings({}, [], factors=[], step_factors=[], num_trajectories=1, horizons=[9]))
+    models = {"every": (untrained(), Spent(0.0)), "third": (untrained(3), Spent(0.0))}  # before training they fall freely
+    points, _ = compare(spec, models, Settings({}, [], factors=[], step_factors=[], soft_factors=[], num_trajectories=1, horizons=[9]))
     by_name = {p.name: p for p in points}
     assert by_name["third"].error("9") == pytest.approx(by_name["every"].error("9"), rel=0.3)
     assert np.isfinite(by_name["third"].error("full")) and set(by_name["third"].mse) == {"9", "full"}
 
 
-def test_training_took_its_steps_at_the_step_time_of_its_sweep(tmp_path: Path) -> None:
-    config = {"data.name": "sand", "size.name": "tiny", "model._target_": "gpe_pl.models.gpe.GPE", "training.num_steps": 100}
-    config |= {"size.comparison.budget_minutes": 1}
-    sweep = tmp_path / "sweep"
-    sweep.mkdir()
-    trained = Run(sweep / "seed=0", config, table_of([]))
-    assert math.isnan(training_seconds(trained))
-    times = {"sand tiny GPE 1": 0.5, "sand tiny GPE 2": 0.1, "sand tiny GPE 3": 0.7, "sand small GPE 1": 0.55, "sand tiny GNS 1": 0.58}
-    sealed.write(sweep / "step_times.json", times)
-    assert training_seconds(trained) == 50.0  # 70 s were more than it had
+def test_models_of_finer_labels_start_where_the_solver_at_their_own_spacing_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = dataset_spec(compose("simulate", *OVERRIDES, "data.fine=2"))
+    seen = []
+    monkeypatch.setattr(module, "_reference", lambda spec, start, data: data)
+    monkeypatch.setattr(module, "_order", lambda *_: 1.0)
+
+    def timed(simulator: Any, at: Any, data: Trajectory, kept_from: int) -> tuple[Trajectory, float]:
+        seen.append((simulator, at))
+        return data.frames(kept_from), 1.0 if at.from_start else 0.5
+
+    monkeypatch.setattr(module, "_timed", timed)
+    settings = Settings({}, [], factors=[], step_factors=[], soft_factors=[], num_trajectories=1, horizons=[9])
+    points, _ = compare(spec, {"model": (untrained(), Spent(0.0))}, settings)
+    by_name = {p.name: p for p in points}
+    assert {DATA, NODES} < set(by_name)
+    plain = generate_trajectory(replace(spec, fine=1), "test_unseen", 0, num_frames=3)
+    (at,) = (at for simulator, at in seen if isinstance(simulator, Contained))
+    np.testing.assert_allclose(np.asarray(at.resolved.state.pos), plain.pos[2])
+    assert not np.allclose(plain.pos[2], generate_trajectory(spec, "test_unseen", 0, num_frames=3).pos[2])
+    assert by_name["model"].seconds == pytest.approx([0.5 + 0.5 * 2 / 23])  # two of 23 steps are the solver's
 
 
 def test_longer_steps_are_as_many_frames_and_what_lies_between_is_interpolated() -> None:
@@ -179,24 +178,16 @@ def test_longer_steps_are_as_many_frames_and_what_lies_between_is_interpolated()
         np.testing.assert_allclose(prediction.pos, start.pos + times * start.vel, rtol=1e-6, atol=1e-9)
 
 
-def test_solvers_on_a_grid_have_longer_steps_up_to_a_cell() -> None:
-    spec = dataset_spec(compose("simulate", *OVERRIDES))
-    longer = _with_longer_steps(spec.solver, 4)
-    assert longer is not None
-    assert (longer.frame_dt, longer.cfl) == (4 * spec.solver.frame_dt, 1.0)
-    assert _with_longer_steps(dataset_spec(compose("simulate", "data=fem", "size=tiny")).solver, 4) is None
-
-
 def test_every_model_also_repeats_its_predictions(monkeypatch: pytest.MonkeyPatch) -> None:
     simulator = untrained()
     simulator.model = GNS(simulator.builder.spec, num_message_passing_steps=1, hidden_channels=8)
     monkeypatch.setattr(module, "trained_on", lambda *_, **__: {"GNS": (simulator, None)})
-    monkeypatch.setattr(module, "training_seconds", lambda _: 120.0)
+    monkeypatch.setattr(module, "spent_on", lambda *_: Spent(120.0))
     models = _models([], dataset_spec(compose("simulate", *OVERRIDES)), Settings({}, [], repeats=[2, 4]))
-    assert {label: (s.skips.repeat_frames, seconds) for label, (s, seconds) in models.items()} == {
-        "GNS": (1, 120.0),
-        "GNS, repeated predictions × 2": (2, 120.0),
-        "GNS, repeated predictions × 4": (4, 120.0),
+    assert {label: (s.skips.repeat_frames, spent) for label, (s, spent) in models.items()} == {
+        "GNS": (1, Spent(120.0)),
+        "GNS, repeated predictions × 2": (2, Spent(120.0)),
+        "GNS, repeated predictions × 4": (4, Spent(120.0)),
     }
     weights = [*simulator.model.parameters()]
     assert all(own is shared for s, _ in models.values() for own, shared in zip(s.model.parameters(), weights, strict=True))
@@ -212,7 +203,7 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
         point("careless model", 0.1, 5e-2, "learned"),
         point("ballistic", 0.01, 0.1, "trivial"),
         point("solver, spacing × 2, steps × 2", 0.4, 1.1e-2),
-        point("solver, spacing × 2, steps × 4", 0.3, 1.2e-2),
+        point("solver, spacing × 2, moduli ÷ 4", 0.3, 1.2e-2),
     ]
     for p in points:
         p.distance = [1e-3]
@@ -225,8 +216,18 @@ def test_records_make_the_table_and_the_figure(monkeypatch: pytest.MonkeyPatch, 
     assert "| exact model | **more accurate" in table and "| careless model | cheaper and less accurate" in table
     assert "@full: **below the solver's curve**: model, exact model." in table
     assert "order of convergence is 1.3" in table
+    assert "| medium |" in table and "| worse |" not in table and "Of the solvers, 1 are only in `results.json`" in table
     axes = figures(records)["cost_error_sand"].axes[0]
-    labels = ["solver, coarser to the left", "solver, longer steps", "solver, both", "model", "slow", "exact", "careless", "ballistic"]
+    labels = [
+        "solver, coarser to the left",
+        "solver, longer steps or softer",
+        "solver, both",
+        "model",
+        "slow",
+        "exact",
+        "careless",
+        "ballistic",
+    ]
     assert axes.get_title() == "all frames" and [line.get_label() for line in axes.lines] == labels
 
 
@@ -234,3 +235,11 @@ def test_nothing_to_compare_says_so(tmp_path: Path) -> None:
     spec = dataset_spec(compose("simulate", *OVERRIDES))
     with pytest.raises(ComparisonError, match=": no finished run that was trained on the data set 'sand' of size 'tiny'"):
         run(Settings({"sand": Case(OVERRIDES)}, [str(tmp_path)]), {"sand": spec})
+
+
+def test_the_suite_also_has_scenes_of_2500_nodes_at_the_spacing_of_the_small_ones() -> None:
+    cases = {name: dataset(*case.overrides) for name, case in compose("benchmark", "suite=runtime_vs_error").suite.cases.items()}
+    for material in ("sand", "snow"):
+        small, large = cases[material], cases[f"{material}_2500"]
+        assert (large.name, large.size, large.scene.spacing) == (small.name, small.size, small.scene.spacing)  # the same models take part
+        assert initial_state(large, "test_unseen", 0).num_nodes == pytest.approx(2500, rel=0.02)
