@@ -25,9 +25,9 @@ AUTOMATIC_BYTES = 2**30
 """``fit`` and ``evaluate`` generate data sets up to this size [bytes]. Generate larger ones with ``simulate``."""
 
 TABLES = ("sizes", "dimensions", "default_dimension", "variant", "suffix", "bounds", "larger", "comparison", "showcase", "split_name")
-"""Keys of ``data`` from which other keys take their values."""
+"""Keys of ``data`` that only hold values for other keys, such as one for each size or dimension."""
 STRIDE = "stride"
-"""Key of ``data`` with the number of stored frames in a frame of a model. Data sets do not depend on it."""
+"""Key of ``data`` with the number of stored frames in a frame of a model. It selects frames when data are read; stored data do not depend on it."""
 
 
 def stride_of(cfg: DictConfig) -> int:
@@ -112,12 +112,12 @@ def ensure_data(cfg: DictConfig) -> Path:
 
 
 def scene_metadata(cfg: DictConfig, split: str, strided: bool = True) -> Metadata:
-    """Return the metadata of the first scene of a split. Generated data need not exist for this, imported data do.
+    """Return the metadata of the first scene of a split. Imported data must exist. Generated data need not, because their configuration determines them.
 
     Args:
         cfg: configuration of a command.
         split: split of the data set.
-        strided: whether its frames are as long as ``data.stride`` says. Otherwise they are those that are stored.
+        strided: describe frames of the model, each of which has ``data.stride`` stored frames; False describes the stored frames.
     """
     from gpe_pl.data.ground_truth import trajectory_metadata
     from gpe_pl.trajectory.store import iter_trajectories
@@ -130,10 +130,10 @@ def scene_metadata(cfg: DictConfig, split: str, strided: bool = True) -> Metadat
 
 
 def ensure_split(cfg: DictConfig, split: str) -> Path:
-    """Return the folder of the config's data set if it exists, with missing parts generated.
+    """Return the folder of a data set that contains a split. Missing data are generated.
 
-    Otherwise generate a data set of its own, ``{name}_{split}``, with only this split and a single training trajectory, and return its folder. Errors are those
-    of ``ensure_data``.
+    If the config's data set exists, it is completed. If not, only this split and one training trajectory are generated, as a data set named
+    ``{name}_{split}``. Errors are those of ``ensure_data``.
     """
     from omegaconf import OmegaConf
 
@@ -150,7 +150,7 @@ def ensure_split(cfg: DictConfig, split: str) -> Path:
 
 
 def evaluated_config(cfg: DictConfig) -> DictConfig:
-    """Return the config with the evaluated data: those of training, changed by ``evaluation.data``, if that is not null."""
+    """Return the config with ``data`` as the evaluation needs it: that of the training, with the keys of ``evaluation.data`` replaced."""
     from omegaconf import OmegaConf
 
     merged: Any = OmegaConf.merge(cfg, {"data": cfg.evaluation.data or {}})
@@ -167,7 +167,7 @@ def check_same_frames(trained: Metadata, evaluated: Metadata) -> None:
 
 
 def check_material_controls(cfg: DictConfig, settings: EvaluationSettings) -> None:
-    """Raise ``ConfigError`` if an evaluation asks for controls that its data cannot have."""
+    """Raise ``ConfigError`` if an evaluation asks for rollouts with other material parameters (``evaluation.material_controls``) that its data cannot have."""
     from gpe_pl.evaluation.material_controls import UNSEEN
 
     if settings.material_controls and UNSEEN not in settings.splits:
@@ -177,9 +177,10 @@ def check_material_controls(cfg: DictConfig, settings: EvaluationSettings) -> No
 
 
 def material_controls(cfg: DictConfig, settings: EvaluationSettings, root: Path, start_frame: int) -> MaterialControls | None:
-    """Return the controls of an evaluation on the data in ``root``, or None if the settings want none. Missing solver runs are computed.
+    """Return the rollouts with other material parameters that an evaluation on the data in ``root`` compares with, or None if the settings want none.
 
-    ``start_frame`` counts frames of the model, which ``data.stride`` makes longer. Errors are those of ``MaterialControls.prepare``.
+    Missing runs of the solver are computed. ``start_frame`` counts frames of the model, each of which has ``data.stride`` stored frames. Errors are those of
+    ``MaterialControls.prepare``.
     """
     from gpe_pl.evaluation.material_controls import MaterialControls
     from gpe_pl.system.progress import progress_bar

@@ -68,7 +68,7 @@ def _refused(message: str) -> None:
 
 OmegaConf.register_new_resolver("refused", _refused, replace=True)
 REFUSALS = (NameRefused.__name__, ConfigError.__name__)
-"""Errors of resolvers, whose message is complete without the interpolation that OmegaConf adds."""
+"""Errors that a ``${…}`` in a configuration can raise and whose message is complete. What OmegaConf adds to such a message is dropped."""
 
 
 _results: list[Path] = []

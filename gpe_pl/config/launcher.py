@@ -45,7 +45,7 @@ USAGE_ERROR = 64
 GRACE_SECONDS = 30.0
 """Time that a run has to save its training after its sweep has ended [s]; the same as in Slurm and Kubernetes."""
 REPORT = "hydra.callbacks.report"
-"""Key of the report callback. The sweep reports as a whole, so its runs drop the key."""
+"""Key of the callback that writes tables. The runs of a sweep drop it, because the sweep writes one table of all runs."""
 
 
 class SweepError(GpeError, RuntimeError):
