@@ -41,7 +41,7 @@ Scene = dict[str, Tensor]
 
 DESCRIPTION = "description.json"
 EVERYTHING = Skips(absent_types=False, isolated_nodes=False, edges_at_once=None, sorted_from=None)
-"""Levels of skipping in an exported program. Its operations cannot depend on the values of a scene, so the levels that do are off."""
+"""Levels of skipping in an exported program. It always executes the same operations, so levels that leave some out for some scenes are off."""
 BOUNDARY_FIELDS = ("pos", "vel", "normal", "friction", "restitution")
 
 
@@ -50,7 +50,7 @@ class Input:
     """Description of one tensor of a scene.
 
     Attributes:
-        shape: lengths, or names of lengths that may differ from call to call.
+        shape: length of each axis, or its name if the length may differ from call to call.
         dtype: ``float64``, ``int64`` or ``bool``.
         unit: unit of the values.
         doc: meaning of the values.
@@ -63,7 +63,7 @@ class Input:
 
 
 class ExportedStep(nn.Module):
-    """Step of a learned simulator on plain tensors.
+    """One step of a learned simulator, from plain tensors to plain tensors.
 
     Graph features, model and integration are those of the simulator. The topology of the graph is an input.
 
@@ -246,7 +246,7 @@ def scene_of(simulator: LearnedSimulator, state: State) -> Scene:
 
 
 def export_model(simulator: LearnedSimulator, path: Path | str) -> None:
-    """Write a simulator's step as a ``torch.export`` program, atomically; ``path`` ends in ``.pt2``.
+    """Write a simulator's step as a ``torch.export`` program to ``path``, which ends in ``.pt2``. The file appears complete or not at all.
 
     Raises:
         ValueError: ``path`` has another file type.
