@@ -19,7 +19,7 @@ FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 """Error numbers for missing room: the disk is full, the file is too large, or the user's quota is used up."""
 
 ALMOST_FULL = 2**20
-"""A disk with fewer free bytes counts as full. Some bytes are free again because a failing command has already removed its unfinished file."""
+"""A disk with fewer free bytes counts as full. A command that fails has often removed its unfinished file already, which frees some bytes."""
 
 
 class FullDiskError(GpeError):
@@ -63,7 +63,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def unnamed(error: OSError, folders: Iterable[Path]) -> OSError | FullDiskError:
-    """Return a ``FullDiskError`` for an error of missing room (``FULL``) that names no file. Other errors are returned unchanged.
+    """Return a ``FullDiskError`` for an error that says the disk is full (``FULL``) and names no file. Return any other error unchanged.
 
     The message names those of ``folders`` whose disks are full, or all of them if none is.
     """
