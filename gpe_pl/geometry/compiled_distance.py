@@ -1,6 +1,6 @@
-"""Signed distance to several shapes in one compiled pass over the points. It takes the same steps as the methods of the shapes.
+"""Signed distance to several shapes in one compiled pass over the points. The results equal those of the shapes' methods ``signed_distance``.
 
-A step of a rollout asks for it several times, for a few hundred points each.
+A step of a rollout needs such distances several times, for a few hundred points each, where separate NumPy operations would cost more than the arithmetic.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from numba import njit
 
 _WALL, _SPHERE, _BOWL, _BOX, _POLYGON, _GRID = range(6)
 _MOST_KEPT = 64
-"""Number of tuples of shapes whose numbers are kept."""
+"""Number of tuples of shapes whose packed form is cached."""
 
 
 class Packed(NamedTuple):
-    """Numbers of shapes.
+    """Shapes as arrays, for the compiled pass.
 
     Attributes:
-        kinds: kind of each shape.
-        starts: first of each shape's numbers in ``numbers``, and their total.
-        numbers: numbers of all shapes.
-        others: shapes of other kinds.
+        kinds: code of each shape's kind, such as ``_WALL`` [shape].
+        starts: index in ``numbers`` at which the values of each shape start, and the total number of values [shape + 1].
+        numbers: values that define the shapes, such as centres and radii, one shape after the other.
+        others: shapes of kinds that the compiled pass does not cover.
     """
 
     kinds: np.ndarray

@@ -21,7 +21,7 @@ Solid = Literal["inside", "outside", "below"]
 """Which side of a surface is solid."""
 
 _BAND = 2
-"""Width of the band around a triangle in which distances are exact [cells]. Nodes farther away inherit the nearest triangle of a neighbour."""
+"""Width of the band around a triangle in which distances are exact [cells]. Nodes farther away take the nearest triangle of a neighbouring node."""
 MAX_PAIRS = 2**30
 """Maximum number of pairs of a triangle and a nearby grid node. Computing that many distances takes about half a minute."""
 

@@ -416,7 +416,7 @@ def optimise_shapes(
         cells: corners of the cells [cell, corner].
         fixed: mask of nodes that do not move [node].
         iterations: maximum number of iterations of L-BFGS-B.
-        penalty: function of the positions that returns an additional cost and its gradient [node, dim]; it counts 20 times.
+        penalty: function of the positions that returns an additional cost and its gradient [node, dim]. The cost is multiplied by 20.
     """
     points = np.array(points)
     if np.all(fixed) or len(cells) == 0:
