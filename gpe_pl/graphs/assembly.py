@@ -15,7 +15,7 @@ from gpe_pl.schema import EdgeType
 
 
 def assembled(nodes: Mapping[str, dict[str, Any]], edges: Mapping[EdgeType, dict[str, Any]], about: dict[str, Any]) -> HeteroData:
-    """Return a graph from the attributes of each node store, of each edge store, and of the graph itself. It keeps these dictionaries."""
+    """Return a graph from the attributes of each node store, of each edge store, and of the graph itself. The graph uses these dictionaries, not copies."""
     data = HeteroData()
     for kind, stores, target in ((NodeStorage, nodes, data._node_store_dict), (EdgeStorage, edges, data._edge_store_dict)):
         for key, values in stores.items():

@@ -1,7 +1,7 @@
-"""Builder of graphs: ``State`` → ``HeteroData``, as features ∘ topology. Training, rollouts and exported programs use the same builder.
+"""Builder of graphs: turns a ``State`` into a ``HeteroData``, in two steps. Training, rollouts and exported programs use the same builder.
 
-``GraphBuilder.topology`` searches with NumPy. ``GraphBuilder.graph`` computes features from the indices found and the state, with tensor operations alone, so
-that ``torch.export`` can trace it.
+``GraphBuilder.topology`` finds the indices of nodes and edges with NumPy. ``GraphBuilder.graph`` computes features from these indices and the state, with
+tensor operations alone, so that ``torch.export`` can trace it.
 
 All graphs of a data set have the same node and edge stores. A store is empty if a frame has no such nodes or edges; PyG's ``Batch`` would number edges wrongly
 if it were missing. Each undirected edge is stored once. There are no edges between boundary nodes.
@@ -74,15 +74,15 @@ class GraphBuilder:
     - ``body_pos`` and ``rest_pos``: present and undeformed positions relative to the mean of the body [m], in one piece in periodic domains
     - ``velocity``: mean velocity over the last frame, then velocity at the frame [node, 2 dim] in m/frame
     - ``wall``: normal, distance [m] and friction of the plane of the nearest wall [node, dim + 2]; zero without a wall within the radius
-    - ``corner_index`` and ``corner``: ends of an edge of a body [pair, 2], and for a corner of an obstacle near it the way from the first end [m] and its
-      friction [pair, dim + 1]; empty in 3D
+    - ``corner_index`` [pair, 2] and ``corner`` [pair, dim + 1], for each pair of an edge of a body and a nearby corner of an obstacle: the nodes at the ends of
+      the edge; the vector from the first of them to the corner [m] and the friction of the corner. Empty in 3D
     - ``cell_index``: corners of each cell [cell, 2^dim]; simplices repeat the last one
 
     Attributes:
         config: settings of the graph.
         metadata: metadata of the data set.
-        skips: computations to leave out. They do not change the graph.
-        precision: precision of features, masses and lever arms.
+        skips: levels of skipping. Those that act here are exact, so they do not change the graph.
+        precision: floating-point type of ``x``, ``odd``, ``even``, ``mass`` and ``pos``.
 
     Raises:
         PeriodicityError: the connectivity radius is half a period or more.
@@ -207,7 +207,7 @@ class GraphBuilder:
         return data
 
     def standardized(self, state: State, standards: Standards) -> HeteroData:
-        """Return the graph of a state with features that are already standardised; ``compiled_graph.works_on`` tells of which states it can.
+        """Return the graph of a state with standardised features. The state must satisfy ``compiled_graph.works_on``.
 
         Raises:
             GraphError, MeshError, SimulationError: as ``topology``.

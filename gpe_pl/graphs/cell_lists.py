@@ -1,8 +1,8 @@
 """Cell lists: nodes sorted into the cells of a grid, and the pairs within a radius found from them (compiled, on the CPU).
 
 Cells are a little wider than the radius, so the neighbours of a node lie in its own cell and in the cells around it [Allen and Tildesley, Computer Simulation
-of Liquids (1987), section 5.3.2]. Nodes have the order of their cells, in which the last axis varies fastest, and within a cell their own order. Pairs have the
-order of their first node, then of their second. This order is that of space, so the nodes of successive pairs are near each other in memory.
+of Liquids (1987), section 5.3.2]. Nodes are sorted by cell, with the last axis fastest; nodes of one cell keep their order. Pairs are sorted by their first
+node in this order, then by their second. Nodes that are near in space are therefore near in memory.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from gpe_pl.geometry.periodicity import NOWHERE, Periodicity
 MARGIN = 1e-6
 """Fraction by which cells are wider than the radius, so that no rounding moves a neighbour beyond the next cell."""
 FARTHEST = 1e8
-"""Largest distance from the origin, in radii, at which the margin is wider than rounding."""
+"""Largest distance from the origin [radii]. Beyond it, rounding of positions could exceed ``MARGIN``, and no grid is used."""
 CELLS_PER_NODE = 64
-"""Largest number of cells per node; scattered nodes have too many."""
+"""Largest number of cells per node. Nodes so scattered that a grid needs more get no grid."""
 FEW_CELLS = 4096
-"""Number of cells that scenes may have however few nodes they have."""
+"""Number of cells that a grid may always have, even with few nodes."""
 
 
 class CellList(NamedTuple):
@@ -30,8 +30,8 @@ class CellList(NamedTuple):
 
     Attributes:
         points: positions [3, node] in m in the order of the cells; the third row is zero in 2D. Along periodic axes they start at the corner of the domain.
-        nodes: node at each place of this order.
-        start: first place of each cell, and the number of nodes.
+        nodes: number of the node at each place in this order.
+        start: place at which the nodes of each cell start, and the number of nodes [cell + 1].
         first: coordinates of the first cell [3].
         counts: number of cells along each axis [3].
         period: period of each axis [3] in m; 0 for axes that are not periodic.
@@ -46,7 +46,7 @@ class CellList(NamedTuple):
 
 
 def grid(radius: float, periodicity: Periodicity, dim: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return for each of three axes the width of cells [m], their number around a period, and the period [m]; the last two are 0 if it is not periodic."""
+    """Return for each of three axes the width of cells [m], the number of cells in a period, and the period [m]; the last two are 0 without a period."""
     side, period, around = np.full(3, radius * (1 + MARGIN)), np.zeros(3), np.zeros(3, np.int64)
     if periodicity:
         period[:dim] = periodicity.period
@@ -81,7 +81,7 @@ def pairs_between(sources: CellList, targets: CellList, radius: float, most: int
 
 
 def num_near(cells: CellList, dim: int) -> float:
-    """Return an upper bound of the number of pairs within the radius: half of the squared numbers of nodes per cell, times the number of cells around one."""
+    """Return an upper bound of the number of pairs within the radius: 3^dim / 2 times the sum over cells of the squared number of nodes."""
     return 0.5 * 3**dim * float(np.square(np.diff(cells.start).astype(np.float64)).sum())
 
 

@@ -20,7 +20,7 @@ ROUNDED_TO_ZERO = 1e-9
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def motion(history, rows, gravity, level, velocity_unit, acceleration_unit, mean, inverse, out):
-    """Write the motion features of nodes [row, channel]: ``material_features``; of virtual nodes also the ``level`` (empty for others)."""
+    """Write ``features.material_features`` of nodes to ``out`` [row, channel], or ``features.virtual_features`` if ``level`` [row] is not empty."""
     num_steps, dim = history.shape[1], history.shape[2]
     per_velocity = 1 / velocity_unit
     for k in range(rows.shape[0]):
@@ -39,7 +39,7 @@ def motion(history, rows, gravity, level, velocity_unit, acceleration_unit, mean
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def walls(vel, normal, friction, restitution, rows, with_condition, velocity_unit, mean, inverse, out):
-    """Write the features of boundary nodes [row, channel]: ``boundary_features``."""
+    """Write ``features.boundary_features`` of boundary nodes to ``out`` [row, channel]."""
     dim = vel.shape[1]
     for k in range(rows.shape[0]):
         n = rows[k]
@@ -60,16 +60,16 @@ def contacts(
     source_pos, source_vel, source_rows, normal, target_pos, target_vel, target_rows, edges, period, units, inverse_odd, mean_even,
     inverse_even, offset, odd, even,
 ):  # fmt: skip
-    """Write the features of edges within the radius: ``edge_features``, and the displacement divided by the radius.
+    """Write ``features.edge_features`` of edges within the radius, and the displacement divided by the radius.
 
     Args:
-        source_pos, source_vel: positions and velocities of possible sources.
-        source_rows: rows of the sources in them.
+        source_pos, source_vel: positions [m] and velocities [m/s] of possible sources.
+        source_rows: rows of the sources in these arrays.
         normal: normals of the sources; empty between dynamic nodes.
-        target_pos, target_vel, target_rows: the same of targets.
-        edges: sources and targets as numbers of these rows [2, edge].
+        target_pos, target_vel, target_rows: the same for targets.
+        edges: source and target of each edge, as indices of ``source_rows`` and ``target_rows`` [2, edge].
         period: period of each axis [3] in m; 0 for axes that are not periodic.
-        units: radius [m], spacing [m] and velocity [m/s] of 1.
+        units: radius [m], spacing [m] and unit of velocity [m/s], by which features are divided.
         inverse_odd, mean_even, inverse_even: statistics of the channels.
         offset, odd, even: results [edge, channel].
     """
@@ -114,9 +114,9 @@ def contacts(
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def points_of_mesh(pos, rest_pos, history, mass, shift, descent, num_virtual):
-    """Return positions, rest positions and velocities [point, 3 dim] of nodes and of the virtual nodes above them, and the velocity history of the latter.
+    """Return positions, rest positions and velocities of mesh nodes and of the virtual nodes above them [point, 3 dim], and the histories of the virtual nodes.
 
-    A virtual node has the mass-weighted mean of the mesh nodes below it.
+    A history has the last velocities [virtual, history, dim]. The values of a virtual node are the means over the mesh nodes below it, weighted by mass.
     """
     num_nodes, dim = pos.shape
     num_steps = history.shape[1]
@@ -152,12 +152,12 @@ def points_of_mesh(pos, rest_pos, history, mass, shift, descent, num_virtual):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def mesh_edges(points, ends, starts, levels, spacing, frame_dt, inverse_odd, mean_even, inverse_even, odd, cell_even, even):
-    """Write the features of the edges of meshes: ``mesh_features``.
+    """Write ``features.mesh_features`` of the edges of meshes.
 
     Args:
-        points: position, rest position and velocity of all points [point, 3 dim].
+        points: position [m], rest position [m] and velocity [m/s] of all points, see ``points_of_mesh`` [point, 3 dim].
         ends: points at the ends of all edges [2, edge].
-        starts: first edge of each relation, and the number of edges.
+        starts: first edge of each relation, and the number of edges [relation + 1].
         levels: level of the sources of each relation; 0 for edges along cells.
         spacing: rest spacing [m].
         frame_dt: frame interval [s].

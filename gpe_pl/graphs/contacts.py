@@ -1,4 +1,4 @@
-"""Obstacles beside the nodes and edges of bodies, for ``nn.elastic_bodies``: the plane of the nearest wall of a node, and corners near edges."""
+"""Obstacles that bodies can touch, for ``nn.elastic_bodies``: the plane of the nearest wall of each node, and corners of obstacles near edges of bodies."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from gpe_pl.geometry.shapes import Shape, outward_normal
 from gpe_pl.trajectory.boundary import Boundary, as_numpy
 
 BEHIND = 0.1
-"""Depth in rest spacings from which a node is beside the face that a boundary node belongs to, not behind it."""
+"""A node deeper than this below the plane of a boundary node lies beside that face, not behind it [rest spacings]. The plane is then the last choice."""
 BLUNTEST = 0.42
-"""Length of the mean direction from a corner to its neighbours, which is the cosine of half its angle: 130° or less. A disc of three spacings has 0.17."""
+"""A boundary node is a corner if the mean of the unit vectors to its neighbours is longer than this. The length is the cosine of half the corner's angle, so
+the angle is below 130°. On a disc with a radius of three spacings the length is 0.17."""
 MOST_FRICTION = 1e6
 """Largest Coulomb coefficient."""
 
@@ -38,7 +39,7 @@ def nearest_walls(
         pos: positions of nodes [m].
         boundary: boundary nodes.
         shapes: the shapes that the boundary nodes sample, where they are now; empty if unknown.
-        edge_index: edges from boundary nodes (row 0) to nodes (row 1); None stands for none.
+        edge_index: edges from boundary nodes (row 0) to nodes (row 1); None if there are none.
         spacing: rest spacing of nodes [m].
         periodicity: axes along which distances take the shortest way.
     """
@@ -93,13 +94,14 @@ def corners_near_edges(
     Args:
         pos: positions of the nodes of bodies [m].
         rest_pos: their positions at rest [m].
-        cells: their cells, all in one sense.
+        cells: their cells [cell, corner], all with the same orientation.
         boundary: boundary nodes.
         spacing: rest spacing [m].
         radius: largest distance of a corner from the middle of an edge [m].
 
     Returns:
-        Nodes at the ends of each edge, the body on the left; and for each pair the way from the first node to the corner [m], and the friction of the corner.
+        For each pair the nodes at the ends of the edge, with the body on the left of the edge; and the vector from the first of these nodes to the corner [m]
+        with the friction of the corner.
     """
     edges, corner = surface_edges(cells.cpu().numpy()), convex_corners(boundary, spacing)
     if not len(edges) or not len(corner):
@@ -118,7 +120,7 @@ def corners_near_edges(
 
 
 def convex_corners(boundary: Boundary, spacing: float) -> np.ndarray:
-    """Return the rows of boundary nodes in 2D that are convex corners. The result is kept, as the positions of a ``Boundary`` never change."""
+    """Return the rows of boundary nodes in 2D that are convex corners. The result is cached, because the positions of a ``Boundary`` never change."""
     kept: dict[float, np.ndarray] = boundary.__dict__.setdefault("_corners", {})  # not a field, so neither compared nor stored
     if spacing not in kept:
         kept[spacing] = _convex_corners(as_numpy(boundary.pos), as_numpy(boundary.normal).astype(np.float64), spacing)
@@ -164,9 +166,9 @@ def _neighbours_apart(edges: np.ndarray) -> np.ndarray:
 
 
 def surface_edges(cells: np.ndarray) -> np.ndarray:
-    """Return the edges that belong to only one plane cell [edge, 2], each in the direction of the cell's corners. The result for the same cells is kept.
+    """Return the edges that belong to only one plane cell [edge, 2], each in the direction of the cell's corners. Results are cached.
 
-    Edges that share a node are far from each other in the result, so that contacts with many edges are computed together (``nn.elastic_motion``).
+    Edges that share a node are far apart in the list, so that ``nn.elastic_motion`` can compute contacts of successive edges together.
     """
     cells = np.ascontiguousarray(cells, dtype=np.int64)
     return _surface_edges(cells.tobytes(), cells.shape[1]) if len(cells) else np.empty((0, 2), dtype=np.int64)

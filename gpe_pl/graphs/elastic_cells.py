@@ -1,4 +1,4 @@
-"""Cells of bodies in a graph, and what else moves their nodes within a frame, for ``nn.elastic_bodies``."""
+"""Adds to a graph what ``nn.elastic_bodies`` needs to move bodies within a frame: cells, rest shapes, velocities, walls and corners of obstacles."""
 
 from __future__ import annotations
 

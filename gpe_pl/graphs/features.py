@@ -56,7 +56,7 @@ class GraphConfig:
         trim_boundary: leave out boundary nodes without an edge, which cannot influence anything.
         mesh: connect ``schema.MESH_MATERIALS`` along their cells and add levels of virtual nodes above them. If false, their nodes are particles like all
             others.
-        num_levels: number of levels of virtual nodes; None takes as many as lead to one root in any body of the domain.
+        num_levels: number of levels of virtual nodes; None takes as many as a body of the size of the domain needs for a single root.
         islands: find the connected groups of nodes, and those without an edge to the boundary; see ``nn.island_momentum``.
         cells: include the cells of meshes and their rest shape, for ``model.elastic``; needs ``mesh`` and ``islands``.
     """

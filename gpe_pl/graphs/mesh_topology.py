@@ -1,4 +1,4 @@
-"""The part of the topology of a scene with meshes that does not change with time; it is found once for equal arrays."""
+"""The part of the topology of a scene with meshes that does not change with time. It is computed once and cached by the content of the mesh's arrays."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from gpe_pl.trajectory.state import State
 
 @dataclass(frozen=True, eq=False)
 class MeshParts:
-    """What a scene with meshes has in all frames.
+    """The part of the topology of a scene with meshes that is the same in all frames.
 
     Attributes:
         mesh: the multi-scale graph.
         edges: ``edge_index`` of each relation of meshes, as rows of node stores.
-        at_rest: virtual nodes and their edges.
+        at_rest: virtual nodes and their edges; in periodic domains without the shifts of a frame.
         body: body that each node of the materials with meshes moves with, by material.
         num_bodies: number of these bodies.
         cell_keys: sorted ``pair_keys`` of the edges along cells.
@@ -45,14 +45,14 @@ class MeshParts:
     cell_keys: Int64[np.ndarray, " cell_edge"]
 
     def contacts(self, pairs: Int64[np.ndarray, "2 pair"], radius: float) -> Int64[np.ndarray, "2 contact"]:
-        """Return the pairs of nodes that are contacts, see ``MultiscaleGraph.are_in_contact``."""
+        """Return those of the given pairs of near nodes that are contacts, see ``MultiscaleGraph.are_in_contact``."""
         if not is_wanted():
             return pairs[:, self.mesh.are_in_contact(pairs, radius)]
         contacts: np.ndarray = _contacts(pairs, self.mesh.body, self.mesh.rest_pos, self.cell_keys, (2 * radius) ** 2)
         return contacts
 
     def topology(self, pos: Float64[np.ndarray, "node dim"], periodicity: Periodicity) -> MeshTopology:
-        """Return the virtual nodes of a frame.
+        """Return the virtual nodes of a frame, with the shifts that keep meshes in one piece in a periodic domain.
 
         Raises:
             GraphError: a mesh wraps around a periodic domain.
@@ -66,7 +66,7 @@ class MeshParts:
 
 
 def mesh_parts(state: State, spec: FeatureSpec, scales: Scales) -> MeshParts | None:
-    """Return what a state's meshes have in all frames, or None if the state has no mesh.
+    """Return the ``MeshParts`` of a state, or None if the state has no mesh.
 
     Raises:
         GraphError: the cells do not fit the nodes.

@@ -82,9 +82,9 @@ class MultiscaleGraph:
         return _moving_bodies(self, kind.tobytes(), spacing)
 
     def are_in_contact(self, pairs: Int64[np.ndarray, "2 edge"], radius: float) -> Bool[np.ndarray, " edge"]:
-        """Return a mask of the pairs of nodes that are contacts. All pairs are nearer than the radius now.
+        """Return a mask of the pairs of nodes that are contacts, given pairs of nodes whose present distance is below the radius [m].
 
-        A pair of nodes of two bodies is a contact. A pair within one body is a contact if its nodes are more than two radii [m] apart at rest and have no
+        A pair of nodes of two bodies is a contact. A pair within one body is a contact if its nodes are more than two radii apart at rest and have no
         common cell.
         """
         j, i = pairs
@@ -97,7 +97,7 @@ class MultiscaleGraph:
 
 
 def levels_of(extent: float, spacing: float) -> int:
-    """Return the number of levels up to one root for any body that is at least ``spacing`` shorter than a domain whose longest side is ``extent`` [m]."""
+    """Return the number of levels of virtual nodes that gives every body in a domain of longest side ``extent`` [m] one root, ⌈log₂(extent / spacing)⌉."""
     return max(1, math.ceil(math.log2(extent / spacing)))
 
 

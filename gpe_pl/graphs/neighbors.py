@@ -26,7 +26,7 @@ MOST_PAIRS = 2**26
 NUM_SAMPLED = 64
 """Number of nodes whose neighbours serve to estimate the number of all pairs."""
 ROUNDING = 1e-9
-"""Fraction by which the radius of a tree is larger; exact distances decide afterwards."""
+"""Fraction by which searches in a k-d tree enlarge the radius, against rounding. Exact distances decide afterwards."""
 
 
 class Points:
@@ -56,7 +56,7 @@ class Points:
 
     @cached_property
     def places(self) -> Int64[np.ndarray, " node"]:
-        """Place of each node in the order of a cell list."""
+        """Place of each node in the order in which a cell list would sort the nodes."""
         x, place = self.tree.data, np.empty(len(self), np.int64)
         side, around, _ = cell_lists.grid(self.radius, self.periodicity, x.shape[1])
         cells = np.floor(x / side[: x.shape[1]])

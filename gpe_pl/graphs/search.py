@@ -39,7 +39,7 @@ def find_topology(
         config: settings of the graph.
         spec: node types and relations of the graph.
         scales: connectivity radius and rest spacing.
-        skips: tell whether to keep the sorted boundary.
+        skips: levels of skipping; ``static_boundary`` keeps the sorted boundary nodes for later states.
 
     Raises:
         GraphError: the cells do not fit the nodes, or a mesh wraps around a periodic domain.
@@ -74,7 +74,7 @@ def find_topology(
 
 
 def walls_of(state: State, radius: float, once: bool = True) -> Points:
-    """Return the positions of a state's boundary for searches within a radius [m]; with ``once`` they are sorted once for all states with it."""
+    """Return positions of a state's boundary nodes, sorted for searches within a radius [m]. With ``once``, states with the same boundary share the result."""
     boundary, space = state.boundary, state.periodicity
 
     def sort() -> Points:

@@ -33,9 +33,10 @@ class StatisticsSample:
 
     Attributes:
         graphs: graphs evenly spread over the split.
-        rare: function of roles (see ``schema.role``). It returns graphs of trajectories with nodes of all these roles if too few of ``graphs`` have them, else
-            an empty list.
-        touching: function of a ``radius`` relation and of graphs. It returns these graphs, or others with edges of the relation if too few of these have any.
+        rare: function that takes roles of node types (see ``schema.role``). If few of ``graphs`` have nodes of all these roles, it returns further graphs that
+            do; otherwise an empty list.
+        touching: function that takes a ``radius`` relation and graphs. If few of these graphs have edges of the relation, it returns other graphs that do;
+            otherwise the same graphs.
     """
 
     graphs: list[HeteroData]
@@ -139,7 +140,7 @@ class GraphStandardizer(nn.Module):
         return [*materials, *(r for r in self.spec.relations if cast(Standardize, self.odd[self._key(r)]).is_identity)]
 
     def take_over(self, other: GraphStandardizer) -> None:
-        """Take the statistics of another standardizer, as far as it has any."""
+        """Copy the statistics of another standardizer. Statistics that the other lacks are kept."""
         own = {name: module for name, module in self.named_modules() if isinstance(module, Standardize)}
         for name, module in other.named_modules():
             if isinstance(module, Standardize) and not module.is_identity:
@@ -208,5 +209,5 @@ class GraphStandardizer(nn.Module):
 
 
 def named(kind: str | EdgeType) -> str:
-    """Return a material or relation in words."""
+    """Return a material or relation in words, for messages."""
     return kind if isinstance(kind, str) else "–".join((role(kind[0]), kind[1], role(kind[2])))

@@ -1,4 +1,4 @@
-"""Statistics of features as arrays, by which the compiled features standardise."""
+"""Statistics of features as arrays, with which ``compiled_features`` standardises."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class ParameterStandards:
     """Statistics of a material's parameters.
 
     Attributes:
-        statistics: of each parameter, or of its logarithm.
+        statistics: mean and 1 / std of each parameter, or of its logarithm.
         is_log: whether each parameter enters as its logarithm.
         limits: lowest and highest value [2, param] to which values are clamped; None does not clamp.
     """
@@ -46,8 +46,8 @@ class Standards:
         node: statistics of each node type.
         odd: 1 / std of each relation's odd channels.
         even: statistics of each relation's even channels.
-        params: statistics of each material's parameters; without any they stay as they are, in single precision.
-        mass: unit of masses.
+        params: statistics of each material's parameters. Parameters of other materials are not standardised.
+        mass: mass by which masses are divided [kg].
         precision: type of the features.
     """
 
@@ -60,7 +60,7 @@ class Standards:
     _of_mesh: dict[tuple[EdgeType, ...], tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=dict)
 
     def of_params(self, material: str, values: np.ndarray) -> np.ndarray:
-        """Return the parameters [node, param] of nodes of a material as a model takes them."""
+        """Return standardised parameters of nodes of a material [node, param], given those in the units of ``schema.MATERIALS`` [node, param]."""
         values = values.astype(np.float32)
         return self.params[material](values).astype(self.precision) if material in self.params else values
 

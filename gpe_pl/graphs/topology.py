@@ -58,8 +58,8 @@ class MeshTopology:
 
     Attributes:
         num_virtual: number of virtual nodes of each level, lowest level first.
-        descent: pairs of a virtual node of any level (row 0, numbered from the lowest level up) and a node of the state below it (row 1). ``descent_of`` has a
-            pair for every node and level; if the node has no ancestor in that level, row 0 has the total number of virtual nodes.
+        descent: pairs of a virtual node of any level (row 0, numbered from the lowest level up) and a node of the state below it (row 1). A pair without a
+            virtual node has the total number of virtual nodes in row 0; ``descent_of`` makes such pairs.
         rest_pos: undeformed positions of the nodes of the state [m]; in periodic domains the images that keep each body together.
         shift: vector to add to each position so that meshes stay in one piece at the seams of a periodic domain [m]; None stands for zero.
         edges: edges between points, for the compiled features; None where they are not needed.
@@ -88,8 +88,8 @@ class IslandTopology:
         is_free: whether an island has no edge to the boundary.
         body: for each material of meshes, the index of the body of each node. It is -1 in scenes without cells.
         num_bodies: number of bodies, or an upper bound of it.
-        arm: positions relative to the centre of the island [m], for periodic domains. It is zero in an island that wraps around the domain. With None,
-            it is computed from positions.
+        arm: positions relative to the mean of the island [m], for periodic domains; zero in an island that wraps around the domain. None if they follow from
+            positions alone.
     """
 
     label: Int64[Tensor, " node"]
@@ -130,7 +130,7 @@ class Topology:
 
 
 def descent_of(parents: list[Int64[Tensor, " _"]], num_virtual: tuple[int, ...]) -> Int64[Tensor, "2 pair"]:
-    """Return ``MeshTopology.descent`` of nodes whose parents are known level by level.
+    """Return ``MeshTopology.descent`` from the parents of nodes, level by level. The result has a pair for every node and level.
 
     Args:
         parents: for each level, the parent of every node of the level below, as a row of its level. A node without a parent has the number of virtual nodes of
