@@ -34,13 +34,13 @@ UNITS: dict[str, str] = {
 """Metrics of ``body_metrics`` and their units."""
 
 STRESS = ("peak_von_mises", "peak_von_mises_ratio", "contact_von_mises_error")
-"""Those that need a stress of the prediction."""
+"""Metrics of ``body_metrics`` that need a stress of the prediction."""
 
 SMALLEST_DEFORMATION = 1e-4
-"""Smaller deformations of the ground truth, in spacings, are rounding of its stored positions. No ratio to them is reported."""
+"""Deformations are not compared if that of the ground truth is smaller [rest spacings], because it may be rounding of stored positions."""
 
 SMALLEST_BOUNCE = 0.1
-"""Smaller bounces of the ground truth, in spacings, have no ratio."""
+"""Bounce heights are not compared if the body rises less than this in the ground truth [rest spacings]."""
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,12 @@ from gpe_pl.geometry.shapes import signed_distance
 from gpe_pl.trajectory.trajectory import Trajectory
 
 FARTHEST = 1.5
-"""A body whose closest approach in the ground truth is further away than this has no contact, in spacings. Particles of the material point solver stay up to
-1.1 spacings away from the walls that they rest on; nodes of finite elements reach the surface."""
+"""A body has no contact if its smallest gap to walls and obstacles in the ground truth exceeds this [rest spacings]. Particles of the material point solver
+stay up to 1.1 spacings away from the walls that they rest on; nodes of finite elements reach the surface."""
 
 NEAR = 0.75
-"""A body touches while its gap is at most the smallest gap in the ground truth plus this, in spacings. An obstacle's corner that touches the edge of a cell
-between two nodes is half a spacing from both."""
+"""A body is in contact while its gap exceeds the smallest gap in the ground truth by at most this [rest spacings]. A corner of an obstacle that touches the
+middle of an edge is half a spacing away from both nodes of the edge."""
 
 
 def boundary_gaps(trajectory: Trajectory, bodies: list[Int64[np.ndarray, "_"]]) -> Float[np.ndarray, "frame body"]:
@@ -35,13 +35,19 @@ def boundary_gaps(trajectory: Trajectory, bodies: list[Int64[np.ndarray, "_"]]) 
 
 
 def contact_limits(gap: Float[np.ndarray, "frame body"], spacing: float) -> Float[np.ndarray, "body"]:
-    """Return the gap [m] below which each body touches, from the gaps in the ground truth; minus infinity for a body that never does."""
+    """Return the largest gap [m] at which each body counts as in contact, from its gaps in the ground truth; minus infinity for a body without contact."""
     closest = gap.min(axis=0, initial=np.inf)
     return np.where(closest <= FARTHEST * spacing, closest + NEAR * spacing, -np.inf)
 
 
 def contact_times(gap: Float[np.ndarray, "frame body"], limit: Float[np.ndarray, "body"], frame_dt: float) -> Float[np.ndarray, "body"]:
-    """Return the time [s] for which each body touches. Gaps between frames are interpolated linearly."""
+    """Return the time [s] for which each body is in contact. Gaps between frames are interpolated linearly.
+
+    Args:
+        gap: gaps of the bodies to walls and obstacles [m].
+        limit: largest gap of each body in contact [m], see ``contact_limits``.
+        frame_dt: time between frames [s].
+    """
     with np.errstate(invalid="ignore"):
         above, below = np.maximum(gap - limit, 0.0), np.maximum(limit - gap, 0.0)
         above, below = above[1:] + above[:-1], below[1:] + below[:-1]
@@ -50,12 +56,12 @@ def contact_times(gap: Float[np.ndarray, "frame body"], limit: Float[np.ndarray,
 
 
 def has_touched(gap: Float[np.ndarray, "frame body"], limit: Float[np.ndarray, "body"]) -> Bool[np.ndarray, "frame body"]:
-    """Return a mask of the frames from the first contact of each body on."""
+    """Return a mask of the frames from each body's first contact to the end; arguments as for ``contact_times``."""
     return np.logical_or.accumulate(gap <= limit, axis=0)
 
 
 def in_first_contact(gap: Float[np.ndarray, "frame body"], limit: Float[np.ndarray, "body"]) -> Bool[np.ndarray, "frame body"]:
-    """Return a mask of the frames of each body's first contact, up to the frame before it lets go."""
+    """Return a mask of the frames of each body's first contact, until its gap first exceeds the limit again; arguments as for ``contact_times``."""
     touches = gap <= limit
     let_go = np.logical_or.accumulate(has_touched(gap, limit) & ~touches, axis=0)
     return touches & ~let_go
@@ -64,7 +70,9 @@ def in_first_contact(gap: Float[np.ndarray, "frame body"], limit: Float[np.ndarr
 def bounce_heights(
     height: Float[np.ndarray, "frame body"], gap: Float[np.ndarray, "frame body"], limit: Float[np.ndarray, "body"]
 ) -> Float[np.ndarray, "body"]:
-    """Return the largest rise [m] of each body's centre of mass after its first contact, from the lowest point that it had reached since then.
+    """Return the largest rise [m] of each body's centre of mass after its first contact.
+
+    In each frame, the rise is measured from the lowest point that the centre has reached since the first contact.
 
     Args:
         height: height of the centre of mass [m].

@@ -17,7 +17,7 @@ from gpe_pl.trajectory.reflection import Reflection
 from gpe_pl.trajectory.trajectory import Trajectory
 
 CLOSE = 0.01
-"""Positions of a scene and of its mirror image that agree up to this, in spacings, are equal."""
+"""Tolerance for mirror symmetry: of positions in rest spacings, and of velocities as a fraction of the largest one."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,9 @@ class Mirror:
 def mirrors(truth: Trajectory) -> list[Mirror]:
     """Return the vertical planes about which a scene is symmetric.
 
-    Positions and velocities of the first frame, masses and materials are symmetric, and so are the walls and obstacles that nodes come near to in any frame.
-    Mesh cells may differ, as the diagonals of a lattice of triangles do. The list is empty in periodic domains, and if the boundary moves or has only nodes.
+    A scene is symmetric if its first frame equals its mirror image in positions, velocities, masses and materials, and if the walls and obstacles near
+    nodes of any frame do. Mesh cells are not compared, because the diagonals of a lattice of triangles are rarely symmetric. The list is empty in periodic
+    domains, and if the boundary moves or has nodes but no shapes.
     """
     metadata, boundary = truth.metadata, truth.boundary
     if any(metadata.periodic) or boundary.motion is not None or (len(boundary.pos) and not boundary.shapes):
@@ -68,13 +69,13 @@ def mirrors(truth: Trajectory) -> list[Mirror]:
 
 
 def mirror_error(prediction: Trajectory, truth: Trajectory, mirror: Mirror, num_steps: int) -> float:
-    """Return ‖x − Mx‖ / ‖x̂ − x̂(0)‖ over frames 1 to ``num_steps``, with Mx the mirror image of the prediction and x̂ the ground truth."""
+    """Return ‖x − Mx‖ / ‖x̂ − x̂(0)‖ over frames 1 to ``num_steps``, with x the prediction, Mx its mirror image and x̂ the ground truth."""
     pos, true = (t.pos[: num_steps + 1].astype(np.float64) for t in (prediction, truth))
     return _relative(pos[1:] - mirror.image(pos[1:])[:, mirror.partner], true[1:] - true[0])
 
 
 def equivariance_error(prediction: Trajectory, mirrored: Trajectory) -> float:
-    """Return ‖x − y‖ / ‖x − x(0)‖ over all frames, with x a rollout and y that of a ``rollout.mirrored.Mirrored`` simulator.
+    """Return ‖x − y‖ / ‖x − x(0)‖ over all frames, with x a rollout of a simulator and y that of the same simulator in ``rollout.mirrored.Mirrored``.
 
     It is zero if the simulator moves the mirror image of a scene like the scene itself, mirrored. It is infinite if one of the rollouts stopped earlier.
     """

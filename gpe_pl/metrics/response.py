@@ -9,8 +9,8 @@ from jaxtyping import Float
 def rank_correlation(parameter: Float[np.ndarray, "value"], response: Float[np.ndarray, "scene value"]) -> float:
     """Return Spearman's rank correlation of a response with the parameter, mean over scenes.
 
-    1 means that the response rises with the parameter in every scene, -1 that it falls. A response that does not change in a scene counts as 0 there, and so
-    does an infinite or missing one, which a failed rollout has.
+    1 means that the response rises with the parameter in every scene, -1 that it falls in every scene. A scene counts as 0 if the response does not change, or
+    if one of its values is infinite or NaN because a rollout failed.
 
     Args:
         parameter: at least two different values of the material parameter.

@@ -407,7 +407,7 @@ class RolloutMSE(Metric):
 
 
 BOTH = (-2, -1)
-"""Axes of a table [seed, trajectory]."""
+"""The last two axes of a table [..., seed, trajectory], over which statistics are taken."""
 
 
 def median_of_means(table: np.ndarray, axis: tuple[int, int]) -> Any:
@@ -472,7 +472,7 @@ def bootstrap_ratio(
         is_paired: rows of both tables belong to the same trained networks, so they are resampled together, too.
 
     Raises:
-        ValueError: the tables have different numbers of trajectories, or paired ones of rows.
+        ValueError: the tables have different numbers of trajectories, or with ``is_paired`` different numbers of rows.
     """
     if values.shape[1] != reference.shape[1]:
         raise ValueError(f"both models need the same test trajectories, got {values.shape[1]} and {reference.shape[1]}")
