@@ -12,14 +12,20 @@ from gpe_pl.schema import MATERIALS
 from gpe_pl.trajectory.state import State
 
 CELLS_ACROSS = 4
-"""Number of cells that a body should at least be thick. One two triangles thick is about 1.5 times as stiff in bending as it should be."""
+"""Smallest thickness [cells] of a body that is not called thin. A body two triangles thick is about 1.5 times as stiff in bending as it should be."""
 
 THIN_FRACTION = 0.1
 """Fraction of the nodes of a mesh that may be thin without a warning."""
 
 
 def unresolved(solver: Any, parameters: Mapping[str, Sequence[float]], scenes: Iterable[State]) -> Iterator[str]:
-    """Yield a warning for parameter values, and one for initial states, that the solver does not resolve."""
+    """Yield warnings about what the solver does not resolve: one for each material with such values, and one for initial states with thin meshes.
+
+    Args:
+        solver: solver of the data set.
+        parameters: values of the first parameter of each material.
+        scenes: some initial states.
+    """
     for material, smallest in getattr(solver, "smallest_resolved", {}).items():
         name, unit = MATERIALS[material][0].name, MATERIALS[material][0].unit
         values = [value for value in parameters.get(material, ()) if value < smallest]
@@ -41,7 +47,8 @@ def unresolved(solver: Any, parameters: Mapping[str, Sequence[float]], scenes: I
 def thin_nodes(cells: np.ndarray, num_nodes: int, dim: int) -> np.ndarray:
     """Return a mask [node] of the nodes in thin parts of a mesh, which are fewer than ``CELLS_ACROSS`` cells thick; cells [cell, corner] are of one kind.
 
-    This is a morphological opening along the edges: half of ``CELLS_ACROSS`` steps from the surface inward, then as many outward.
+    This is a morphological opening on the graph of mesh edges. It removes half of ``CELLS_ACROSS`` layers of nodes from the surface, then grows what is left by
+    as many layers. Nodes that are not reached again are thin.
     """
     corners = cells.shape[1]
     pairs = np.repeat(cells, corners, axis=1).ravel(), np.tile(cells, (1, corners)).ravel()

@@ -19,7 +19,7 @@ FACTORS = (1, 2, 4)
 """Factors by which the spacing can be divided."""
 
 TRACERS = "1"
-"""Version of how scenes are divided into parts; data sets store it. Raise it with every change of results."""
+"""Version of the code that divides scenes and selects tracers; data sets store it. Raise it with every change of results."""
 
 
 @runtime_checkable
@@ -95,7 +95,7 @@ class FinerSolver:
 
         Raises:
             SimulationError: with reason ``input``, if the finer solution of a state is not known, or the cells of a mesh cannot be divided; otherwise as the
-                solver. Its node is the node of the scene that the particle comes from.
+                solver. The error names the node of the scene from which the failing particle comes.
         """
         fine = self.solution(state)
         start = replace(fine.state, material_params=fine.origin @ state.material_params, boundary=state.boundary, gravity=state.gravity)

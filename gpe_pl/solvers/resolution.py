@@ -23,7 +23,7 @@ from gpe_pl.trajectory.state import State, Stress
 Positions = Float[np.ndarray, "node dim"]
 
 MARKER = 1e-9
-"""Mass of the particle at the position of a divided one, as a fraction of its mass. Such a light particle moves with the others and does not act on them."""
+"""Mass of a tracer as a fraction of the mass of the divided particle. So light a particle moves with the others and hardly acts on them."""
 
 PARTS: dict[int, tuple[list[tuple[int, ...]], list[tuple[int, ...]]]] = {
     3: ([(0, 1), (1, 2), (2, 0)], [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)]),
@@ -77,11 +77,11 @@ def coarser(state: State, spacing: float, factor: float = 2.0) -> Resolved:
 
 
 def divided_particles(state: State, spacing: float, factor: int) -> Divided:
-    """Divide every particle into ``factor`` parts along each axis. A further particle of nearly no mass stays at its position (``MARKER``).
+    """Divide every particle into ``factor`` parts along each axis, and put a tracer of nearly no mass (``MARKER``) at its position.
 
-    The parts form a lattice. For materials with cells it has the axes of the lattice that the cells describe, otherwise those of space.
+    The parts form a lattice. Its axes are those of the particle lattice for materials with cells, and the coordinate axes for all others.
 
-    Node k of the scene keeps the number k. Its parts follow after all nodes, in the order of the nodes.
+    The tracer of node k has the number k. The parts of all nodes follow, in the order of the nodes.
 
     Args:
         state: start of a scene.

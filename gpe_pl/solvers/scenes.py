@@ -31,7 +31,7 @@ MAX_ATTEMPTS = 200
 """Number of layouts to try before a scene counts as impossible."""
 
 CLEARANCE = 0.25
-"""Smallest initial distance between a liquid particle and a solid, in spacings; a jittered lattice beside a wall just satisfies it."""
+"""Smallest initial distance between a liquid particle and a solid [spacings]. A lattice with ``JITTER`` that starts half a spacing from a wall keeps it."""
 
 JITTER = 0.25
 """Largest displacement from the initial lattice along each axis [spacings]. A regular lattice would separate along its rows when the material spreads."""

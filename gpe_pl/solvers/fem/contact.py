@@ -246,7 +246,10 @@ def _beyond(box, margin, plane):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def resist_nodes(pos, vel, box, reach, h, obstacles):
-    """Slow down nodes that would enter an obstacle; ``box`` [6] is the extent of the nodes, ``reach`` the furthest that a node may move."""
+    """Slow down nodes that would enter an obstacle in a substep of length ``h`` [s].
+
+    ``box`` [6] has the smallest and the largest coordinates of all nodes [m]. ``reach`` is the largest distance that a node may move in the substep [m].
+    """
     for k in range(obstacles.polygons.shape[0]):
         xl, yl, xh, yh, friction = obstacles.polygons[k]
         if _apart(box, reach, xl, yl, 0.0, xh, yh, 0.0):

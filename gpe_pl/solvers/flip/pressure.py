@@ -40,7 +40,7 @@ def _drop(inside, outside):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def reach_into_solids(active, strides, area, cell_room, half, density, touched):
-    """Mark as touched the open cells with a solid centre that lie next to a cell with mass and a free centre."""
+    """Mark as touched each open cell whose centre lies in a solid, if a neighbour contains mass and has its centre in free space."""
     for n in active:
         if not density[n] > 0.0 or cell_room[n] < half:
             continue
@@ -53,10 +53,11 @@ def reach_into_solids(active, strides, area, cell_room, half, density, touched):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def extend_into_solids(active, strides, area, cell_room, half, density, viscous):
-    """Give cells with a solid centre the density that they would have with further open space ``half``, filled like their open neighbours.
+    """Extrapolate density and viscosity into cells whose centre lies in a solid.
 
-    Such cells contain few particles, so their density would be too low, and the correction of the density would draw liquid into them. The mass in the cell
-    itself is counted too; otherwise particles would gather in it.
+    Such cells contain few particles. With their own density, which is too low, the correction of the density would draw liquid into them. The new density is
+    the mean over the cell's open space and over further open space ``half`` that is filled like the open neighbours. Without the cell's own mass in this mean,
+    particles would gather in the cell.
     """
     for c in active:
         if cell_room[c] >= half:

@@ -199,7 +199,7 @@ def elastomer(f00, f01, f10, f11, lam, mu):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def respond(law, f00, f01, f10, f11, plastic, constants, p):
-    """Apply the law of particle ``p`` to its trial deformation gradient. An unknown law gives NaN.
+    """Apply the law of particle ``p`` to its trial deformation gradient. For an unknown code, all results are NaN.
 
     Args:
         law: code of the law: ``materials.SAND``, ``SNOW`` or ``ELASTOMER``.

@@ -219,7 +219,7 @@ def elastomer(f, lam, mu):
 def respond(law, f, plastic, constants, p):
     """Apply the law of particle ``p`` to its trial deformation gradient F; arguments as in ``laws_2d``.
 
-    Return the return-mapped F, the new plastic state, τ and the stiffness [Pa]. An unknown law leaves F as it is, and the other results are NaN.
+    Return the return-mapped F, the new plastic state, τ and the stiffness [Pa]. For an unknown code, F is returned unchanged and the other results are NaN.
     """
     lam, mu = constants[p, LAMBDA], constants[p, MU]
     if law == SAND:

@@ -1,7 +1,7 @@
-"""Deformation of elastic particles from their positions alone.
+"""Deformation of elastic particles from their positions at rest and now.
 
-The stress of an elastomer depends on its deformation only. Positions at rest and now tell the deformation, and velocities tell its rate. A restart loses what
-the particles keep of motions that the grid does not represent. It is therefore near the continued run, but not equal to it.
+The stress of an elastomer depends on its deformation only. Positions at rest and now determine the deformation, and velocities its rate. A restart loses the
+part of the velocity that the grid does not represent (``smoothing``). A restarted run is therefore near the continued run, but not equal to it.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from scipy.spatial import cKDTree
 def gradients(
     values: Float64[np.ndarray, "node dim"], at: Float64[np.ndarray, "node dim"], cells: Int[np.ndarray, "cell corner"]
 ) -> Float64[np.ndarray, "node dim dim"]:
-    """Return the gradient at each node of the linear function that fits the differences to the nodes with which it shares cells, in least squares.
+    """Return the gradient of values at each node, by a least-squares fit to the differences from the nodes with which it shares cells.
 
     Nodes without a cell take the gradient of the nearest node that has one.
 
     Args:
-        values: values at the nodes.
-        at: positions [m] by which they are differentiated.
+        values: vectors at the nodes.
+        at: positions of the nodes [m], with respect to which the vectors are differentiated.
         cells: nodes of each cell; at least one.
     """
     dim = at.shape[1]

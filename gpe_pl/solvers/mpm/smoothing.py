@@ -52,7 +52,10 @@ class Remainder(NamedTuple):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def set_aside(particles, remainder, active, counts, origin, inv, h):
-    """Store what the particles keep over a substep of length h, before they change; on entry ``remainder.grid`` must be zero within ``active``."""
+    """Compute the remainders k and K of a substep of length ``h`` [s]. Call it before the substep changes the particles.
+
+    On entry, ``remainder.grid`` must be zero within ``active``.
+    """
     dim = len(counts)
     grid, flat, kept, rest = remainder.grid, remainder.grid.reshape(-1), remainder.vel, remainder.affine
     for p in range(kept.shape[0]):
@@ -92,7 +95,7 @@ def set_aside(particles, remainder, active, counts, origin, inv, h):
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def give_back(particles, remainder, counts, inv, h):
-    """Add the remainder to the particles after the transfer from the grid; their ``affine`` must still be that before the substep."""
+    """Add the remainders k and K to the particles after the transfer from the grid. ``particles.affine`` must still have the values before the substep."""
     dim = len(counts)
     vel, affine, gradient, kept, rest, before = (
         particles.vel, particles.affine, particles.gradient, remainder.vel, remainder.affine, remainder.before,

@@ -177,7 +177,7 @@ class MPM:
         return set(self.materials) == {"elastomer"}
 
     def restarted(self, state: State) -> State:
-        """Return a state with the internal part that positions and velocities of its mesh tell; see ``mpm.restart``.
+        """Return a state whose ``internal`` part is computed from positions and velocities of its mesh; see ``mpm.restart``.
 
         Raises:
             SimulationError: with reason ``input``, if a particle is no elastomer or the state has no cells.

@@ -3,9 +3,9 @@
 ``grid`` holds three numbers for each node, one after the other: momentum or velocity, then mass. Node ``(i, j)`` has the index ``i n_y + j``. Indices are
 unsigned, which saves the test for negative ones.
 
-Stresses have a separate pass, so that their logarithms, roots and divisions overlap between particles. The lower bound of the cost per particle and substep of
-sand is 450 floating-point operations, of which a scalar core does about two per cycle, and 400 bytes from the second-level cache. At 3 GHz this takes 75 ns,
-all of it arithmetic.
+Stresses have a separate pass, so that the processor overlaps the slow logarithms, roots and divisions of several particles. For sand, a particle needs at least
+450 floating-point operations and 400 bytes from the second-level cache in each substep. With two operations per cycle at 3 GHz, the arithmetic takes 75 ns,
+longer than the memory access.
 """
 
 from __future__ import annotations
