@@ -1,7 +1,7 @@
-"""Solver runs of a data set's scenes with other material parameters. They are the controls for models that are said to read the material.
+"""Control runs: the solver simulates scenes of a data set with other material parameters. They show how much a parameter changes the motion.
 
-The solver starts from the state in which a model's rollout starts, internal state included, so both see the change of the parameter from the same frame on.
-Runs depend on the data and the solver only. All models that are evaluated on the data share them. A killed command resumes. Layout::
+The solver starts from the state in which a model's rollout starts, internal state included. The parameter therefore changes in solver and model from the same
+frame on. Runs depend on the data and the solver only, and all models that are evaluated on the data share them. A killed command resumes. Layout::
 
     {root}/{name}/{size}-controls/{split}-from-{frame}/00000.h5    runs of one scene: nearest, lowest and highest trained values
 """
@@ -60,9 +60,10 @@ def with_values(material_params: Any, node_type: Any, param_names: Sequence[str]
 
 @dataclass(frozen=True)
 class TrainedValues:
-    """Values of material parameters in the training split of a data set, and choices among them. A material's parameters are chosen together, as a vector.
+    """Values of material parameters in the training split of a data set, and functions that select some of them.
 
-    Parameters are compared on their scales in ``schema.MATERIALS``, in units of their trained ranges.
+    The parameters of a material in one scene are a vector, and vectors are selected as a whole. Distances between vectors are Euclidean. Each parameter is
+    taken on its scale in ``schema.MATERIALS`` (linear or logarithmic) and divided by its trained range.
     """
 
     spec: DatasetSpec
@@ -74,16 +75,16 @@ class TrainedValues:
         return {m: np.unique([[*scene[m].values()] for scene in scenes], axis=0) for m in scenes[0]}
 
     def nearest(self, own: Values) -> Values:
-        """Return the trained values of each material nearest to a scene's own, by the Euclidean distance of the vectors."""
+        """Return the trained vector of each material that is nearest to a scene's own."""
         return self._chosen({m: np.argmin(distance) for m, distance in self._distances(own).items()})
 
     def farthest(self, own: Values) -> Values:
-        """Return the trained values of each material farthest from a scene's own, by the Euclidean distance of the vectors."""
+        """Return the trained vector of each material that is farthest from a scene's own."""
         return self._chosen({m: np.argmax(distance) for m, distance in self._distances(own).items()})
 
     @property
     def middle(self) -> Values:
-        """The trained values of each material nearest to the middle of the trained ranges, by the largest difference of a parameter."""
+        """The trained vector of each material that is nearest to the middle of the trained ranges, by the largest difference of a parameter."""
         return self._chosen({m: np.argmin(np.abs(self._scaled(m, v) - 0.5).max(axis=1)) for m, v in self._vectors.items()})
 
     def end(self, name: str) -> Values:
@@ -141,7 +142,7 @@ class ControlRuns:
         return {NEAREST: self.trained.nearest(own), **{name: self.trained.end(name) for name in (LOWEST, HIGHEST)}}
 
     def generate(self, indices: Sequence[int], num_workers: int = 1, on_progress: Progress | None = None) -> None:
-        """Compute the missing runs of some scenes; wait first while another process computes them.
+        """Compute the missing runs of some scenes. Wait first if another process is computing them.
 
         Args:
             indices: numbers of the scenes in the split.

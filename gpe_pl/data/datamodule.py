@@ -49,7 +49,7 @@ over all nodes."""
 ENOUGH = 0.25
 """Fraction of the statistics windows. Node types that occur in fewer windows get this many additional windows."""
 FEW_CONTACTS = 1 / 16
-"""Fraction of the statistics windows. A ``radius`` relation that has edges in fewer windows is searched for in additional windows."""
+"""Fraction of the statistics windows. For a ``radius`` relation with edges in fewer windows, additional windows with such edges are searched."""
 MOST_SEARCHED = 8
 """Maximum number of windows searched for a rare relation, as a multiple of the number of statistics windows."""
 

@@ -65,7 +65,7 @@ class UnrollKey:
 
 
 Key = int | tuple[int, int] | StartKey | UnrollKey
-"""The number of a window, or sample number and window, or the key of a push-forward sample or of an unroll with gradients."""
+"""Key of a sample: the number of a window; sample number and window; or the key of a push-forward sample or of an unroll with gradients."""
 
 CACHE_BYTES = 2 * 1024**3
 """A split is cached in memory if its compressed files have at most half this size [bytes]. Larger splits are read from disk window by window. Cached graphs may
@@ -73,7 +73,7 @@ take this much memory, too."""
 
 
 MIRROR_STREAM = 1
-"""Part of the seed by which windows are mirrored. It makes mirroring independent of the noise."""
+"""Further component of the seed for mirroring, which makes mirroring independent of the noise."""
 
 MAX_DAMAGED = 0.2
 """Maximum fraction of a split's trajectories that may be left out. One trajectory may always be left out."""
@@ -84,7 +84,7 @@ data."""
 
 @dataclass(frozen=True)
 class StoredTrajectory:
-    """The place of a stored trajectory, and the trajectory itself if it is cached. With a stride, its frames are every ``stride``-th stored frame.
+    """A trajectory in a shard: where it is stored, and its arrays if they are cached. With a stride, its frames are every ``stride``-th stored frame.
 
     Attributes:
         path: shard.
@@ -93,7 +93,7 @@ class StoredTrajectory:
         num_nodes: number of dynamic nodes.
         cached: the trajectory with all stored frames if the split is cached in memory and its values are valid, else None.
         stride: number of stored frames in a frame.
-        phase: number of the stored frame that is frame 0.
+        phase: stored frame that is frame 0 of this view.
     """
 
     path: Path
@@ -262,14 +262,14 @@ class Start:
 
     Attributes:
         state: initial state with noise, as float64 tensors.
-        truth: true positions [num_steps + 2, node, dim] in m of the frames from the state's on.
-        stress: true Cauchy stress [num_steps + 1, node, component] in Pa of the frames after the state's; None if the trajectory has none, or if the
+        truth: true positions in m, from the frame of ``state`` on [num_steps + 2, node, dim].
+        stress: true Cauchy stress in Pa, from the frame after ``state`` on [num_steps + 1, node, component]; None if the trajectory has none, or if
             ``WindowDataset`` leaves it out.
         position_correction: fraction of the deviation from the true position that the target removes within one step; see ``Noise``.
         velocity_correction: fraction of the deviation from the true velocity that the target removes within one step, after the unroll; as in ``StartKey``.
         about: attributes of the graphs: numbers of trajectory and frame, and the weight in the loss if there is one.
         sample, lane: as in ``StartKey``.
-        solver_targets: the targets of the solver, which replace the corrections; None without them.
+        solver_targets: computes targets with the solver instead of with the two corrections; None without a solver.
     """
 
     state: State
@@ -295,9 +295,9 @@ class Start:
     def graph(self, builder: GraphBuilder, state: State, step: int) -> HeteroData:
         """Create the training graph of the state that the model has reached after ``step`` steps.
 
-        The target velocity is the next true velocity, plus the part of the velocity's deviation that remains, minus the removed part of the position's
-        deviation per frame interval. At step 0 the velocity's deviation is noise, of which nothing remains. With ``solver_targets``, the target is that of
-        ``SolverTargets.target`` instead, unless the solver refuses the state.
+        The target is the acceleration that leads to a target velocity v*. With v̂ the next true velocity, Δv and Δx the deviations of velocity and position from
+        the truth, and c_v and c_x the two corrections, v* = v̂ + (1 − c_v) Δv − c_x Δx / Δt. At step 0, Δv is noise and c_v is 1. With ``solver_targets``, the
+        target is that of ``SolverTargets.target`` instead, unless the solver refuses the state.
         """
         if self.solver_targets is not None and (found := self.solver_targets.target(state, step)) is not None:
             acceleration, stress = found

@@ -12,7 +12,7 @@ from gpe_pl.trajectory.trajectory import Metadata
 
 
 def factor_of(metadata: Metadata) -> Any:
-    """Return the factor by which the solver divided the spacing, as the metadata say, unchecked; 1 if they say nothing."""
+    """Return the factor by which the solver divided the spacing, as the metadata name it; 1 if they name none. The value is not checked."""
     return _settings(metadata).get("fine", 1)
 
 

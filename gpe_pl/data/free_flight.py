@@ -20,10 +20,11 @@ TOLERANCE = 1e-3
 """Tolerance for the acceleration of a free group, as a fraction of gravity; without gravity, of the rms acceleration of all nodes."""
 
 SCATTER = 0.25
-"""Free groups agree on another acceleration if their median scatter is below this fraction of that acceleration's distance from gravity."""
+"""Free groups share an acceleration other than gravity if its median scatter is below this fraction of its difference from gravity."""
 
 SUBSTANTIAL = 0.1
-"""Another acceleration must differ from gravity by at least this fraction of gravity and of the rms acceleration of all nodes. Less is a disturbance."""
+"""A shared acceleration must differ from gravity by at least this fraction of gravity, and of the rms acceleration of all nodes. Smaller differences are
+disturbances of single groups."""
 
 MOST_FRAMES = 50
 """Maximum number of frames of a trajectory, evenly spread, in which groups are examined."""
@@ -81,7 +82,7 @@ class FreeFlight:
         return bool(distance > SUBSTANTIAL * strength and scatter < SCATTER * distance)
 
     def under(self, gravity: tuple[float, ...]) -> FreeFlight:
-        """Return the same groups, compared with another gravity [dim] in m/s²."""
+        """Return the same groups with another ``gravity`` [dim] in m/s² to compare with."""
         return replace(self, gravity=np.broadcast_to(np.asarray(gravity, np.float64), self.acceleration.shape))
 
 

@@ -29,7 +29,7 @@ from gpe_pl.trajectory.state import State
 from gpe_pl.trajectory.trajectory import Metadata, Trajectory
 
 MOST = 1_000_000
-"""Maximum number of trajectories of a split, and of frames of a trajectory. It is far more than anyone needs, and small enough to be listed."""
+"""Maximum number of trajectories of a split, and of frames of a trajectory. Lists of this length still fit into memory."""
 
 Count = Annotated[int, Field(ge=0, le=MOST)]
 
@@ -265,8 +265,9 @@ def scene_seed(spec: DatasetSpec, split: str, index: int) -> int:
 def parameter_values(spec: DatasetSpec, split: str, index: int) -> tuple[dict[str, dict[str, float]], ParameterGroup]:
     """Return the parameters of each material by name in one trajectory, and the group that these values belong to.
 
-    The values of the first parameter of the first material are used in turn. Those of any other parameter are also used in turn, but each round has a random
-    order that follows from the seed, so that parameters are independent. Rounds of parameters with equally many values form a Latin hypercube.
+    Trajectories take the values of a parameter in turn. For the first parameter of the first material, every round through the values has the given order. For
+    other parameters, each round has a random order that follows from the seed, so that parameters are independent. If all have equally many values, a round is
+    a Latin hypercube.
 
     In the group ``interpolated``, a parameter has interpolated values if there are any, else seen ones. The group ``extrapolated`` is alike. A scene is
     therefore unseen if any parameter is, and extrapolated if any parameter is outside the range of its seen values.

@@ -5,7 +5,8 @@ Positions that are rounded to multiples of q have the error q/√12 (rms, unifor
     q/√12 · √(1 + 4 + 1) / Δt² = q / (√2 Δt²)
 
 For floating-point positions, q is the distance of neighbouring numbers, which grows with the distance from the origin. The positions of some sources are
-multiples of a coarser step, called the distance of marks here: the last digit in a text file, or the pixel of a camera. Then q is that distance.
+multiples of a coarser step, such as the last digit in a text file or the pixel of a camera. This module calls that step the distance of marks, like the marks
+on a ruler; q is then that distance.
 """
 
 from __future__ import annotations
@@ -28,16 +29,16 @@ model can learn."""
 
 
 ENOUGH_CHANGES = 100
-"""Number of velocity changes that distinguish marks from chance."""
+"""Fewest non-zero velocity changes from which marks are inferred; with fewer, multiples could be chance."""
 
 CHANGES_PER_WINDOW = 20_000
 """Maximum number of velocity changes that are sampled from each part of the frames."""
 
 OFF_MARK = 0.1
-"""Tolerance for second differences of positions to be multiples of the marks' distance, as a fraction of it. Floating-point rounding makes it necessary."""
+"""A second difference of positions counts as a multiple of the distance of marks if it deviates by at most this fraction of the distance, due to rounding."""
 
 ON_MARKS = 0.99
-"""Fraction of second differences that must be such multiples. A node that crosses a seam may give another value."""
+"""Fraction of second differences that must be multiples of the distance of marks. A node that crosses the seam of a periodic domain may give another value."""
 
 
 def rounding_to(step: np.ndarray, frame_dt: float) -> np.ndarray:
@@ -64,9 +65,9 @@ def rounding_fault(rounding: float, acceleration: float, where: str = "in float3
 
 
 def marks(changes: np.ndarray, rounding: float) -> float:
-    """Return the distance of marks [m], of which coordinates are multiples; 0 if there are none coarser than floating-point numbers.
+    """Return the distance of marks [m]: the coarsest step of which coordinates are multiples. Return 0 if it is not coarser than floating-point numbers.
 
-    Second differences of coordinates on marks are multiples of the marks' distance and have both signs. Rounding has no direction, unlike gravity.
+    Second differences of coordinates on marks are multiples of this step. They have both signs, because rounding has no direction, unlike gravity.
 
     Args:
         changes: second differences of coordinates from frame to frame [change] in m.
@@ -89,7 +90,7 @@ class MotionSummary:
         low, high: smallest and largest positions [dim] in m.
         frame_dt: time between frames [s].
         precision: coarsest floating-point type that represents all positions exactly, independent of the array's type.
-        marks: distance of marks [dim] in m, of which positions are multiples; 0 if there are none coarser than ``precision``.
+        marks: distance of marks [dim] in m (see ``marks``); 0 if there are none coarser than ``precision``.
         acceleration: rms per component of accelerations without gravity [m/s²].
         mean_acceleration: mean acceleration without gravity [dim] in m/s².
         step: largest displacement of a node between two frames [m].
@@ -114,7 +115,7 @@ class MotionSummary:
 
     @property
     def rounding_to_marks(self) -> np.ndarray:
-        """Rms error of accelerations [dim] in m/s² due to the source's marks."""
+        """Rms error of accelerations [dim] in m/s² due to rounding to marks."""
         return rounding_to(self.marks, self.frame_dt)
 
     def with_gravity(self, change: np.ndarray) -> MotionSummary:

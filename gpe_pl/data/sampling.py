@@ -50,8 +50,8 @@ class PushForward:
 
     Attributes:
         first_step: first optimiser step with unrolls.
-        max_steps: maximum number of steps of an unroll. A batch is trained on at its true state and after each step of its unroll; then the next batch takes
-            its lane.
+        max_steps: maximum number of steps of an unroll. The model is trained on a batch at its true state and after each step of its unroll. Then the next
+            batch takes its lane.
         correction: fraction of the velocities' deviation that the target removes within one step. The original trick has 1, which suits material that friction
             slows down anyway. For swinging bodies, 1 puts forces into the target that do not exist.
     """

@@ -1,9 +1,9 @@
 """Training targets for states that no stored trajectory contains: the solver's step from there.
 
-Noise and unrolls lead away from the true trajectory. The usual target leads back to it within a step. Real bodies do not move like that: a body that swings
-has restoring forces, and a strain that noise causes has consequences. The target here is the true acceleration, plus the difference between two steps of the
-solver: one from the deviating state, one from the true state. Both steps start from positions and velocities only. Errors from what else the solver would
-remember therefore cancel to first order. Without a deviation the target is that of the data.
+Noise and unrolls lead away from the true trajectory. The usual target leads back to it within a step, which no physical force does: a body that swings has
+restoring forces, and a strain that noise causes changes the motion. The target here is the true acceleration, plus the difference between two steps of the
+solver: one from the deviating state, one from the true state. Both steps start from positions and velocities only, without the solver's internal state, so
+errors due to its absence cancel to first order. Without a deviation the target is that of the data.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 @dataclass(frozen=True)
 class SolverTargets:
-    """A solver with the stretch of a true trajectory from which an unroll deviates.
+    """A solver, and the frames of a true trajectory from which an unroll deviates.
 
     A learned simulator knows the mean velocity since the frame before; a solver needs the velocity at the frame. The deviating state gets the true velocity at
     the frame plus the deviation of the mean velocity.
@@ -32,11 +32,11 @@ class SolverTargets:
     Attributes:
         solver: solver of the data set.
         scene: true state at the start of the unroll.
-        pos: true positions [num_steps + 3, node, dim] in m, from the frame before the start on.
-        vel: true velocities at the frames [num_steps + 1, node, dim] in m/s, from the start's on.
-        stress: true stress of nodes [num_steps + 1, node, component] in Pa, from the frame after the start's on; None if the data have none.
+        pos: true positions in m, from the frame before the start on [num_steps + 3, node, dim].
+        vel: true velocities at the frames in m/s, from the start on [num_steps + 1, node, dim].
+        stress: true stress of nodes in Pa, from the frame after the start on [num_steps + 1, node, component]; None if the data have none.
         frame_dt: frame interval [s].
-        reflection: takes the coordinates of the data set to those of the unroll, which may be a mirror image, and back.
+        reflection: converts between coordinates of the data set and of the unroll, which may be its mirror image.
     """
 
     solver: Restartable
@@ -49,7 +49,7 @@ class SolverTargets:
 
     @classmethod
     def of(cls, solver: Restartable, trajectory: Trajectory, first: int, reflection: Reflection) -> SolverTargets:
-        """Return the targets of unrolls from frame ``first`` of a stretch of a stored trajectory to its last frame but one."""
+        """Return the targets of unrolls from frame ``first`` of a part of a stored trajectory to the last frame but one of this part."""
         pos = trajectory.pos[first - 1 :].astype(np.float64)
         vel = trajectory.vel[first:-1].astype(np.float64)
         stress = None if trajectory.stress is None else trajectory.stress.node[first + 1 :]

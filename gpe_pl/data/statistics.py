@@ -21,7 +21,7 @@ FRAMES_AT_ONCE = 2048
 
 
 def shard_moments(path: Path) -> tuple[str, dict[str, Any]]:
-    """Return the path of a shard, and sums over its trajectories, from which the statistics are computed."""
+    """Return the path of a shard as text, and sums over its trajectories, from which ``combined`` computes statistics."""
     sums: dict[str, Any] = {"velocity": [0, 0.0], "acceleration": [0, 0.0], "params": None, "nodes": 0, "frames": 0, "trajectories": 0}
     for name in trajectory_names(path):
         trajectory = read_trajectory(path, name)
@@ -65,7 +65,7 @@ def _scaled(trajectory: Trajectory) -> np.ndarray:
 
 
 def combined(moments: list[dict[str, Any]]) -> dict[str, Any]:
-    """Combine the sums of shards into statistics.
+    """Compute statistics from the sums that ``shard_moments`` returns for each shard.
 
     The statistics are the root mean squares per component of velocities [m/s] and accelerations without gravity [m/s²], the mean and standard deviation of each
     material parameter on its scale in ``schema``, and the numbers of trajectories, frames and nodes.

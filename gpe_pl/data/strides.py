@@ -6,10 +6,10 @@ An edge has to connect a node with what it meets within a frame. With the radius
 
 where v is the largest speed in the train split and Δt the time between stored frames. In periodic domains it also stays below half a period.
 
-REACH was chosen by two measurements. The first is how much groups of nodes accelerate that no edge connects with anything else, in sand and snow at k = 2, 4
-and 8. Their mean squared acceleration without gravity is less than 3e-4 of that of all nodes with REACH = 1/2, and up to 1e-2 with R alone. The second
-compares models of sand with k = 4 after 4,000 steps (one seed, 20 scenes). With REACH = 1/2 and REACH = 1 their errors are within a quarter of each other,
-neither always lower. REACH = 1 took 1.4 times as long.
+REACH was chosen by two measurements. The first asks whether groups of nodes without an edge to anything else fall freely, in sand and snow at k = 2, 4 and 8.
+Their mean squared acceleration without gravity, over that of all nodes, is less than 3e-4 with REACH = 1/2, and up to 1e-2 with the radius R. The second
+compares models of sand with k = 4 after 4,000 steps (one seed, 20 scenes). Their errors with REACH = 1/2 and REACH = 1 differ by less than a quarter, and
+neither is always lower. REACH = 1 took 1.4 times as long.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class StrideStatistics:
     """Statistics of a train split at every ``stride``-th frame.
 
     Attributes:
-        acceleration_std: rms per component of the accelerations without gravity over the longer frames [m/s²], from stored frame 0 of each trajectory on.
+        acceleration_std: rms per component of the accelerations without gravity [m/s²], over the longer frames that begin at stored frame 0.
         max_speed: largest speed of a node between stored frames [m/s].
     """
 
@@ -50,9 +50,10 @@ class StrideStatistics:
 
 
 def stride_statistics(root: Path | str, stride: int, train: Sequence[StoredTrajectory]) -> StrideStatistics:
-    """Return the statistics of the train split, from ``statistics_stride_{stride}.json`` in the data set's folder if it belongs to these data.
+    """Return the statistics of the train split at every ``stride``-th frame.
 
-    Otherwise they are computed, and written if the folder can be written.
+    They are read from ``statistics_stride_{stride}.json`` in the data set's folder if this file belongs to the data. Otherwise they are computed and, if the
+    folder can be written, stored there.
 
     Args:
         root: folder of the data set.

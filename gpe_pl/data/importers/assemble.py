@@ -66,7 +66,7 @@ TYPED = ("gns", "lagrangebench", "meshgraphnets")
 
 
 def import_dataset(root: Path | str, settings: ImportSettings, on_progress: Progress | None = None, contact_sheet: bool = False) -> Report:
-    """Convert a source into ``{root}/{name}/imported``.
+    """Convert a source to the data set ``{root}/{name}/imported``.
 
     Args:
         root: folder of all data sets.
