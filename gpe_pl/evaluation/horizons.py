@@ -1,4 +1,4 @@
-"""Horizons of an evaluation: times after the start of a rollout, so that models with frames of different lengths are compared at the same instants."""
+"""Horizons of an evaluation. They are times after the start of a rollout, so that models with frames of different lengths are compared at the same times."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ FULL = "full"
 
 
 def labels(seconds: Sequence[float], frame_dt: float) -> dict[int, str]:
-    """Return the label of each horizon by its number of frames.
+    """Return a dictionary of the labels of horizons, whose keys are their numbers of frames.
 
     A horizon is at the frame nearest to the time, but at least at frame 1. Its label is the time of that frame: with frames of 0.02 s, the horizon 0.25 s
     becomes ``0.24s``. Times with the same nearest frame become one horizon.
@@ -23,7 +23,7 @@ def labels(seconds: Sequence[float], frame_dt: float) -> dict[int, str]:
 
 
 def time_of(label: str) -> float:
-    """Return the number by which a label is sorted: its time [s], infinity for ``full``, and the number of frames for labels of earlier versions.
+    """Return the number by which labels are sorted: the time [s] in a label, infinity for ``full``, and the number of frames for labels of earlier versions.
 
     Raises:
         ValueError: the text is no label.

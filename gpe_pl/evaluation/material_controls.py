@@ -1,9 +1,9 @@
-"""Rollouts with other material parameters, which show whether a model reads the material.
+"""Controls of the material: rollouts with other material parameters, which show whether a model uses the parameter that it is given.
 
 A model reads the material only if it is better with a scene's own, unseen values than with the nearest trained ones. For each scene with unseen parameters,
 the model starts from the same state with the nearest trained values, those in the middle of the trained range, the farthest ones, and those of another scene.
-The solver runs with the nearest, the lowest and the highest trained values. The error of the first run shows what the parameter changes. The difference of the
-other two is the whole effect of the parameter.
+The solver runs with the nearest, the lowest and the highest trained values. The distance of the first run from the ground truth shows how much the parameter
+changes. The distance between the other two is the effect of the whole trained range.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ UNSEEN: Split = "test_unseen"
 CONTROLS = ("nearest", "middle", "far", "shuffled")
 """Names of the values that replace a scene's own in rollouts of a model."""
 SOLVER_NEAREST, SOLVER_ENDS = "solver at nearest value", "solver at lowest against highest value"
-"""Labels of the solver's rows: against the ground truth, and of two runs against each other."""
+"""Labels of the rows that compare a run of the solver with the ground truth, and two runs of the solver with each other."""
 SAME_START = 1e-3
 """Largest difference between a stored frame and the start of the solver's runs [spacings]."""
 MOST_DRAWS = 100
-"""Number of permutations from which the one with the fewest scenes that keep their values is taken."""
+"""Number of random permutations of the scenes' values. The permutation in which the fewest scenes keep their own values is used for ``shuffled``."""
 
 AtValue = tuple[str, Trajectory, Trajectory]
-"""A scene at some values of its parameters: caption with the values, run of the solver, rollout of the model."""
+"""A scene with some values of its parameters: caption that names the values, run of the solver, rollout of the model."""
 
 
 class ControlError(GpeError):
@@ -45,13 +45,13 @@ class ControlError(GpeError):
 
 
 def label_of(model: str, control: str) -> str:
-    """Return the label of a model's rollouts with other values."""
+    """Return the label of a model's rollouts with the values that ``control``, one of ``CONTROLS``, names."""
     return f"{model} at {control} value"
 
 
 @dataclass(frozen=True)
 class MaterialControls:
-    """Controls of one evaluation.
+    """Computes the controls of one evaluation.
 
     Attributes:
         root: folder of the evaluated data set.
@@ -84,10 +84,10 @@ class MaterialControls:
         self._runs.generate(self._indices, num_workers, on_progress)
 
     def predictions(self, simulator: Simulator, starts: Sequence[Start], first: int) -> list[dict[str, Trajectory]]:
-        """Return the rollouts of scenes by control.
+        """Return the model's rollouts of each scene, by name in ``CONTROLS``.
 
         Args:
-            simulator: the model, with everything that its own rollouts have.
+            simulator: the model, wrapped as for its other rollouts, for example with containment.
             starts: starts of consecutive scenes with their own values.
             first: number of the first scene.
         """
@@ -102,7 +102,7 @@ class MaterialControls:
         """Return a scene at the lowest trained values, its own unseen ones and the highest trained ones, in ascending order of the values.
 
         Args:
-            simulator: the model, with everything that its own rollouts have.
+            simulator: the model, wrapped as for its other rollouts, for example with containment.
             start: start of the scene with its own values.
             number: number of the scene.
             truth: its ground truth from ``start_frame`` on.
@@ -139,7 +139,7 @@ class MaterialControls:
 
     @cached_property
     def values(self) -> list[dict[str, Values]]:
-        """Values of each scene by control."""
+        """Parameter values of each scene, by name in ``CONTROLS``."""
         trained, own = TrainedValues(self.trained), [scene_values(self.spec, UNSEEN, k) for k in self._indices]
         other = self._shuffled()
         return [

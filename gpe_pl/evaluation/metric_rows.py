@@ -21,9 +21,9 @@ from gpe_pl.schema import SPLITS, ParameterGroup
 LEARNED = "learned"
 """Label of a learned simulator."""
 EXACT = "learned, exact"
-"""Label of the same model without the approximate levels of ``Skips``; used if the rollout has any."""
+"""Label of a second rollout of the learned simulator, without the approximate levels of ``Skips``. It is made if the first rollout has such levels."""
 GROUPS = ("", *get_args(ParameterGroup))
-"""Groups of the material parameter; empty for the metrics of a whole split."""
+"""Values of ``Row.parameter_group``: groups of the material parameter, and the empty text for metrics of a whole split."""
 
 
 class MetricsError(GpeError, ValueError):

@@ -1,4 +1,4 @@
-"""Check of mirror symmetry for any scene: the model rolls out the scene and its mirror image."""
+"""Checks whether a model treats a scene and its mirror image alike, by a rollout of both. The scene needs no symmetry."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 
 def mirror_equivariance_error(simulator: LearnedSimulator, trajectory: Trajectory, start_frame: int | None = None) -> float:
-    """Roll a model out on a scene and on its mirror image, and return ‖x − y‖ / ‖x − x(0)‖ with y the mirrored result.
+    """Return ‖x − y‖ / ‖x − x(0)‖, with x the rollout of a scene and y that of its mirror image, mirrored back.
 
-    The scene needs no symmetry. The mirror is the plane in the middle of the domain, normal to the first axis without gravity. A model that treats left and
-    right alike has an error of rounding, which grows where the motion is chaotic. Compare it with the error of the rollout against the ground truth
-    (``displacement_error``).
+    The mirror is the plane in the middle of the domain, normal to the first axis without gravity. For a model that treats left and right alike, the error is
+    due to rounding, which grows where the motion is chaotic. Compare it with the error of the rollout against the ground truth (``displacement_error``).
 
     Args:
         simulator: trained simulator.

@@ -56,7 +56,7 @@ class PredictedScene:
 
 @dataclass
 class Predictor:
-    """Rolls scenes out.
+    """Rolls out the scenes of a split.
 
     Attributes:
         simulator: trained simulator.
@@ -65,7 +65,7 @@ class Predictor:
         controls: prepared controls of scenes with unseen parameters.
         stride: number of stored frames in a frame of the simulator.
         start_frame: frame at which rollouts start.
-        seconds: processor times of the steps so far [s].
+        seconds: processor time per scene of each step so far [s].
     """
 
     simulator: LearnedSimulator
@@ -142,7 +142,14 @@ class Predictor:
 
 
 def start_of(simulator: LearnedSimulator, start_frame: int, trajectory: Trajectory, truth: Trajectory) -> Start:
-    """Return the start of a rollout, with a guard whose limits are far beyond the ground truth."""
+    """Return the start of a rollout, with a guard whose limits are far beyond the ground truth.
+
+    Args:
+        simulator: simulator that is rolled out.
+        start_frame: frame of ``trajectory`` at which the rollout starts.
+        trajectory: the stored scene.
+        truth: its ground truth from ``start_frame`` on.
+    """
     bounds = truth.metadata.bounds
     size = max(high - low for low, high in bounds)
     across = size / (trajectory.num_frames * truth.metadata.frame_dt)  # the reference where everything rests

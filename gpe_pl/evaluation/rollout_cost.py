@@ -45,9 +45,9 @@ class Timed:
 
 
 def write_cost(folder: Path, seconds: list[float], frame_dt: float) -> None:
-    """Write the median processor time of a step of one scene [s], and that time per simulated second [s/s]. Without a step, nothing is written.
+    """Write the median processor time of a step of one scene [s], and this time divided by ``frame_dt``. Without a step, nothing is written.
 
-    The median leaves out the compilation in the first steps.
+    The first steps take longer because functions are compiled; they hardly change the median.
 
     Args:
         folder: folder of the run or evaluation.

@@ -50,16 +50,16 @@ def evaluate(
 
     - ``one_step_nmse``: one value for each split (see ``one_step_nmse``).
     - ``num_good_frames``: number of frames that the rollout reached.
-    - ``edges_per_node``: number of edges within the radius over that of dynamic nodes, in the graph of the middle frame of the ground truth. Each pair of
-      nodes has one edge.
+    - ``edges_per_node``: number of edges within the radius divided by the number of dynamic nodes, in the graph of the middle frame of the ground truth. A pair
+      of nodes has one edge.
     - ``fraction_outside_at_end``: fraction of particles inside a wall or obstacle in the last frame.
     - ``fraction_corrected``: fraction of particle-steps that containment corrects.
     - ``fraction_outside_uncontained``: fraction of particle-frames inside a wall or obstacle with containment off, for the first ``settings.num_uncontained``
-      rollouts of a split. These three are not reported for a boundary that consists of nodes only.
+      rollouts of a split. This metric and the two before it are left out if the boundary consists of nodes only.
     - ``skipping_mse`` [m²]: position MSE between the rollouts with and without the approximate levels of ``simulator.skips``, over the frames of both.
     - ``fraction_asleep``: fraction of particle-steps that the approximate levels did not compute.
-    - ``lost_impulse`` [kg m/s]: momentum that was lost when nodes fell asleep. The last three are reported if approximate levels are on. The rollout without
-      these levels is then evaluated, too.
+    - ``lost_impulse`` [kg m/s]: momentum that was lost when nodes fell asleep. This metric and the two before it are reported if approximate levels are on. The
+      rollout without these levels is then evaluated, too.
 
     Args:
         simulator: trained simulator.

@@ -74,7 +74,7 @@ def write_exports(run_dir: Path, split: str, number: int, truth: Trajectory, pre
 
 
 def write_error_curve(path: Path, curves: dict[str, list[np.ndarray]], frame_dt: float) -> None:
-    """Draw the mean error over time. ``curves`` has errors of each frame [m²], by model and scene."""
+    """Draw the error against time. ``curves`` has the position error of each frame [m²], for each model and scene."""
     from gpe_pl.viz.figures import error_curve_figure
 
     save_figure(error_curve_figure(curves, frame_dt), path, dpi=150)
