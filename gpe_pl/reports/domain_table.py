@@ -55,7 +55,7 @@ PAPER = {
     "fem": {"DPINet": 1.76, "GNS": 5.03, "ContinuousConvNet": 4.96, "GPE": 1.27},
     "fluid": {"DPINet": 3.31, "GNS": 3.78, "ContinuousConvNet": 2.75, "GPE": 3.22},
 }
-"""Average MSE ×1e-3 of Yang et al. 2022, table 1. The units of the paper are not ours, so only ratios can be compared."""
+"""Average MSE ×1e-3 of Yang et al. 2022, table 1. The paper uses other units, so only ratios can be compared."""
 
 EVALUATED = "test_unseen"
 """Split that is evaluated in every domain: all scenes with material parameters that training did not have, between the trained values and outside. The paper

@@ -19,7 +19,7 @@ from gpe_pl.reports.material_table import MATERIALS_FIGURE, material_lines, writ
 
 EVALUATIONS_MD = "table.md"
 NOT_IN_LABELS = ("data", "split", "evaluation.material_controls", "evaluation.num_pictures")
-"""Prefixes of keys that no label names."""
+"""Prefixes of configuration keys that labels leave out."""
 
 Labelled = dict[tuple[str, str], dict[str, Run]]
 """Evaluations by domain and split, then by label."""
@@ -37,7 +37,10 @@ def report_evaluations(folder: Path, runs: Sequence[Run]) -> None:
 
 
 def labelled(runs: Sequence[Run]) -> Labelled:
-    """Return evaluations by domain and split, and by the settings in which those of a domain differ; the name of the checkpoint if they differ in none."""
+    """Return evaluations by domain and split, then by label.
+
+    A label names the settings in which the evaluations of a domain differ, or the checkpoint if they differ in none.
+    """
     groups: Labelled = {}
     for domain in dict.fromkeys(str(run.config["data.name"]) for run in runs):
         own = [run for run in runs if run.config["data.name"] == domain]

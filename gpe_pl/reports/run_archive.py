@@ -1,4 +1,4 @@
-"""Archive of many runs: two small files from which tables can be made again without the runs.
+"""Archive of many runs: two small files from which tables can be made again after the folders of the runs are deleted.
 
 ``runs.json`` has the configurations and validation curves. ``rollouts.csv.xz`` has one line per run, model, split and trajectory, and one column per metric and
 horizon, such as ``rollout_mse@full``. Values have nine significant digits.

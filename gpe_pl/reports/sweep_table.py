@@ -123,7 +123,7 @@ def report_evaluation(folder: Path) -> None:
 
 
 def conclusion(folder: Path) -> str:
-    """Return the last output of a command: the metrics of the run or evaluation in a folder, whether the model reads the material, and the viewers to open."""
+    """Return the text that a command prints at its end: metrics of the run or evaluation in a folder, whether the model reads the material, and viewers."""
     viewers = sorted(folder.glob("rollout_*_00.html"))
     rows = table_of(read_rows(folder / "metrics.csv"))
     reads = [line for line in [verdict([Run(folder, {}, rows)])] if line]

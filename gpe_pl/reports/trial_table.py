@@ -27,7 +27,8 @@ TRIALS_CSV, TRIALS_MD = "trials.csv", "trials.md"
 CONSEQUENCES = ("training.val_interval", "seed")
 """Keys that may differ between trials but are not compared: the validation interval, which follows from the number of steps, and the seed."""
 NUM_STEPS = "training.num_steps"
-"""Key of the number of steps. It is compared only if it differs between runs with equal other settings and seed; else it follows from a time budget."""
+"""Key of the number of steps. It counts as a compared setting only if runs with the same other settings and seed differ in it. Otherwise it follows from a
+time budget."""
 
 
 def compares_settings(runs: list[Run]) -> bool:
@@ -39,7 +40,7 @@ def compares_settings(runs: list[Run]) -> bool:
 def report_trials(folder: Path, runs: list[Run]) -> None:
     """Write ``trials.csv``, with one line per run and split, and ``trials.md``, with one line per setting and the best of each domain and model in bold.
 
-    An existing table of models in domains is deleted, as it would not show all runs.
+    An existing table of ``domain_table`` is deleted, because it would not show all runs.
     """
     groups = _by_model(runs)
     settings = sorted({key for members in groups.values() for key in _settings(members)})
