@@ -1,4 +1,4 @@
-"""Whether compiled passes for CPUs are wanted, or plain operations for comparison. Every such pass has a plain form that gives the same results."""
+"""Switch between compiled passes for CPUs and plain operations of NumPy and PyTorch. Both give the same results; plain ones serve for comparison."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _is_wanted = ContextVar("_is_wanted", default=True)
 
 
 def is_wanted() -> bool:
-    """Tell whether compiled passes are wanted: not inside ``unfused``."""
+    """Tell whether compiled passes are wanted. They are, except inside ``unfused``."""
     return _is_wanted.get()
 
 

@@ -139,14 +139,14 @@ def reduces_precision(device: str) -> bool:
 
 
 def copy_rate(device: str, num_bytes: int = 2**28) -> float:
-    """Return the rate of copying an array that is too large for caches, reads and writes together [bytes/s]."""
+    """Return the rate at which this machine copies an array that is too large for caches, as bytes read plus bytes written per second."""
     source = torch.zeros(num_bytes // 4, device=device)
     target = torch.empty_like(source)
     return 2 * num_bytes / best_time(lambda: target.copy_(source), device, 5)
 
 
 def peak_on_gpu(function: Callable[[], Any]) -> int:
-    """Return GPU memory that a call needs in addition to the memory allocated before it [bytes]."""
+    """Return the largest GPU memory during the second of two calls, less the memory in use before it [bytes]."""
     function()
     torch.cuda.synchronize()
     before = torch.cuda.memory_allocated()
@@ -156,12 +156,12 @@ def peak_on_gpu(function: Callable[[], Any]) -> int:
 
 
 def peak_memory(function: Callable[..., Callable[[], Any]], *arguments: Any) -> int:
-    """Return the memory that a function needs in addition to the memory in use when it is called [bytes], measured in a separate process.
+    """Return the largest memory during a call, less the memory in use before it [bytes], measured in a separate process.
 
     On a GPU use ``peak_on_gpu`` instead.
 
     Args:
-        function: picklable; its result is the measured function.
+        function: picklable function that returns the function to measure.
         arguments: passed to ``function``.
 
     Raises:

@@ -22,7 +22,7 @@ PROVENANCE = "provenance.json"
 PACKAGES = ("torch", "torch-geometric", "lightning", "numpy", "numba")
 ADVICE = "delete the file; only the record of how the results were made is lost"
 LOCAL = ("paths.", "hydra.run.dir", "hydra.sweep.dir")
-"""Prefixes of overrides that say where files lie. Results do not depend on them."""
+"""Prefixes of overrides that name folders. Results do not depend on them."""
 
 
 RESULTS = ("*.json", "*.csv", "*.md", "*/**/config.json")

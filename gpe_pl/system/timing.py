@@ -57,8 +57,8 @@ def paired_ratio(times: Mapping[str, np.ndarray], name: str, reference: str) -> 
 def apart(factories: Mapping[str, Callable[[], Callable[[], Any]]]) -> Iterator[dict[str, Callable[[], None]]]:
     """Yield functions, by name, that run in separate processes. A call waits until the function has run there, and returns nothing.
 
-    Functions with large arrays in one process slow each other down through its heap, by up to a third. Returning memory to the system can be as slow. Here each
-    function has a process and heap of its own, which keeps freed memory (with glibc).
+    Functions with large arrays that share a process also share its heap, and slow each other down by up to a third. Returning memory to the system can cost as
+    much. Here each function has a process and a heap of its own, which keeps freed memory (with glibc).
 
     Args:
         factories: picklable functions that are called in the new processes and return the functions to run.
