@@ -62,14 +62,14 @@ class Camera:
         return float(height / width)
 
     def project(self, points: Float[np.ndarray, "*shape dim"]) -> tuple[Float[np.ndarray, "*shape 2"], Float[np.ndarray, "*shape"]]:
-        """Return the position in the picture [m], and the distance in front of the origin towards the viewer [m]."""
+        """Return the positions of points in the picture [m], and their depths: distances from the origin towards the viewer [m]."""
         return points @ self.plane.T, np.asarray(points @ self.toward)
 
     def turn(self, directions: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape 3"]:
-        """Return the components to the right, upward and towards the viewer."""
+        """Return the components of directions to the right, upward and towards the viewer."""
         return directions @ np.stack([*self.plane, self.toward]).T
 
     def haze(self, depth: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-        """Return 1 at the far end of the domain to 0 at the near end; 0 in 2D."""
+        """Return the haze of points of these depths [m], from 1 at the far end of the domain to 0 at the near end; 0 in 2D."""
         far, near = self._depth_range
         return np.clip((near - depth) / (near - far), 0, 1) if near > far else np.zeros_like(depth)

@@ -19,7 +19,7 @@ def heading(trajectory: Trajectory) -> str:
 
 
 def with_heading(first: Trajectory, others: Mapping[str, Trajectory]) -> dict[str, Trajectory]:
-    """Return all trajectories by name; the first is named by its heading.
+    """Return all trajectories by name. The first one is called ``ground truth`` or ``prediction``, see ``heading``.
 
     Raises:
         ValueError: another trajectory has the name of the first.

@@ -118,12 +118,12 @@ def parameter_figure(
 
 @dataclass(frozen=True)
 class CostAndError:
-    """Content of a panel, by label; infinite errors are left out.
+    """Content of a panel of ``cost_error_figure``, by label. Pairs are (cost, error); infinite errors are left out.
 
     Attributes:
-        lines: costs and errors that form a line, such as the resolutions of a solver. Every third one is drawn without the line.
-        marks: separate costs and errors. Marks have one colour if their labels agree up to the first comma; those with a comma are hollow.
-        levels: errors without a cost.
+        lines: points joined by a line, such as the resolutions of a solver. For every third label, the line between the points is left out.
+        marks: separate points. Labels that agree up to the first comma share a colour; marks whose label has a comma are hollow.
+        levels: errors of models without a cost, drawn as horizontal lines.
     """
 
     lines: Mapping[str, Sequence[tuple[float, float]]]

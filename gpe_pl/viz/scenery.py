@@ -28,7 +28,7 @@ LIGHT = np.array([-0.45, 0.75, 0.5]) / np.linalg.norm([-0.45, 0.75, 0.5])
 
 
 class Cover:
-    """Depth of the nearest surface of a 3D scene, on a raster of the picture; it tells which points are hidden.
+    """Tells which points of a 3D scene are hidden by a surface. It keeps the depth of the nearest surface in each cell of a raster of the picture.
 
     Args:
         camera: camera of the picture.
@@ -143,7 +143,7 @@ def _draw_3d(axes: Any, camera: Camera, trajectory: Trajectory, points_per_metre
 def surface_points(boundary: Boundary, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions and normals [point, 3] on all surfaces except boxes, and distances between neighbours [point] in m.
 
-    Nodes on walls are among them; leave them out where walls are drawn as areas.
+    Nodes on walls are included. The caller leaves them out where it draws walls as areas.
     """
     flat_or_round: tuple[Any, ...] = tuple(s for s in boundary.shapes if s.kind in ("box", "sphere", "bowl"))
     rest = np.abs(signed_distance(flat_or_round, boundary.pos)) > 1e-6 * spacing
