@@ -1,4 +1,4 @@
-"""Cost and error of simulators: which of them nothing beats, and what others have at equal cost or at equal error."""
+"""Cost and error of simulators: the Pareto front, and comparisons at equal cost or at equal error."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Point:
 
 
 def front(points: Sequence[Point], horizon: str) -> list[Point]:
-    """Return the points that no other point beats in both cost and error, from the cheapest on."""
+    """Return the Pareto front: the points that no other point beats in both cost and error, from the cheapest on."""
     best: list[Point] = []
     for point in sorted(points, key=lambda p: (p.cost, p.error(horizon))):
         if np.isfinite(point.error(horizon)) and (not best or point.error(horizon) < best[-1].error(horizon)):
@@ -56,7 +56,7 @@ def front(points: Sequence[Point], horizon: str) -> list[Point]:
 
 
 def hypervolume(points: Sequence[Point], horizon: str, worst: tuple[float, float]) -> float:
-    """Return the area in decades² that the points dominate, up to the worst cost and error; larger is better."""
+    """Return the area [decades²] between the Pareto front and ``worst``, a cost and an error, on logarithmic axes; larger is better."""
     area, limit = 0.0, worst[1]
     for point in front(points, horizon):
         if point.cost < worst[0] and point.error(horizon) < limit:
@@ -66,7 +66,10 @@ def hypervolume(points: Sequence[Point], horizon: str, worst: tuple[float, float
 
 
 def cost_at_error(points: Sequence[Point], error: float, horizon: str) -> float:
-    """Return the cost of a solver of this error, interpolated along the logarithmic front; the cheapest cost for larger errors, infinite for smaller ones."""
+    """Return the cost at which the points reach an error, interpolated along their Pareto front on logarithmic axes.
+
+    For larger errors than those of the front it is the lowest cost; for smaller errors it is infinite.
+    """
     best = front(points, horizon)
     if not best or error < best[-1].error(horizon):
         return float("inf")
@@ -78,7 +81,10 @@ def cost_at_error(points: Sequence[Point], error: float, horizon: str) -> float:
 
 
 def error_at_cost(points: Sequence[Point], cost: float, horizon: str) -> float:
-    """Return the error of a solver of this cost, as ``cost_at_error``; the smallest error for larger costs, infinite for smaller ones."""
+    """Return the error that the points reach at a cost, interpolated as in ``cost_at_error``.
+
+    For larger costs than those of the front it is the smallest error; for smaller costs it is infinite.
+    """
     best = front(points, horizon)
     if not best or cost < best[0].cost:
         return float("inf")
@@ -88,8 +94,8 @@ def error_at_cost(points: Sequence[Point], cost: float, horizon: str) -> float:
 def ratio_at_cost(point: Point, solvers: Sequence[Point], horizon: str) -> Interval | None:
     """Return a simulator's mean error over that of the solvers at its cost, with its 95 % interval over paired scenes.
 
-    The solvers' error of each scene is interpolated along the logarithmic front of the means, with the same weights in all scenes. Return None if every solver
-    costs more.
+    The solvers' error of each scene is interpolated between the two solvers of the Pareto front with the next lower and the next higher cost, with the same
+    weights in all scenes. Return None if every solver costs more.
     """
     best = front(solvers, horizon)
     if not best or point.cost < best[0].cost:

@@ -65,7 +65,7 @@ class Solution:
 
     Attributes:
         pos: positions of each choice of tracers [instant, node, dim] in m, by name.
-        momentum: mean velocity of the tracers, less that of all parts, weighted by mass [instant, dim] in m/s, by name.
+        momentum: mean velocity of the tracers minus mean velocity of all parts, both weighted by mass [instant, dim] in m/s, by name.
         seconds: processor time per simulated second.
     """
 

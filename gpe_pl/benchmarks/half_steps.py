@@ -1,4 +1,4 @@
-"""A solver with half its time step. What this changes is a measure of the solver's own error."""
+"""A solver with half its time step. The change of its result is a measure of the solver's own error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from gpe_pl.trajectory.state import State
 class HalfSteps:
     """A simulator that advances a frame in two steps of a solver with half the frame interval and half the ``cfl``.
 
-    It takes twice as many substeps as the solver, also where one substep takes a whole frame. It takes fewer where gravity or viscosity limits them.
+    It takes twice as many substeps as the solver, even if one substep takes a whole frame. Where gravity or viscosity limits the substeps, the number grows
+    less.
 
     Attributes:
         solver: the solver, a dataclass with ``frame_dt`` and ``cfl``, or a ``FinerSolver`` with such a solver.

@@ -1,7 +1,7 @@
-"""The matrix products of a forward pass of GPE: the yardstick of run times.
+"""The floating-point operations of the matrix products in a forward pass of GPE. Benchmarks divide run times by the time that these products take.
 
-``products`` counts the operations of the factored form, in which node features are multiplied before they are gathered to edges. The formula is written out
-here, so that it stays the same when layers are computed in another way.
+``products`` counts the operations of the factored form, in which node features are multiplied before they are gathered to edges. The formula is written
+out here, so that it does not change when the implementation of layers changes.
 """
 
 from __future__ import annotations

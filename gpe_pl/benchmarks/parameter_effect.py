@@ -53,10 +53,10 @@ CHANGES = {
     "half_step": "half the time step",
     "rounded": "initial positions rounded to float32",
 }
-"""What is changed. All but ``range`` are compared with the scene's own value."""
+"""Changes of a scene by key, in words. ``range`` compares two changed scenes with each other; all others are compared with the unchanged scene."""
 
 GROUPS = ("below", "between", "above")
-"""Where an unseen value lies: below, between or above the trained ones."""
+"""Groups of unseen values: below, between or above the trained ones."""
 
 
 class EffectError(GpeError):

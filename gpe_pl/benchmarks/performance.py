@@ -65,7 +65,7 @@ class Settings:
     Attributes:
         cases: data sets of shipped models, by the name of the model.
         several: case of which several scenes together, and a training step, are timed as well.
-        reference: ``results.json`` of an earlier run. With None, or if the file does not exist, ratios are not compared.
+        reference: path of the ``results.json`` of an earlier run. With None, or if the file does not exist, ratios are not compared.
         num_rounds: number of rollouts per case. The shortest processor time counts, because other work on the machine only makes it longer.
         num_scenes: number of scenes that are rolled out together.
         num_threads: threads of PyTorch.

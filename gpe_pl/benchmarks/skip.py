@@ -75,7 +75,7 @@ class Growth:
         amount: amount that was added, in words.
         state: state of the grown scene.
         builder: builder of its graphs.
-        on, off: skips with and without the level that skips the added part.
+        on, off: levels of skipping with and without the one that skips the added part.
     """
 
     metric: str
@@ -93,7 +93,7 @@ def scene_of(settings: Settings) -> tuple[GraphBuilder, State]:
 
 
 def growths(settings: Settings, builder: GraphBuilder, scene: State) -> list[Growth]:
-    """Return all ways in which a scene grows."""
+    """Return the scene with each kind and amount of irrelevant parts."""
     found = []
     for n in settings.num_boundary:
         found.append(

@@ -29,7 +29,7 @@ class Case:
 
     Attributes:
         overrides: overrides of ``python -m gpe_pl.simulate``.
-        prototype: figures of an earlier implementation, printed beside the measured ones.
+        prototype: figures of an earlier implementation as text, printed beside the measured ones.
     """
 
     overrides: list[str]

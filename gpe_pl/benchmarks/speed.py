@@ -47,7 +47,7 @@ log = logging.getLogger(__name__)
 
 INTERACTIONS: tuple[Interaction, ...] = ("directed", "negated", "odd", "odd_even")
 REFERENCE = "directed, plain"
-"""Reference case: concatenated features and one product per directed edge, the usual form of message passing."""
+"""Case with which others are compared: the usual message passing, which multiplies concatenated features of each directed edge."""
 TRAINS = True
 """Whether the suite also takes the settings of a training on each data set."""
 SAND = "sand"
@@ -111,7 +111,7 @@ class Case:
 
     @property
     def saves_against(self) -> str | None:
-        """Name of the case that computes both directions of an edge and is the same otherwise, or None."""
+        """Name of the case that differs only by computing both directions of an edge, or None if there is no such case."""
         if self.model != "GPE" or self.edge_state != "latent" or self.compiled or self.precision != "highest":
             return None
         if self.implementation == "plain":

@@ -54,8 +54,9 @@ def start_of(simulator: LearnedSimulator, spec: DatasetSpec) -> tuple[State, Met
 def step_records(specs: dict[str, DatasetSpec], num_rounds: int) -> list[dict[str, Any]]:
     """Return records of every shipped model: the time of a step [s], that of its products [s], and their ratio ``step_ratio``.
 
-    ``step_speedup_vs_plain`` and ``step_speedup_vs_gns`` are the times of a step with the same model by PyG's operations, and with GNS of the same width and
-    depth, over that of the model. Times are the shortest of all rounds, because other work on the machine only makes them longer.
+    Two more records divide other times by that of the step: ``step_speedup_vs_plain`` that of the same model computed with PyG's operations, and
+    ``step_speedup_vs_gns`` that of GNS of the same width and depth. Times are the shortest of all rounds, because other work on the machine only makes them
+    longer.
 
     Args:
         specs: data set of each shipped model, by its name.

@@ -19,7 +19,7 @@ DEPTHS = ("num_message_passing_steps", "num_propagation_steps", "num_convolution
 
 
 NOT_IN_LABELS = ("training.num_steps", "training.val_interval", "training.budget_minutes", "training.num_val_rollouts")
-"""No label names these settings, which say how long training takes, and how often and on what it is validated."""
+"""Settings that labels leave out: the length of the training, and how often and on what it is validated."""
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""Acceptance scenes of trained models: small scenes that a person would look at, run by solver and model side by side."""
+"""Acceptance scenes of trained models: small scenes that a person would look at before using a model. Solver and model simulate each scene."""

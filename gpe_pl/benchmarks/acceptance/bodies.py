@@ -38,7 +38,7 @@ MAX_TILT = 3.0
 MAX_SIDEWAYS = 0.05
 """Largest sideways speed over the speed of impact."""
 MAX_MIRROR = 5.0
-"""Largest difference of a symmetric body from its mirror image, over the way that it moves [%]."""
+"""Largest difference of a symmetric body from its mirror image, over the distance that it moves in the ground truth [%]."""
 BOUNCE_TOLERANCE = 0.25
 DEFORMATION_RATIO = (0.8, 1.25)
 """Range of the rms deformation over the solver's."""
@@ -81,7 +81,7 @@ def sideways_speed(trajectory: Trajectory) -> float:
 
 
 def asymmetry(truth: Trajectory, trajectory: Trajectory) -> float:
-    """Return the difference of a body from its mirror image, over the displacement of the ground truth from its start, in all frames together [%]."""
+    """Return the difference of a body from its mirror image, divided by the displacement from the start in the ground truth [%]. Norms are over all frames."""
     (mirror,) = mirrors(truth)
     return 100 * mirror_error(trajectory, truth, mirror, trajectory.num_frames - 1)
 
@@ -104,8 +104,8 @@ def against_solver(name: str, trials: list[Trial]) -> list[Check]:
 def bounce_height(truth: Bodies, trajectory: Trajectory) -> float:
     """Return the largest rise of the centre of mass after the first contact [m].
 
-    A block is in contact while its gap is at most the smallest gap in the ground truth plus ``NEAR`` spacings. The smallest gap may be large, because a block
-    surely touches the floor: in the material point method its flat side stays up to a cell of the grid, or two spacings, away.
+    A block is in contact while its gap exceeds the smallest gap in the ground truth by at most ``NEAR`` spacings. Unlike ``metrics.contact``, this sets no
+    limit on the smallest gap: the block certainly falls on the floor, but in the material point method its flat side stays up to two spacings away from it.
     """
     own = truth.predicted(trajectory)
     assert own.height is not None, "bodies fall"

@@ -10,7 +10,7 @@ from gpe_pl.trajectory.trajectory import Trajectory
 
 SECONDS = 0.1
 MAX_DRIFT = 1.0
-"""Largest change of momentum besides that of gravity, over that of gravity [%]."""
+"""Largest change of momentum that gravity does not explain, over the change that gravity causes [%]."""
 
 
 def free_flight(candidate: Candidate) -> Result:
@@ -21,7 +21,7 @@ def free_flight(candidate: Candidate) -> Result:
 
 
 def drift(trajectory: Trajectory) -> float:
-    """Return the change of momentum besides that of gravity between the first and the last frame, over that of gravity [%]."""
+    """Return the change of momentum that gravity does not explain between the first and the last frame, over the change that gravity causes [%]."""
     dt, gravity = trajectory.metadata.frame_dt, np.asarray(trajectory.metadata.gravity)
     velocity = np.diff(centre(trajectory), axis=0) / dt
     change = velocity[-1] - velocity[0]

@@ -30,15 +30,16 @@ MAX_LEVEL = 0.25
 MAX_SLOSH = 0.25
 """Largest sideways motion of the centre of mass of a pool at rest, in spacings."""
 MAX_VOLUME = 5.0
-"""Largest change of the height of the centre of mass above the lowest particle [%]; a change of volume changes it by as much."""
+"""Largest change of the height of the centre of mass above the lowest particle [%]. It measures the volume: in a vessel with vertical walls, both change by the
+same fraction."""
 FRONT_SECONDS = 0.3
 FRONT_TOLERANCE = 0.15
 OUTER = 0.02
-"""Fraction of the particles beyond the front."""
+"""Fraction of the particles that may be beyond the front, so that single drops do not count."""
 
 
 def pool_at_rest(candidate: Candidate) -> Result:
-    """Let a pool settle in the solver, and see whether it stays level in the model."""
+    """Let a pool settle in the solver, and check whether it stays level in the model."""
     spec, value = candidate.spec, candidate.values[1]
     state = scenes.pool(spec, value, one_side=False)
     trial = tried(candidate, value, advanced(spec.solver, state, round(SECONDS / spec.solver.frame_dt)), SECONDS)
@@ -70,7 +71,7 @@ def volume_change(trajectory: Trajectory) -> float:
 
 
 def dam_break(candidate: Candidate) -> Result:
-    """Simulate the collapse of a column of liquid at one side of the vessel. Check the way of its front, beside the solver's and over the viscosity."""
+    """Simulate the collapse of a column of liquid at one side of the vessel. Check how far its front runs, against the solver and against the viscosity."""
     spec = candidate.spec
     trials = [tried(candidate, value, scenes.pool(spec, value, one_side=True), FRONT_SECONDS) for value in candidate.values]
     fronts = [trial.measured(partial(front, float(scenes.middle(spec)[0]))) for trial in trials]

@@ -38,7 +38,7 @@ BALL_RADIUS, CYLINDER, SPEED = 8, 0.1, 2.0
 MAX_IMBALANCE = 5.0
 """Largest deviation from half of the mass on each side [%]."""
 OVERLAP = 2.0
-"""The deposit may be as far from the solver's as the solver's own deposit would be if it were moved sideways by this number of spacings."""
+"""Largest distance of a deposit from the solver's. It is expressed as the sideways shift [spacings] of the solver's deposit that gives the same distance."""
 MAX_SLIDING = 0.5
 """Largest mean speed of a deposit at the end, in spacings per second."""
 AT_END = 0.2
@@ -65,7 +65,7 @@ def run_out(width: float, trajectory: Trajectory) -> float:
 
 
 def pile(candidate: Candidate) -> Result:
-    """Let a column collapse in the solver, and see whether the pile stays in the model."""
+    """Let a column collapse in the solver, and check whether the pile stays at rest in the model."""
     spec, value = candidate.spec, candidate.values[1]
     state = scenes.column(spec, value, COLUMNS, ROWS)
     settled = advanced(spec.solver, state, 2 * round(SECONDS / spec.solver.frame_dt))
@@ -140,7 +140,7 @@ def separation(truth: Trajectory, trajectory: Trajectory) -> float:
 
 
 def final_speed(trajectory: Trajectory) -> float:
-    """Return the mean distance that particles move per time at the end, in spacings per second."""
+    """Return the mean speed of particles over the last ``AT_END`` seconds, in spacings per second."""
     frames = min(trajectory.num_frames - 1, round(AT_END / trajectory.metadata.frame_dt))
     way = np.linalg.norm(trajectory.pos[-1].astype(np.float64) - trajectory.pos[-1 - frames], axis=-1)
     return float(way.mean()) / trajectory.metadata.spacing / (frames * trajectory.metadata.frame_dt)

@@ -1,4 +1,4 @@
-"""Starts of the acceptance scenes, in the domain and with the spacing and gravity of a data set."""
+"""Initial states of the acceptance scenes. Domain, spacing and gravity are those of a data set."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def density_of(spec: DatasetSpec) -> float:
 
 
 def start(spec: DatasetSpec, value: float, pos: np.ndarray, vel: Any, shapes: tuple[Shape, ...], cells: np.ndarray | None = None) -> State:
-    """Return an undeformed start of one material.
+    """Return an undeformed initial state of one material.
 
     Args:
         spec: data set.

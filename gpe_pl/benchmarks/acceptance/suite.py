@@ -1,4 +1,4 @@
-"""The suite of acceptance scenes: what a person would look at before using a model, run by solver and model side by side.
+"""The suite of acceptance scenes: small scenes that a person would look at before using a model. Solver and model simulate each scene.
 
 Every check has a criterion from physics or from the solver's own uncertainty. A model that ignores its material parameter fails the checks in which a quantity
 has to change with the parameter.

@@ -32,7 +32,7 @@ MAX_CORRECTED = 0.01
 """Largest fraction of particle-steps in which containment may move a particle back out of a wall."""
 
 SMALLEST_CHANGE = 0.1
-"""A quantity that changes by a smaller fraction over the range of the parameter does not depend on it as far as a person can see."""
+"""Smallest change of a quantity over the range of the parameter, as a fraction, that a person would see. Smaller changes are not compared."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,14 @@ class Trial:
 
 
 def tried(candidate: Candidate, value: float, start: State, seconds: float) -> Trial:
-    """Run a scene from a start of the solver. The model takes over after the frames that its velocity history needs."""
+    """Run a scene by solver and model. The solver starts at ``start``; the model starts some frames later, when the solver has the history that it needs.
+
+    Args:
+        candidate: model and its data set.
+        value: material parameter of the scene, for the results.
+        start: initial state.
+        seconds: duration of the compared rollouts [s].
+    """
     solver: Any = candidate.spec.solver
     history, metadata = candidate.simulator.builder.config.history, candidate.metadata()
     num_frames = max(2, round(seconds / solver.frame_dt))
@@ -111,7 +118,7 @@ def tried(candidate: Candidate, value: float, start: State, seconds: float) -> T
 
 
 def advanced(solver: Simulator, state: State, num_steps: int) -> State:
-    """Return the state after some steps."""
+    """Return the state after ``num_steps`` steps."""
     for after in steps(solver, state, num_steps):
         state = after
     return state
@@ -151,7 +158,10 @@ def at_most(name: str, values: Sequence[float], limit: float, unit: str) -> Chec
 
 
 def not_above_solver(name: str, values: Sequence[tuple[float, float, float]], limit: float, unit: str) -> Check:
-    """Return the check that no value of the model exceeds a limit, or twice the larger value of both solver runs in the same scene if that is more."""
+    """Return the check that no value of the model exceeds its limit: ``limit``, or twice the larger value of the two solver runs of the scene if that is more.
+
+    ``values`` has the quantity of model, solver and finer solver in each scene.
+    """
     own = [max(solver, finer) for _, solver, finer in values]
     passed = all(model <= max(limit, 2 * most) for (model, _, _), most in zip(values, own, strict=True))
     return Check(name, passed, *_both([model for model, _, _ in values], own, unit), f"at most {limit:.3g}{unit} or twice the solver's")
@@ -164,7 +174,7 @@ def near_solver(name: str, values: Sequence[tuple[float, float, float]], toleran
         name: name of the check.
         values: quantity of model, solver and finer solver in each scene.
         tolerance: largest difference as a fraction of the solver's value.
-        smallest: difference that always passes, in the unit of the values; twice the solver's change at half its time step passes, too.
+        smallest: difference that always passes, in the unit of the values. A difference of twice that between the two solver runs passes, too.
         unit: unit of the values.
     """
     passed = all(abs(own - solver) <= max(tolerance * abs(solver), smallest, 2 * abs(finer - solver)) for own, solver, finer in values)
@@ -175,8 +185,8 @@ def near_solver(name: str, values: Sequence[tuple[float, float, float]], toleran
 def follows_parameter(name: str, values: Sequence[tuple[float, float, float]], unit: str) -> list[Check]:
     """Return the check that a quantity changes with the material parameter as the solver's does: in the same order, and by half to twice as much.
 
-    A model that ignores the parameter fails. The check is left out if the solver's order is not beyond its own uncertainty, or if its change is too small to
-    be seen (``SMALLEST_CHANGE``).
+    A model that ignores the parameter fails. The check is left out if the solver's values do not rise or fall steadily by more than their uncertainty, or
+    change too little to be seen (``SMALLEST_CHANGE``).
     """
     model, solver, finer = (np.array(v) for v in zip(*values, strict=True))
     change = solver[-1] - solver[0]
@@ -229,7 +239,7 @@ class Result:
 
 
 def shown(candidate: Candidate, trials: Sequence[Trial], *fractions: float) -> list[Shown]:
-    """Return columns of all trials at these fractions of their length."""
+    """Return a column of the figure for each trial and each fraction of its length."""
     columns = []
     for trial in trials:
         for fraction in fractions:

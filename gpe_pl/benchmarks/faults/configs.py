@@ -25,7 +25,7 @@ PLACES = (
     "data.larger",
     "logger.project",
 )
-"""Keys that are not drawn: paths, and tables from which other keys are taken and whose entries are mostly unused."""
+"""Keys that are never changed: paths, and tables that only hold values for other keys, most of which are unused."""
 UNBOUNDED = ("training.num_steps", "training.val_interval", "seed", "data.seed", "num_workers")
 """Integers without an upper limit."""
 

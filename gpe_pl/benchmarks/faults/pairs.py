@@ -17,7 +17,7 @@ from gpe_pl.benchmarks.faults.runs import Command
 from gpe_pl.benchmarks.faults.verdict import GOOD, MAX_DETAIL, Fault, Verdict
 
 SAYS_WHY = re.compile(r"another command writes to it \((process \d+ on .+|which has just begun)\)|exists already")
-"""Reasons of a refused command that ended first: the other one holds the folder, or has put its results there and is about to end."""
+"""Messages with which a command may refuse while the other one runs: the other one holds the folder, or its results already exist."""
 Results = dict[str, str]
 """Digests of a command's results, see ``runs.digests``."""
 
@@ -64,7 +64,7 @@ def together(commands: Sequence[Command], expected: Sequence[Results], delay: fl
 def deleted(command: Command, part: str, delay: float, expected: Results, limit: float, folder: Path) -> Verdict:
     """Delete the folder of the data or of the results while a command runs; it must fail with an error or succeed, and its repetition must succeed.
 
-    A command whose data are deleted gets a separate copy of them, and makes it again if it is missing.
+    If the data are to be deleted, the command works on a copy of them and generates them again if they are missing.
     """
     own = folder / "own"
     if command.data is not None and part == "data":

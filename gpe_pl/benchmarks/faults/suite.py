@@ -30,7 +30,7 @@ KILLED = "killed"
 TEMPORARY = re.compile(r"\S*/faults-\w+/")
 """Pattern of the folders in which faults are injected."""
 HERE = str(Path(__file__).resolve().parents[3])
-"""Folder that contains the package, which is another one on each machine."""
+"""Folder that contains the package. Reports leave it out, because it differs between machines."""
 
 
 RAW = "raw"

@@ -29,7 +29,7 @@ VALID_ERROR = 0.5
 PERTURBATION = 1e-6
 """Initial distance of twin rollouts, as a fraction of the domain's longest side."""
 STATIC_FRICTION = 0.5
-"""Static friction, as a fraction of gravity, in the rollout that is reported without a limit for models that have none."""
+"""Static friction, as a fraction of gravity, in a second rollout of models that have none. Its result is reported and decides nothing."""
 AT_REST = 0.01
 """Largest speed of a pile at rest, in spacings per frame."""
 

@@ -38,7 +38,7 @@ class Subject:
         max_speed: largest speed [m/s] in training trajectories.
         is_gating: whether a failure of this model fails the suite.
         peers: all simulators of this domain by name, including this one.
-        horizon_factors: lengths of long rollouts over the trained horizon, which is the number of frames of a scene.
+        horizon_factors: lengths of long rollouts, as multiples of the number of frames of a scene.
         num_rest_steps: number of frames over which a pile at rest is observed.
     """
 
@@ -200,7 +200,7 @@ def shifted(state: State, offset: Tensor) -> State:
 
 
 def in_flight(state: State, dt: float) -> State:
-    """Return the state with the velocities at the frame of free flight [m/s]: the mean over the last frame, plus half of what gravity adds in a frame."""
+    """Return the state with the velocities that free flight has at the frame [m/s]: the mean over the last frame, plus half of what gravity adds in a frame."""
     return state if state.frame_velocity is None else replace(state, frame_velocity=state.vel + 0.5 * dt * state.gravity)
 
 

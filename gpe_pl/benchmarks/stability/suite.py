@@ -66,7 +66,7 @@ class Settings:
         checkpoints: further models, as files or names of shipped models; they take part in the case whose data set they were trained on.
         gating: settings of the models that must pass, which are those of the shipped configuration.
         num_scenes: number of scenes of the split ``test``, per data set.
-        horizon_factors: lengths of long rollouts over the trained horizon.
+        horizon_factors: lengths of long rollouts, as multiples of the number of frames of a scene.
         num_rest_steps: number of frames over which a pile at rest is observed.
         tests: numbers of the tests to run; an empty list runs all.
         num_workers: number of processes; each takes whole data sets.
