@@ -20,17 +20,18 @@ from gpe_pl.trajectory.trajectory import Metadata, Termination
 from gpe_pl.trajectory.values import faults, size_conflicts
 
 CROWDING_LIMIT = 32
-"""Stop with ``clustering`` when more nodes than this share a cell of side ``spacing``; raised for starts that are nearly as dense (``Guard.of``)."""
+"""A rollout stops with the reason ``clustering`` if more nodes than this share a cell of side ``spacing``. ``Guard.of`` raises this limit for starts that are
+nearly as dense."""
 FINEST = 0.01
-"""Width of a cell whose nodes count as coincident [rest spacings]. If too many nodes of a start coincide, its limit on crowding is not raised."""
+"""Nodes that share a cell of this width count as coincident [rest spacings]. If too many nodes of a start coincide, its limit on crowding is not raised."""
 TUNNEL_DEPTH = 0.25
 """Depth in a wall or obstacle up to which a path between two frames does not count as going through it [rest spacings]."""
 MAX_PATH_SAMPLES = 4096
 """Maximum number of samples of a path. Paths longer than this many eighths of a spacing are sampled more coarsely."""
 NUM_BISECTIONS = 20
-"""Number of bisections that find where a way crosses a surface."""
+"""Number of bisections that find where the path of a node crosses a surface."""
 SUSPECTS_AT_ONCE = 1000
-"""Number of nodes whose paths are sampled together, as finely as the fastest of them needs."""
+"""Number of nodes whose paths are sampled together. All have as many samples as the fastest of them needs."""
 
 
 @dataclass(frozen=True)
@@ -244,14 +245,17 @@ def _within(pos, vel, low, high, squared_speed, spacing, max_crowding):
 
 
 def crowding(pos: np.ndarray, width: float) -> np.ndarray:
-    """Return for every node [node] the number of nodes in its cell of a grid of this width [m]. Very rarely, two cells count as one."""
+    """Return for every node [node] the number of nodes in its cell of a grid of this width [m].
+
+    Cells are told apart by a hash value. Very rarely, two cells have the same value and count as one.
+    """
     primes = np.array([73_856_093, 19_349_663, 83_492_791])[: pos.shape[1]]  # spatial hash [Teschner et al. 2003]; products may overflow
     _, box, counts = np.unique(np.floor(pos / width).astype(np.int64) @ primes, return_inverse=True, return_counts=True)
     return counts[box]
 
 
 def unsound(state: State, metadata: Metadata) -> Termination | None:
-    """Return a termination for the first array or shape of an initial state that breaks its rule, or None.
+    """Return the reason why a rollout cannot start: the first array or shape of the initial state that breaks its rule. Return None if there is none.
 
     The rules are those of ``schema.FIELDS`` and ``shape_values.shapes_fault``. Gravity, velocity history and velocities at the frame must be finite.
     """

@@ -37,7 +37,7 @@ class BatchSimulator(Simulator, Protocol):
 
 @runtime_checkable
 class Restartable(Simulator, Protocol):
-    """A solver that can continue from the positions and velocities of a frame, without what it remembers besides."""
+    """A solver that can continue from the positions and velocities of a frame, without its internal state."""
 
     @property
     def can_restart(self) -> bool:

@@ -22,12 +22,13 @@ class Skips:
         isolated_nodes: exact. Leave nodes without an edge out of message passing.
         edges_at_once: exact. Number of edges for which features and messages are computed at a time. This limits the memory; None takes all edges at once.
         sorted_from: exact. Graphs with at least this number of nodes are sorted so that neighbours are near each other in memory. None never sorts.
-        stress: exact for the motion. Do not decode the stress.
+        stress: exact for the motion. Leave out the prediction of the stress.
         sleep_after: approximate. Number of frames at rest after which an island sleeps: it stands still until something moves near it. None switches this off.
-            A body that is thrown upward is slow at the top of its flight; choose more frames than this takes.
-        rest_step_spacings: a node at rest moves less than this distance in a frame [rest spacings]. Learned models make steps of 0.01 to 0.03 spacings where
-            the ground truth rests.
-        rest_step_change_spacings: the step of a node at rest differs from the step before by less than this distance [rest spacings].
+            A body that is thrown upward is slow at the top of its flight; choose more frames than it is slow.
+        rest_step_spacings: a node is at rest only if it moves less than this distance in a frame [rest spacings]. Where the ground truth is at rest, learned
+            models move nodes by 0.01 to 0.03 spacings.
+        rest_step_change_spacings: a node is at rest only if its displacement in a frame differs from that in the frame before by less than this distance [rest
+            spacings].
         repeat_frames: approximate. Number of frames for which one prediction is repeated.
     """
 
