@@ -1,6 +1,6 @@
 """Approximate levels of skipping: nodes at rest are not computed, or one prediction is repeated for several frames.
 
-What these simulators remember between steps is in ``State.internal``, so a rollout can stop at any frame and continue.
+These simulators keep their memory between steps in ``State.internal``, so a rollout can stop at any frame and continue.
 """
 
 from __future__ import annotations

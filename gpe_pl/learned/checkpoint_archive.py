@@ -1,7 +1,7 @@
 """Checks of PyTorch archives from unknown sources, made before their pickle is read.
 
-PyTorch's safe loading runs no code. A few bytes in a file can still make it use gigabytes of memory or run for hours. Such files have members that unpack to
-far more than is stored, members that overlap in the file, empty arrays of any length, or nested tuples as keys of tables.
+PyTorch's safe loading (``weights_only=True``) runs no code. A few bytes in a file can still make it use gigabytes of memory or run for hours. Such files have
+members that unpack to far more than is stored, members that overlap in the file, arrays that claim more values than are stored, or nested tuples as keys.
 """
 
 from __future__ import annotations

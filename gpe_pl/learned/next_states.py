@@ -1,7 +1,7 @@
-"""From the predictions of a model for a batch to the next states and stresses of its scenes.
+"""Computes the next states of scenes, with stresses, from the predictions of a model for a batch of their graphs.
 
-On the CPU and without gradients, NumPy and compiled loops do what ``LearnedSimulator.accelerations`` and ``advance`` do in PyTorch. For the arrays of a scene,
-PyTorch's operations take longer to start than to compute.
+On the CPU and without gradients, NumPy and compiled loops replace ``LearnedSimulator.accelerations`` and ``advance``, because for the small arrays of a scene
+most of the time of a PyTorch operation is its overhead.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def works_on_all(states: list[State], predicted: dict[str, Tensor]) -> bool:
 
 
 def moved(states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor], unit: float, dt: float) -> list[State]:
-    """Return the next states under the accelerations that a model predicts.
+    """Return the states one frame later, given the accelerations that a model predicts.
 
     Args:
         states: states of the scenes of a batch.
@@ -52,10 +52,10 @@ def moved(states: list[State], graphs: list[HeteroData], predicted: dict[str, Te
 
 
 def with_frame_velocity(states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor], dt: float) -> list[State]:
-    """Return the next states with velocities at the frame, if a model predicts any. Other nodes have their mean velocity.
+    """Return states with the field ``frame_velocity``, if a model predicts velocities at the frame. Nodes without a prediction get their mean velocity.
 
     Args:
-        states: next states of the scenes of a batch.
+        states: the states one frame later, as ``moved`` returns them.
         graphs: their graphs.
         predicted: velocities at the frame for the batch, by material [node, dim] in m/frame.
         dt: frame interval [s].
@@ -69,14 +69,14 @@ def with_frame_velocity(states: list[State], graphs: list[HeteroData], predicted
 
 
 def with_stress(states: list[State], graphs: list[HeteroData], predicted: dict[str, Tensor], unit: Tensor, components: int) -> list[State]:
-    """Return the states of scenes with cells with the stresses that a model predicts.
+    """Return states with the stresses that a model predicts. States without cells are returned unchanged.
 
     Args:
-        states: next states of the scenes of a batch.
+        states: the states one frame later, as ``moved`` returns them.
         graphs: their graphs.
         predicted: stresses for the batch, by material [node, component].
         unit: unit of these stresses [Pa].
-        components: number of components.
+        components: number of components of a stress.
     """
     node = [state.pos.new_zeros(state.num_nodes, components) for state in states]
     compiled = works_on_all(states, predicted)
@@ -93,7 +93,7 @@ def with_stress(states: list[State], graphs: list[HeteroData], predicted: dict[s
 
 
 def per_scene(predicted: dict[str, Tensor], graphs: list[HeteroData]) -> Iterator[tuple[int, Tensor, Tensor]]:
-    """Yield the predictions for a batch as (number of the scene, rows of its state, values)."""
+    """Yield the predictions for a batch, split by scene, as (number of the scene, rows of its state, values of these rows)."""
     for material, values in predicted.items():
         rows = [graph[material].node_id for graph in graphs]
         if len(rows) == 1:

@@ -1,4 +1,4 @@
-"""A learned model as a ``Simulator``: builder ∘ standardisation ∘ model ∘ integrator.
+"""A learned model as a ``Simulator``. A step builds the graph, standardises it, calls the model, and integrates its accelerations.
 
 A checkpoint contains everything that a rollout needs: settings and weights of the model, statistics of the training data, settings of the graphs, and metadata
 of the data set.
@@ -247,7 +247,7 @@ class LearnedSimulator(nn.Module):
             yield material, self.get_buffer(f"trained_{material}")
 
     def described_training(self) -> Iterator[tuple[str, str]]:
-        """Yield a name, and the range in training with its unit, for each material parameter, mass, gravity and property of boundary nodes."""
+        """Yield name, and range in training with unit, of each material parameter, of masses, of gravity and of each property of boundary nodes."""
         for material, trained in self.trained_ranges():
             for spec, (low, high) in zip(self.builder.spec.parameters[material], trained.T.tolist(), strict=True):
                 yield f"{spec.name} of {material}", spec.quantity(f"{low:g} to {high:g}")
@@ -264,7 +264,7 @@ class LearnedSimulator(nn.Module):
         return outside_parameters(state, self.builder.metadata, self.trained_ranges())
 
     def untrained_scene(self, state: State) -> list[str]:
-        """Return one line for each kind of mass, gravity and property of boundary nodes of a scene that is outside the range of training."""
+        """Return one line for each material's mass, for gravity, and for each property of boundary nodes, if a scene leaves the range of training there."""
         return [line for _, line in self._outside_scene(state)]
 
     def _outside_scene(self, state: State) -> Iterator[tuple[str, str]]:
@@ -281,8 +281,8 @@ class LearnedSimulator(nn.Module):
     def initial_state(self, trajectory: Trajectory, frame: int) -> State:
         """Return the state at a frame with the velocity history that the graph needs, on this model's device.
 
-        Warnings name material parameters, masses, gravity and boundary nodes outside the range of training, and a version of the solver other than in training.
-        Each kind of warning appears once.
+        Warnings name material parameters, masses, gravity and boundary nodes outside the range of training, and a version of the solver that differs from that
+        of the training data. Each kind of warning appears once.
 
         Raises:
             IndexError: there are too few frames before ``frame``, or no such frame.
@@ -297,7 +297,7 @@ class LearnedSimulator(nn.Module):
         return self._checked(state, f"frame {frame}")
 
     def standing(self, state: State, scene: Metadata) -> State:
-        """Return the start of a rollout without earlier frames, on this model's device. All velocities of the history equal the present velocity.
+        """Return an initial state for a scene without earlier frames, on this model's device. All velocities of the history equal the present velocity.
 
         Raises:
             SceneError: as ``initial_state``.
@@ -332,7 +332,7 @@ class LearnedSimulator(nn.Module):
             )
 
     def stride_on(self, stored: Metadata) -> int:
-        """Return the stride with which data fit the model; 0 if there is none. ``stored`` describes the data with all stored frames."""
+        """Return the ``data.stride`` with which stored data have the frame interval of the model; 0 if there is none."""
         stride = round(self.builder.metadata.frame_dt / stored.frame_dt)
         return stride if stride >= 1 and self.fits(stored.every(stride)) else 0
 
@@ -378,7 +378,7 @@ class LearnedSimulator(nn.Module):
         return self.next_states(states)
 
     def next_states(self, states: list[State]) -> list[State | SimulationError]:
-        """Return the result of ``step_all`` as tensors that autograd can use in training."""
+        """Do the same as ``step_all`` outside inference mode, so that autograd can use the results in training."""
         standards = self._standards(states)
         graphs = [self._graph_or_error(state, standards) for state in states]
         sound = [k for k, graph in enumerate(graphs) if not isinstance(graph, SimulationError)]
@@ -421,7 +421,7 @@ class LearnedSimulator(nn.Module):
         return self._with_stress(new, graphs, predicted.stress) if predicted.stress else new
 
     def moved(self, states: list[State], graphs: list[HeteroData], predicted: Prediction) -> list[State]:
-        """Return the next states from the prediction for a batch of their graphs."""
+        """Return the states one frame later, given the states, their graphs, and the model's prediction for the batch of these graphs."""
         acceleration, dt = predicted.acceleration, self.builder.metadata.frame_dt
         if not self.static_friction and next_states.works_on_all(states, acceleration):
             new = next_states.moved(states, graphs, acceleration, float(self.acceleration_std), dt)
@@ -464,7 +464,10 @@ class LearnedSimulator(nn.Module):
         return self.static_friction * self.builder.metadata.frame_dt * gravity.norm()
 
     def supported(self, graph: HeteroData) -> Tensor:
-        """Return a mask [island] of the islands that static friction may keep in place."""
+        """Return a mask [island] of the islands that static friction may keep in place: those that touch walls, none of which moves.
+
+        The features of ``graph`` must not be standardised.
+        """
         spec = self.builder.spec
         moves = (graph[BOUNDARY].x[:, : spec.dim] != 0).any(dim=1)
         walls = [relation for relation in spec.relations if relation[0] == BOUNDARY]

@@ -98,9 +98,9 @@ def read(path: Path) -> Verdict:
 
 
 def headline(checkpoint: Path | str) -> str:
-    """Return the line with which model cards and ``evaluate`` begin. It says what fails in acceptance scenes, and then in stress tests.
+    """Return the line with which model cards and ``evaluate`` begin. It names the failed checks of the acceptance scenes, then the failed stress tests.
 
-    Without results of acceptance it says so. Stress tests are left out if they were never run.
+    If there are no results of acceptance scenes, the line says so. If there are none of stress tests, it does not mention them.
 
     Args:
         checkpoint: path of a checkpoint, folder of a run, or name of a shipped model.

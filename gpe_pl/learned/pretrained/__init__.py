@@ -27,7 +27,7 @@ def checkpoint_path(checkpoint: Path | str) -> Path:
 
 
 def fingerprint(checkpoint: Path | str) -> str:
-    """Return the text that identifies a checkpoint in configurations: the file's name and the beginning of its checksum, without its folder."""
+    """Return a text that identifies a checkpoint in configurations, wherever it lies: the file's name and the beginning of its checksum."""
     path = checkpoint_path(checkpoint)
     return f"{path.name} (sha256 {sha256(path.read_bytes()).hexdigest()[:12]})"
 
@@ -35,8 +35,8 @@ def fingerprint(checkpoint: Path | str) -> str:
 def model_name(checkpoint: Path | str | None, runs: Path | str) -> str:
     """Return the name of a model for use in folder names: that of a shipped model, or the path of its run below ``runs`` with ``_`` for ``/``.
 
-    A checkpoint other than the best of its run adds its own name. A checkpoint outside ``checkpoints/`` has the name of its file. All characters are allowed in
-    file names (``names.portable``).
+    If the checkpoint is not the best one of its run, its file's name is appended. For a checkpoint outside a folder ``checkpoints/``, the result is the file's
+    name. Characters that file names cannot have are encoded by ``names.portable``.
     """
     if checkpoint is None or str(checkpoint) in names():
         return str(checkpoint)

@@ -1,7 +1,7 @@
 """Contract of models whose cells move bodies (``model.elastic``): the units of gravity and of stress.
 
-The law reads gravity and returns stress in other units than the network. The symmetries in ``contract`` hold for any factor between these units, so they would
-not find a wrong one. A check raises ``AssertionError`` if a model fails.
+The law takes gravity and returns stress in other units than the network. The checks of symmetries in ``contract`` pass with a wrong conversion factor, too, so
+the checks here test the factors. A check raises ``AssertionError`` if a model fails.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ HEAVY = 1e6
 
 
 def check_gravity(make: Factory, kind: str) -> None:
-    """Check that more gravity moves a free body by half of what it adds within a frame, and adds all of it to the velocity at the frame.
+    """Check that additional gravity Δg moves a free body by Δg/2 in a frame and adds Δg to its velocity at the frame (in units of frames).
 
-    The network gets the same features with both.
+    The features of the network are the same with and without it, so only the law can cause the difference.
     """
     simulator, state = _simulator_and_state(make, kind)
     extra, dt = torch.linspace(-20.0, 3.0, state.dim, dtype=torch.float64), simulator.builder.metadata.frame_dt
@@ -44,7 +44,10 @@ def check_gravity(make: Factory, kind: str) -> None:
 
 
 def check_stress(make: Factory, kind: str) -> None:
-    """Check that the change of the stress [Pa] with a homogeneous strain is the one whose forces accelerate the nodes: m a = −Σ V σ ∇N."""
+    """Check that the stress [Pa] is that of the forces which move the nodes, by the changes of stress and acceleration due to a homogeneous strain.
+
+    The nodal forces of a stress σ are −Σ V σ ∇N, with the volumes V of cells and the gradients ∇N of their shape functions.
+    """
     simulator, state = _simulator_and_state(make, kind)
     resting = _graph(simulator, state)
     store = resting[SOLID]
