@@ -44,7 +44,7 @@ RATE = "FLOP/s in products"
 PRODUCTS = (4096, 128)
 """Rows and channels of the matrix products that are timed for ``RATE``."""
 SAME_MACHINE = 1.4
-"""Rates that differ by more than this factor come from different machines, or from a busy one."""
+"""If two measured rates differ by more than this factor, the machines differ, or one of them was busy. A warning is logged then."""
 
 
 def step_time_key(config: dict[str, Any], training: TrainingSettings, trainer: TrainerSettings, data: str | None = None) -> str:
@@ -181,7 +181,7 @@ def _check_machine(times: dict[str, float], path: Path, key: str, device: str) -
 
 
 class PauseForMeasurements(L.Callback):
-    """Pauses a training while another run of its sweep measures a step time, which the training would lengthen.
+    """Pauses a training while another run of its sweep measures a step time, because the training would slow the measured steps down.
 
     Args:
         path: the sweep's file of step times.

@@ -77,8 +77,8 @@ BODY_METRICS = ("deformation_ratio", "deformation_error", "rotation_error", "str
 class RolloutValidation(Callback):
     """Rolls the current (averaged) model out on validation trajectories and logs the position MSE [m²] as ``val/rollout_mse``.
 
-    Frames that a stopped rollout lacks count as the square of the domain's longest side. Meshes also get ``val/deformation_ratio`` and the other
-    ``BODY_METRICS``, as means over the trajectories whose ground truth has them. These metrics use only the frames before a rollout stops.
+    If a rollout stops early, each missing frame has the error of the squared longest side of the domain. Meshes also get ``val/deformation_ratio`` and the
+    other ``BODY_METRICS``, as means over the trajectories whose ground truth has them. These metrics use only the frames before a rollout stops.
 
     Put it before ``WarmAverage`` in the list of callbacks, so that it sees the averaged weights. Each rank takes some of the trajectories.
 

@@ -39,8 +39,8 @@ class Checkpoints(Checkpoint):
     Attributes:
         best_score: validation score of ``best.ckpt`` [m²]; None if there is none.
         best_step: training step of ``best.ckpt``; None if there is none.
-        saved_step: training step of ``last.ckpt``; None if this training has neither loaded nor saved it.
-        has_begun: whether training steps have begun, so that all of ``last.ckpt`` has been restored.
+        saved_step: training step of ``last.ckpt``; None if this process has neither loaded nor saved it.
+        has_begun: whether a training step has begun. By then, all of ``last.ckpt`` has been restored.
     """
 
     def __init__(self, folder: Path, seconds: float = math.inf, interruption: Interruption | None = None) -> None:

@@ -23,7 +23,7 @@ class Interruption:
     Use it as a context manager: on exit it restores the previous signal handlers.
 
     Attributes:
-        requested: whether a signal has come since ``listen``.
+        requested: whether a signal has arrived since ``listen`` was called.
     """
 
     def __init__(self) -> None:

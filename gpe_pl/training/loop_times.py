@@ -18,7 +18,7 @@ from gpe_pl.training.run import TrainingSettings
 WARM_UP_STEPS, STEPS_PER_ROUND = 2 * NUM_LANES, NUM_LANES
 """Steps before the first round, and in each round. A round takes every lane of push-forward once."""
 LEARNING_RATE = 1e-9
-"""The weights stay almost the same."""
+"""Learning rate of the timed steps. It is so small that the weights stay almost the same."""
 
 
 class _Rounds(L.Callback):

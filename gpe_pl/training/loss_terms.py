@@ -1,4 +1,4 @@
-"""How errors of accelerations count in the loss: penalties other than the square, and weights by the number of neighbours.
+"""Terms of the loss of accelerations: penalties of an error, and weights that depend on a node's number of neighbours.
 
 Source of ``root`` and of the weights: Ummenhofer et al. 2020, "Lagrangian Fluid Simulation with Continuous Convolutions", ICLR, section 4. Their loss is the
 mean of exp(−n/40) |error|^0.5, where n is the number of neighbours, and 40 is about its mean.
@@ -17,13 +17,14 @@ from torch_geometric.data import HeteroData
 Loss = Literal["square", "log", "root"]
 
 SMALL_ERROR = 0.1
-"""Normalised error s of an acceleration up to which ``log`` is nearly the square."""
+"""Scale s of the penalty ``log``, in units of normalised accelerations. For smaller errors, ``log`` is nearly the square."""
 LEAST_ERROR = 6.3e-4
-"""Error of a position in rest spacings below which ``root`` is smooth. The code of Ummenhofer et al. adds 1e-9 m² to the square, with a spacing of 0.05 m."""
+"""Error of a position [rest spacings] below which the penalty ``root`` is smooth. The code of Ummenhofer et al. adds 1e-9 m² to the square, with a spacing of
+0.05 m."""
 
 
 def penalty(error: Float[Tensor, "node dim"], loss: Loss, least: Float[Tensor, ""]) -> Float[Tensor, "node _"]:
-    """Return how errors e count in the loss.
+    """Return the penalty of errors e, whose mean is the loss.
 
     ``square`` is e² of each component, ``log`` is s² log(1 + e²/s²) of each with s = ``SMALL_ERROR``, and ``root`` is (|e|² + least²)^(1/4) of each node.
 

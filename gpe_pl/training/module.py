@@ -1,4 +1,4 @@
-"""``LightningModule`` of a learned simulator: loss of one step or a few, optimiser, learning-rate schedule, and a stop when losses are not finite."""
+"""``LightningModule`` of a learned simulator: loss over one or several steps, optimiser, learning-rate schedule, and an end if losses stay infinite or NaN."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MAX_SKIPPED, SKIP_WINDOW, MAX_IN_ROW = 10, 100, 3
 run."""
 
 COMPILE_PAYS_AFTER = 10_000
-"""Steps from which ``compile: auto`` repays the time that compilation takes."""
+"""Number of training steps from which compilation saves more time than it takes. ``compile: auto`` compiles longer runs."""
 
 RESUMED = {
     *("state_dict", "optimizer_states", "lr_schedulers", "loops", "callbacks", "global_step"),
@@ -60,10 +60,10 @@ class TrainingError(GpeError, RuntimeError):
 
 
 class TrainingModule(L.LightningModule):
-    """Trains a ``LearnedSimulator`` on one-step accelerations.
+    """Trains a ``LearnedSimulator`` on accelerations.
 
-    The loss is the mean squared error of the normalised acceleration over all dynamic nodes and axes. For a fixed frame interval this is, up to a constant, the
-    paper's MSE of the next position.
+    By default, the loss is the mean squared error of the normalised acceleration over all dynamic nodes and axes. For a fixed frame interval this is, up to a
+    constant, the paper's MSE of the next position.
 
     Args:
         simulator: simulator with its statistics set.
@@ -73,7 +73,7 @@ class TrainingModule(L.LightningModule):
         schedule: ``exponential`` decays geometrically (paper: 5e-5 to 1e-6); ``cosine`` warms up and follows a half cosine (short budgets); ``staircase`` keeps
             the rate for half of the steps, then falls after every tenth of the steps by the same factor, to the final rate in the last tenth.
         warmup_steps: steps of linear warm-up in the ``cosine`` schedule.
-        loss: ``square``, ``log`` or ``root``: how errors of normalised accelerations count; see ``loss_terms.penalty``. Stress always has the squared error.
+        loss: penalty of errors of normalised accelerations, ``square``, ``log`` or ``root``; see ``loss_terms.penalty``. Stress always has the squared error.
         stress_weight: weight of the mean squared error of the normalised stress, relative to that of the acceleration; used if the model decodes a stress.
         neighbor_weight: c in the weight exp(−c n/n̄) of the acceleration of a node with n neighbours; see ``loss_terms.num_neighbors``. None weights all alike.
         mean_neighbors: n̄, the mean number of neighbours of a node in the training data.
@@ -168,11 +168,11 @@ class TrainingModule(L.LightningModule):
             del model.compute  # leaves the method of the class
 
     def loss(self, samples: Samples) -> Tensor:
-        """Return the mean error of the normalised accelerations, plus that of the normalised stress if the model decodes one.
+        """Return the mean penalty of the normalised accelerations, plus the weighted error of the normalised stress if the model decodes one.
 
-        ``loss_terms.penalty`` says how an error counts. With several ranks, the loss is this rank's part of the sum. For push-forward samples, the
-        graphs show the states that the unrolls have reached, and the predictions advance these unrolls by one step. For unrolls with gradients, the loss is the
-        mean over their steps. Its errors are those of positions after each step, in units of the acceleration scale times the squared frame interval.
+        With several ranks, the result is this rank's part of the loss; the loss is the sum over ranks. For push-forward samples, graphs are made of the states
+        that the unrolls have reached, and the predictions advance these unrolls by one step. For unrolls with gradients, the loss is the mean over their steps.
+        Its errors are those of positions after each step, in units of the acceleration scale times the squared frame interval.
         """
         if isinstance(samples, list) and isinstance(samples[0], Unroll):
             unrolls = [sample for sample in samples if isinstance(sample, Unroll)]

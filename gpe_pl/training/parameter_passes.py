@@ -2,7 +2,7 @@
 
 PyTorch's functions for lists of tensors spend microseconds on each tensor. A model of this package has a hundred or more small ones, for which that is longer
 than the arithmetic takes. The kernels here read the addresses of all tensors. They work on contiguous tensors of one precision, single or double. PyTorch does
-not see what kernels write, so the functions that change parameters raise PyTorch's count of their changes.
+not notice what kernels write, so the functions that change tensors increase PyTorch's version counters of these tensors.
 """
 
 from __future__ import annotations

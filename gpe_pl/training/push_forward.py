@@ -1,7 +1,7 @@
 """Push-forward: trains a simulator on states that its own unrolls reach.
 
-A training step predicts the accelerations that the unroll needs for its next step, so the unroll needs no additional pass of the model. The model is trained on
-a batch of states; the prediction then advances these states, which are kept until the next turn of their lane.
+A training step uses the prediction of the model twice: for the loss, and to advance the unrolled states by one step. Unrolls therefore need no additional pass
+of the model. The advanced states are kept until the next training step of their lane.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MOVED = ("pos", "vel", "velocity_history", "frame_velocity", "time")
 
 @dataclass
 class Excursion:
-    """A batch of scenes in the middle of their unrolls.
+    """The unrolls of one batch of scenes, at the step that they have reached.
 
     Attributes:
         samples: number of each scene's sample in the data set.
@@ -51,7 +51,7 @@ Stored = dict[int, dict[int, dict[str, Any]]]
 class Excursions:
     """All batches that a simulator is unrolling, one per lane (see ``PushForward``).
 
-    After ``clear``, the unrolls are repeated from their starts with the current weights.
+    After ``clear``, the unrolls are computed again from their starts with the current weights.
     """
 
     def __init__(self) -> None:
@@ -63,7 +63,7 @@ class Excursions:
         self._loaded.clear()
 
     def state_dict(self) -> Stored:
-        """Return unrolls of all ranks: ``steps`` and the fields ``MOVED`` of each scene. All ranks have to call it."""
+        """Return the unrolls of all ranks: the number of steps and the fields ``MOVED`` of each scene. All ranks have to call it."""
         own: Stored = {lane: dict(scenes) for lane, scenes in self._loaded.items()}  # loaded from a checkpoint and not used since
         for lane, way in self._lanes.items():
             scenes = zip(way.samples, way.states, way.steps, strict=True)

@@ -36,7 +36,7 @@ from gpe_pl.training.parallel import SummedGradients
 log = logging.getLogger(__name__)
 
 Targets = Literal["trajectory", "solver"]
-"""Where the targets of noisy and unrolled states lead: ``trajectory``, back to the true one; ``solver``, where the solver goes from them."""
+"""Targets of noisy and unrolled states: ``trajectory`` leads back to the true trajectory, ``solver`` follows the solver from these states."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class TrainingSettings:
         push_steps: maximum number of steps of an unroll.
         push_correction: fraction of the velocity's deviation after an unroll that the target removes within one step, with ``targets=trajectory``.
         mirror: mirror training windows at random along axes without gravity; see ``WindowDataset``.
-        targets: where the targets of noisy and unrolled states lead; see ``data.solver_targets``.
+        targets: targets of noisy and unrolled states, see ``Targets`` and ``data.solver_targets``.
         val_containment: put particles that cross a wall back on its surface in the validation rollouts, which choose the best checkpoint.
     """
 
