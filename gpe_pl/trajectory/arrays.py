@@ -145,7 +145,7 @@ def checked_bounds(bounds: Any, periodic: tuple[bool, ...], pos: np.ndarray, bou
 def checked_materials(
     materials: str | Sequence[str], params: Mapping[str, Any], num_nodes: int
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """Return codes of ``node_type`` [node], ``material_params`` [node, param], the names of the materials that occur, and those of the columns.
+    """Return codes of ``node_type`` [node], ``material_params`` [node, param], the names of the materials that occur, and the names of the parameter columns.
 
     Raises:
         ArrayError: a material or parameter is unknown or missing, or a value breaks its rule. The message names it, and the node if there is one.
@@ -187,7 +187,7 @@ def checked_materials(
 
 
 def checked_cells(cells: Any, codes: np.ndarray, dim: int) -> tuple[np.ndarray, int]:
-    """Return all cells of a mesh in one array [cell, corner], and whether they are surfaces (2) or volumes (3). In 2D they are surfaces.
+    """Return all cells of a mesh in one array [cell, corner], and their dimension: 2 for surfaces, 3 for volumes. In 2D it is 2.
 
     Cells with fewer corners than others repeat their last corner.
 

@@ -44,7 +44,7 @@ class BoundaryMotion:
         return BoundaryMotion(self.pos[start:stop], self.vel[start:stop], self.normal[start:stop])
 
     def every(self, stride: int) -> BoundaryMotion:
-        """Return every ``stride``-th frame from the first on. Velocities are means over the frames up to, and without, the next returned one."""
+        """Return every ``stride``-th frame from the first on. A velocity is the mean from its frame to the next returned frame."""
         first = np.arange(0, self.num_frames, stride)
         count = np.minimum(first + stride, self.num_frames) - first
         vel = np.add.reduceat(self.vel, first, axis=0) / count[:, None, None]
@@ -177,7 +177,7 @@ class Boundary:
         return replace(first, motion=BoundaryMotion(inside, vel, normals)).at(0)
 
     def inside(self, periodicity: Periodicity) -> Boundary:
-        """Return this boundary of NumPy arrays, prepared for a periodic domain; the same object if no axis is periodic.
+        """Return this boundary with its nodes and shapes adapted to a periodic domain; the same object if no axis is periodic. Arrays must be NumPy arrays.
 
         Nodes are wrapped into the domain. If nodes with the same normal coincide, only one is kept. Nodes inside an image of a shape are left out. Shapes get
         their periodic images.
@@ -207,9 +207,10 @@ class Boundary:
         return replace(self, **values)
 
     def at(self, frame: int, stop: int | None = None) -> Boundary:
-        """Return the boundary ``frame`` frames later, with its motion before the frame ``stop``; the same object if it has no motion.
+        """Return the boundary ``frame`` frames later; the same object if it has no motion.
 
-        After the last frame of its motion, the boundary stays in place with zero velocity.
+        Its remaining motion ends before the frame ``stop``, counted from now; None keeps all of it. After the last frame of its motion, the boundary stays in
+        place with zero velocity.
         """
         if self.motion is None:
             return self
@@ -226,11 +227,11 @@ class Boundary:
         return self if self.motion is None else replace(self, motion=self.motion.every(stride)).at(0)
 
     def tree(self, periodicity: Periodicity) -> Any:
-        """Return ``search_tree`` of the positions. It is built once, as the positions of a ``Boundary`` never change."""
+        """Return ``search_tree`` of the positions. It is built once, because the positions of a ``Boundary`` never change."""
         return self.made_once(periodicity, lambda: search_tree(self.pos, periodicity))
 
     def made_once(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """Return what ``make`` returned at the first call with this key."""
+        """Return ``make()``, computed at the first call with this key and then cached with the boundary."""
         kept: dict[Hashable, Any] = self.__dict__.setdefault("_made", {})  # not a field, so neither compared nor stored
         if key not in kept:
             kept[key] = make()
@@ -238,7 +239,10 @@ class Boundary:
 
 
 def search_tree(pos: Array, periodicity: Periodicity = NOWHERE) -> Any:
-    """Return a k-d tree of positions [node, dim] for neighbour search on the CPU. It is quick to build, as moving nodes need a new one in every step."""
+    """Return a k-d tree of positions [node, dim] for neighbour search on the CPU.
+
+    Moving nodes need a new tree in every step, so its options make it quick to build.
+    """
     from scipy.spatial import cKDTree
 
     points = np.ascontiguousarray(as_numpy(pos))
@@ -258,7 +262,7 @@ def _unit(normal: np.ndarray) -> np.ndarray:
 
 
 def check_steps(boundary: Boundary, frame_dt: float, periodicity: Periodicity) -> None:
-    """Raise ``ArrayError`` if a node moves by more than half a period between frames: its motion was made without this periodicity."""
+    """Raise ``ArrayError`` if a boundary node moves by more than half a period between frames, which means that its motion ignores the periodicity."""
     if boundary.motion is None:
         return
     for axis in periodicity.axes:

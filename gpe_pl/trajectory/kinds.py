@@ -11,11 +11,11 @@ Kind = Mapping[str, str]
 NODE: Kind = {"kind": "node"}
 """The field has one row per node."""
 CELL: Kind = {"kind": "cell"}
-"""The field has one row per mesh cell, which holds numbers of nodes."""
+"""The field has one row per mesh cell. Its values are numbers of nodes."""
 SCENE: Kind = {"kind": "scene"}
 """The field has one value for the whole scene."""
 STEP: Kind = {"kind": "step"}
-"""The field describes the step that led to a state, or holds what a simulator needs for the next one. Its default, which it must have, means unknown."""
+"""The field describes the step that led to a state, or is memory of a simulator for its next step. It needs a default value, which means unknown."""
 
 
 def names_of(part: Any, kind: Kind) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Mirror images of scenes. The image of a motion obeys the same laws of physics, under the image of its gravity."""
+"""Mirror images of scenes. The mirror image of a motion obeys the same laws of physics if gravity is mirrored, too."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Reflection:
         )
 
     def trajectory(self, trajectory: Trajectory) -> Trajectory:
-        """Return the image of a trajectory, or the trajectory itself without planes. The planes have to leave gravity and the domain as they are."""
+        """Return the image of a trajectory; the same object if there are no planes. The planes must map gravity and the domain onto themselves."""
         if all(plane is None for plane in self.planes):
             return trajectory
         rest_pos, stress = trajectory.rest_pos, trajectory.stress

@@ -25,7 +25,7 @@ TOLERANCE = 1e-5
 """Differences of positions below this fraction of the boundary's extent are rounding."""
 
 STRETCH = 0.25
-"""Near nodes count as connected if their distance changes by at most this fraction."""
+"""Two near nodes count as connected if their distance changes by at most this fraction in all frames."""
 
 PARTNERS = 8
 NEIGHBOURS = 16
@@ -109,8 +109,8 @@ class _Part:
 def carried_along(pos: np.ndarray, normal: np.ndarray, periodicity: Periodicity = NOWHERE) -> np.ndarray:
     """Return unit normals [frame, boundary_node, dim] that turn with the rigid part of each node.
 
-    Normals of parts that do not turn stay equal bit for bit. A node outside rigid parts turns with the near nodes outside rigid parts that keep about the same
-    distance from it; this follows a membrane. A single node does not turn. In 3D, parts whose nodes lie in a row do not turn about this row.
+    Normals of parts that do not turn stay equal bit for bit. The normal of a node outside rigid parts, such as a node of a membrane, turns with the connected
+    nodes outside rigid parts. The normal of a single node does not turn. In 3D, parts whose nodes lie in a row do not turn about this row.
 
     Args:
         pos: positions [frame, boundary_node, dim] in m, continuous across seams.

@@ -1,7 +1,7 @@
 """Ranges of gravity, boundary conditions and the spacing of boundary nodes in scenes.
 
-A model knows only the values of its training, often a single one. A range is an array [2, channel] of lowest and highest values. Its channels are the
-components of gravity, followed by ``BOUNDARY_CHANNELS``. Without boundary nodes, the lowest value is ∞ and the highest −∞.
+A model has learned only from the values of its training, often a single one. A range is an array [2, channel] of lowest and highest values. Its channels are
+the components of gravity, followed by ``BOUNDARY_CHANNELS``. Without boundary nodes, the lowest value is ∞ and the highest −∞.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def united(ranges: Iterable[Float64[np.ndarray, "2 channel"]]) -> Float64[np.nda
 
 
 def described(trained: Float64[np.ndarray, "2 channel"]) -> Iterator[tuple[str, str]]:
-    """Yield a name, and the values of the training range with their unit, for each kind of value."""
+    """Yield the name of each channel, and its range with the unit, as text."""
     gravity, boundary = np.split(trained, [-len(BOUNDARY_CHANNELS)], axis=1)
     yield "gravity", _between(_vector(gravity[0]), _vector(gravity[1]), " m/s²")
     for (name, unit), (low, high) in zip(BOUNDARY_CHANNELS, boundary.T, strict=True):
@@ -74,7 +74,7 @@ def described(trained: Float64[np.ndarray, "2 channel"]) -> Iterator[tuple[str, 
 
 
 def outside(trained: Float64[np.ndarray, "2 channel"], scene: Float64[np.ndarray, "2 channel"], speed: float) -> Iterator[tuple[str, str]]:
-    """Yield the kinds of values in a scene that training did not have, each with a line that names the value and the trained range.
+    """Yield the kinds of values with which a scene leaves the trained range, each with a line that names the value and the range.
 
     Args:
         trained: range of training.

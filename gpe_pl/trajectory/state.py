@@ -76,8 +76,8 @@ class State:
         num_corrected: number of nodes that containment put back in the last frame.
         num_asleep: number of sleeping nodes, which the simulator did not compute in the last frame.
         lost_impulse: momentum [kg m/s] that the sleeping nodes lost, as the sum of magnitudes.
-        internal: private data of a solver or simulator (deformation gradient, …). With it, a rollout goes on from any state as if it had not been interrupted.
-            It is not stored.
+        internal: private data of a solver or simulator, such as deformation gradients. With it, a rollout can continue from any state as if it had not been
+            interrupted. It is not stored.
         periodicity: axes along which space repeats.
         param_names: names of the columns of ``material_params``; empty stands for the first parameter of each material of the data set. Solvers take the
             values of parameters without a column from their settings.

@@ -165,7 +165,7 @@ class Trajectory:
         boundary: boundary in the first frame; if it moves, its motion has as many frames as the trajectory.
         rest_pos, cells, cell_dim: reference configuration of meshes, as in ``State``.
         stress: stress of the mesh in every frame.
-        termination: reason if a rollout stopped before its last frame.
+        termination: reason why a rollout stopped early; None if it did not.
         start_time: time of the first frame since the start of the scene [s].
         is_prediction: whether the trajectory is a rollout of a simulator other than a ground-truth solver.
     """
